@@ -181,7 +181,7 @@ def judge(seed: int, span: tuple[float, float]) -> dict[str, Any]:
         zwidth.Device(truth["mass"], truth["damping"]), zwidth.Timing(period=PERIOD, delay=truth["delay"])
     )
     truth["stiffness_max"] = float(scene.max_stiffness().stiffness)
-    known = {name: bar for name, bar in fit.intervals.items() if np.isfinite(bar.low)}
+    known = {name: bar for name, bar in fit.intervals.items() if np.isfinite(bar.low) and name in truth}
     safe = fit.safe_wall()
     # In standard errors.
     away = {name: abs(getattr(fit, name) - truth[name]) * fit.reach / (bar.high - getattr(fit, name))
@@ -352,7 +352,7 @@ def report(count: int, processes: int) -> str:
         "",
         f"{count:,} logs of devices that may have an amplifier's lag of 0.1 to 1 ms, and one or two resonances",
         "of 30 to 400 Hz and 0.5 to 10 % damping, moved to and fro, read with 1 to 40 µm and noise as above.",
-        "K_max is given where nothing is doubted; it is that of a rigid mass, and a lag counts as delay.",
+        "K_max is given where nothing is doubted, with the lag and the resonances that the log asks for.",
         "`safe_wall()` bears what may hide in the log. The last column has `safe_wall(rigid=True)`, which does",
         "not: how many of those walls are stable.",
         "",

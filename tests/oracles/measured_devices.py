@@ -121,6 +121,84 @@ class TrueDevice:
         return float(found.stiffness) if found.status == 0 else 0.0
 
 
+MASS, DAMPING, DELAY, PERIOD, STRONGEST = 0.1, 1.0, 1.5e-3, 1e-3, 3.0
+
+
+@dataclass(frozen=True)
+class OtherDevice(TrueDevice):
+    """One of other matrices, of 100 g and 1 N s/m."""
+
+    plant: Any = None
+
+    @classmethod
+    def of(cls, plant: Any, step: float = 1e-5) -> OtherDevice:
+        return cls("", MASS, DAMPING, 0.0, (), DELAY, PERIOD, step, STRONGEST, plant)
+
+    def matrices(self) -> tuple[Any, Any, Any]:
+        return self.plant
+
+    def limit_of_walls(self) -> float:
+        scene = zwidth.Scene(zwidth.LinearDevice(self.plant), zwidth.Timing(self.period, self.delay))
+        return float(scene.max_stiffness().stiffness)
+
+    def record(self, rng: np.random.Generator, count: int = 2000, hold: int = 25) -> tuple[np.ndarray, np.ndarray]:
+        """Steps to and fro, and what an encoder with noise reads of them."""
+        force = self.limit * np.repeat(rng.choice([-1.0, 1.0], -(-count // hold)), hold)[:count]
+        exact = self.play(force, read=False)
+        return force, self.encoder * np.round(exact / self.encoder + 0.3 * rng.standard_normal(count))
+
+
+def couple(stiffness: float, tip: float, damping: float, sensor: int) -> Any:
+    """Two bodies of 100 g together, the force and damping to ground on the first, the sensor on either."""
+    masses = np.array([MASS - tip, tip])
+    pull = np.array([[-1.0, 1.0], [1.0, -1.0]]) / masses[:, None]
+    rub = damping * pull - np.diag([DAMPING / masses[0], 0.0])
+    A = np.block([[np.zeros((2, 2)), np.eye(2)], [stiffness * pull, rub]])
+    return A, np.array([0.0, 0.0, 1.0 / masses[0], 0.0]), np.eye(4)[sensor]
+
+
+def add_mode(plant: Any, frequency: float, ratio: float, share: float) -> Any:
+    """A resonance beside the mass that moves so much as it; negative beyond a node."""
+    A, B, C = plant
+    w = 2 * np.pi * frequency
+    more = np.array([[0, 1], [-w * w, -2 * ratio * w]])
+    return block_diag(A, more), np.array([*B, 0.0, 1 / MASS]), np.array([*C, share, 0.0])
+
+
+def add_lag(plant: Any, den: tuple[float, ...]) -> Any:
+    """An amplifier of ``1 / (den[0] s^n + ... + 1)`` before it."""
+    A, B, C = plant
+    size, order = len(A), len(den) - 1
+    lag = np.eye(order, k=1)
+    lag[-1] = -np.array(den[:0:-1]) / den[0]
+    whole = np.block([[A, np.outer(B, np.eye(order)[0])], [np.zeros((order, size)), lag]])
+    return whole, np.eye(size + order)[-1] / den[0], np.array([*C, *np.zeros(order)])
+
+
+def _loop(hertz: float) -> tuple[float, float, float]:
+    w = 2 * np.pi * hertz
+    return w**-2, 1.4 / w, 1.0
+
+
+def _couple(hertz: float, sensor: int) -> Any:
+    """Compliance with two thirds of the mass at the tip."""
+    tip = 2 / 3 * MASS
+    less = tip * (MASS - tip) / MASS
+    w = 2 * np.pi * hertz
+    return couple(less * w**2, tip, 2 * 0.03 * w * less, sensor)
+
+
+RIGID = np.array([[0.0, 1.0], [0.0, -DAMPING / MASS]]), np.array([0.0, 1 / MASS]), np.array([1.0, 0.0])
+OTHERS = {
+    **{f"amplifier, lag of {lag} ms": add_lag(RIGID, (1e-3 * lag, 1.0)) for lag in (0.1, 0.3, 1, 2)},
+    **{f"current loop of {hertz} Hz": add_lag(RIGID, _loop(hertz)) for hertz in (500, 150)},
+    **{f"compliance of {hertz} Hz, encoder at the motor": _couple(hertz, 0) for hertz in (50, 100, 200, 300)},
+    **{f"compliance of {hertz} Hz, encoder at the load": _couple(hertz, 1) for hertz in (100, 300)},
+    "two resonances": add_mode(add_mode(RIGID, 60, 0.03, 0.3), 150, 0.03, 0.3),
+    "lag and resonance": add_lag(add_mode(RIGID, 200, 0.03, 0.4), (1e-3, 1.0)),
+}
+
+
 class Trial(NamedTuple):
     """What two records of one device told of its walls: the first one blind, the second one made from it."""
 

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.scenes import scene_of
+from zwidth.fitting.scenes import name_numbers, scene_of
+from zwidth.parts.actuator import Actuator
 from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.mode import Mode
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
+from zwidth.words.errors import InputError
 from zwidth.words.formatting import to_json, with_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
+    from zwidth.fitting.hidden import HiddenLag
     from zwidth.fitting.safe_wall import SafeWall
 
 NAMES = ("mass", "damping", "delay")
@@ -33,6 +37,8 @@ VAGUE = 0.5
 BEYOND = 3.0
 # Sampling periods of loops, in s: outside a unit is suspected.
 _QUICKEST, _SLOWEST = 5e-6, 0.02
+# Of the usual safe wall.
+_RELIABILITY = 0.99
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of it"
 
 
@@ -93,8 +99,11 @@ class DeviceFit:
 
     Attributes:
         mass, damping, delay: estimates in kg, N s/m, s.
-        errors: standard errors of the three, by name, and of "cutoff" where that was unknown.
-        covariance: of the three, in that order, SI units; of the cut-off as a fourth where that was unknown.
+        actuator, modes: of a log, the amplifier's lag and the resonances that it asks for, a `zwidth.Actuator` or None
+            and `zwidth.Mode`; the sensor of a positive modal mass is at the motor, of a negative one beyond a node.
+        errors: standard errors of the three, by name, of "cutoff" where that was unknown, and of the parts by their
+            paths, as "actuator.time_constant" and "modes.0.frequency".
+        covariance: of ``numbers``, in that order, SI units.
         stiffness_max: K_max in N/m of the estimated device, `zwidth.Scene.max_stiffness`; NaN where the status is not
             OK, unless it is UNDECIDED and the rivals have the same within the error.
         stiffness_error: its standard error, by K_max's gradient.
@@ -114,6 +123,9 @@ class DeviceFit:
         response: of a log, a `zwidth.MeasuredDevice`: the response of the estimated device, with the radius by which a
             resonance of a damping ratio of 0.005 or more may move it and not show in the log. None of buzzing walls, of
             a log without noise, and under a doubt of what the fit leaves.
+        lag: of a log, ``(time_constant, delay, stiffness_max)`` of the longest lag of an amplifier that it does not
+            tell from a delay, in s and N/m; the interval of K_max reaches there. None as ``response``, and where none
+            is so.
         freedom: degrees of freedom that the noise was estimated with; None where it is known.
     """
 
@@ -138,6 +150,14 @@ class DeviceFit:
     freedom: int | None = None
     rivals: tuple[RivalDevice, ...] = ()
     response: MeasuredDevice | None = None
+    actuator: Actuator | None = None
+    modes: tuple[Mode, ...] = ()
+    lag: HiddenLag | None = None
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Paths of what was fitted, in the order of the covariance: mass, damping, delay, and what more there is."""
+        return name_numbers(self.scene, "cutoff" in self.errors)
 
     @property
     def is_doubted(self) -> bool:
@@ -160,12 +180,39 @@ class DeviceFit:
     @cached_property
     def scene(self) -> Scene:
         """The estimated device with its timing and velocity estimate."""
-        return scene_of((self.mass, self.damping, self.delay), self.period, self.velocity)
+        scene = scene_of((self.mass, self.damping, self.delay), self.period, self.velocity)
+        return replace(scene, device=replace(scene.device, actuator=self.actuator, modes=self.modes))
 
     @cached_property
     def responding(self) -> Scene | None:
-        """The same loop with the response in place of the device: what holds for every resonance within its radius."""
-        return None if self.response is None else Scene(self.response, Timing(self.period), velocity=self.velocity)
+        """The same loop with the response in place of the device: what holds for every resonance within its radius.
+
+        Of a device with an amplifier or resonances, the radius has what their numbers may be, too.
+        """
+        return None if self.response is None else self.respond(_RELIABILITY, True)
+
+    def respond(self, reliability: float, hidden: bool) -> Scene:
+        """The loop of the response; within its radius are so many devices that the log allows, and what it may hide."""
+        from scipy.special import fdtri
+
+        known = self.response
+        if known is None:
+            raise InputError("log: this fit has no response")
+        radius = known.deviation if hidden else 0.0 * known.deviation
+        if self.is_structured:
+            changes = self.differ(lambda scene: scene.frequency_response(1.0, 0.0, known.frequency))
+            # The longer axis of the ellipse in which the response lies with the numbers.
+            square, across = np.sum(np.abs(changes) ** 2, 0), np.abs(np.sum(changes**2, 0))
+            count = len(self.numbers)
+            reach = count * fdtri(count, self.freedom, reliability)
+            radius = radius + np.sqrt(0.5 * (square + across) * reach)
+        device = MeasuredDevice(known.frequency, known.response, radius)
+        return Scene(device, Timing(self.period), velocity=self.velocity)
+
+    @property
+    def is_structured(self) -> bool:
+        """Whether it is more than a rigid mass: by an amplifier, or by resonances."""
+        return self.actuator is not None or bool(self.modes)
 
     @cached_property
     def virtual_damping(self) -> float:
@@ -175,37 +222,55 @@ class DeviceFit:
     @cached_property
     def virtual_damping_error(self) -> float:
         """Standard error of that B, by differences along the axes of the covariance."""
-        values = [self.mass, self.damping, self.delay, *([self.cutoff] if "cutoff" in self.errors else [])]
-        errors = np.sqrt(np.diag(self.covariance))
-        if not np.isfinite(self.virtual_damping + errors.sum()):
+        if not np.isfinite(self.virtual_damping + self.covariance.sum()):
             return np.nan
+        return float(np.sqrt(np.sum(self.differ(lambda scene: scene.max_stiffness().virtual_damping) ** 2)))
+
+    def differ(self, ask: Callable[[Scene], Any]) -> np.ndarray:
+        """By how much an answer changes along each axis of the covariance, one standard deviation far: a row each."""
+        values, errors = self.estimates, np.sqrt(np.diag(self.covariance))
         scales = np.where(errors > 0, errors, 1.0)
         sizes, axes = np.linalg.eigh(self.covariance / np.outer(scales, scales))
-        total = 0.0
+        middle, rows = ask(self.scene), []
         for size, axis in zip(sizes, axes.T, strict=True):
             step = _STEP * np.sqrt(max(size, 0.0)) * axis * scales
             # Where damping or delay would be negative, to one side.
-            sides = [side for side in (-1.0, 1.0) if np.all(values + side * step >= 0)]
-            ends = [
-                scene_of(values + side * step, self.period, self.velocity).max_stiffness().virtual_damping
-                for side in sides
-            ]
+            sides = [side for side in (-1.0, 1.0) if np.all((values + side * step) * np.where(values < 0, -1, 1) >= 0)]
+            ends = [ask(self.vary(values + side * step)) for side in sides]
             if len(sides) == 1:
-                sides, ends = [0.0, *sides], [self.virtual_damping, *ends]
-            total += (float(ends[-1] - ends[0]) / (_STEP * (sides[-1] - sides[0]))) ** 2 if sides else np.nan
-        return float(np.sqrt(total))
+                sides, ends = [0.0, *sides], [middle, *ends]
+            change = (ends[-1] - ends[0]) / (_STEP * (sides[-1] - sides[0])) if sides else np.nan * middle
+            rows.append(change)
+        return np.array(rows)
+
+    def value_of(self, name: str) -> float:
+        """What ``errors`` names: an attribute of the fit, or a parameter of a part by its path."""
+        return float(self.scene.parameters()[name] if "." in name else getattr(self, name))
+
+    @cached_property
+    def estimates(self) -> np.ndarray:
+        """The values of ``numbers``."""
+        own = self.scene.parameters()
+        return np.array([own[name] for name in self.numbers])
+
+    def vary(self, values: Iterable[float]) -> Scene:
+        """The scene with other values of ``numbers``."""
+        return self.scene.replace(**dict(zip(self.numbers, map(float, values), strict=True)))
 
     @property
     def intervals(self) -> dict[str, ErrorBar]:
-        """95 % intervals by name: of what ``errors`` has, and of "stiffness_max"."""
+        """95 % intervals by name: of what ``errors`` has, and of "stiffness_max", up to that with ``lag``."""
         errors = self.errors | {"stiffness_max": self.stiffness_error}
-        reaches = {name: (getattr(self, name), self.reach * error) for name, error in errors.items()}
-        # A NaN stays one; a constant force alone may be negative.
-        least = {"offset": -np.inf}
-        return {
-            name: ErrorBar(float(np.maximum(least.get(name, 0.0), value - far)), value + far)
+        reaches = {name: (self.value_of(name), self.reach * error) for name, error in errors.items()}
+        # A NaN stays one; a constant force and the mass of a mode may be negative.
+        bars = {
+            name: ErrorBar(float(value - far if _may_be_negative(name) else np.maximum(0.0, value - far)), value + far)
             for name, (value, far) in reaches.items()
         }
+        if self.lag is not None:
+            bar, more = bars["stiffness_max"], self.lag.stiffness_max - self.stiffness_max
+            bars["stiffness_max"] = ErrorBar(bar.low, bar.high + max(more, 0.0))
+        return bars
 
     def safe_wall(
         self, reliability: float = 0.99, *, samples: int | None = None, seed: int = 0, rigid: bool = False
@@ -266,7 +331,7 @@ class DeviceFit:
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON; None for what is NaN."""
         numbers = {
-            **{name: getattr(self, name) for name in (*NAMES, *(["cutoff"] if "cutoff" in self.errors else []))},
+            **{name.removeprefix("velocity."): value for name, value in zip(self.numbers, self.estimates, strict=True)},
             "stiffness_max": self.stiffness_max,
             "virtual_damping": self.virtual_damping,
             "errors": self.errors
@@ -283,24 +348,26 @@ class DeviceFit:
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),
             "safe_wall": self.safe_wall()._asdict(),
+            "lag": None if self.lag is None else self.lag._asdict(),
         }
         return to_json(numbers)
 
 
 @dataclass(frozen=True)
 class StiffnessEstimate:
-    """K_max of a scene and its derivatives in mass, damping and delay, and in an unknown cut-off."""
+    """K_max of a scene and its derivatives in what is fitted, as `name_numbers` has it."""
 
     scene: Scene
     value: float
     gradient: np.ndarray
+    numbers: tuple[str, ...]
 
     @classmethod
     def at(cls, scene: Scene, unknown_cutoff: bool = False) -> StiffnessEstimate:
         """By `zwidth.Scene.sensitivities`."""
         slopes = scene.sensitivities()
-        paths = (*NAMES, "velocity.cutoff")[: 4 if unknown_cutoff else 3]
-        return cls(scene, float(slopes.stiffness), np.array([slopes.per[path] for path in paths]))
+        paths = name_numbers(scene, unknown_cutoff)
+        return cls(scene, float(slopes.stiffness), np.array([slopes.per[path] for path in paths]), paths)
 
     def conclude(
         self,
@@ -317,11 +384,13 @@ class StiffnessEstimate:
         motions: tuple[FittedMotion, ...] = (),
         rivals: tuple[RivalDevice, ...] = (),
         response: MeasuredDevice | None = None,
+        lag: HiddenLag | None = None,
     ) -> DeviceFit:
         """The result; ``parts`` are a log's offset and friction with their errors, ``freedom`` as for `reach_of`."""
         scene = self.scene
         doubts = [*doubts, *_doubt_period(scene.timing.period)]
-        errors = dict(zip((*NAMES, "cutoff"), np.sqrt(np.diag(covariance)).tolist(), strict=False))
+        names = [name.removeprefix("velocity.") for name in self.numbers]
+        errors = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
         error = float(np.sqrt(self.gradient @ covariance @ self.gradient))
         agreed = bool(rivals) and all(abs(one.stiffness_max - self.value) <= error for one in rivals)
         known = 1.0 if status == Status.OK or (status == Status.UNDECIDED and agreed) else np.nan
@@ -347,7 +416,14 @@ class StiffnessEstimate:
             freedom=freedom,
             rivals=rivals,
             response=response,
+            actuator=scene.device.actuator,
+            modes=scene.device.modes,
+            lag=lag,
         )
+
+
+def _may_be_negative(name: str) -> bool:
+    return name == "offset" or (name.startswith("modes") and name.endswith("mass"))
 
 
 def _doubt_period(period: float) -> list[str]:

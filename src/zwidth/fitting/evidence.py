@@ -75,7 +75,7 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
         raise InputError("scene: no wall of the fitted device is stable; measure again")
     end = max(float(each.virtual_damping.max()) for each in outlines)
     damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
-    own = np.array([[fit.mass, fit.damping, fit.delay, *([fit.cutoff] if "cutoff" in fit.errors else [])]])
+    own = fit.estimates[None]
     low = high = np.full(damping.size, np.nan)
     drawn = draw_devices(fit, min(_DRAWS, fit.scene.loop.draws), 0)
     if drawn is not None:
@@ -90,8 +90,7 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """Up to which stiffness every softer wall is stable, for devices, a row each, and dampings; 0 where none is."""
-    paths = ("mass", "damping", "delay", "velocity.cutoff")
-    return fit.scene.loop.vary(dict(zip(paths, devices.T, strict=False))).row_ends(damping)
+    return fit.scene.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).row_ends(damping)
 
 
 def tabulate_walls(

@@ -15,7 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from zwidth.fitting.output_error import FittedModel
+from zwidth.fitting.structure import add_lag, to_scene
 from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
+from zwidth.parts.actuator import Actuator
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.scene import Scene
 
@@ -34,13 +36,29 @@ _LOOKED, _AT_ONCE = 20_000, 4_000_000
 _SURELY, _NEAR = 4.0, 15
 # Of the response: its lowest line, how many there are below the bank, and by what its delay turns it between two lines.
 _FIRST, _BELOW, _TURN = 2e-4, 40, 0.3
+# Lags that are looked for, in periods, as long as the delay and this at least.
+_SHORTEST, _LONGEST, _LONGEST_LAG, _LAGS = 0.03, 0.05, 3.0, 40
+# Beside a resonance, in half-widths; steps of theta's differences.
+_BESIDE, _STEP = np.sinh(np.linspace(-4.0, 4.0, 61)), 1e-5
+
+
+class HiddenLag(NamedTuple):
+    """The longest lag of an amplifier that a log does not tell from a delay, both in s, and K_max with it in N/m."""
+
+    time_constant: float
+    delay: float
+    stiffness_max: float
 
 
 class HiddenPole(NamedTuple):
-    """The pole that the residuals show: its frequency in turns a period, and whether it rings, as no lag does."""
+    """The pole that the residuals show: its frequency in turns a period, and whether it rings, as no lag does.
+
+    Or one that explains as well as the lag ``instead`` of which it may be there.
+    """
 
     frequency: float
     rings: bool
+    instead: bool = False
 
 
 @dataclass(frozen=True)
@@ -51,12 +69,17 @@ class PoleBank:
     frequency: np.ndarray
     explained: np.ndarray  # squares of the residuals that each pole explains
     whole: np.ndarray  # what a mode of each would leave that moves as the whole mass does
+    absorbed: np.ndarray  # by how much it would move each number of theta
 
     @property
     def rates(self) -> npt.NDArray[np.complex128]:
         """Poles of the continuous device, in periods."""
-        w, ratio = 2.0 * np.pi * self.frequency, self.ratio
-        return np.asarray(w * complex(-ratio, np.sqrt(1.0 - ratio**2)), np.complex128)
+        return self.rates_of(self.ratio, self.frequency)
+
+    @staticmethod
+    def rates_of(ratio: float, frequency: np.ndarray) -> npt.NDArray[np.complex128]:
+        """Those of a damping ratio."""
+        return np.asarray(2.0 * np.pi * frequency * complex(-ratio, np.sqrt(1.0 - ratio**2)), np.complex128)
 
     def bound_modes(self) -> np.ndarray:
         """How much more than the whole mass a mode of each pole may move, at most."""
@@ -85,7 +108,7 @@ def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
         if any(max(frequency / other, other / frequency) < _ELSEWHERE for other in tried):
             continue
         tried.append(frequency)
-        cleared = _filter_forces(best, np.array([frequency]), ratio)
+        cleared = _filter_forces(best, ratio, PoleBank.rates_of(ratio, np.array([frequency])))
         cleared, _ = np.linalg.qr(cleared - basis @ (basis.T @ cleared))
         along = cleared.T @ rest
         # In squares of standard errors, of errors as kindred as the encoder's and as the sums of neighbors are.
@@ -99,19 +122,88 @@ def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
     return None, banks
 
 
+@dataclass(frozen=True)
+class LagTest:
+    """Lags of an amplifier in periods, in place of as much delay, and what the residuals say of them."""
+
+    lag: np.ndarray
+    whole: np.ndarray  # what each would leave, in standard errors
+    toward: np.ndarray  # what of that is left
+    theta: np.ndarray  # the device's numbers with it, a column each
+
+
+def look_for_lags(best: FittedModel) -> LagTest:
+    """Compare the residuals with what lags of first order would leave that were taken for a delay."""
+    best = _glimpse(best)
+    lags = np.geomspace(_SHORTEST, max(_LONGEST, min(_LONGEST_LAG, best.theta[2])), _LAGS)
+    # Of the mass alone: what resonances add turns hardly.
+    (g, delta, d), logs = best.theta[:3], best.model.logs
+    columns = [np.concatenate([add_lag(np.array([g, delta, d - lag, lag]), log, 1) for log in logs]) for lag in lags]
+    columns = best.model.weigh(g * np.concatenate(columns, -1))
+    absorbed = best.inverse.matrix @ columns
+    left, rest = columns - best.columns[0] @ absorbed, best.model.weigh(best.residuals)
+    whole = np.linalg.norm(left, axis=0)
+    # Of errors as kindred as the encoder's, where these are larger.
+    kindred = np.diag(best.noise.spread(best.model.weigh(left))) / whole**2
+    error = np.sqrt(np.maximum(kindred, best.variance) * best.excess)
+    moved = best.theta[:, None] - absorbed / best.columns[1][:, None]
+    moved[2] -= lags
+    return LagTest(lags, whole / error, left.T @ rest / whole / error, moved)
+
+
+def bound_lag(best: FittedModel, scene: Scene, reach: float) -> HiddenLag | None:
+    """The longest lag, a first-order one of the amplifier, with which the log goes as well; None where it shows all.
+
+    The delay is less by the lag and has to remain.
+    """
+    if best.model.lag:
+        return None
+    test, period = look_for_lags(best), scene.timing.period
+    may = (test.whole - test.toward <= reach) & (test.theta[1] >= 0) & (test.theta[2] >= 0)
+    count = int(np.argmin(np.append(may, False)))
+    if not count:
+        return None
+    lag = float(test.lag[count - 1] * period)
+    there = to_scene(best.model, test.theta[:, count - 1], period, scene.velocity)
+    there = replace(there, device=replace(there.device, actuator=Actuator(time_constant=lag)))
+    return HiddenLag(lag, float(there.timing.delay), float(there.max_stiffness().stiffness))
+
+
 def respond_as_fitted(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> MeasuredDevice:
-    """The response of a fitted device, with the radius by which a resonance may move it that the log does not show."""
-    period = scene.timing.period
-    even = np.arange(1.0, 2.0 * np.pi * _HIGHEST * (1.0 + scene.d) / _TURN) * _TURN / (2.0 * np.pi * (1.0 + scene.d))
+    """The response of a fitted device, with the radius by which a resonance may move it that the log does not show.
+
+    What such a resonance moves the other numbers by, they have been found with.
+    """
+    period, top = scene.timing.period, _HIGHEST
+    even = np.arange(1.0, 2.0 * np.pi * top * (1.0 + scene.d) / _TURN) * _TURN / (2.0 * np.pi * (1.0 + scene.d))
     below = np.geomspace(_FIRST, _LOWEST, _BELOW)[:-1]
-    lines = np.unique(np.concatenate([below, even[even > _LOWEST], banks[0].frequency]))
+    near = [mode.frequency * period * (1.0 + mode.damping_ratio * _BESIDE) for mode in scene.device.modes]
+    lines = np.concatenate([below, even[even > _LOWEST], banks[0].frequency, *near])
+    lines = np.unique(lines[(lines >= _FIRST) & (lines <= top)])
     response = scene.frequency_response(1.0, 0.0, lines / period)
     radius, z = np.zeros(lines.size), np.exp(2j * np.pi * lines)[:, None]
+    slopes = _differ_response(best, scene, lines / period)
     for bank in banks[:_RINGING]:
         poles, size = np.exp(bank.rates), _size_modes(best, bank)
-        moved = size / (z - poles) - size.conj() / (z - poles.conj())
-        radius = np.maximum(radius, np.max(0.5 * np.abs(moved) * bank.bound_modes(), axis=1))
+        moved = (size / (z - poles) - size.conj() / (z - poles.conj())) / 2j * z ** -float(int(best.theta[2]))
+        moved = moved - slopes @ bank.absorbed[: best.model.parts.stop]
+        radius = np.maximum(radius, np.max(np.abs(moved) * bank.bound_modes(), axis=1))
     return MeasuredDevice(lines / period, response, radius)
+
+
+def _differ_response(best: FittedModel, scene: Scene, frequency: np.ndarray) -> np.ndarray:
+    """The derivatives of the response in the first numbers of theta, a column each."""
+    columns = []
+    for k in range(best.model.parts.stop):
+        step, ends = _STEP * max(abs(best.theta[k]), 1e-3 if k in (1, 2) else 0.0), []
+        for side in (1.0, 0.0) if k in (1, 2) else (1.0, -1.0):
+            theta = best.theta.copy()
+            theta[k] += side * step
+            ends.append(
+                to_scene(best.model, theta, scene.timing.period, scene.velocity).frequency_response(1.0, 0.0, frequency)
+            )
+        columns.append((ends[0] - ends[1]) / (step if k in (1, 2) else 2.0 * step))
+    return np.stack(columns, -1)
 
 
 def _glimpse(best: FittedModel) -> FittedModel:
@@ -125,35 +217,36 @@ def _glimpse(best: FittedModel) -> FittedModel:
 
 def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, noise: float) -> PoleBank:
     """Compare the residuals with the forces filtered by poles of one damping ratio."""
+    parts = 1 if ratio == 1.0 else 2
     frequency = np.geomspace(_LOWEST, _HIGHEST, 1 + round(np.log(_HIGHEST / _LOWEST) / np.log(_APART[ratio])))
-    bank = PoleBank(ratio, frequency, np.zeros(frequency.size), np.zeros(frequency.size))
-    sizes, count = _size_modes(best, bank), max(1, _AT_ONCE // (2 * rest.size))
+    explained, whole = np.zeros((2, frequency.size))
+    bank = PoleBank(ratio, frequency, explained, whole, np.zeros((best.theta.size, frequency.size)))
+    sizes = _size_modes(best, bank)
+    modes = np.stack([sizes.imag, sizes.real], -1)[:, -parts:]
+    count = max(1, _AT_ONCE // (2 * rest.size))
     for first in range(0, frequency.size, count):
         part = slice(first, first + count)
-        columns = _filter_forces(best, frequency[part], ratio)
-        raw = np.linalg.norm(columns, axis=0)
-        cleared = columns - basis @ (basis.T @ columns)
-        each = (-1, 1 if ratio == 1.0 else 2)
-        cleared = cleared.reshape(rest.size, *each)
-        own = np.linalg.norm(cleared, axis=0).min(-1) <= _OWN * raw.reshape(each).max(-1)
+        columns = _filter_forces(best, ratio, bank.rates[part])
+        raw = np.linalg.norm(columns, axis=0).reshape(-1, parts)
+        cleared = (columns - basis @ (basis.T @ columns)).reshape(rest.size, -1, parts)
+        own = np.linalg.norm(cleared, axis=0).min(-1) <= _OWN * raw.max(-1)
         square, along = np.einsum("nki,nkj->kij", cleared, cleared), np.einsum("nki,n->ki", cleared, rest)
-        by = np.linalg.pinv(square, rcond=_OWN**2, hermitian=True)
+        by, mode = np.linalg.pinv(square, rcond=_OWN**2, hermitian=True), modes[part]
         bank.explained[part] = np.where(own, 0.0, np.einsum("ki,kij,kj->k", along, by, along)) / noise
-        mode = np.stack([sizes.imag, sizes.real], -1)[part, : each[1]]
         bank.whole[part] = np.sqrt(np.einsum("ki,kij,kj->k", mode, square, mode) / noise)
+        moved = np.einsum("nki,ki->nk", columns.reshape(rest.size, -1, parts), mode)
+        bank.absorbed[:, part] = best.inverse.matrix @ moved / best.columns[1][:, None]
     return bank
 
 
-def _filter_forces(best: FittedModel, frequency: np.ndarray, ratio: float) -> np.ndarray:
+def _filter_forces(best: FittedModel, ratio: float, rates: np.ndarray) -> np.ndarray:
     """What poles make of all forces, at the positions: real and imaginary part side by side, or one of a real pole."""
     from scipy.signal import lfilter
 
-    bank, ends = PoleBank(ratio, frequency, frequency, frequency), [0]
-    for log in best.model.logs:
-        ends.append(ends[-1] + log.position.size)
-    parts = 1 if ratio == 1.0 else 2
-    columns, whole = np.empty((ends[-1], frequency.size * parts)), int(best.theta[2])
-    for k, pole in enumerate(np.exp(bank.rates)):
+    ends = np.cumsum([0, *(log.position.size for log in best.model.logs)])
+    parts, whole = 1 if ratio == 1.0 else 2, int(best.theta[2])
+    columns = np.empty((ends[-1], rates.size * parts))
+    for k, pole in enumerate(np.exp(rates)):
         for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
             late = np.asarray(lfilter([0.0, 1.0], [1.0, -pole], log.force), np.complex128)[log.skip - whole :][
                 : end - start

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.fitting.choosing import ALIKE, EXACT, choose_structure
 from zwidth.fitting.device_fit import (
     BEYOND,
     MASS_OPEN,
@@ -13,17 +14,15 @@ from zwidth.fitting.device_fit import (
     DeviceFit,
     FittedMotion,
     StiffnessEstimate,
-    in_si,
+    reach_of,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
-from zwidth.fitting.hidden import find_hidden, respond_as_fitted
+from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
-from zwidth.fitting.scenes import scene_of
+from zwidth.fitting.structure import derive_numbers, to_scene
 from zwidth.parts.checks import check_number
-from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.velocity import BackwardDifference, Velocity
-from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE
@@ -42,17 +41,14 @@ _FEW = 60
 _MOST = 200_000
 # A slope of less than so many of its standard errors is none.
 _SEEN = 5.0
-# Sums of what the fit leaves may spread so many times more than noise's, before it is doubted.
-_ALIKE = 1.5
 # So much of the motion's squares may stay unexplained by anything, where it is so far from noise.
 _UNEXPLAINED, _SMOOTH = 0.01, 5.0
-# What to do about a device that is more than the model.
+# What to do about a device that is more than the model, and about one that may be.
+_RECORD_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
 _RECORD_NEXT = (
     "it has something that the model lacks, so that no K_max follows; play a record of zwidth.excite, for "
     "zwidth.respond needs no model"
 )
-# Smaller residuals, as a share of the way moved, are rounding.
-_EXACT = 1e-9
 
 
 def fit_log(
@@ -70,7 +66,8 @@ def fit_log(
 
     ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, the force held from sample to sample, least squares of the
     positions. The constant force f0 and the friction F_c are always sought, and widen the errors of the others: left
-    out where a log hardly shows them, they would bias the rest by many standard errors.
+    out where a log hardly shows them, they would bias the rest by many standard errors. An amplifier's lag, of first or
+    second order, and resonances are added where Schwarz's criterion asks for them.
 
     Args:
         time: of the samples in s, evenly spaced, or their period alone. With lists of arrays for all three, several
@@ -93,7 +90,8 @@ def fit_log(
         and ``motions``; ``doubts``, as of a unit or of residuals that are no noise: then there is no safe wall;
         ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED, UNDECIDED where the residuals
         are no noise: then K_max is NaN; ``response``, with the radius by which a resonance may move it that the log
-        does not show: what bounds the safe wall.
+        does not show: what bounds the safe wall; ``actuator`` and ``modes`` where the log asks for them; ``lag``, the
+        longest that it does not tell from a delay: the interval of K_max reaches to it.
 
     Raises:
         InputError: times are uneven, the force or the position never changes, the device runs away from its force, most
@@ -131,6 +129,7 @@ def fit_log(
     doubts = [doubt for log in logs for doubt in find_stretches(log)]
     step, odd = _find_step(resolution, logs)
     best = fit_model(recordings, longest, step)
+    best, pole, banks = choose_structure(best, longest, step)
     theta = best.theta
     _refuse_unmoved(best, period)
     if best.inverse.open[:3].any():
@@ -138,15 +137,15 @@ def fit_log(
             "force: mass, damping and delay cannot be told apart by this log; record longer, with a force that changes "
             "its sign at different times, as steps to and fro"
         )
-    values, by_theta = in_si((np.log(period**2 / theta[0]), theta[1], theta[2]), period)
-    # From g = T^2/m to ln m.
-    by_theta = by_theta @ np.diag([-1.0 / theta[0], 1.0, 1.0])
-    # As T^2, T and T.
-    by_period = wavers * values * [2.0, 1.0, 1.0]
-    covariance = by_theta @ best.covariance[:3, :3] @ by_theta.T + np.outer(by_period, by_period)
-    stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
+    by_theta, power = derive_numbers(best.model, theta, period)
+    stiffest = StiffnessEstimate.at(to_scene(best.model, theta, period, velocity))
+    own = stiffest.scene.parameters()
+    values = np.array([own[name] for name in stiffest.numbers])
+    by_period, known = wavers * values * power, slice(0, values.size)
+    covariance = by_theta @ best.covariance[known, known] @ by_theta.T + np.outer(by_period, by_period)
     errors = np.sqrt(np.diag(covariance))
-    unexplained, response = _find_unexplained(best, stiffest.scene)
+    freedom = max(1, best.count - theta.size)
+    unexplained = _find_unexplained(best, pole, period) if banks else []
     doubts = odd + doubts + _doubt(values, errors, best, logs, rotary) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     # The device that bears K_max is another one then.
@@ -163,29 +162,29 @@ def fit_log(
         residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
         doubts=doubts,
         status=status,
-        freedom=max(1, best.count - theta.size),
+        freedom=freedom,
         parts={"offset": _in_newton(best, -2), "friction": _in_newton(best, -1)},
         resolution=step,
         motions=motions,
-        response=response,
+        response=respond_as_fitted(best, stiffest.scene, banks) if banks and not unexplained else None,
+        lag=bound_lag(best, stiffest.scene, reach_of(freedom)) if banks and not unexplained else None,
     )
 
 
-def _find_unexplained(best: FittedModel, scene: Scene) -> tuple[list[str], MeasuredDevice | None]:
-    """What the residuals show beyond noise, with the record to make next, and the response with what they would not."""
-    way, period = max(float(np.ptp(log.position)) for log in best.model.logs), scene.timing.period
-    if float(best.residuals @ best.residuals) <= _EXACT**2 * best.residuals.size * way**2:
-        # Nothing but rounding is left.
-        return [], None
-    pole, banks = find_hidden(best)
+def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float) -> list[str]:
+    """What the residuals show beyond noise, with the record to make next."""
+    if pole is not None and pole.instead:
+        near = with_unit(pole.frequency / period, "Hz", 3)
+        what = f"an amplifier's lag explains the log, and so does a resonance near {near}, whose K_max is another one"
+        return [f"{what}: {_RECORD_MORE}"]
     if pole is not None:
         kind = "most like a resonance near" if pole.rings else "with a lag, most like one of"
         what = f"it follows the force{',' if pole.rings else ''} {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
-    elif best.excess > _ALIKE:
+    elif best.excess > ALIKE:
         what = f"its sums spread {plain(np.sqrt(best.excess), 2)} times as far, as of a hand or a compliance"
     else:
-        return [], respond_as_fitted(best, scene, banks)
-    return [f"what the fit leaves is no noise, {what}: {_RECORD_NEXT}"], None
+        return []
+    return [f"what the fit leaves is no noise, {what}: {_RECORD_NEXT}"]
 
 
 def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
@@ -215,7 +214,7 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
     """Raise `InputError` where the force explains nothing of the motion, the contrary of it, or too little."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
     # What there would be without any force, not even friction.
-    alone = model.predict(np.append(theta[:-2], [0.0, 0.0]))[1][:, 3:-2]
+    alone = model.predict(np.append(theta[:-2], [0.0, 0.0]))[1][:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
     if float(rest @ rest) - squares <= _SEEN**2 * squares / model.measured.size:
@@ -238,7 +237,7 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
 
 
 def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tuple[Log, ...], rotary: bool) -> list[str]:
-    mass, damping, delay = values
+    mass, damping, delay = values[:3]
     doubts, residuals = [], best.residuals
     if not rotary and not _LIGHTEST <= mass <= _HEAVIEST:
         light = "the position may be in mm, or the force in kN"
@@ -257,7 +256,7 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
             "another device, and the errors do not say so; record longer, or give a shorter max_delay"
         )
     size = float(residuals @ residuals)
-    if size <= _EXACT**2 * residuals.size * way**2:
+    if size <= EXACT**2 * residuals.size * way**2:
         # Nothing but rounding is left.
         return doubts
     if damping == 0:

@@ -13,9 +13,9 @@ NumPy's and LAPACK's compiled recursions, for JAX would compile for seconds for 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, expm1, log1p
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -212,9 +212,9 @@ class Recordings:
         """Columns over samples, as `MeasurementNoise.weigh` where the noise is known."""
         return columns if self.noise is None else self.noise.weigh(columns)
 
-    def begin(self, count: int) -> Recordings:
+    def begin(self, count: int) -> Self:
         """Of each log so many first positions."""
-        return Recordings(tuple(log.begin(count) for log in self.logs))
+        return replace(self, logs=tuple(log.begin(count) for log in self.logs), noise=None)
 
     @property
     def measured(self) -> np.ndarray:
@@ -228,12 +228,25 @@ class Recordings:
     @property
     def size(self) -> int:
         """How many numbers theta has."""
-        return 5 + 2 * len(self.logs)
+        return self.parts.stop + 2 + 2 * (1 + self.modes) * len(self.logs)
+
+    # Of the amplifier the order, and how many modes: none beside a rigid mass.
+    lag: ClassVar[int] = 0
+    modes: ClassVar[int] = 0
+
+    @property
+    def parts(self) -> slice:
+        """Where in theta the numbers of amplifier and modes are."""
+        return slice(3, 3 + self.lag + 3 * self.modes)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the largest that each number of theta may be."""
+        return np.full(self.size, -np.inf), np.full(self.size, np.inf)
 
     @property
     def speeds(self) -> np.ndarray:
         """Where in theta the first speeds are."""
-        return 4 + 2 * np.arange(len(self.logs))
+        return self.parts.stop + 1 + 2 * np.arange(len(self.logs))
 
     @property
     def largest(self) -> float:

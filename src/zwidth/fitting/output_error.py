@@ -25,6 +25,8 @@ _STARTS, _APART = 3, 2
 _GLIMPSE, _FIRST = 600, 4
 # So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
+# Devices with other parts are compared after so many steps, or at this promised reduction.
+_COMPARED, _CLOSELY = 40, 2e-5
 # Promised reductions of the squares that end the search, and excuse a corner; steps; how they are damped.
 _ARRIVED, _NEARLY, _STEPS = 1e-12, 1e-6, 100
 _EASY, _LIGHT, _STUBBORN = 1e-4, 1e-6, 1e12
@@ -181,7 +183,7 @@ def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: flo
     if best.theta[-1] ** 2 < _CLOSE_BY * best.covariance[-1, -1]:
         none = best.theta - np.nan_to_num(best.covariance[:, -1]) * best.theta[-1] / best.covariance[-1, -1]
         none[-1] = LEAST * abs(none[0]) * model.largest
-        gliding = _settle(model, none, longest, resolution, (-1,))
+        gliding = settle(model, none, longest, resolution, (-1,))
         if best.explains_as_well(gliding):
             return replace(best, rivals=(gliding,))
         return replace(gliding, rivals=(best,))
@@ -252,6 +254,11 @@ def _follow(model: Recordings, starts: list[np.ndarray], longest: float) -> np.n
     return starts[0]
 
 
+def follow_start(model: Recordings, start: np.ndarray, longest: float) -> tuple[np.ndarray, float]:
+    """Some steps from a start, as far as devices are compared by: theta and the sum of squares."""
+    return _refine(model, start, longest, (), _COMPARED, _CLOSELY)[:2]
+
+
 def _fit(
     model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
 ) -> FittedModel:
@@ -260,7 +267,7 @@ def _fit(
     First speeds that friction stops within the noise hardly move the positions. Beside such a speed the position's
     derivative is next to 0, and steps towards the best one hardly end.
     """
-    best = _settle(model, start, longest, resolution, held)
+    best = settle(model, start, longest, resolution, held)
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.speeds]), best.theta
     # The way to the stop, v^2/(2 c) without damping and v/delta without friction.
     slid = speed**2 / (2.0 * friction + delta * speed)
@@ -268,13 +275,13 @@ def _fit(
     if idle.any():
         still = best.theta.copy()
         still[model.speeds[idle]] = 0.0
-        resting = _settle(model, still, longest, resolution, held)
+        resting = settle(model, still, longest, resolution, held)
         if not best.arrived or resting.explains_as_well(best):
             return resting
     return best
 
 
-def _settle(
+def settle(
     model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
 ) -> FittedModel:
     """As `_refine`, with neither damping nor delay negative."""
@@ -299,7 +306,7 @@ def _refine(
     What is ``held`` stays as it starts.
     """
     count = max(log.force.size for log in model.logs)
-    low, high = np.full(start.size, -np.inf), np.full(start.size, np.inf)
+    low, high = model.bounds()
     # A little beyond 0 the model goes on, so that an optimum at 0 is no corner.
     low[1], low[2], high[1], high[2] = -5.0 / count, -1.0, 50.0, longest
     low[-1] = LEAST * abs(start[0]) * model.largest

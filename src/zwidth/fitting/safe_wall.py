@@ -83,6 +83,8 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
     drawn = draw_devices(fit, count, seed)
     if drawn is None:
         return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+    if fit.is_structured:
+        return _bear_response(fit, reliability, rigid, drawn)
     filtered = scene.velocity != BackwardDifference()
     devices = _FilteredDevices(drawn, scene, "cutoff" in fit.errors) if filtered else _RigidDevices(drawn, scene)
     (stiffness, virtual_damping), resonance = devices.find(reliability), np.nan
@@ -101,6 +103,20 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
     return SafeWall(stiffness, virtual_damping, share, int(Status.OK), resonance)
 
 
+def _bear_response(fit: DeviceFit, reliability: float, rigid: bool, drawn: np.ndarray) -> SafeWall:
+    """The stiffest wall of the response of a device that is more than rigid, with what its numbers may be as radius."""
+    if fit.response is None:
+        return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+    top = fit.respond(reliability, not rigid).max_stiffness(negative_damping=False)
+    if top.status != Status.OK:
+        return SafeWall(0.0, 0.0, 1.0, int(Status.OK), float(top.frequency))
+    wall = float(top.stiffness), float(top.virtual_damping)
+    share = float(np.mean([_bears(fit.vary(values), *wall) for values in drawn]))
+    if share < reliability - 1.0 / np.sqrt(len(drawn)):
+        return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+    return SafeWall(*wall, share, int(Status.OK), np.nan if rigid else float(top.frequency))
+
+
 def bears_resonances(fit: DeviceFit, stiffness: float, virtual_damping: float) -> bool:
     """Whether a wall and the softer ones of its damping bear every resonance that the log does not show."""
     scene = fit.responding
@@ -111,15 +127,20 @@ def bears_resonances(fit: DeviceFit, stiffness: float, virtual_damping: float) -
 
 
 def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:
-    """Mass, damping, delay (and cut-off) of possible devices around the estimate, a row each; None if few are possible.
+    """What `DeviceFit.numbers` has of possible devices around the estimate, a row each; None if few are possible.
 
-    The mass is drawn by its logarithm, for what walls and logs tell of it is a share; of a filter its time constant is.
+    The mass is drawn by its logarithm, for what walls and logs tell of it is a share; of a filter its time constant is,
+    and of a mode what it moves.
     """
-    values = [fit.mass, fit.damping, fit.delay, *([fit.cutoff] if "cutoff" in fit.errors else [])]
+    values, names = fit.estimates, fit.numbers
     if not np.all(np.isfinite(fit.covariance)):
         return None
-    center = np.array([np.log(fit.mass), fit.damping, fit.delay, *(1.0 / value for value in values[3:])])
-    slopes = np.array([1.0 / fit.mass, 1.0, 1.0, *(-1.0 / value**2 for value in values[3:])])
+    # By their reciprocals, those of which a mass may change its sign.
+    inverse = np.array([name == "velocity.cutoff" or (name[0] == "m" and name.endswith(".mass")) for name in names])
+    signed = inverse & np.array([name != "velocity.cutoff" for name in names])
+    center, slopes = values.copy(), np.ones(values.size)
+    center[inverse], slopes[inverse] = 1.0 / values[inverse], -1.0 / values[inverse] ** 2
+    center[0], slopes[0] = np.log(fit.mass), 1.0 / fit.mass
     covariance = fit.covariance * np.outer(slopes, slopes)
     # Of very different units: by correlations. What is known exactly has none.
     errors = np.sqrt(np.diag(covariance))
@@ -128,17 +149,19 @@ def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:
     root = errors[:, None] * sides * np.sqrt(np.maximum(sizes, 0.0))
     generator = np.random.default_rng(seed)
     coded = getattr(fit.velocity, "coded_period", None) or fit.period
-    kept = np.zeros((0, len(values)))
+    kept = np.zeros((0, values.size))
     for _ in range(_ROUNDS):
-        spread = generator.standard_normal((count, len(values)))
+        spread = generator.standard_normal((count, values.size))
         if fit.freedom is not None:
             spread /= np.sqrt(generator.chisquare(fit.freedom, count) / fit.freedom)[:, None]
         some = center + spread @ root.T
-        some = some[np.all(some[:, 1:] >= 0, 1)]
+        some = some[np.all((some >= 0) | signed | (np.arange(values.size) == 0), 1)]
         with np.errstate(over="ignore", divide="ignore"):
             some[:, 0] = np.exp(some[:, 0])
+            some[:, inverse] = 1.0 / some[:, inverse]
             # Faster filters than half the sampling rate do nothing.
-            some[:, 3:] = np.minimum(1.0 / some[:, 3:], _HIGHEST / coded)
+            filters = inverse & ~signed
+            some[:, filters] = np.minimum(some[:, filters], _HIGHEST / coded)
         kept = np.concatenate([kept, some])
         if len(kept) >= count:
             return kept[:count]

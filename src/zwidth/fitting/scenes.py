@@ -1,4 +1,4 @@
-"""The scene of a fitted device."""
+"""The scene of a fitted device, and its numbers in the order of their covariance."""
 
 from __future__ import annotations
 
@@ -18,6 +18,15 @@ def scene_of(values: Iterable[float], period: float, velocity: Velocity) -> Scen
     if cutoff:
         velocity = with_cutoff(velocity, cutoff[0])
     return Scene(Device(mass, damping), Timing(period=period, delay=delay), velocity=velocity)
+
+
+def name_numbers(scene: Scene, cutoff: bool = False) -> tuple[str, ...]:
+    """Paths of what is fitted: mass, damping, delay, an unknown cut-off, and what stands beside the rigid mass."""
+    actuator, modes = scene.device.actuator, range(len(scene.device.modes))
+    lag = () if actuator is None else ("time_constant", *(["damping_ratio"] if actuator.order == 2 else []))
+    of_mode = ("frequency", "damping_ratio", "mass")
+    beside = [f"actuator.{name}" for name in lag] + [f"modes.{k}.{name}" for k in modes for name in of_mode]
+    return ("mass", "damping", "delay", *(["velocity.cutoff"] if cutoff else []), *beside)
 
 
 def with_cutoff(velocity: Any, cutoff: float) -> Any:

@@ -50,12 +50,15 @@ class AxisUnits(NamedTuple):
         units = {
             **self._asdict(),
             "delay": "s",
+            "time_constant": "s",
             "cutoff": "Hz",
+            "frequency": "Hz",
             "friction": self.force,
             "offset": self.force,
             "stiffness_max": self.stiffness,
         }
-        return with_unit(value, units[name], digits)
+        unit = units.get(name.rpartition(".")[2], "")
+        return with_unit(value, unit, digits) if unit else plain(value, digits)
 
 
 LINEAR = AxisUnits("kg", "N s/m", "N/m", "N", "m")
@@ -93,10 +96,11 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     if any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
         count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
         rows.append(("of it", f"{count:,} of {total:,} samples, the first ones; more would only narrow the errors"))
-    names = ("mass", "damping", "delay", *(["cutoff"] if "cutoff" in fit.errors else []), "stiffness_max")
+    beside = [name for name in fit.numbers if name.startswith(("actuator", "modes"))]
+    names = ("mass", "damping", "delay", *(["cutoff"] if "cutoff" in fit.errors else []), *beside, "stiffness_max")
     for name in names:
-        symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS[name]
-        known = math.isfinite(getattr(fit, name))
+        symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS.get(name, name)
+        known = math.isfinite(fit.value_of(name))
         rows.append((symbol, f"{_spell(fit, name, units)} ({_between(fit, name, units)})" if known else "open"))
     if math.isfinite(fit.virtual_damping):
         B, error = (units.spell("damping", value) for value in (fit.virtual_damping, fit.virtual_damping_error))
@@ -109,6 +113,10 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
         if fit.resolution:
             rows.append(("step of the encoder", units.spell("position", fit.resolution, 3)))
     rows += [("or as well", spell_rival(rival, units)) for rival in fit.rivals]
+    if fit.lag is not None:
+        names = ("time_constant", "delay", "stiffness_max")
+        lag, delay, K = (units.spell(name, value, 3) for name, value in zip(names, fit.lag, strict=True))
+        rows.append(("or as well", f"an amplifier's lag of up to {lag}, with t_d = {delay} and K_max = {K}"))
     safe, wall = fit.safe_wall(), choose_wall(fit)
     if safe.status == Status.OK and safe.stiffness > 0:
         rows.append(
@@ -165,7 +173,7 @@ def _spell_wall(wall: SafeWall | WallChoice, units: AxisUnits) -> str:
 
 def _spell(fit: DeviceFit, name: str, units: AxisUnits) -> str:
     """A value with so many digits that its interval shows."""
-    return units.spell(name, getattr(fit, name), _count_digits(fit, name))
+    return units.spell(name, fit.value_of(name), _count_digits(fit, name))
 
 
 def _between(fit: DeviceFit, name: str, units: AxisUnits) -> str:
@@ -176,7 +184,7 @@ def _between(fit: DeviceFit, name: str, units: AxisUnits) -> str:
 
 
 def _count_digits(fit: DeviceFit, name: str) -> int:
-    value, bar = abs(getattr(fit, name)), fit.intervals[name]
+    value, bar = abs(fit.value_of(name)), fit.intervals[name]
     known = value / (bar.high - bar.low) if bar.high > bar.low else 1.0
     return min(max(4, 2 + math.ceil(math.log10(known))), 9) if known > 0 and math.isfinite(known) else 4
 
@@ -192,11 +200,18 @@ def _explain_parts(fit: DeviceFit, units: AxisUnits) -> Iterable[tuple[str, str]
 
 def _write(fit: DeviceFit, name: str) -> str:
     """A value to a thousandth of its standard error: further digits differ from machine to machine."""
-    value, error = getattr(fit, name), fit.errors[name]
+    value, error = fit.value_of(name), fit.errors[name]
     if not (error > 0 and value):
         return repr(float(f"{value:.12g}"))
     digits = 4 + math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
     return repr(float(f"{value:.{min(max(digits, 4), 12)}g}"))
+
+
+def _write_part(fit: DeviceFit, name: str, units: AxisUnits) -> str:
+    """A number of an amplifier or a resonance."""
+    key = name.rpartition(".")[2]
+    unit = {"time_constant": " s", "frequency": " Hz", "mass": f" {units.mass}"}.get(key, "")
+    return f"{key}: {_write(fit, name)}{unit} # fitted, {_between(fit, name, units)}"
 
 
 def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[str]:
@@ -209,6 +224,13 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
     for key, unit in (("mass", units.mass), ("damping", units.damping), ("delay", "s")):
         lines.append(f"  {key}: {_write(fit, key)} {unit} # fitted, {_between(fit, key, units)}")
     lines.append(f"  period: {fit.period!r} s # as given")
+    if fit.actuator is not None:
+        lines += ["  actuator:", f"    order: {fit.actuator.order} # fitted"]
+        lines += [f"    {_write_part(fit, name, units)}" for name in fit.numbers if name.startswith("actuator")]
+    lines += ["  modes:"] if fit.modes else []
+    for k in range(len(fit.modes)):
+        parts = [_write_part(fit, name, units) for name in fit.numbers if name.startswith(f"modes.{k}.")]
+        lines += [f"    {'-' if j == 0 else ' '} {part}" for j, part in enumerate(parts)]
     for key, section in spell_estimate(fit.velocity, every=True).items():
         inside = ", ".join(f"{name}: {json.dumps(value).strip(chr(34))}" for name, value in section.items())
         lines.append(f"  {key}: {{{inside}}} # {'its cut-off fitted' if 'cutoff' in fit.errors else 'as given'}")

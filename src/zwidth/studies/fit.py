@@ -301,11 +301,13 @@ def _tabulate(each: _Fitted, units: AxisUnits) -> dict[str, Any]:
     fit = each.fit
     row: dict[str, Any] = {"fitted_to": each.source, "status": Status(fit.status).name}
     of = {"mass": units.mass, "damping": units.damping, "delay": "s", "stiffness_max": units.stiffness}
+    of_part = {"time_constant": "s", "frequency": "Hz", "damping_ratio": "", "mass": units.mass}
+    of |= {name: of_part[name.rpartition(".")[2]] for name in fit.numbers if name.startswith(("actuator", "modes"))}
     of |= {name: units.force for name in ("friction", "offset") if name in fit.errors}
     errors = fit.errors | {"stiffness_max": fit.stiffness_error}
     for name, unit in of.items():
         ends = fit.intervals[name]
-        numbers = {"": getattr(fit, name), "_error": errors[name], "_low": ends.low, "_high": ends.high}
+        numbers = {"": fit.value_of(name), "_error": errors[name], "_low": ends.low, "_high": ends.high}
         row |= {header(name + end, unit): value for end, value in numbers.items()}
     return row | {header("offset", units.force): fit.offset, header("resolution", units.position): fit.resolution}
 

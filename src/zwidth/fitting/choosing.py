@@ -1,0 +1,133 @@
+"""Which device a log asks for: a rigid one, or with an amplifier's lag and resonances, by Schwarz's criterion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.fitting.hidden import HiddenPole, PoleBank, find_hidden, look_for_lags
+from zwidth.fitting.output_error import FittedModel, follow_start, settle
+from zwidth.fitting.structure import StructuredRecordings
+
+# So many parts, lags and resonances, are added at most; so many positions of each log tell which one.
+_MOST, _TOLD = 4, 2500
+# Sums of what the fit leaves may spread so many times more than noise's, before it is doubted.
+ALIKE = 1.5
+# Smaller residuals, as a share of the way moved, are rounding.
+EXACT = 1e-9
+# What two numbers more explain of noise in 19 of 20 cases.
+_BY_CHANCE = 5.99
+# Time constants that lags are started from, in periods; a second order's damping ratio.
+_LAGS, _RATIO = (0.3, 1.5), 0.7
+
+
+class _Trial(NamedTuple):
+    """A device that was compared: -2 times its logarithmic likelihood, what a number costs, and its theta."""
+
+    misfit: float
+    price: float
+    model: StructuredRecordings
+    theta: np.ndarray
+
+    @property
+    def cost(self) -> float:
+        """By Schwarz's criterion."""
+        return self.misfit + self.theta.size * self.price
+
+
+def choose_structure(
+    best: FittedModel, longest: float, resolution: float
+) -> tuple[FittedModel, HiddenPole | None, list[PoleBank]]:
+    """Add what explains the residuals best as long as they show a pole; then, what they still show.
+
+    Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
+    """
+    way = max(float(np.ptp(log.position)) for log in best.model.logs)
+    if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * way**2:
+        return best, None, []
+    pole, banks = find_hidden(best)
+    rigid = best, pole, banks
+    for _ in range(_MOST):
+        # A lag has no size of its own, and so is seen where a pole of any size is not.
+        lags = not best.model.lag and look_for_lags(best).toward.max() ** 2 > 2.0 * np.log(best.count)
+        if pole is None and not lags:
+            break
+        richer, rival = _grow(best, banks, longest, resolution)
+        if richer is None:
+            break
+        best = richer
+        pole, banks = find_hidden(best)
+        if rival is not None:
+            return best, rival, banks
+    known = best.arrived and not best.inverse.open[: best.model.parts.stop].any()
+    return (best, pole, banks) if pole is None and best.excess <= ALIKE and known else rigid
+
+
+def _grow(
+    best: FittedModel, banks: list[PoleBank], longest: float, resolution: float
+) -> tuple[FittedModel | None, HiddenPole | None]:
+    """The likeliest device with one part more, None where none is as likely as without; and what else it may be.
+
+    A resonance that a log hardly shows looks like a lag, which has fewer numbers, but quite another K_max. So a lag is
+    doubted where the further numbers of a resonance explain more than chance does.
+    """
+    tried = []
+    for lag, modes, start in _start(best, banks):
+        model = StructuredRecordings(best.model.logs, None, lag, modes).begin(_TOLD)
+        theta, squares = follow_start(model, start, longest)
+        tried.append(_Trial(model.measured.size * np.log(squares), np.log(model.measured.size), model, theta))
+    likeliest = min(tried, key=lambda trial: trial.cost)
+    model = replace(likeliest.model, logs=best.model.logs)
+    found = settle(model, likeliest.theta, longest, resolution)
+    if resolution:
+        found = settle(replace(model, noise=found.noise), found.theta, longest, resolution)
+    if best.lag_behind(found) <= (found.theta.size - best.theta.size) * np.log(best.count):
+        return None, None
+    for trial in tried:
+        if trial.model.modes > model.modes and trial.misfit < likeliest.misfit - _BY_CHANCE:
+            turns = float(trial.theta[trial.model.parts.stop - 3]) / (2.0 * np.pi)
+            return found, HiddenPole(turns, True, instead=True)
+    return found, None
+
+
+def _start(best: FittedModel, banks: list[PoleBank]) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Devices with one part more: the amplifier's order, how many modes, and theta to begin with."""
+    model, theta = best.model, best.theta
+    lag, modes, logs = model.lag, model.modes, len(model.logs)
+    head, ringing = theta[:3], theta[3 + lag : 3 + lag + 3 * modes]
+    speeds, states = np.split(theta[3 + lag + 3 * modes : -2], [2 * logs])
+    if lag == 0:
+        for late in _LAGS:
+            if late <= head[2] + 0.5:
+                start = [head[0], head[1], max(head[2] - late, 0.0)]
+                yield 1, modes, np.r_[start, late, ringing, speeds, states, theta[-2:]]
+                yield 2, modes, np.r_[start, late / (2.0 * _RATIO), _RATIO, ringing, speeds, states, theta[-2:]]
+    elif lag == 1:
+        yield 2, modes, np.r_[head, theta[3] / (2.0 * _RATIO), _RATIO, ringing, speeds, states, theta[-2:]]
+    states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
+    for ratio, frequency in _likeliest(banks):
+        mode = [2.0 * np.pi * frequency, ratio, 0.0]
+        yield lag, modes + 1, np.r_[head, theta[3 : 3 + lag], ringing, mode, speeds, states, theta[-2:]]
+
+
+def _likeliest(banks: list[PoleBank]) -> Iterator[tuple[float, float]]:
+    """Damping ratios and frequencies of the ringing poles that explain most."""
+    found = sorted(
+        (
+            (e, f, bank.ratio)
+            for bank in banks
+            if bank.ratio < 1.0
+            for e, f in zip(bank.explained, bank.frequency, strict=True)
+        ),
+        reverse=True,
+    )
+    kept: list[float] = []
+    for _, frequency, ratio in sorted(found, reverse=True):
+        if all(abs(np.log(frequency / other)) > 0.2 for other in kept):
+            kept.append(frequency)
+            yield ratio, frequency
+        if len(kept) == 2:
+            return
