@@ -20,10 +20,9 @@ from zwidth.fitting.device_fit import (
     DeviceFit,
     FurtherExperiment,
     RivalDevice,
-    StiffnessEstimate,
-    in_si,
 )
 from zwidth.fitting.scenes import scene_of
+from zwidth.fitting.stiffness_estimate import StiffnessEstimate, in_si
 from zwidth.fitting.words import spell_rival
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity

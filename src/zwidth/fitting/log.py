@@ -13,13 +13,13 @@ from zwidth.fitting.device_fit import (
     VAGUE,
     DeviceFit,
     FittedMotion,
-    StiffnessEstimate,
     reach_of,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
+from zwidth.fitting.stiffness_estimate import StiffnessEstimate
 from zwidth.fitting.structure import derive_numbers, to_scene
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity

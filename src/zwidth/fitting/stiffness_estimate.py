@@ -1,0 +1,111 @@
+"""From an estimate and its covariance to what a fit says: K_max, how far off it may be, and SI units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from zwidth.fitting.device_fit import DeviceFit, FittedMotion, FurtherExperiment, RivalDevice
+from zwidth.fitting.scenes import name_numbers
+from zwidth.parts.measured import MeasuredDevice
+from zwidth.scenes.scene import Scene
+from zwidth.words.formatting import with_unit
+from zwidth.words.status import Status
+
+if TYPE_CHECKING:
+    from zwidth.fitting.hidden import HiddenLag
+
+# Sampling periods of loops, in s: outside a unit is suspected.
+_QUICKEST, _SLOWEST = 5e-6, 0.02
+
+
+@dataclass(frozen=True)
+class StiffnessEstimate:
+    """K_max of a scene and its derivatives in what is fitted, as `name_numbers` has it."""
+
+    scene: Scene
+    value: float
+    gradient: np.ndarray
+    numbers: tuple[str, ...]
+
+    @classmethod
+    def at(cls, scene: Scene, unknown_cutoff: bool = False) -> StiffnessEstimate:
+        """By `zwidth.Scene.sensitivities`."""
+        slopes = scene.sensitivities()
+        paths = name_numbers(scene, unknown_cutoff)
+        return cls(scene, float(slopes.stiffness), np.array([slopes.per[path] for path in paths]), paths)
+
+    def conclude(
+        self,
+        covariance: np.ndarray,
+        *,
+        noise: float | tuple[float, float],
+        residuals: np.ndarray,
+        doubts: Iterable[str],
+        status: int,
+        freedom: int | None = None,
+        further: FurtherExperiment | None = None,
+        parts: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+        resolution: float = 0.0,
+        motions: tuple[FittedMotion, ...] = (),
+        rivals: tuple[RivalDevice, ...] = (),
+        response: MeasuredDevice | None = None,
+        lag: HiddenLag | None = None,
+    ) -> DeviceFit:
+        """The result; ``parts`` are a log's offset and friction with their errors, ``freedom`` as for `reach_of`."""
+        scene = self.scene
+        doubts = [*doubts, *_doubt_period(scene.timing.period)]
+        names = [name.removeprefix("velocity.") for name in self.numbers]
+        errors = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+        error = float(np.sqrt(self.gradient @ covariance @ self.gradient))
+        agreed = bool(rivals) and all(abs(one.stiffness_max - self.value) <= error for one in rivals)
+        known = 1.0 if status == Status.OK or (status == Status.UNDECIDED and agreed) else np.nan
+        return DeviceFit(
+            mass=scene.device.mass,
+            damping=scene.device.damping,
+            delay=scene.timing.delay,
+            errors=errors | {name: error for name, (_, error) in parts.items()},
+            covariance=covariance,
+            stiffness_max=known * self.value,
+            stiffness_error=known * error,
+            noise=noise,
+            residuals=residuals,
+            doubts=tuple(doubts),
+            status=int(status),
+            next=further and further._replace(error_afterwards=known * further.error_afterwards),
+            offset=parts["offset"][0] if parts else 0.0,
+            friction=parts["friction"][0] if parts else 0.0,
+            resolution=resolution,
+            motions=motions,
+            period=scene.timing.period,
+            velocity=scene.velocity,
+            freedom=freedom,
+            rivals=rivals,
+            response=response,
+            actuator=scene.device.actuator,
+            modes=scene.device.modes,
+            lag=lag,
+        )
+
+
+def _doubt_period(period: float) -> list[str]:
+    if _QUICKEST <= period <= _SLOWEST:
+        return []
+    slip = "in ms or us" if period > _SLOWEST else "in s"
+    return [
+        f"a sampling period of {with_unit(period, 's')} is far from any loop; the time may be {slip}: check its unit"
+    ]
+
+
+def in_si(theta: Iterable[float], period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mass, damping and delay of ``(ln m, delta, d)``, and their derivatives in these; ``ln cutoff`` may follow."""
+    log_mass, delta, d, *log_cutoff = theta
+    mass, rest = float(np.exp(log_mass)), np.exp(log_cutoff)
+    rate = mass / period
+    by_theta = np.diag([mass, rate, period, *rest])
+    by_theta[1, 0] = delta * rate
+    return np.array([mass, delta * rate, d * period, *rest]), by_theta
