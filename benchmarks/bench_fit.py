@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Measure fits of logs: how far off, how often the intervals and the safe walls hold on the true device.
 
-    python benchmarks/bench_fit.py [--logs 1000] [--processes 2] [--write docs/fitting.md]
+    python benchmarks/bench_fit.py [--logs 1000] [--devices 1000] [--processes 2] [--write docs/fitting.md]
 
 Devices, delays, forces, encoders, noises and clocks are random, with friction in two thirds of them. Errors stand over
 the bound of Cramer and Rao, for noise and the encoder's q^2/12 as white. The logs are made by the closed forms that the
@@ -309,13 +309,13 @@ def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
     ])  # fmt: skip
 
 
-def report(count: int, processes: int) -> str:
+def report(count: int, parts: int, processes: int) -> str:
     """All tables."""
     noisy, silent = (
         judge_all(partial(judge, span=span), size, processes)
         for size, span in ((count, NOISY), (max(count // 3, 1), SILENT))
     )
-    devices = judge_all(judge_device, count, processes)
+    devices = judge_all(judge_device, parts, processes)
     fitted, quiet = ([row for row in rows if "refused" not in row] for rows in (noisy, silent))
     for row in (*noisy, *silent):
         if "refused" in row or row["safe"] is False or (not row["doubts"] and max(row["away"].values()) > 5):
@@ -350,7 +350,7 @@ def report(count: int, processes: int) -> str:
         "",
         tell_rest(silent, quiet),
         "",
-        f"{count:,} logs of devices that may have an amplifier's lag of 0.1 to 1 ms, and one or two resonances",
+        f"{parts:,} logs of devices that may have an amplifier's lag of 0.1 to 1 ms, and one or two resonances",
         "of 30 to 400 Hz and 0.5 to 10 % damping, moved to and fro, read with 1 to 40 µm and noise as above.",
         "K_max is given where nothing is doubted, with the lag and the resonances that the log asks for.",
         "`safe_wall()` bears what may hide in the log. The last column has `safe_wall(rigid=True)`, which does",
@@ -366,10 +366,11 @@ def main() -> None:
     """Measure, and print or write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--logs", type=int, default=1000)
+    parser.add_argument("--devices", type=int, default=1000, help="logs of devices with lags and resonances")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--write", type=Path, help="file for the tables, in Markdown")
     given = parser.parse_args()
-    text = report(given.logs, given.processes)
+    text = report(given.logs, given.devices, given.processes)
     print(text)
     if given.write:
         given.write.write_text(text)

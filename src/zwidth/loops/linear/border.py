@@ -99,11 +99,14 @@ class Border:
         b = self.boundary
         few = [edge.w for edge in edges if edge.w.size < _FEW]
         within = [np.linspace(w[0], w[-1], _FILLED)[1:-1] for w in few]
-        ends = np.concatenate([edge.beta[[0, -1]] for edge in edges]) if edges else np.empty(0)
+        ends = np.sort(np.concatenate([edge.beta[[0, -1]] for edge in edges])) if edges else np.empty(0)
         ends = ends[np.isfinite(ends)]
         if not ends.size:
             return np.empty(0)
-        rows = (ends[:, None] + _BESIDE_ENDS * (np.ptp(ends) or np.abs(ends).max()) * np.array([-1.0, 1.0])).ravel()
+        beside = _BESIDE_ENDS * (np.ptp(ends) or np.abs(ends).max())
+        # Most ends are those of two edges.
+        ends = ends[np.diff(ends, prepend=-np.inf) > 0.1 * beside]
+        rows = (ends[:, None] + beside * np.array([-1.0, 1.0])).ravel()
         intervals, crossed = bound_intervals(b, rows), b.crossings(rows).w
         for column in np.concatenate([intervals.below, intervals.above], 1).T:
             on = np.flatnonzero((column >= 0) & (column < len(b.arcs)))
