@@ -55,6 +55,11 @@ class PoleTable(NamedTuple):
     time_constant: np.ndarray  # -1/Re s in s; negative for a growing one, infinite on the unit circle
 
 
+@shown(phase_margin="degrees", delay_margin="s", phase_crossover="Hz", gain_crossover="Hz", modulus_frequency="Hz")
+class SceneMargins(Margins):
+    """`zwidth.Margins` of a wall of a scene, with the delay margin in s and the frequencies in Hz."""
+
+
 class SceneAnswers:
     """The questions of `zwidth.Scene` about walls; of the scene they need its parts, loop and boundary.
 
@@ -275,7 +280,9 @@ class SceneAnswers:
         """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
         return np.asarray(self.passivity_margin(stiffness, virtual_damping)) > 0
 
-    def margins(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> Margins:
+    def margins(
+        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> SceneMargins:
         """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
 
         Of several crossovers the nearest counts, as in python-control: ``gain_margin`` is the factor nearest to 1 on K
@@ -289,7 +296,7 @@ class SceneAnswers:
         """
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
-        found = self.loop.margins(alpha, beta)
+        found = SceneMargins._make(self.loop.margins(alpha, beta))
         return found._replace(
             delay_margin=found.delay_margin * self.timing.period,
             phase_crossover=found.phase_crossover * hertz,

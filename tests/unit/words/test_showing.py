@@ -61,6 +61,11 @@ def test_units_and_names_in_place_of_numbers():
     )
     assert "alpha=array (1000), 0.144469 to 0.874821" in repr(RESULTS["ridges"])
     assert "1000 OK" in repr(RESULTS["ridges"])
+    # A scene's are in s and Hz, those of the normalized loop in periods and radians a period.
+    margins = RESULTS["margins"]
+    assert f"delay_margin={1e6 * margins.delay_margin:.6g} µs" in repr(margins)
+    assert f"gain_crossover={margins.gain_crossover:.6g} Hz" in repr(margins)
+    assert "periods" in repr(zwidth.margins(0.1, 0.4, 0.1, 1))
 
 
 def test_every_nan_has_a_reason():
