@@ -99,7 +99,7 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     beside = [name for name in fit.numbers if name.startswith(("actuator", "modes"))]
     names = ("mass", "damping", "delay", *(["cutoff"] if "cutoff" in fit.errors else []), *beside, "stiffness_max")
     for name in names:
-        symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS.get(name, name)
+        symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS.get(name) or _name_part(name, len(fit.modes))
         known = math.isfinite(fit.value_of(name))
         rows.append((symbol, f"{_spell(fit, name, units)} ({_between(fit, name, units)})" if known else "open"))
     if math.isfinite(fit.virtual_damping):
@@ -130,7 +130,8 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     if not fit.is_doubted and (rigid := choose_wall(fit, rigid=True)) not in (None, wall):
         at = "" if math.isnan(safe.resonance) else f" near {with_unit(safe.resonance, 'Hz', 3)}"
         hidden = f"a resonance{at} may make stiffer walls unstable, K_max too, and not show in this log: {_SEE_MORE}"
-        rows += [("not seen", hidden), ("if it is rigid", f"{_spell_wall(rigid, units)}: {rigid.why}")]
+        alone = "if nothing hides" if fit.is_structured else "if it is rigid"
+        rows += [("not seen", hidden), (alone, f"{_spell_wall(rigid, units)}: {rigid.why}")]
     if fit.next is not None:
         step = fit.next
         B, K = units.spell("damping", step.virtual_damping, 3), units.spell("stiffness", step.stiffness, 3)
@@ -141,6 +142,16 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
             ("measure next", text + (f": K_max's standard error falls from {' to '.join(errors)}" if falls else ""))
         )
     return rows
+
+
+def _name_part(name: str, count: int) -> str:
+    """The label of a number of the amplifier or of one of so many resonances."""
+    part, *place, number = name.split(".")
+    if number in ("time_constant", "frequency"):
+        return (
+            "amplifier's lag" if part == "actuator" else f"resonance {int(place[0]) + 1 if count > 1 else ''}".rstrip()
+        )
+    return f"  its {number.replace('_', ' ')}"
 
 
 def name_trouble(fit: DeviceFit) -> str:
@@ -239,8 +250,9 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
     else:
         safe = fit.safe_wall()
         if not math.isnan(safe.resonance):
+            alone = "these parts alone" if fit.is_structured else "a rigid device"
             lines += [
-                "# As of a rigid device. A resonance that the log does not show may make walls unstable,",
+                f"# As of {alone}. A resonance that the log does not show may make walls unstable,",
                 f"# if they are stiffer than {_spell_wall(safe, units)}: {_SEE_MORE}.",
             ]
         lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]

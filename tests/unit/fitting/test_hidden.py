@@ -44,7 +44,9 @@ def test_a_resonance_is_found_with_its_numbers_and_written_into_the_scene(tmp_pa
         path = f"modes.0.{name}"
         assert abs(fit.value_of(path) - value) < 4 * fit.errors[path]
         assert fit.errors[path] < 0.1 * value
-    assert "modes.0.frequency" in dict(describe_fit(fit, "a log"))
+    said = dict(describe_fit(fit, "a log"))
+    assert said["resonance"].startswith(f"{fit.value_of('modes.0.frequency'):.2f} Hz")
+    assert "if nothing hides" in said
     (tmp_path / "scene.yaml").write_text("\n".join(write_scene(fit, "a log")))
     section: Any = zwidth.load_config(tmp_path / "scene.yaml").scene
     (written,) = section.modes
