@@ -186,7 +186,9 @@ def _find_column(file: str | Path, heads: Sequence[str], name: str, wanted: str 
         if not found and len(instead) == 1:
             return instead[0], titles[instead[0]][1] or usual
         what = f"may be any of {_listing(heads[k] for k in found)}" if found else f"is none of {_listing(heads)}"
-        raise InputError(f"{name}: by its name it {what} in {file}; say which column it is")
+        measured = "frequency" in {title.lower() for title, _ in titles}
+        remedy = f"a table of a response is a device: zwidth ridge --device {file}" if measured else ""
+        raise InputError(f"{name}: by its name it {what} in {file}; {remedy or 'say which column it is'}")
     title, unit = wanted.strip(), None
     found = _matches(heads, title)
     if not found:

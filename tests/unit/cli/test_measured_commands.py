@@ -83,12 +83,14 @@ def test_the_table_that_was_kept_gives_the_same_wall(first):
         (["respond", "no.csv"], "no such file"),
         (["excite", *LOOP[:-1], "1 s"], "too short"),
         (["excite", *LOOP[2:]], "--period"),
+        (["respond", "table.csv", "--period", "1 ms"], "zwidth ridge --device table.csv"),
     ],
 )
 def test_what_is_missing_is_said(arguments, said, tmp_path, monkeypatch, capsys):
     from zwidth.cli import main
 
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "table.csv").write_text("frequency [Hz],real [m/N],imag [m/N]\n1,2,3\n2,3,4\n")
     with pytest.raises(SystemExit) as end:
         main(arguments)
     assert end.value.code == 2
