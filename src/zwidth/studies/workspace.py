@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -33,6 +33,7 @@ _EXAMPLE = "write {csv: arm.csv, across: shoulder, up: elbow}"
 class Poses:
     """Masses and dampings of a device, one row a pose, and two coordinates of it with their names and units."""
 
+    source: dict[str, str]  # as it is written: the file and its two columns
     table: DeviceTable
     names: tuple[tuple[str, str], ...]
     places: tuple[tuple[float, ...], ...]
@@ -59,7 +60,7 @@ def _read_poses(raw: Any) -> Any:
         places = columns.numbers(chosen)
     except InputError as error:
         raise problem(str(error).partition("; ")[0], _FORM, "complete the file") from None
-    return Poses(table, tuple(heads[at] for at in chosen), tuple(tuple(each.tolist()) for each in places))
+    return Poses(dict(raw), table, tuple(heads[at] for at in chosen), tuple(tuple(each.tolist()) for each in places))
 
 
 _KEYS = ("csv", "across", "up")
@@ -73,7 +74,7 @@ _SCHEMA = {
 PosesField = Annotated[
     Poses,
     PlainValidator(_read_poses),
-    PlainSerializer(asdict, return_type=dict[str, Any]),
+    PlainSerializer(lambda poses: poses.source, return_type=dict[str, str]),
     WithJsonSchema(_SCHEMA),
 ]
 

@@ -98,7 +98,7 @@ class Border:
         """Angles on edges that are not among these, and within those of few nodes."""
         b = self.boundary
         few = [edge.w for edge in edges if edge.w.size < _FEW]
-        within = [np.linspace(w[0], w[-1], _FILLED)[1:-1] for w in few]
+        within = [np.empty(0), *(np.linspace(w[0], w[-1], _FILLED)[1:-1] for w in few)]
         ends = np.sort(np.concatenate([edge.beta[[0, -1]] for edge in edges])) if edges else np.empty(0)
         ends = ends[np.isfinite(ends)]
         if not ends.size:

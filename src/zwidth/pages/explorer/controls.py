@@ -12,6 +12,7 @@ from urllib.parse import parse_qsl, urlencode
 
 from zwidth.config.devices import ResponseSection
 from zwidth.config.reader import read_mapping
+from zwidth.config.scenes import NormalizedScene
 from zwidth.pages.words import unit_of
 from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
@@ -284,9 +285,8 @@ def _show_scene(given: Any, origin: Any) -> Controls:
             f"{origin}: scene.device: the page shows poles and motions at any rate, which a response or a sampled "
             "system does not tell; judge it by zwidth check, draw it by zwidth run"
         )
-    controls = (
-        Controls(given.to_scene()) if hasattr(given, "to_scene") else normalized_controls(0, 0, given.delta, given.d)
-    )
+    bare = isinstance(given, NormalizedScene)
+    controls = normalized_controls(0, 0, given.delta, given.d) if bare else Controls(given.to_scene())
     wall = (given.wall.alpha, given.wall.beta) if given.wall and controls.normalized else controls.wall
     if given.wall is None:
         best = controls.scene.max_stiffness()
