@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from zwidth.arrays.kernel_cache import mend_compilation_cache
-from zwidth.sweep.files import hopeless
+from zwidth.sweep.files import content, hopeless
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
 from zwidth.words.errors import ZwidthError
@@ -70,14 +70,15 @@ def in_this_process(jobs: Iterable[Job], perform: Perform) -> Generator[Finished
 
 
 @lru_cache(maxsize=4)
-def _open_store(path: str, made: int) -> Store:
-    """A store that this process works on; ``made`` tells it from another one that took its place."""
+def _open_store(path: str, described: bytes) -> Store:
+    """A store that this process works on; its description tells it from another one that took its place."""
     return Store(Path(path))
 
 
 def perform(path: str, family: str, index: int) -> None:
     """Compute and write one chunk of a store, by its number in a family of outputs, unless it is done already."""
-    store = _open_store(path, os.stat(os.path.join(path, "zarr.json")).st_ino)
+    # Not by the file's number, which the next store may get.
+    store = _open_store(path, content(Path(path) / "zarr.json"))
     task = Task("device" if family == "device" else "wall", index)
     if store.is_done(task):
         return

@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -17,6 +18,8 @@ import zwidth
 from zwidth.sweep import files
 from zwidth.sweep.dataset import verify
 from zwidth.sweep.files import held_briefly, holding
+from zwidth.sweep.jobs import perform
+from zwidth.sweep.store import Store
 from zwidth.words.errors import InputError, StoreBusyError
 
 # Holds the folder until it is killed, and says when it does.
@@ -172,6 +175,20 @@ def test_overwriting_starts_again(tmp_path):
     assert_same(tmp_path / "fresh", tmp_path / "out")
     with pytest.raises(InputError, match="overwrite: it starts again"):
         run_sweeps(changed, tmp_path / "out", overwrite=True, resume=True)
+
+
+def test_a_store_in_the_place_of_another_is_computed_as_itself(tmp_path):
+    for name, alpha in (("first", 0.1), ("second", 0.3)):
+        axes = {"alpha": [alpha, 2 * alpha], "beta": 0.1, "delta": 0.1, "d": 1}
+        assert run_sweeps(config_of(study(axes=axes, outputs=["spectral_radius"])), tmp_path / name).ok
+    path = tmp_path / "first" / "map.zarr"
+    # Over the files that were there, which keep their numbers; a new store may get those of one that is gone.
+    shutil.copytree(tmp_path / "second" / "map.zarr", path, dirs_exist_ok=True)
+    store = Store(path)
+    for task in store.plan.tasks():
+        store.flag(task).unlink()
+        perform(str(path), task.family, task.index)
+    assert_same(path.parent, tmp_path / "second")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
