@@ -229,7 +229,8 @@ def judge_device(seed: int) -> dict[str, Any]:
         "held": bar.low <= limit <= bar.high,
         "safe": true.is_stable(*safe[:2]) if safe.stiffness > 0 else None,
         "share": safe.stiffness / limit,
-        "rigid": true.is_stable(*rigid[:2]),
+        # Without a wall that drawn devices bear there is none to judge.
+        "rigid": bool(np.isfinite(rigid.stiffness)) and true.is_stable(*rigid[:2]),
     }
 
 
