@@ -105,13 +105,8 @@ def functions() -> Answers:
     zeros, poles = np.array([0.3, 0.9]), np.array([0.2, 0.99, 1.0])
     yield from ask("count_poles", zwidth.count_poles, zeros, poles, alpha[:50], np.floor(d[:50]), 1.0)
     device = {"mass": 10.0 ** random.uniform(-2, 1, 30), "damping": delta[:30], "period": 1e-3}
-    wanted = 10.0 ** random.uniform(2, 5, 30)
     yield from ask("max_stiffness", zwidth.max_stiffness, **device, delay=1e-3 * d[:30])
     yield from ask("sensitivities", zwidth.sensitivities, **device, delay=1e-3 * d[:30])
-    for name in ("damping", "period", "mass"):
-        given = {key: part for key, part in device.items() if key != name}
-        yield from ask(f"required_{name}", zwidth.required, name, wanted, **given, delay=1e-3)
-    yield from ask("allowed_delay", zwidth.required, "delay", wanted, **device)
     with jax.enable_x64(True):
         slopes = jax.vmap(jax.grad(lambda delta, d: zwidth.alpha_max(delta, d).alpha), (0, None))
         yield from ask("grad alpha_max", slopes, delta[:20] + 0.01, 1.0)

@@ -71,10 +71,8 @@ from .scenes.robust import RobustWall as RobustWall
 from .scenes.robust import robust_max_stiffness as robust_max_stiffness
 from .scenes.robust import robust_wall as robust_wall
 from .scenes.scene import Scene as Scene
-from .scenes.stiffness import Requirement as Requirement
 from .scenes.stiffness import Sensitivities as Sensitivities
 from .scenes.stiffness import max_stiffness as max_stiffness
-from .scenes.stiffness import required as required
 from .scenes.stiffness import sensitivities as sensitivities
 from .scenes.tolerances import Tolerance as Tolerance
 from .scenes.tolerances import ToleranceEstimate as ToleranceEstimate

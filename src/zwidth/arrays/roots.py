@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import along, epsilon, frozen, namespace, repeat
+from zwidth.arrays.xp import along, frozen, namespace, repeat
 from zwidth.words.types import Array
 
 Function = Callable[[Array], Array]
@@ -20,8 +20,6 @@ Sloped = Callable[[Array], tuple[Array, Array]]
 _HALVINGS = 60
 # After a step of such a share of x nothing but rounding is left, near a double zero too.
 _SMALL = 1e-11
-# Cells of a first look at a function of several zeros, and what counts as zero, in rounding units of 1.
-_CELLS, _ZERO = 160, 45.0
 # A phase in radians, which false position is for, is not known better.
 _ROUNDING = 1e-15
 
@@ -66,27 +64,6 @@ def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) 
         if np.all(state[3] <= _SMALL * np.abs(state[0])):
             break
     return state[0], state[3]
-
-
-def last_cell(function: Function, inner: Array, outer: Array, offset: Array) -> tuple[Array, Array, Array]:
-    """A narrow bracket of the last zero between ``inner`` and ``outer`` of a function that is positive at ``outer``.
-
-    ``function`` takes points along a new last axis. They have equal ratios with ``offset`` added. A peak above zero
-    narrower than a cell is not seen; a dip below it is bracketed where the lowest of the samples stands beside it. The
-    third result tells whether a sample was not positive.
-    """
-    xp = namespace(inner, outer)
-    first, width = inner[..., None], (outer - inner)[..., None]
-    part = along(np.arange(_CELLS + 1) / _CELLS, inner)
-    spread = xp.expm1(part * xp.log((outer + offset) / (inner + offset))[..., None]) * (inner + offset)[..., None]
-    points = first + xp.where(part < 1.0, spread, width)
-    values = function(points)
-    last = xp.max(xp.where(values <= _ZERO * epsilon(values), xp.arange(_CELLS + 1), -1), axis=-1)
-    lowest = xp.argmin(xp.where(xp.isnan(values), xp.inf, values), axis=-1)
-    crossed = last >= 0
-    ends = xp.where(crossed, last, xp.maximum(lowest - 1, 0)), xp.minimum(xp.where(crossed, last, lowest) + 1, _CELLS)
-    low, high = (xp.take_along_axis(points, end[..., None], axis=-1)[..., 0][()] for end in ends)
-    return low, high, crossed
 
 
 # Of a step of golden section.
