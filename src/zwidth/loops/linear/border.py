@@ -31,7 +31,7 @@ _ONE_DAMPING = 1e-12
 _BEYOND = 0.05
 # Lines whose slopes differ by less, as a share, do not meet.
 _PARALLEL = 1e-12
-# Dampings of corners that differ by less, as a share, are one.
+# Corners that differ by less, as a share, are one.
 _SAME = 1e-12
 
 
@@ -42,6 +42,12 @@ class Edge(NamedTuple):
     alpha: np.ndarray
     beta: np.ndarray
     line: int  # which of the boundary's lines, or -1 for the curve
+
+    @property
+    def is_point(self) -> bool:
+        """Whether its walls differ by rounding, as those of a hardly sprung device's slowest angles do."""
+        least = _SAME * np.max(np.abs(self.alpha) + np.abs(self.beta))
+        return bool(np.ptp(self.alpha) <= least and np.ptp(self.beta) <= least)
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ class Border:
     def _find_missed(self, edges: list[Edge]) -> np.ndarray:
         """Angles on edges that are not among these, and within those of few nodes."""
         b = self.boundary
-        few = [edge.w for edge in edges if edge.w.size < _FEW]
+        few = [edge.w for edge in edges if edge.w.size < _FEW and not edge.is_point]
         within = [np.empty(0), *(np.linspace(w[0], w[-1], _FILLED)[1:-1] for w in few)]
         ends = np.sort(np.concatenate([edge.beta[[0, -1]] for edge in edges])) if edges else np.empty(0)
         ends = ends[np.isfinite(ends)]

@@ -86,9 +86,11 @@ class Page:
         for axis in (self.plots["plane"].x_range, self.plots["plane"].y_range):
             for end in ("start", "end"):
                 axis.on_change(end, lambda attr, old, new: self._point_at_wall())
-        for name, plot in self.plots.items():
-            plot.name = name
-            document.add_root(plot)
+        # Bokeh looks through all that is in the document once, not after each figure.
+        with document.models.freeze():
+            for name, plot in self.plots.items():
+                plot.name = name
+                document.add_root(plot)
         self._paint()
 
     def _new(self, height: int, **keywords: Any) -> figure:
