@@ -162,8 +162,7 @@ def _report_end(result: RunResult, command: str) -> None:
     sweeps = result.sweeps.values()
     chunks = [sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")]
     done = sum(study.state in ("done", "kept") for study in result.studies if study.sweep is None)
-    whole = len(result.studies) - len(sweeps)
-    parts = [f"{done} of {whole} done"] if whole else []
+    parts = [f"{done} of {result.whole} done"] if result.whole else []
     parts += [f"{chunks[0] + chunks[1]} of {chunks[2]} chunks done ({chunks[0]} now)"] if sweeps else []
     click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
     for study in result.studies:

@@ -109,7 +109,8 @@ def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
         step = 10.0 ** floor(log10(size)) / 4.0
         low, high = step * floor(low / step - 0.2), step * ceil(high / step + 0.2)
         if low - 2.0 * size <= place <= high + 2.0 * size:
-            low, high = min(low, step * floor(place / step)), max(high, step * ceil(place / step))
+            # Its mark has room, too.
+            low, high = min(low, step * floor(place / step - 0.2)), max(high, step * ceil(place / step + 0.2))
         ranges.append((low, high))
     return ranges[0], ranges[1]
 
