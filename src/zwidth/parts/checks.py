@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from dataclasses import Field, fields
+from dataclasses import MISSING, Field, fields
 from functools import wraps
 from numbers import Real
-from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -142,6 +142,26 @@ def check_fields(part: Any, owner: str = "") -> None:
         _read_fields(part, owner)
 
 
+class Part:
+    """Base of the dataclasses that a scene is made of: it checks their numbers, and their ``repr`` makes them again."""
+
+    owner: ClassVar[str] = ""  # what begins the names of its quantities
+
+    def __post_init__(self) -> None:
+        check_fields(self, self.owner)
+
+    def __repr__(self) -> str:
+        """A call, without what is as it is where left out."""
+        parts = []
+        for item in (item for item in fields(self) if item.repr):  # pyright: ignore[reportArgumentType]
+            usual = item.default if item.default_factory is MISSING else item.default_factory()
+            text = repr(getattr(self, item.name))
+            # A device that does not turn says so by None as well.
+            if text != repr(usual) and (text, usual) != ("False", None):
+                parts.append(f"{item.name}={text}")
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
 def _list_told(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """What may tell a kind of device: every value by its name, each text of a list."""
     for name, value in given.items():
@@ -163,13 +183,12 @@ def find_kind(given: dict[str, Any]) -> bool | None:
         kind = tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
         if kind is None:
             continue
-        words = f"{value!r}" if isinstance(value, str) else "a part"
         if told and kind not in told:
             raise InputError(
-                f"{name}: got {words}, in units of a {_KINDS[kind]} device, beside {told[not kind]}, of a "
+                f"{name}: got {value!r}, in units of a {_KINDS[kind]} device, beside {told[not kind]}, of a "
                 f"{_KINDS[not kind]} one; write all of them in {_UNITS[False]}, or in {_UNITS[True]}"
             )
-        told.setdefault(bool(kind), f"{name} = {words}" if isinstance(value, str) else name)
+        told.setdefault(bool(kind), f"{name} = {value!r}")
     return next(iter(told), None)
 
 

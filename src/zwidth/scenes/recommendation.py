@@ -41,6 +41,7 @@ _UNITS = {
     "time": "s",
     "frequency": "Hz",
 }
+_EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
 _WALL = ("stiffness", "virtual_damping")
 _JUDGED = (
     *("alpha", "beta", "virtual_damping_lower", "virtual_damping_upper", "spectral_radius", "passive"),
@@ -66,7 +67,7 @@ class Wanted(NamedTuple):
         for name, value in given.items():
             number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
             if value is not None and not (number and math.isfinite(value) and ranges[name].holds(value)):
-                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed")
+                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, as {_EXAMPLES[name]}")
         if not isinstance(passive, bool | np.bool_):
             raise InputError(f"passive: got {passive!r}; True or False is needed")
         if gain_margin is None and phase_margin is None and not passive and stiffness_fraction is None:
