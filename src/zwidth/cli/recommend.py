@@ -35,7 +35,7 @@ from zwidth.pages.words import row
 @click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
 @json_option
 def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wanted: Any) -> None:
-    """Say which wall to set on a device: the stiffest one that keeps the margins asked for.
+    """Say which wall to set: the stiffest one with wanted margins.
 
     Then what else is known of that wall, and what would allow a stiffer one.
     """

@@ -36,7 +36,7 @@ class Actuator(Part):
         36925 N/m
     """
 
-    owner = "actuator"
+    _owner = "actuator"
     # Forms that the explorer offers.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "first order": {"cutoff": 300.0},

@@ -145,10 +145,10 @@ def check_fields(part: Any, owner: str = "") -> None:
 class Part:
     """Base of the dataclasses that a scene is made of: it checks their numbers, and their ``repr`` makes them again."""
 
-    owner: ClassVar[str] = ""  # what begins the names of its quantities
+    _owner: ClassVar[str] = ""  # what begins the names of its quantities
 
     def __post_init__(self) -> None:
-        check_fields(self, self.owner)
+        check_fields(self, self._owner)
 
     def __repr__(self) -> str:
         """A call, without what is as it is where left out."""

@@ -32,7 +32,7 @@ class Coupling(Part):
         'motor'
     """
 
-    owner = "coupling"
+    _owner = "coupling"
     # Forms that the explorer offers.
     usual: ClassVar[dict[str, dict[str, Any]]] = {
         "motor": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0},

@@ -31,7 +31,7 @@ class Mode(Part):
         25419 N/m
     """
 
-    owner = "mode"
+    _owner = "mode"
 
     frequency: Any
     damping_ratio: Any

@@ -37,7 +37,7 @@ class Operator(Part):
         True
     """
 
-    owner = "operator"
+    _owner = "operator"
     # Forms that the explorer offers.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "rigid": _HAND,

@@ -64,7 +64,7 @@ class Estimate:
 class _Checked(Part):
     """Base of the estimates that are given by their numbers."""
 
-    owner = "velocity"
+    _owner = "velocity"
 
 
 @dataclass(frozen=True, repr=False)

@@ -156,7 +156,9 @@ class Recommendation:
         first = f"K = {K}, B = {B}: {share:.4g} % of the stiffest stable wall, {spell_stiffness(float(largest))}"
         if self.limited_by != "stiffness_fraction":
             first += f"; {self.wanted.spell(self.limited_by)} allows no more"
-        lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper)
+        lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
+        # A unit that both have stands once.
+        lower = lower.removesuffix(f" {upper.partition(' ')[2]}")
         delay = verdict.delay_margin
         apart = (
             f"gain {plain(verdict.gain_margin)}",
@@ -164,7 +166,7 @@ class Recommendation:
             f"delay {'not known' if math.isnan(delay) else with_unit(delay, 's')}",
         )
         rest = f"margins: {', '.join(apart)}; passive: {self.spell_passive()}"
-        return first, f"stable for B from {lower} to {upper} {own_unit('N s/m')}; {rest}"
+        return first, f"stable for B from {lower} to {upper}; {rest}"
 
     def spell_passive(self) -> str:
         """Whether the wall is passive, or why that is not known."""

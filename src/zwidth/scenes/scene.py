@@ -229,7 +229,7 @@ class Scene(Part, SceneAnswers, SceneOptima, SceneAdvice):
         ]
 
     simulate = simulate
-    """`zwidth.simulate` of this scene, with all its arguments."""
+    """A method: `zwidth.simulate` of this scene, with all its arguments."""
 
     def parameters(self) -> dict[str, Any]:
         """Every number of every part by its dotted path.
