@@ -197,7 +197,8 @@ def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
     kind = MotionKind(int(hit.outcome))
     end = "" if kind in (MotionKind.UNCLEAR, MotionKind.INVALID) else f", {kind.name.lower()} at the end"
-    words = f"(leaves it {int(hit.bounces)} times{end})"
+    count = int(hit.bounces)
+    words = f"(leaves it {count} {'time' if count == 1 else 'times'}{end})"
     return hit.time, hit.position, hit.wall_force, words
 
 
