@@ -19,20 +19,18 @@ MOUNT = '''"""A spring and a damper between the motor's side of the device and t
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from zwidth.parts.checks import check_fields
+from zwidth.parts.checks import Part
 
 
-@dataclass(frozen=True)
-class Mount:
+@dataclass(frozen=True, repr=False)
+class Mount(Part):
     """A spring and a damper between device and ground."""
 
+    _owner = "mount"
     usual: ClassVar[dict[str, dict[str, float]]] = {"soft": {"stiffness": 100.0, "damping": 1.0}}
 
     stiffness: Any
     damping: Any = 0.0
-
-    def __post_init__(self) -> None:
-        check_fields(self, "mount")
 '''
 IMPORT = "from zwidth.parts.mount import Mount\n"
 # By file: texts, and what stands there in the copy.

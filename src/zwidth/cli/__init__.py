@@ -47,10 +47,6 @@ def main(arguments: list[str] | None = None) -> None:
         for line in str(error).splitlines():
             click.echo(f"zwidth: {line}", err=True)
         sys.exit(_EXIT_INPUT)
-    except BrokenPipeError:
-        # The reader of a pipe, `head` say, has gone: nothing is wrong.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
     except Exception as error:
         if os.environ.get("ZWIDTH_TRACEBACK"):
             raise

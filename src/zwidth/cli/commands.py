@@ -45,7 +45,7 @@ def cli() -> None:
 @click.option("--resolution", type=quantity_type("m", POSITIVE), help="One step Q of the position sensor, in m.")
 @json_option
 def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
-    """Judge one wall: stable, passive, how far from the boundary, and what limits the device."""
+    """Judge one wall: stable, passive, how far from the boundary."""
     from zwidth.scenes.assessment import assess, friction_rule, limits_of
 
     verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
@@ -161,9 +161,9 @@ def schema() -> None:
 @click.argument("name", required=False)
 @json_option
 def devices(name: str | None, as_json: bool) -> None:
-    """List devices with published numbers; with a NAME, every number of one and its source.
+    """List devices with published numbers, or those of one NAME.
 
-    A dash stands where nothing is published. Rotary devices have an inertia in kg m^2 and a damping in N m s/rad.
+    A dash stands where nothing is published.
     """
     from zwidth.parts.devices import DEVICES, Published, find_device
 
@@ -176,26 +176,17 @@ def devices(name: str | None, as_json: bool) -> None:
         click.echo(f"{device.title} ({device.motion})")
         for quantity, number in device.numbers.items():
             note = f" ({number.note})" if number.note else ""
-            click.echo(row(quantity, f"{_amount(number)}{note}; {number.source}"))
+            click.echo(row(quantity, f"{number.spell()}{note}; {number.source}"))
         return
 
     def cell(number: Published | None) -> str:
-        return "-" if number is None else _amount(number)
+        return "-" if number is None else number.spell()
 
     lines = [("name", *(column.replace("_", " ") for column in _COLUMNS))]
     lines += [(device.name, *(cell(getattr(device, column)) for column in _COLUMNS)) for device in chosen]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in lines:
         click.echo("  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip())
-
-
-def _amount(number: tuple[float, str, str, str]) -> str:
-    """A number with its unit; inertias and counts without a prefix."""
-    value, unit = number[:2]
-    if unit == "counts":
-        return f"{value:g} counts"
-    # A prefix on "kg m^2" would be a second one.
-    return f"{value:g} {unit}" if unit == "kg m^2" else with_unit(value, unit, 3)
 
 
 def _complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
@@ -270,11 +261,11 @@ def describe_example(text: str) -> str:
 
 
 @cli.command()
-@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(exists=True, path_type=Path))
+@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(path_type=Path))
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
 @click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
 def explore(path: Path | None, port: int, no_browser: bool) -> None:
-    """Open a page with sliders for device, timing and wall, on which the stable walls follow.
+    """Open a page with sliders, on which the stable walls follow.
 
     It starts from the scene of a CONFIG file, or of the run in DIR. The server is for this machine alone and asks for
     the token in its address. Ctrl-C ends it.
@@ -306,9 +297,9 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
 @click.option("--out", type=click.Path(path_type=Path), help="The file.  [default: DIR/report.html]")
 @json_option
 def report(folder: Path, out: Path | None, as_json: bool) -> None:
-    """Write the run in DIR as one HTML file: figures, slices of its maps, methods, versions, configuration.
+    """Write the run in DIR as one HTML file, with slices of its maps.
 
-    The file needs no server and no network.
+    It holds figures, methods, versions and configuration, and needs no server and no network.
     """
     from zwidth.pages.report.page import write_report
 

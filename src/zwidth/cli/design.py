@@ -53,7 +53,7 @@ def design(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Say what a wanted stiffness needs, or how many devices within tolerances bear a wall.
+    """Say what a wanted stiffness needs, or what tolerances cost.
 
     With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given.
     With --tolerance: the share of devices on which the wall (--stiffness, --virtual-damping) is stable, the stiffness

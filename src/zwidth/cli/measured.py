@@ -35,7 +35,7 @@ _PERIOD = quantity_type("s", POSITIVE)
 @velocity_options
 @json_option
 def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> None:
-    """Design the force to play, N at every period, from which `zwidth respond` finds a response."""
+    """Design the force to play before `zwidth respond`."""
     from zwidth.fitting.excite import excite as design
     from zwidth.parts.measured import MeasuredDevice
 
@@ -76,10 +76,11 @@ def respond(
     as_json: bool,
     **columns: str | None,
 ) -> None:
-    """Find a device's frequency response with its band, and the walls that are safe by it, without a model.
+    """Find a device's frequency response, and what is safe by it.
 
-    From logs of a force that `zwidth excite` designed, or of any other. What --save keeps, and any table of an
-    analyzer, is a device of the other commands: `zwidth ridge --device FILE.csv` answers of it.
+    Without a model, with the band that noise leaves. From logs of a force that `zwidth excite` designed, or of any
+    other. What --save keeps, and any table of an analyzer, is a device of the other commands: `zwidth ridge --device
+    FILE.csv` answers of it.
     """
     from zwidth.fitting.columns import read_log
     from zwidth.fitting.respond import find_nominal_limit, respond_to_logs

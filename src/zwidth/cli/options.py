@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, fields
 from functools import wraps
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import click
 
 from zwidth.parts.checks import Span, find_kind
+from zwidth.words.errors import InputError
 from zwidth.words.formatting import short
 from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_PARTS, PARAMETERS, Range
 from zwidth.words.rotation import is_rotary, own_unit, use_kind
@@ -94,7 +96,7 @@ class Parsed(click.ParamType):
         """Parse one option; one that is parsed, or a default that is no text, stays as it is."""
         if not isinstance(value, str):
             return value
-        if ctx is not None and param is not None and tell_kind(value) is not None:
+        if self.name == "quantity" and ctx is not None and param is not None and tell_kind(value) is not None:
             ctx.meta.setdefault(_TOLD, {})[param.opts[0]] = value
         try:
             return self.read(value)
@@ -120,15 +122,23 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> 
 def number_or_text(text: str) -> float | str:
     """What stands there without a unit, or with one."""
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         return text
+    # What is not finite is named as it was written.
+    return number if math.isfinite(number) else text
 
 
 def read_share(text: str) -> float:
     """A share: ``2%`` or ``0.02``."""
     text = text.strip()
     return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+
+
+def read_factor(text: str) -> float:
+    """A factor: ``2`` or ``6 dB``."""
+    number = float(text.strip().removesuffix("dB"))
+    return 10.0 ** (number / 20.0) if text.strip().endswith("dB") else number
 
 
 def _read_figure(text: str) -> Path:
@@ -185,13 +195,20 @@ def _take_options(
         def with_made(**given: Any) -> Any:
             named = {path: given.pop(path.replace(".", "__")) for path in paths}
             known = {path: each for path, each in named.items() if each is not None}
-            if "device" in known:
-                from zwidth.parts.devices import read_device
+            context = click.get_current_context()
+            try:
+                if "device" in known:
+                    from zwidth.parts.devices import read_device
 
-                known["device"] = read_device(known["device"])
-            told = click.get_current_context().meta.get(_TOLD, {})
-            with use_kind(bool(find_kind(told | ({"--device": known["device"]} if "device" in known else {})))):
-                return function(**{name: make(known)}, **given)
+                    known["device"] = read_device(known["device"])
+                told = context.meta.get(_TOLD, {}) | ({"--device": known["device"]} if "device" in known else {})
+                with use_kind(bool(find_kind(told))):
+                    return function(**{name: make(known)}, **given)
+            except InputError as error:
+                field, _, text = str(error).partition(": ")
+                if field.replace(".", "__") not in {option.name for option in context.command.params}:
+                    raise
+                raise click.BadParameter(text, param_hint=f"'{flag_of(field)}'") from None
 
         command = with_made
         for path in reversed(paths):
@@ -217,7 +234,6 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     from zwidth.parts.timing import Timing
     from zwidth.parts.wall import VirtualWall
     from zwidth.scenes.scene import Scene
-    from zwidth.words.errors import InputError
 
     if not given and not required:
         return None
@@ -232,31 +248,26 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     def some(*names: str) -> dict[str, Any]:
         return {name: given[name] for name in names if name in given}
 
-    try:
-        parts: dict[str, Any] = {
-            name: _make_part(name, kind, own) for name, kind in PARTS.items() if (own := _own(given, name))
-        }
-        modes = [_make_part(name, Mode, own) for name in _MODES if (own := _own(given, name))]
-        parts |= {"modes": modes} if modes else {}
-        if device is None:
-            device = Device(**some("mass", "damping"), rotary=is_rotary())
-        elif isinstance(device, KnownDevice):
-            device = device.to_device(**some("mass", "damping"))
-        else:
-            for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _HELD):
-                raise click.UsageError(f"--device is given as a whole and holds {flag_of(path)}: give one of the two")
-        scene = Scene(
-            device,
-            Timing(**some("period", "rate", "delay")),
-            VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0)),
-            velocity=_make_velocity(given),
-        ).replace(**parts)
-        scene.check_parts()
-        return scene
-    except InputError as error:
-        field, _, text = str(error).partition(": ")
-        known = field in _PARTS or field in PARAMETERS
-        raise click.BadParameter(text, param_hint=f"'{flag_of(field)}'") if known else error from None
+    parts: dict[str, Any] = {
+        name: _make_part(name, kind, own) for name, kind in PARTS.items() if (own := _own(given, name))
+    }
+    modes = [_make_part(name, Mode, own) for name in _MODES if (own := _own(given, name))]
+    parts |= {"modes": modes} if modes else {}
+    if device is None:
+        device = Device(**some("mass", "damping"), rotary=is_rotary())
+    elif isinstance(device, KnownDevice):
+        device = device.to_device(**some("mass", "damping"))
+    else:
+        for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _HELD):
+            raise click.UsageError(f"--device is given as a whole and holds {flag_of(path)}: give one of the two")
+    scene = Scene(
+        device,
+        Timing(**some("period", "rate", "delay")),
+        VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0)),
+        velocity=_make_velocity(given),
+    ).replace(**parts)
+    scene.check_parts()
+    return scene
 
 
 def _list_needed(kind: Any) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
-from zwidth.cli.options import Parsed, figure_option, json_option, read_share, save_figure, scene_options
+from zwidth.cli.options import Parsed, figure_option, json_option, read_factor, read_share, save_figure, scene_options
 from zwidth.pages import words
 from zwidth.pages.words import row
 
@@ -21,17 +21,21 @@ from zwidth.pages.words import row
     help="At most this share of K_max.  [default: 75% where nothing else is asked for]",
 )
 @click.option(
-    "--gain-margin", type=click.FloatRange(1.0, min_open=True), help="At least this factor on K and B together."
+    "--gain-margin",
+    type=Parsed("FACTOR", read_factor, "write a factor, as 2, or 6 dB"),
+    help="At least this factor on K and B together.",
 )
 @click.option(
-    "--phase-margin", type=click.FloatRange(0.0, 180.0, min_open=True, max_open=True), help="At least so many degrees."
+    "--phase-margin",
+    type=Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")), "write degrees, as 30"),
+    help="At least so many degrees.",
 )
 @click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
 @figure_option
 @click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
 @json_option
 def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wanted: Any) -> None:
-    """Say which wall to set on a device: the stiffest one that keeps the margins asked for.
+    """Say which wall to set: the stiffest one with wanted margins.
 
     Then what else is known of that wall, and what would allow a stiffer one.
     """

@@ -50,17 +50,21 @@ def _read_slice(text: str) -> tuple[str, str]:
     return name, wanted
 
 
-def _read_figure_size(text: str) -> tuple[float, float]:
-    width, height = (float(part) for part in text.lower().split("x"))
-    if not (1 <= width <= 100 and 1 <= height <= 100):
+def _read_figure_size(text: str) -> tuple[float, float | None]:
+    """Width and height in inches, or in mm; a width in mm alone has no height."""
+    metric = text.strip().endswith("mm")
+    width, *rest = (float(part.replace("mm", "")) / (25.4 if metric else 1.0) for part in text.split("x"))
+    if not all(1 <= side <= 100 for side in (width, *rest)) or len(rest) != 1 - (metric and not rest):
         raise ValueError
-    return width, height
+    return width, rest[0] if rest else None
 
 
 _SHARD = Parsed("i/n", _read_shard, "write i/n with 1 <= i <= n, as in 3/8")
 _SIZE = Parsed("size", _read_size, "write a size from 128 MiB to 1024 GiB, as in '512 MiB'")
 _SLICE = Parsed("name=value", _read_slice, "write NAME=VALUE, as in delta=0.1")
-_FIGURE_SIZE = Parsed("WxH", _read_figure_size, "write width x height from 1 to 100 inches, as in 7x4.5")
+_FIGURE_SIZE = Parsed(
+    "WxH", _read_figure_size, "write width x height from 1 to 100 inches, as in 7x4.5, or a width, as in 85mm"
+)
 
 
 @cli.command()
@@ -72,9 +76,9 @@ _FIGURE_SIZE = Parsed("WxH", _read_figure_size, "write width x height from 1 to 
 @click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
 @click.option("--shard", type=_SHARD, help="Compute every n-th chunk of sweeps only, as one of n jobs.")
 @click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
-@click.option("--size", type=_FIGURE_SIZE, help="Width and height of the studies' figures in inches, as in 7x4.5.")
+@click.option("--size", type=_FIGURE_SIZE, help="Size of the studies' figures in inches, as 7x4.5, or width, as 85mm.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
-def run(path: Path, dry_run: bool, size: tuple[float, float] | None, **options: Any) -> None:
+def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **options: Any) -> None:
     """Run the studies of a CONFIG file.
 
     Data, figures and a record of the run go into one folder, the results of each sweep into a store DIR/STUDY.zarr.
@@ -162,8 +166,7 @@ def _report_end(result: RunResult, command: str) -> None:
     sweeps = result.sweeps.values()
     chunks = [sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")]
     done = sum(study.state in ("done", "kept") for study in result.studies if study.sweep is None)
-    whole = len(result.studies) - len(sweeps)
-    parts = [f"{done} of {whole} done"] if whole else []
+    parts = [f"{done} of {result.whole} done"] if result.whole else []
     parts += [f"{chunks[0] + chunks[1]} of {chunks[2]} chunks done ({chunks[0]} now)"] if sweeps else []
     click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
     for study in result.studies:
@@ -214,7 +217,7 @@ def verify(folder: Path, as_json: bool) -> None:
 @click.option("--netcdf", type=click.Path(path_type=Path), help="Write a netCDF-4 file.")
 @click.option("--csv", "table", type=click.Path(path_type=Path), help="Write a table, of a million points at most.")
 def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
-    """Write a sweep, a store or a folder DIR with one, as netCDF or CSV."""
+    """Write the sweep in DIR, or a store, as netCDF or CSV."""
     if netcdf is None and table is None:
         raise click.UsageError("give --netcdf FILE or --csv FILE")
     from zwidth.sweep.dataset import to_csv, to_netcdf
@@ -240,7 +243,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 @click.option("--format", "formats", multiple=True, type=click.Choice(("png", "svg", "pdf")), default=("png", "svg"),
               help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
 @click.option("--dpi", type=click.IntRange(10, 2400), help="Dots an inch.")
-@click.option("--size", type=_FIGURE_SIZE, help="Width and height in inches, as in 7x4.5.")
+@click.option("--size", type=_FIGURE_SIZE, help="Size in inches, as 7x4.5, or width, as 85mm.")
 @click.option("--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib.")
 @click.option("--text", is_flag=True, help="Keep text as text in an SVG: it can be searched, and needs the font.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
@@ -280,7 +283,7 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
 @click.option("--overwrite", is_flag=True, help="Replace the results of an earlier run in that folder.")
 @json_option
 def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
-    """Measure speed against error of every method, beside NumPy, JAX and python-control.
+    """Measure speed and error of every method, beside other tools.
 
     It needs a checkout of the project, whose benchmarks/methods it runs, and for the errors the extra "test".
     """

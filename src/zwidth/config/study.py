@@ -108,6 +108,11 @@ class Study(Strict):
         return name
 
     @classmethod
+    def unknown(cls, name: str) -> tuple[str, str, str]:
+        what, allowed, remedy = super().unknown(name)
+        return what, allowed, "write it at the top of the file" if name in ("figure", "scene") else remedy
+
+    @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         """Add what the study leaves out and the scene knows."""
         supplied: dict[str, Any] = {

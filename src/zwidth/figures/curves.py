@@ -62,7 +62,6 @@ def draw_curves(
             dots = style.POINTS if whole_numbers else {"marker": "o" if few else "", "markersize": 3.5}
             ax.plot(data[x].values, values, label=label, **look | dots)
         grid.scale_axis(ax, "x", data[x])
-        ax.set_title(grid.title(part))
         ax.margins(y=0.06)
         if output.look in ("logarithmic", "steep"):
             # Panels share the axis: ticks that fit all of them.
@@ -72,6 +71,7 @@ def draw_curves(
     values = data[x].values
     if few and not grid.logarithmic(values):
         panels[0].set_xlim(*style.span(float(values.min()), float(values.max())))
+    grid.name_panels(panels, parts)
     style.label_axes(panels, grid.axis_label(data, x), grid.output_label(data, name), once=axes is None)
     _name_looks(panels, labels, looks, outside=axes is None)
     return panels
@@ -121,7 +121,7 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
                 line = {"colors": [look["color"]], "linestyles": [look["linestyle"]], "linewidths": 1.4}
                 ax.contour(part[x].values, part[y].values, shown, levels=[level], **line)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
-        ax.set_title(grid.title(part))
+    grid.name_panels(panels, parts)
     style.label_axes(panels, grid.axis_label(data, x), grid.axis_label(data, y), once=axes is None)
     _name_looks(panels, labels, looks, outside=axes is None, title="boundaries of the stable walls")
     return panels

@@ -21,6 +21,8 @@ _RESOLVED, _RESOLVED_BY_MANY = 1000, 500
 # A grid of more panels than this says nothing on a page: evenly spaced values stand for all.
 _ACROSS = 3
 _MANY_PANELS = 9
+# So many values fit above one of several panels.
+_FITTING = 3
 # Values that are no exact ratios of each other are on a logarithmic axis from here on, which has 2 and 5 up to there.
 _WIDE, _FEW_DECADES = 5.0, 50.0
 # What an axis of a plane is, rather than a choice of panels: the first two that vary.
@@ -117,10 +119,14 @@ def spell(value: xarray.DataArray) -> str:
     return rf"${VARIABLES[str(value.name)].symbol} = {float(value):.4g}{unit}$"
 
 
-def title(part: xarray.Dataset) -> str:
-    """The single values of a part of a dataset."""
-    names = [name for name in ("device", *VARIABLES) if name in part.coords and not part[name].ndim]
-    return ",  ".join(spell(part[name]) for name in names)
+def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
+    """Write the single values of its part above a panel; of more than fit those that tell it from others."""
+    first = parts[0]
+    names = [name for name in ("device", *VARIABLES) if name in first.coords and not first[name].ndim]
+    if len(names) > _FITTING and len(parts) > 1:
+        names = [name for name in names if any(part[name].values != first[name].values for part in parts)]
+    for ax, part in zip(axes, parts, strict=False):
+        ax.set_title(",  ".join(spell(part[name]) for name in names))
 
 
 def axis_label(data: xarray.Dataset, name: str) -> str:

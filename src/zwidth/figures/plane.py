@@ -82,6 +82,7 @@ def draw_plane(
     norm, image = _norm(parts, name), None
     for part, ax in zip(parts, panels, strict=True):
         image = _draw_panel(ax, part, name, norm, find_outlines(part, edges))
+    grid.name_panels(panels, parts)
     style.label_axes(panels, grid.axis_label(parts[0], x), grid.axis_label(parts[0], y), once=axes is None)
     _explain(panels, parts, name, image, outside=axes is None)
     return panels
@@ -147,7 +148,6 @@ def _draw_panel(
     peak = _find_peak(part)
     if peak is not None:
         ax.plot(*peak, linestyle="", zorder=5, clip_on=False, label="stiffest stable wall", **_PEAK)
-    ax.set_title(grid.title(part))
     return image
 
 

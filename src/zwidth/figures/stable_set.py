@@ -29,6 +29,8 @@ MARKS: dict[str, dict[str, Any]] = {
     "stiffest": {"marker": "o", "markersize": 4.5},
     "recommended": {"marker": "D", "markersize": 5.0},
 }
+# Of words beside them, in points; and what of a panel lies beside its axes, in inches.
+_LETTER, _AROUND = 4.4, 0.8
 _DASHES = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED, "passive": style.DASH_DOTTED}
 
 
@@ -61,13 +63,27 @@ def _close(points: np.ndarray) -> np.ndarray:
     return points if np.array_equal(points[0], points[-1]) else np.append(points, points[:1], 0)
 
 
-def mark_wall(ax: Axes, wall: Any, label: str, *, kind: str, text: str = "", right: bool = False, **look: Any) -> None:
-    """Mark a wall, its stiffness and damping, with words to the left of it or to the right."""
+def mark_wall(
+    ax: Axes,
+    wall: Any,
+    label: str,
+    *,
+    kind: str,
+    text: str = "",
+    right: bool = False,
+    room: float = np.inf,
+    **look: Any,
+) -> None:
+    """Mark a wall, its stiffness and damping, with words to the right or to the left, where ``room`` points are."""
     look = {"linestyle": "", "color": style.BLACK, "zorder": 5, "clip_on": False, **MARKS[kind], **look}
     ax.plot(*wall, label=label, **look)
     if text:
-        place: Any = {"xytext": (6 if right else -8, 0), "ha": "left" if right else "right"}
-        ax.annotate(text, wall, textcoords="offset points", va="center", fontsize=8, zorder=6, **place)
+        place: Any = {"xytext": (6 if right else -8, 0), "ha": "left" if right else "right", "va": "center"}
+        if room < _LETTER * max(map(len, text.split("\n"))) + 8:
+            # From the axis on, above the mark, readable over the lines behind.
+            behind = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 1.0}
+            place = {"xytext": (4 - room, 6), "ha": "left", "va": "bottom", "bbox": behind}
+        ax.annotate(text, wall, textcoords="offset points", fontsize=8, zorder=6, **place)
 
 
 def draw_zeros(ax: Axes) -> None:
@@ -161,7 +177,10 @@ def draw_stable_set(
     pieces = set()
     for label, color in colors.items() if "label" in outlines else ():
         pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factors, 0.5 / (1 + len(labels)))
-    rows = select(walls)
+    rows, spec = select(walls), ax.get_subplotspec()
+    wide = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
+    # Room for words to the right of the stiffest wall, as wide as they are in a narrow panel too.
+    beyond, most = 0.28 * max(1.0, 5.6 / wide), max(rows[names[0]], default=np.nan) * factors[0]
     for kind, label, *wall in zip(*(rows[name] for name in ("wall", "label", *names)), strict=True):
         wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
         symbols = zip((r"\alpha", r"\beta") if normalized else "KB", wall, units, strict=True)
@@ -170,14 +189,13 @@ def draw_stable_set(
         which = kind.split()[0]
         look = {"color": style.BLACK} if alone else {"color": colors[label]}
         look |= {"marker": markers[label]} if which == "stiffest" else {}
-        mark_wall(ax, wall, kind, kind=which, text=text, right=kind == "stiffest", **look)
+        room = np.inf if which == "stiffest" else 72.0 * (wide - _AROUND) * wall[0] / ((1.0 + beyond) * most)
+        mark_wall(ax, wall, kind, kind=which, text=text, right=kind == "stiffest", room=room, **look)
     name_axes(ax, *units)
     ax.margins(0.04)
     if alone and np.isfinite(rows[names[0]]).any():
-        # Room for words to the right of the stiffest wall, as wide as they are in a narrow panel too.
-        (low, high), spec = ax.get_xlim(), ax.get_subplotspec()
-        width = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
-        ax.set_xlim(low, high + 0.28 * max(1.0, 5.6 / width) * (high - low))
+        low, high = ax.get_xlim()
+        ax.set_xlim(low, high + beyond * (high - low))
     handles: list[Any] = []
     for label, color in colors.items() if not alone else ():
         mark = {**MARKS["stiffest"], "marker": markers[label]}

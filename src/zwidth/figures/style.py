@@ -61,7 +61,7 @@ _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"
 _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
 # What a user's style sheet changes of it, and the size of new figures that a user wants.
 _changes: ContextVar[Any] = ContextVar("changes", default=None)
-_size: ContextVar[tuple[float, float] | None] = ContextVar("size", default=None)
+_size: ContextVar[tuple[float, float | None] | None] = ContextVar("size", default=None)
 _width: ContextVar[float | None] = ContextVar("width", default=None)
 # Narrower, in inches, panels stand below each other: beside each other their labels would have no room.
 _ONE_COLUMN = 5.0
@@ -75,8 +75,11 @@ def house_style() -> Iterator[None]:
 
 
 @contextmanager
-def style_sheet(file: Path | None, size: tuple[float, float] | None = None) -> Iterator[None]:
-    """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given."""
+def style_sheet(file: Path | None, size: tuple[float, float | None] | None = None) -> Iterator[None]:
+    """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given.
+
+    A size without a height is a width, as `figure_width` has it.
+    """
     token, sized = None, _size.set(size)
     if file is not None:
         try:
@@ -104,13 +107,16 @@ def figure_width(width: float | None) -> Iterator[None]:
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **keywords: Any) -> tuple[Figure, Any]:
     """A figure of its own, unknown to pyplot, and its axes as a 2-D array."""
-    engine, wanted = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05), _width.get()
-    if wanted is not None:
+    engine = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05)
+    across, up = _size.get() or (_width.get(), None)
+    if up is not None:
+        width, height = across or width, up
+    elif (wanted := across) is not None:
         narrow = wanted < _ONE_COLUMN and columns > 1 and not {"width_ratios", "height_ratios"} & set(keywords)
         rows, columns, height = (rows * columns, 1, height * columns) if narrow else (rows, columns, height)
         # Labels stay as high as they are: a panel is not as flat as it is narrow.
         width, height = wanted, height * min(1.0, max(wanted * (2.0 if narrow else 1.0) / width, 0.9))
-    figure = Figure(figsize=_size.get() or (width, height), layout=engine)
+    figure = Figure(figsize=(width, height), layout=engine)
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
 
 

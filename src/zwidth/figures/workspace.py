@@ -27,14 +27,17 @@ def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | Non
     wanted = next(str(name) for name in table if str(name).startswith("stiffness_"))
     x, y, stiffness = (np.asarray(table[name], float) for name in (across, up, wanted))
     factor, unit = style.si_unit(stiffness, "N/m")
-    norm, weakest = LogNorm(factor * stiffness.min(), factor * stiffness.max()), int(np.argmin(stiffness))
+    # A pose without an answer stays empty, which no smooth shading can show.
+    stiffness = np.ma.masked_invalid(stiffness)
+    shading = "nearest" if np.ma.is_masked(stiffness) else "gouraud"
+    norm, weakest = LogNorm(factor * stiffness.min(), factor * stiffness.max()), int(stiffness.argmin())
     columns, rows = np.unique(x), np.unique(y)
     order = np.lexsort((x, y))
     shape = rows.size, columns.size
     grid = np.stack(np.meshgrid(columns, rows)).reshape(2, -1)
     if min(shape) > 1 and np.array_equal(np.stack([x, y])[:, order], grid):
         values = factor * stiffness[order].reshape(shape)
-        image = ax.pcolormesh(columns, rows, values, shading="gouraud", rasterized=True, norm=norm)
+        image = ax.pcolormesh(columns, rows, values, shading=shading, rasterized=True, norm=norm)
         draw_contours(ax, columns, rows, values, OUTPUTS["stiffness_max"], norm, [np.array([[x[weakest], y[weakest]]])])
     else:
         image = ax.scatter(x, y, c=factor * stiffness, s=9.0, norm=norm, label="poses")

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from zwidth.parts.checks import check_fields
+from zwidth.parts.checks import Part
 from zwidth.words.errors import InputError
 
 
@@ -16,8 +16,8 @@ def angular(frequency: Any) -> Any:
     return 2.0 * (frequency.pi() if hasattr(frequency, "pi") else np.pi) * frequency
 
 
-@dataclass(frozen=True)
-class Actuator:
+@dataclass(frozen=True, repr=False)
+class Actuator(Part):
     """The lag between the commanded force and the one that acts, of first or second order.
 
     ``tau F' + F = u``, or ``F''/w^2 + 2 zeta F'/w + F = u`` with ``w = 1/tau = 2 pi cutoff``. A hand and friction act
@@ -36,6 +36,7 @@ class Actuator:
         36925 N/m
     """
 
+    _owner = "actuator"
     # Forms that the explorer offers.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "first order": {"cutoff": 300.0},
@@ -53,7 +54,7 @@ class Actuator:
         if (self.cutoff is None) == (self.time_constant is None):
             given = "neither cutoff nor time_constant" if self.cutoff is None else "cutoff and time_constant"
             raise InputError(f"actuator: got {given}; one of them says the lag; give cutoff (Hz) or time_constant (s)")
-        check_fields(self, "actuator")
+        super().__post_init__()
         if self.order == 1 and self.damping_ratio is not None:
             raise InputError(
                 f"actuator.damping_ratio: got {self.damping_ratio!r} of an actuator of first order; leave it out, or "

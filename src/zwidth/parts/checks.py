@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from dataclasses import Field, fields
+from dataclasses import MISSING, Field, fields
 from functools import wraps
 from numbers import Real
-from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -127,19 +127,44 @@ def _in_si(name: str, value: Any, period: Any) -> Any:
     return _map_texts(read, value)
 
 
-def check_fields(part: Any, owner: str = "") -> None:
-    """Put every number of a part in its SI unit, where `words.quantities` allows it; else raise `InputError`.
+class Part:
+    """Base of the dataclasses that a scene is made of: it checks their numbers, and their ``repr`` makes them again."""
 
-    ``owner`` begins the names of its quantities. A number that is None by default may be left out. A part that was told
-    in units of one kind of device, linear or rotary, has that as ``rotary``.
-    """
-    told = find_kind(
-        {f"{owner}.{item.name}" if owner else item.name: getattr(part, item.name) for item in fields(part)}
-    )
-    if told is not None:
-        object.__setattr__(part, "rotary", told)
-    with use_kind(is_rotary() if told is None else told):
-        _read_fields(part, owner)
+    _owner: ClassVar[str] = ""  # what begins the names of its quantities
+
+    def __post_init__(self) -> None:
+        """Put every number in its SI unit, where `words.quantities` allows it; else raise `InputError`.
+
+        One that is None by default may be left out. A part that was told in units of one kind of device, linear or
+        rotary, has that as ``rotary``.
+        """
+        own = {f"{self._owner}.{item.name}".lstrip("."): item for item in fields(self)}  # pyright: ignore[reportArgumentType]
+        told = find_kind({path: getattr(self, item.name) for path, item in own.items()})
+        if told is not None:
+            object.__setattr__(self, "rotary", told)
+        with use_kind(is_rotary() if told is None else told):
+            for path, item in own.items():
+                value = getattr(self, item.name)
+                if path in CHOICES:
+                    check_choice(path, value, CHOICES[path].names)
+                elif path in FIELDS and not (value is None and item.default is None):
+                    known, allowed = FIELDS[path], find_range(item, path)
+                    if known.whole:
+                        value = check_whole(path, value, int(allowed.low), int(allowed.high))
+                    else:
+                        value = check_number(path, value, known.unit, allowed)
+                    object.__setattr__(self, item.name, value)
+
+    def __repr__(self) -> str:
+        """A call, without what is as it is where left out."""
+        parts = []
+        for item in (item for item in fields(self) if item.repr):  # pyright: ignore[reportArgumentType]
+            usual = item.default if item.default_factory is MISSING else item.default_factory()
+            text = repr(getattr(self, item.name))
+            # A device that does not turn says so by None as well.
+            if text != repr(usual) and (text, usual) != ("False", None):
+                parts.append(f"{item.name}={text}")
+        return f"{type(self).__name__}({', '.join(parts)})"
 
 
 def _list_told(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -163,13 +188,12 @@ def find_kind(given: dict[str, Any]) -> bool | None:
         kind = tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
         if kind is None:
             continue
-        words = f"{value!r}" if isinstance(value, str) else "a part"
         if told and kind not in told:
             raise InputError(
-                f"{name}: got {words}, in units of a {_KINDS[kind]} device, beside {told[not kind]}, of a "
+                f"{name}: got {value!r}, in units of a {_KINDS[kind]} device, beside {told[not kind]}, of a "
                 f"{_KINDS[not kind]} one; write all of them in {_UNITS[False]}, or in {_UNITS[True]}"
             )
-        told.setdefault(bool(kind), f"{name} = {words}" if isinstance(value, str) else name)
+        told.setdefault(bool(kind), f"{name} = {value!r}")
     return next(iter(told), None)
 
 
@@ -182,21 +206,6 @@ def check_kind(rotary: bool, given: dict[str, Any]) -> None:
                 f"{name}: got {value!r}, in units of a {_KINDS[kind]} device, for a {_KINDS[rotary]} one; write it in "
                 f"{_UNITS[rotary]}, or make the device {_KINDS[kind]}: zwidth.Device(..., rotary={bool(kind)})"
             )
-
-
-def _read_fields(part: Any, owner: str) -> None:
-    """Put every number of a part in its SI unit."""
-    for item in fields(part):
-        path, value = f"{owner}.{item.name}" if owner else item.name, getattr(part, item.name)
-        if path in CHOICES:
-            check_choice(path, value, CHOICES[path].names)
-        elif path in FIELDS and not (value is None and item.default is None):
-            unit, allowed = FIELDS[path].unit, find_range(item, path)
-            if FIELDS[path].whole:
-                value = check_whole(path, value, int(allowed.low), int(allowed.high))
-            else:
-                value = check_number(path, value, unit, allowed)
-            object.__setattr__(part, item.name, value)
 
 
 def find_range(item: Field[Any], path: str) -> Range:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from zwidth.parts.actuator import Actuator
-from zwidth.parts.checks import check_fields, check_kind, find_kind
+from zwidth.parts.checks import Part, check_kind, find_kind
 from zwidth.parts.mode import Mode
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import with_unit
 from zwidth.words.rotation import use_kind
 
 
-@dataclass(frozen=True)
-class Coupling:
+@dataclass(frozen=True, repr=False)
+class Coupling(Part):
     """The mass beyond a spring and a damper: a tendon's, a belt's, a gear's or a link's elasticity.
 
     ``m x1'' = F - b x1' + k (x2 - x1) + c (x2' - x1')``, ``m2 x2'' = -k (x2 - x1) - c (x2' - x1')`` with the wall's
@@ -32,6 +32,7 @@ class Coupling:
         'motor'
     """
 
+    _owner = "coupling"
     # Forms that the explorer offers.
     usual: ClassVar[dict[str, dict[str, Any]]] = {
         "motor": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0},
@@ -43,12 +44,9 @@ class Coupling:
     damping: Any = 0.0
     sensor: Literal["motor", "tip"] = "motor"
 
-    def __post_init__(self) -> None:
-        check_fields(self, "coupling")
 
-
-@dataclass(frozen=True)
-class Device:
+@dataclass(frozen=True, repr=False)
+class Device(Part):
     """The haptic device: a mass with viscous damping, or an inertia where it is rotary.
 
     A rotary device is the same mathematics in other units: kg m^2 in place of kg, N m s/rad of N s/m, N m/rad of N/m,
@@ -66,7 +64,7 @@ class Device:
     Example:
         >>> import zwidth
         >>> zwidth.Device("12 g cm^2", "0.02 mN m s/rad")
-        Device(mass=1.2e-06, damping=2e-05, coupling=None, actuator=None, modes=(), rotary=True)
+        Device(mass=1.2e-06, damping=2e-05, rotary=True)
     """
 
     mass: Any
@@ -93,7 +91,7 @@ class Device:
                 raise InputError(f"{name}: got {part!r}; a zwidth.{kind.__name__} is needed, or None")
         check_kind(rotary, own | {f"modes.{k}": mode for k, mode in enumerate(modes)})
         with use_kind(rotary):
-            check_fields(self)
+            super().__post_init__()
         object.__setattr__(self, "rotary", rotary)
 
     def spell(self) -> str:
@@ -101,8 +99,3 @@ class Device:
         with use_kind(bool(self.rotary)):
             mass, damping = with_unit(self.mass, "kg"), with_unit(self.damping, "N s/m")
         return f"{'J' if self.rotary else 'm'} = {mass}, b = {damping}"
-
-    def __repr__(self) -> str:
-        """As a call; of linear devices without their kind."""
-        names = [item.name for item in fields(self) if item.name != "rotary" or self.rotary]
-        return f"Device({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from zwidth.parts.device import Device
-from zwidth.parts.linear_device import LinearDevice, split_fraction
+from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.operator import Operator
 from zwidth.parts.response_table import SUFFIXES
 from zwidth.words.errors import InputError, describe_choice
+from zwidth.words.formatting import with_unit
 
 __all__ = ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
 
@@ -33,6 +34,10 @@ class Published(NamedTuple):
     unit: str
     source: str
     note: str = ""
+
+    def spell(self) -> str:
+        """It with its unit."""
+        return f"{self.value:g} counts" if self.unit == "counts" else with_unit(self.value, self.unit, 3)
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,11 @@ class KnownDevice:
     stiffness_limit: Published | None = None
     damping_limit: Published | None = None
 
+    def __repr__(self) -> str:
+        """Its name and numbers, without their sources."""
+        numbers = [f"{name}={number.spell()}" for name, number in self.numbers.items()]
+        return f"KnownDevice({', '.join([self.name, *numbers])})"
+
     @property
     def rotary(self) -> bool:
         """Whether it turns."""
@@ -95,7 +105,7 @@ class KnownDevice:
         Example:
             >>> import zwidth
             >>> zwidth.devices.find_device("haptic_wheel").to_device()
-            Device(mass=0.00045, damping=0.0013, coupling=None, actuator=None, modes=(), rotary=True)
+            Device(mass=0.00045, damping=0.0013, rotary=True)
         """
         numbers = {"mass": self._chosen("mass", mass), "damping": self._chosen("damping", damping)}
         return Device(**numbers, rotary=self.rotary)
@@ -107,7 +117,7 @@ class KnownDevice:
         if found is None:
             known = ", ".join(self.numbers)
             raise InputError(
-                f"{name}: none is published for {self.name!r} (published are {known}); give to_device({name}=...)"
+                f"{name}: none is published for {self.name!r} (published are {known}); give one of your own"
             )
         return found.value
 
@@ -197,4 +207,4 @@ def read_device(text: str) -> KnownDevice | LinearDevice | MeasuredDevice:
     """
     if text.endswith(SUFFIXES):
         return MeasuredDevice.read(text)
-    return LinearDevice(split_fraction(text)) if "/" in text else find_device(text)
+    return LinearDevice(text) if "/" in text else find_device(text)

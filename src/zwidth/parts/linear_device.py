@@ -30,7 +30,7 @@ class RationalResponse(NamedTuple):
     dt: float | None  # s
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LinearDevice:
     """A device as any strictly proper linear system from commanded force (N) to sensed position (m).
 
@@ -38,9 +38,10 @@ class LinearDevice:
     friction, starts and energies of motions are for `Device`.
 
     Args:
-        system: matrices ``(A, B, C)``, coefficients ``(numerator, denominator)`` with the highest power first, or
-            ``(zeros, poles, gain)``; or a model of scipy.signal (lti, dlti) or python-control (TransferFunction,
-            StateSpace). One that is sampled, with ``dt`` the period of the loop, has hold and delay inside.
+        system: matrices ``(A, B, C)``, coefficients ``(numerator, denominator)`` with the highest power first, as text
+            too, "1 / 0.1 10 0", or ``(zeros, poles, gain)``; or a model of scipy.signal (lti, dlti) or python-control
+            (TransferFunction, StateSpace). One that is sampled, with ``dt`` the period of the loop, has hold and delay
+            inside.
 
     Raises:
         InputError: the system is none of these, or the force would move the position at once.
@@ -65,6 +66,10 @@ class LinearDevice:
     def __post_init__(self) -> None:
         if not isinstance(self.system, RationalResponse):
             object.__setattr__(self, "system", _read(self.system))
+
+    def __repr__(self) -> str:
+        """As configurations have it."""
+        return f"LinearDevice({self.spell_form()!r})"
 
     def spell_form(self) -> str | dict[str, Any]:
         """What configurations have under ``device``: coefficients to float64."""
@@ -134,6 +139,7 @@ def _read(given: Any) -> RationalResponse:
         import flint
     except ImportError as error:
         raise InputError("device: a LinearDevice needs python-flint; pip install 'zwidth[certified]'") from error
+    given = split_fraction(given) if isinstance(given, str) else given
     dt = getattr(given, "dt", None)
     if dt is True:
         raise InputError("device: got a sampled system without its period; give it dt, that of the loop, in s")

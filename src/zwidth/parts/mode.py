@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from zwidth.parts.actuator import angular
-from zwidth.parts.checks import check_fields
+from zwidth.parts.checks import Part
 from zwidth.words.errors import InputError
 
 
-@dataclass(frozen=True)
-class Mode:
+@dataclass(frozen=True, repr=False)
+class Mode(Part):
     """What one resonance adds to the position that the sensor sees: ``(1/mass)/(s^2 + 2 zeta w s + w^2)`` of the force.
 
     A command excites it behind the actuator; a hand and friction act on the device's body without it.
@@ -31,12 +31,14 @@ class Mode:
         25419 N/m
     """
 
+    _owner = "mode"
+
     frequency: Any
     damping_ratio: Any
     mass: Any
 
     def __post_init__(self) -> None:
-        check_fields(self, "mode")
+        super().__post_init__()
         if isinstance(self.mass, float) and self.mass == 0.0:
             raise InputError("mode.mass: got 0.0; a mass is needed, negative where the sensor lies beyond a node")
 

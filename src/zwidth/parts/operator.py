@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from zwidth.parts.checks import check_fields, check_number
+from zwidth.parts.checks import Part, check_number
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import POSITIVE
 
@@ -17,8 +17,8 @@ from zwidth.words.quantities import POSITIVE
 _HAND = {"mass": 0.554, "damping": 6.45, "stiffness": 135.0}
 
 
-@dataclass(frozen=True)
-class Operator:
+@dataclass(frozen=True, repr=False)
+class Operator(Part):
     """The operator's hand.
 
     Args:
@@ -37,6 +37,7 @@ class Operator:
         True
     """
 
+    _owner = "operator"
     # Forms that the explorer offers.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "rigid": _HAND,
@@ -52,7 +53,7 @@ class Operator:
     def __post_init__(self) -> None:
         if not self.rigid:
             check_number("operator.mass", self.mass, allowed=POSITIVE)
-        check_fields(self, "operator")
+        super().__post_init__()
         if self.rigid and isinstance(self.coupling_damping, float) and self.coupling_damping:
             raise InputError(
                 f"operator.coupling_damping: got {self.coupling_damping!r} without a spring beside it; give "

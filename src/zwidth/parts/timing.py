@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from zwidth.arrays.xp import is_jax
-from zwidth.parts.checks import Span, check_number, check_span, in_periods
+from zwidth.parts.checks import Part, Span, check_number, check_span, in_periods
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, DelayModel
 
 
-@dataclass(frozen=True)
-class Timing:
+@dataclass(frozen=True, repr=False)
+class Timing(Part):
     """When the wall's force is computed and when it acts.
 
     Args:
@@ -28,7 +28,7 @@ class Timing:
     Example:
         >>> import zwidth
         >>> zwidth.Timing(rate="4 kHz", delay="1.5 periods")
-        Timing(period=0.00025, delay=0.000375, delay_model='held', rate=None)
+        Timing(period=0.00025, delay=0.000375)
     """
 
     period: Any = None

@@ -16,7 +16,7 @@ import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, lag_jet, product_jet
 from zwidth.arrays.xp import is_jax, namespace
-from zwidth.parts.checks import check_fields, check_whole
+from zwidth.parts.checks import Part, check_whole
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import Range
 
@@ -61,14 +61,13 @@ class Estimate:
         return self.window + abs(self.lag) + self.zeros.size + self.poles.size
 
 
-class _Checked:
+class _Checked(Part):
     """Base of the estimates that are given by their numbers."""
 
-    def __post_init__(self) -> None:
-        check_fields(self, "velocity")
+    _owner = "velocity"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BackwardDifference(_Checked):
     """``v = (x_k - x_(k-1))/T``, the default and the paper's.
 
@@ -86,7 +85,7 @@ class BackwardDifference(_Checked):
         return Estimate(window=1, gain=_ratio(period, self.coded_period))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class WindowedDifference(_Checked):
     """``v = (x_k - x_(k-n))/(n T)``, the mean velocity of the last n periods.
 
@@ -106,7 +105,7 @@ class WindowedDifference(_Checked):
         return Estimate(window=self.samples, gain=_ratio(period, self.coded_period))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LowPass(_Checked):
     """The backward difference behind one or two equal first-order low-passes: ``v <- p v + (1 - p) input`` each.
 
@@ -152,7 +151,7 @@ class LowPass(_Checked):
         return Estimate(1, gain, -self.order, poles=poles)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Butterworth(_Checked):
     """The backward difference behind a Butterworth low-pass, as `scipy.signal.butter` designs it.
 
@@ -183,8 +182,8 @@ class Butterworth(_Checked):
         return Estimate(1, gain, zeros=np.full(self.order, 2.0 + 0j), poles=offsets)
 
 
-@dataclass(frozen=True)
-class VelocityFilter:
+@dataclass(frozen=True, repr=False)
+class VelocityFilter(Part):
     """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
 
     Args:
@@ -239,7 +238,7 @@ class VelocityFilter:
         return Estimate(0, self.numerator[0] / self.denominator[0] * period, lag, zeros, poles)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FOAW(_Checked):
     """First-order adaptive windowing, for simulations: it has no linear form and no answer to questions of stability.
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from zwidth.parts.checks import check_fields, read_texts
+from zwidth.parts.checks import Part, read_texts
 from zwidth.words.errors import InputError
 from zwidth.words.rotation import is_rotary, own_unit, use_kind
 
 
-@dataclass(frozen=True)
-class VirtualWall:
+@dataclass(frozen=True, repr=False)
+class VirtualWall(Part):
     """A spring and a damper, the damper acting on the velocity estimate.
 
     Args:
@@ -22,11 +22,8 @@ class VirtualWall:
     stiffness: Any
     virtual_damping: Any = 0.0
 
-    def __post_init__(self) -> None:
-        check_fields(self)
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class NoWall(VirtualWall):
     """What a scene has in place of a wall where none was chosen: no force, and no wall that a question could mean."""
 

@@ -90,7 +90,7 @@ class Drawing:
     col: str | None = None  # a panel for each of its values
     formats: tuple[str, ...] = ("png", "svg")
     dpi: float | None = None
-    size: tuple[float, float] | None = None  # in inches
+    size: tuple[float, float | None] | None = None  # width and height in inches; of a width the height follows
     style: Path | None = None  # a style sheet of matplotlib
     text: bool = False  # whether an SVG keeps text as text
 
@@ -154,7 +154,7 @@ def draw_stores(
             for name, draw in drawn:
                 target.mkdir(parents=True, exist_ok=True)
                 stem = target / f"{store.name.removesuffix(SUFFIX)}_{name}"
-                for file in save(draw(), stem, drawing.formats, drawing.dpi, drawing.size, text=drawing.text):
+                for file in save(draw(), stem, drawing.formats, drawing.dpi, text=drawing.text):
                     files.append(file)
                     (progress or (lambda file: None))(file)
     return tuple(files)

@@ -59,6 +59,7 @@ class RunResult:
     hopeless: str = ""  # the error that ended the run early, for nothing else would have escaped it, as a full disk
     interrupted: bool = False  # whether somebody stopped the run, with Ctrl-C; what was done by then is kept
     lost: str = ""  # why a cluster could not go on, its scheduler having died say; what was done by then is kept
+    whole: int = 0  # how many studies it was to do, beside sweeps
 
     @property
     def failed(self) -> tuple[StudyResult, ...]:
@@ -192,7 +193,7 @@ def run(
         if plans and not job.over:
             job.sweep(plans, about, shard=shard, workers=workers, scheduler=scheduler)
     seconds = time.perf_counter() - clock
-    ends = job.hopeless, job.interrupted, job.lost
+    ends = job.hopeless, job.interrupted, job.lost, len(pieces)
     return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), *ends)
 
 

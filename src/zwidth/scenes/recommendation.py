@@ -41,6 +41,7 @@ _UNITS = {
     "time": "s",
     "frequency": "Hz",
 }
+_EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
 _WALL = ("stiffness", "virtual_damping")
 _JUDGED = (
     *("alpha", "beta", "virtual_damping_lower", "virtual_damping_upper", "spectral_radius", "passive"),
@@ -66,7 +67,7 @@ class Wanted(NamedTuple):
         for name, value in given.items():
             number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
             if value is not None and not (number and math.isfinite(value) and ranges[name].holds(value)):
-                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed")
+                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, as {_EXAMPLES[name]}")
         if not isinstance(passive, bool | np.bool_):
             raise InputError(f"passive: got {passive!r}; True or False is needed")
         if gain_margin is None and phase_margin is None and not passive and stiffness_fraction is None:
@@ -155,7 +156,9 @@ class Recommendation:
         first = f"K = {K}, B = {B}: {share:.4g} % of the stiffest stable wall, {spell_stiffness(float(largest))}"
         if self.limited_by != "stiffness_fraction":
             first += f"; {self.wanted.spell(self.limited_by)} allows no more"
-        lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper)
+        lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
+        # A unit that both have stands once.
+        lower = lower.removesuffix(f" {upper.partition(' ')[2]}")
         delay = verdict.delay_margin
         apart = (
             f"gain {plain(verdict.gain_margin)}",
@@ -163,7 +166,7 @@ class Recommendation:
             f"delay {'not known' if math.isnan(delay) else with_unit(delay, 's')}",
         )
         rest = f"margins: {', '.join(apart)}; passive: {self.spell_passive()}"
-        return first, f"stable for B from {lower} to {upper} {own_unit('N s/m')}; {rest}"
+        return first, f"stable for B from {lower} to {upper}; {rest}"
 
     def spell_passive(self) -> str:
         """Whether the wall is passive, or why that is not known."""

@@ -14,7 +14,7 @@ from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.loops.measured.loop import MeasuredLoop
 from zwidth.loops.normalization import Normalized, Physical, denormalize, normalize
-from zwidth.parts.checks import check_kind
+from zwidth.parts.checks import Part, check_kind
 from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.measured import MeasuredDevice
@@ -49,8 +49,8 @@ class WallSI(NamedTuple):
     virtual_damping: Array
 
 
-@dataclass(frozen=True)
-class Scene(SceneAnswers, SceneOptima, SceneAdvice):
+@dataclass(frozen=True, repr=False)
+class Scene(Part, SceneAnswers, SceneOptima, SceneAdvice):
     """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
 
     Args:
@@ -229,7 +229,7 @@ class Scene(SceneAnswers, SceneOptima, SceneAdvice):
         ]
 
     simulate = simulate
-    """`zwidth.simulate` of this scene, with all its arguments."""
+    """A method: `zwidth.simulate` of this scene, with all its arguments."""
 
     def parameters(self) -> dict[str, Any]:
         """Every number of every part by its dotted path.

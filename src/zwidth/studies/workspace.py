@@ -21,8 +21,9 @@ from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.verdict import is_stable
 from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, header, suggestion, with_unit
+from zwidth.words.formatting import describe, header, plain, suggestion, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
+from zwidth.words.status import Status
 from zwidth.words.tables import read_columns, split_head
 
 _FORM = "poses are a file with columns mass and damping, and the two columns of it that a pose is drawn over"
@@ -124,19 +125,31 @@ class WorkspaceStudy(ComputedStudy):
         places = map(np.array, self.poses.places)
         table = dict(zip(names, places, strict=True)) | {"mass_kg": mass, "damping_N_s_per_m": damping}
         table |= dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))
-        weakest = int(np.argmin(stiffness))
+        known, file = np.isfinite(stiffness), self.poses.source["csv"]
+
+        def spell_pose(k: int) -> str:
+            units = (unit for _, unit in self.poses.names)
+            parts = zip((name for name, _ in self.poses.names), names, units, strict=True)
+            return ", ".join(f"{name} {table[column][k]:.4g} {unit}".rstrip() for name, column, unit in parts)
+
+        notes = [
+            f"{spell_pose(k)}: mass {with_unit(mass[k], 'kg')} and damping {with_unit(damping[k], 'N s/m')} (delta = "
+            f"{plain(delta[k])}) have no K_max: {Status(int(top.status[k])).message} Correct this pose in {file}, or "
+            "leave it out."
+            for k in np.flatnonzero(~known).tolist()
+        ]
+        if not known.any():
+            raise InputError(f"poses: no pose of {file} has a K_max; the first, {notes[0]}")
+        weakest = int(np.nanargmin(stiffness))
         # Other poses are heavier or more damped, but not alike in both: the wall is tried on each.
         wall = RECOMMENDED_SHARE * stiffness[weakest], virtual_damping[weakest]
         bears = np.asarray(is_stable(wall[0] * self.period / rate, wall[1] / rate, delta, d))
-        pose = ", ".join(
-            f"{name} {table[column][weakest]:.4g} {unit}".rstrip()
-            for column, (name, unit) in zip(names, self.poses.names, strict=True)
-        )
-        low, high, set_to = (with_unit(float(each), "N/m") for each in (stiffness.min(), stiffness.max(), wall[0]))
+        ends = stiffness[weakest], np.nanmax(stiffness), wall[0]
+        low, high, set_to = (with_unit(float(each), "N/m") for each in ends)
         answer = (
-            f"K_max from {low} at {pose} to {high}",
+            f"K_max from {low} at {spell_pose(weakest)} to {high}",
             f"K = {set_to}, B = {with_unit(float(wall[1]), 'N s/m')}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
-            f"stable in {np.count_nonzero(bears)} of {bears.size} poses",
+            f"stable in {np.count_nonzero(bears)} of {np.count_nonzero(known)} poses",
         )
         draw = partial(figures.draw_workspace, table, *names)
-        return Outcome(table=table, figures={"": draw}, answer=answer)
+        return Outcome(table=table, figures={"": draw}, answer=answer, notes=tuple(notes))

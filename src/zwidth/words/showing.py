@@ -48,7 +48,9 @@ def shown(
         def spell(self: Any) -> dict[str, str]:
             texts = {name: spell_value(getattr(self, name), known.get(name, "")) for name in names}
             return {
-                name: f"NaN, {missing[name]}" if (text, name in missing) == ("NaN", True) else text
+                name: f"{text}{',' if text == 'NaN' else '; NaN:'} {missing[name]}"
+                if name in missing and "NaN" in text
+                else text
                 for name, text in texts.items()
             }
 
@@ -126,7 +128,8 @@ def _spell_number(value: Any, unit: Unit) -> str:
     if math.isnan(value):
         return "NaN"
     if unit in _BARE or not (value == 0 or 1e-12 < abs(value) < 1e12):
-        return f"{float(value):.6g} {'' if unit == '1' else unit}".strip()
+        # A zero has no sign.
+        return f"{float(value) + 0.0:.6g} {'' if unit == '1' else unit}".strip()
     number, _, rest = with_unit(float(value), unit, 6).partition(" ")
     return f"{float(number):.6g} {rest}"
 

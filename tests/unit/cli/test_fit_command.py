@@ -114,8 +114,8 @@ def test_columns_that_cannot_be_read_are_named(columns, words, tmp_path):
     file = tmp_path / "bad.csv"
     file.write_text("t,x,f,word\n0,0,1,1\n1,0,1,no\n", encoding="utf-8")
     result = CliRunner().invoke(cli, ["fit", str(file), *columns])
-    assert isinstance(result.exception, zwidth.InputError)
-    assert words in str(result.exception)
+    assert result.exit_code
+    assert words in (result.output or str(result.exception))
 
 
 def test_several_logs_in_counts_and_a_figure(tmp_path):
@@ -159,7 +159,7 @@ def test_a_rotary_axis_is_the_linear_one_in_other_units(tmp_path):
     assert device.rotary
     assert device.mass == pytest.approx(turned["mass"], rel=1e-6)
     result = CliRunner().invoke(cli, ["fit", str(file), "--resolution", "0.03mm"])
-    assert "a length belongs to a force" in str(result.exception)
+    assert "a length belongs to a force" in result.output
 
 
 def test_walls_of_a_rotary_axis():

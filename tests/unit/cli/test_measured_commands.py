@@ -142,7 +142,7 @@ def test_a_transfer_function_is_a_device():
     ("options", "words"),
     [
         (["--device", "1 / x"], "highest power first"),
-        (["--device", "nobody"], "device: got 'nobody'"),
+        (["--device", "nobody"], "'--device': got 'nobody'"),
         (["--device", "nothing.csv"], "no such file"),
         (["--device", "1 / 0.1 10 0", "--mass", "1 kg"], "holds --mass"),
         (["--device", "1 / 0.1 10 0", "--operator-mass", "1 kg"], "holds --operator-mass"),

@@ -68,3 +68,29 @@ def test_a_rigid_device_needs_no_jax():
     )
     for wanted in ([], ["--phase-margin", "30"]):
         subprocess.run([sys.executable, "-c", program, "recommend", *DEVICE, *wanted], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [(["--gain-margin", "6 dB"], {"gain_margin": 10**0.3}), (["--phase-margin", "30deg"], {"phase_margin": 30})],
+)
+def test_margins_are_written_as_people_do(written, meant):
+    # The degrees of a margin are no unit of a rotary device.
+    assert json.loads(recommend(*written, "--json").stdout) == json.loads(
+        json.dumps(SCENE.recommend(**meant).as_dict())
+    )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (
+            ["--stiffness-fraction", "60"],
+            "'--stiffness-fraction': got 60.0; a number greater than 0 and less than 1 is needed, as 0.6",
+        ),
+        (["--gain-margin", "1"], "'--gain-margin': got 1.0; a number greater than 1 is needed, as 2 for 6 dB"),
+        (["--phase-margin", "large"], "'--phase-margin': got 'large'; write degrees, as 30"),
+    ],
+)
+def test_a_wish_that_makes_no_sense_is_told_by_its_option(wrong, told):
+    assert told in recommend(*wrong, code=2).output

@@ -136,3 +136,20 @@ def test_questions_read_texts_with_units(name):
 def test_what_is_refused(make, message):
     with pytest.raises(zwidth.InputError, match=message):
         make()
+
+
+def test_a_scene_is_shown_as_a_short_call_that_makes_it_again():
+    scene = zwidth.Scene(
+        zwidth.Device("100 g", 10, modes=[zwidth.Mode(100, 0.01, 1)]),
+        zwidth.Timing("1 ms"),
+        zwidth.VirtualWall("10 kN/m", 3),
+        velocity=zwidth.LowPass(cutoff=60),
+        operator=zwidth.Operator(mass="500 g"),
+    )
+    bare = zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(1e-3))
+    assert repr(bare) == "Scene(device=Device(mass=0.1), timing=Timing(period=0.001))"
+    for each in (scene, bare, zwidth.Scene(zwidth.Device("1 g cm^2"), zwidth.Timing(1e-3))):
+        assert eval(repr(each), {name: getattr(zwidth, name) for name in dir(zwidth)}) == each
+    linear = zwidth.LinearDevice("1 / 0.1 10 0")
+    assert repr(linear) == "LinearDevice('1 / 0.1 10 0')"
+    assert linear == zwidth.LinearDevice(([1.0], [0.1, 10.0, 0.0]))

@@ -9,7 +9,8 @@ from matplotlib.image import imread
 from sweeping import config_of, main_of, run_sweeps, study
 
 from zwidth.figures import draw_curves, draw_plane
-from zwidth.figures.style import figure_of
+from zwidth.figures.grid import name_panels
+from zwidth.figures.style import figure_of, new_figure
 from zwidth.runs import draw
 from zwidth.runs.draw import Drawing, draw_stores
 from zwidth.sweep.dataset import open_dataset
@@ -161,6 +162,7 @@ def test_files_of_the_kind_size_and_style_that_are_wanted(folder, tmp_path, caps
     [
         (["--size", "7"], "got '7'; write width x height"),
         (["--size", "0x4"], "got '0x4'; write width x height"),
+        (["--size", "85 m"], "or a width, as in 85mm"),
         (["--format", "gif"], "'gif' is not one of"),
         (["--style", "no/such.mplstyle"], "style: no/such.mplstyle: No such file"),
     ],
@@ -194,3 +196,22 @@ def test_text_stays_text_where_wanted(folder, tmp_path):
     files = list(tmp_path.glob("*.svg"))
     assert files
     assert all("<text" in file.read_text(encoding="utf-8") for file in files)
+
+
+def test_a_panel_has_the_values_that_fit_above_it(folder):
+    values = {"period": (1e-3, "s"), "delay": (1.0, "sampling periods"), "damping": (10.0, "N s/m")}
+    data = open_dataset(folder / "ridge.zarr").drop_vars(["damping", "delay"]).isel(damping=0, delay=0, rate=0)
+    few, many = (
+        data.assign_coords({name: ((), value, {"units": unit}) for name, (value, unit) in list(values.items())[:count]})
+        for count in (2, 3)
+    )
+
+    def name(data, masses):
+        _, axes = new_figure(7.0, 3.0, 1, len(masses))
+        name_panels(axes[0], [data.isel(mass=k).drop_vars("rate", errors="ignore") for k in masses])
+        return [ax.get_title() for ax in axes[0]]
+
+    assert [title.count("=") for title in name(few, (0, 1, 2))] == [3, 3, 3]
+    # What all have in common would run into the next one's.
+    assert [title.count("=") for title in name(many, (0, 1, 2))] == [1, 1, 1]
+    assert [title.count("=") for title in name(many, (0,))] == [4]

@@ -92,3 +92,25 @@ def test_faults_of_the_file_are_told(poses, said, tmp_path):
     with pytest.raises(ConfigError) as error:
         load_config(write(tmp_path, poses=poses))
     assert said in str(error.value)
+
+
+def test_a_pose_without_a_wall_is_named_and_leaves_the_others_their_values(tmp_path, capsys):
+    table = {}
+    for name, poses in (("whole", POSES), ("holed", POSES.replace("0,90,150,1.2", "0,90,1e-20,1e5"))):
+        folder = tmp_path / name
+        folder.mkdir()
+        assert main_of("run", write(folder, poses=poses), "--out", folder / "out") == 0
+        table[name] = np.genfromtxt(folder / "out" / "w.csv", delimiter=",", names=True)["stiffness_N_per_m"]
+    said = capsys.readouterr()
+    assert np.isnan(table["holed"]).tolist() == [False, False, True, False]
+    np.testing.assert_array_equal(np.delete(table["holed"], 2), np.delete(table["whole"], 2))
+    assert "stable in 3 of 3 poses" in said.out
+    told = "shoulder 0 deg, elbow 90 deg: mass 1.000e-11 ng and damping 100.0 kN s/m (delta = 1.000e+25) have no K_max"
+    assert told in said.err
+    assert "Correct this pose in arm.csv" in said.err
+
+
+def test_poses_without_any_wall_fail_with_the_first(tmp_path, capsys):
+    poses = POSES.splitlines()[0] + "\n0,30,1e-20,1e5\n60,30,1e-20,1e6\n"
+    assert main_of("run", write(tmp_path, poses=poses), "--out", tmp_path / "out") == 1
+    assert "no pose of arm.csv has a K_max; the first, shoulder 0 deg, elbow 30 deg" in capsys.readouterr().err

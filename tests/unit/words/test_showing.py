@@ -130,3 +130,9 @@ def test_a_line_of_nothing_is_no_picture():
 
 def test_modules_show_their_own_names():
     assert dir(zwidth.devices) == ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
+
+
+def test_an_array_says_why_it_has_nan_and_a_zero_has_no_sign():
+    motions = repr(SCENE.simulate([10e3, 1e3], 40.0, start_velocity=0.1, periods=100))
+    assert "impact_velocity=[NaN, NaN]; NaN: the wall is not entered from outside" in motions
+    assert spell_value(np.array([-0.0, 1.0])) == "[0, 1]"

@@ -109,7 +109,8 @@ def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
         step = 10.0 ** floor(log10(size)) / 4.0
         low, high = step * floor(low / step - 0.2), step * ceil(high / step + 0.2)
         if low - 2.0 * size <= place <= high + 2.0 * size:
-            low, high = min(low, step * floor(place / step)), max(high, step * ceil(place / step))
+            # Its mark has room, too.
+            low, high = min(low, step * floor(place / step - 0.2)), max(high, step * ceil(place / step + 0.2))
         ranges.append((low, high))
     return ranges[0], ranges[1]
 
@@ -196,7 +197,8 @@ def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
     kind = MotionKind(int(hit.outcome))
     end = "" if kind in (MotionKind.UNCLEAR, MotionKind.INVALID) else f", {kind.name.lower()} at the end"
-    words = f"(leaves it {int(hit.bounces)} times{end})"
+    count = int(hit.bounces)
+    words = f"(leaves it {count} {'time' if count == 1 else 'times'}{end})"
     return hit.time, hit.position, hit.wall_force, words
 
 

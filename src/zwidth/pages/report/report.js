@@ -51,12 +51,19 @@
       k = Math.min(Math.max(k < 0 ? steps.length - 1 : k, 1), steps.length - 1);
       return k - 0.5 + (value - steps[k - 1]) / (steps[k] - steps[k - 1]);
     }
-    // Round values where the steps are even, else some of the steps themselves.
+    // Round values where the steps are even, or their ratios over a decade or more, else some of the steps themselves.
     function ticks(steps, most) {
-      const last = steps.length - 1, span = Math.abs(steps[last] - steps[0]), step = span / last;
-      if (typeof steps[0] !== "number" || steps.some((value, k) => k && Math.abs(Math.abs(value - steps[k - 1]) - step) > 0.01 * step))
+      const last = steps.length - 1, span = Math.abs(steps[last] - steps[0]), step = span / last, ratio = (steps[last] / steps[0]) ** (1 / last);
+      const low = Math.min(steps[0], steps[last]), alike = (rule) => typeof steps[0] === "number" && steps.every((value, k) => !k || rule(value, steps[k - 1]));
+      if (low > 0 && span >= 9 * low && alike((value, before) => Math.abs(value / before / ratio - 1) < 1e-3)) {
+        const decades = Array.from({ length: 700 }, (_, k) => [1, 2, 5].map((n) => Number(`${n}e${k - 350}`))).flat();
+        const round = decades.filter((value) => value >= low * 0.999 && value <= (low + span) * 1.001), tens = round.filter((_, k) => decades.indexOf(round[k]) % 3 === 0);
+        const chosen = round.length <= most ? round : tens.filter((_, k) => k % Math.ceil(tens.length / most) === 0);
+        return chosen.map((value) => [place(steps, value), shorten(value)]);
+      }
+      if (!alike((value, before) => Math.abs(Math.abs(value - before) - step) <= 0.01 * step))
         return [...new Set(Array.from({ length: most }, (_, k) => Math.round(k * last / (most - 1))))].map((k) => [k + 0.5, shorten(steps[k])]);
-      const low = Math.min(steps[0], steps[last]), size = 10 ** Math.floor(Math.log10(span / most)), unit = [1, 2, 5, 10].find((n) => n * size >= span / most) * size;
+      const size = 10 ** Math.floor(Math.log10(span / most)), unit = [1, 2, 5, 10].find((n) => n * size >= span / most) * size;
       const first = Math.ceil(low / unit - 1e-9), count = Math.floor((low + span) / unit + 1e-9) - first;
       return Array.from({ length: count + 1 }, (_, k) => unit * (first + k)).map((value) => [place(steps, value), shorten(value)]);
     }
