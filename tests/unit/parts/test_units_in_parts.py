@@ -58,9 +58,6 @@ def test_functions_read_texts_with_units():
     assert zwidth.max_stiffness(**texts) == zwidth.max_stiffness(**numbers)
     assert zwidth.sensitivities(**texts) == zwidth.sensitivities(**numbers)
     assert zwidth.normalize(**texts, stiffness="5 kN/m") == zwidth.normalize(**numbers, stiffness=5e3)
-    known = {name: value for name, value in texts.items() if name != "damping"}
-    plain = {name: value for name, value in numbers.items() if name != "damping"}
-    assert zwidth.required("damping", "5 kN/m", **known) == zwidth.required("damping", 5e3, **plain)
     worst = zwidth.robust_max_stiffness(mass=zwidth.Interval("60 g", "80 g"), period="1 ms", delay="1 periods")
     assert worst == zwidth.robust_max_stiffness(mass=zwidth.Interval(0.06, 0.08), period=1e-3, delay=1e-3)
     arrays = zwidth.max_stiffness(mass=np.array([0.07, 0.1]), period="1 ms")
@@ -128,7 +125,7 @@ def test_questions_read_texts_with_units(name):
         (lambda: zwidth.max_stiffness(mass="70 m", period="1 ms"), "mass: got '70 m'; the units allowed are"),
         (lambda: zwidth.max_stiffness(mass="-70 g", period="1 ms"), "mass: got -0.07; it must be finite and greater"),
         (
-            lambda: zwidth.required("mass", "5 kN/m", period=zwidth.Interval(1, 2), delay="1 periods"),
+            lambda: zwidth.robust_wall(mass=0.1, period=zwidth.Interval(1, 2), delay="1 periods"),
             "delay: got '1 per",
         ),
     ],

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from required_values import find_required
 
 import zwidth
 from zwidth import figures
@@ -25,9 +26,9 @@ UNITS = {"damping": "N_s_per_m", "rate": "Hz", "delay": "s", "velocity.cutoff": 
 def test_damping_rate_and_delay_are_those_of_the_closed_search():
     rigid = {"mass": 0.1, "period": 1e-3, "delay": 1e-3}
     expected = {
-        "damping": float(zwidth.required("damping", 30e3, **rigid).value),
-        "rate": 1.0 / float(zwidth.required("period", 30e3, mass=0.1, damping=10.0, delay=1e-3).value),
-        "delay": float(zwidth.required("delay", 30e3, mass=0.1, damping=10.0, period=1e-3).value),
+        "damping": find_required("damping", 30e3, 1.0, 100.0, **rigid),
+        "rate": 1.0 / find_required("period", 30e3, 1e-4, 1e-2, mass=0.1, damping=10.0, delay=1e-3),
+        "delay": find_required("delay", 30e3, 0.0, 5e-3, mass=0.1, damping=10.0, period=1e-3),
     }
     for find, value in expected.items():
         table = design(find, "30 kN/m", num=3).compute(None, True).table
