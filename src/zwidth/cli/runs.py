@@ -244,8 +244,9 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
               help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
 @click.option("--dpi", type=click.IntRange(10, 2400), help="Dots an inch.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size in inches, as 7x4.5, or width, as 85mm.")
-@click.option("--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib.")
-@click.option("--text", is_flag=True, help="Keep text as text in an SVG: it can be searched, and needs the font.")
+@click.option(
+    "--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib, as one with 'svg.fonttype: none'."
+)
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
 @json_option
 def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_json: bool, **drawing: Any) -> None:

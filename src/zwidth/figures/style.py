@@ -237,9 +237,6 @@ def save(
     stem: Path,
     formats: Sequence[str] = ("png", "svg"),
     dpi: float | None = None,
-    size: tuple[float, float] | None = None,
-    *,
-    text: bool = False,
 ) -> tuple[Path, ...]:
     """Write the figure of some Axes as ``stem.png`` and so on; the same figure gives the same bytes.
 
@@ -248,15 +245,11 @@ def save(
         stem: the files' name without its ending.
         formats: the endings, of "png", "svg" and "pdf".
         dpi: dots an inch, also of maps within an SVG or a PDF.
-        size: width and height in inches; as it was drawn where left out.
-        text: whether an SVG keeps text as text, which can be searched and needs the font DejaVu Sans to look right.
     """
     figure = figure_of(drawn)
-    if size is not None:
-        figure.set_size_inches(*size)
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
     engine = figure.get_layout_engine()
-    with house_style(), matplotlib.rc_context({"svg.fonttype": "none"} if text else {}):
+    with house_style():
         for file in files:
             usual = PNG_DPI if file.suffix == ".png" else "figure"
             figure.savefig(file, dpi=dpi or usual, metadata=_METADATA[file.suffix])

@@ -92,7 +92,6 @@ class Drawing:
     dpi: float | None = None
     size: tuple[float, float | None] | None = None  # width and height in inches; of a width the height follows
     style: Path | None = None  # a style sheet of matplotlib
-    text: bool = False  # whether an SVG keeps text as text
 
     @property
     def axes(self) -> dict[str, str]:
@@ -154,7 +153,7 @@ def draw_stores(
             for name, draw in drawn:
                 target.mkdir(parents=True, exist_ok=True)
                 stem = target / f"{store.name.removesuffix(SUFFIX)}_{name}"
-                for file in save(draw(), stem, drawing.formats, drawing.dpi, text=drawing.text):
+                for file in save(draw(), stem, drawing.formats, drawing.dpi):
                     files.append(file)
                     (progress or (lambda file: None))(file)
     return tuple(files)

@@ -173,13 +173,9 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
         return self.stiffness_fraction.size if self.stiffness_fraction is not None else len(self.walls or ())
 
     @property
-    def extent(self) -> str:
-        count = self.count
-        return f"{count} motion{'' if count == 1 else 's'} of {self.duration} with {self.substeps} points a period"
-
-    @property
-    def points(self) -> int:
-        return int(self.count * min(self.duration.periods(self.device.period), 1e15) * self.substeps)
+    def sizes(self) -> dict[str, int]:
+        periods = int(min(self.duration.periods(self.device.period), 1e15))
+        return {"motions": self.count, "periods": periods, "points a period": self.substeps}
 
     def list_walls(self, scene: Scene) -> list[tuple[str, float, float]]:
         if self.stiffness_fraction is not None:

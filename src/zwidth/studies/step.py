@@ -93,14 +93,13 @@ class ResponseStudy(ComputedStudy):
         return columns, f"the response settles after {after}, later than the time shown" if late else ""
 
     @property
-    def extent(self) -> str:
-        count = len(self.pairs())
-        return f"{count} response{'' if count == 1 else 's'} of {self.duration} with {self.substeps} points a period"
-
-    @property
-    def points(self) -> int:
-        periods = sum(min(self.periods(device), 1e15) for device, _ in self.pairs())
-        return int(periods * self.substeps) + len(self.pairs())
+    def sizes(self) -> dict[str, int]:
+        periods = max((self.periods(device) for device, _ in self.pairs()), default=0.0)
+        return {
+            "responses": len(self.pairs()),
+            "periods": 1 + int(min(periods, 1e15)),
+            "points a period": self.substeps,
+        }
 
 
 @register

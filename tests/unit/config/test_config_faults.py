@@ -132,7 +132,7 @@ FAULTS = {
     "rate_unit": [("5:9: scene.rate: got '1 ms'", "write a number and a unit, as in '1 kHz'")],
     "recommend_normalized": [("5:5: studies[0].device: missing", "give the scene mass and period")],
     "recommend_without_scene": [("4:5: studies[0].device: missing", "give the scene mass and period")],
-    "response_too_long": [("4:5: studies[0]: 1 response of 1000 s with 10 points a period is", "shorten the")],
+    "response_too_long": [("4:5: studies[0]: responses x periods x points a period = 1 x 10", "shorten the")],
     "ridge_path_in_other_plane": [("9:17: studies[0].ridge_path: got true with plane delta_beta", "remove")],
     "scene_empty": [
         ("4:3: scene.mass: missing", "add 'mass: 0.1 kg'"),

@@ -108,8 +108,11 @@ def test_dampings_in_equal_ratios_are_on_a_logarithmic_axis():
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_text_is_kept_as_text_where_it_is_wanted(tmp_path, text):
-    (file,) = figures.save(figures.draw_ridge(RIDGE), tmp_path / "ridge", ("svg",), text=text)
+def test_text_is_kept_as_text_where_a_style_sheet_says_so(tmp_path, text):
+    sheet = tmp_path / "text.mplstyle"
+    sheet.write_text("svg.fonttype: none\n", encoding="utf-8")
+    with style.style_sheet(sheet if text else None):
+        (file,) = figures.save(figures.draw_ridge(RIDGE), tmp_path / "ridge", ("svg",))
     written = file.read_text(encoding="utf-8")
     assert ("<text" in written) is text
     # A comment in the outlines says it, too.

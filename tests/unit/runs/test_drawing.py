@@ -191,8 +191,10 @@ def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys, store, 
     assert not (tmp_path / "out").exists()
 
 
-def test_text_stays_text_where_wanted(folder, tmp_path):
-    assert main_of("figures", folder, "--out", tmp_path, "--format", "svg", "--text") == 0
+def test_text_stays_text_where_a_style_sheet_says_so(folder, tmp_path):
+    sheet = tmp_path / "text.mplstyle"
+    sheet.write_text("svg.fonttype: none\n", encoding="utf-8")
+    assert main_of("figures", folder, "--out", tmp_path, "--format", "svg", "--style", sheet) == 0
     files = list(tmp_path.glob("*.svg"))
     assert files
     assert all("<text" in file.read_text(encoding="utf-8") for file in files)
