@@ -1,10 +1,10 @@
-"""What a wanted stiffness needs of a rigid device: SciPy's root of K_max in closed form, on one side of which it is enough."""
+"""What a wanted stiffness needs of a rigid device: the root that SciPy finds of K_max in closed form."""
 
 from __future__ import annotations
 
 import math
 
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 import zwidth
 
@@ -15,4 +15,4 @@ def find_required(name: str, stiffness: float, low: float, high: float, **known:
     def surplus(value: float) -> float:
         return math.log(float(zwidth.max_stiffness(**known, **{name: value})) / stiffness)
 
-    return float(brentq(surplus, low, high, xtol=1e-300, rtol=1e-14))
+    return root_scalar(surplus, bracket=(low, high), method="brentq", xtol=1e-300, rtol=1e-14).root

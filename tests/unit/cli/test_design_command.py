@@ -3,8 +3,8 @@
 import json
 
 import pytest
-from required_values import find_required
 from click.testing import CliRunner
+from required_values import find_required
 
 import zwidth
 from zwidth.cli.commands import cli

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from required_values import find_required
 
-import zwidth
 from zwidth import Device, LowPass, Scene, Status, Timing
 from zwidth.words.errors import InputError
 
