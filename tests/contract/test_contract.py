@@ -17,7 +17,7 @@ from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import Status
 
 ALL = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-OPTIONAL = {("boundary_point", "alpha"), ("boundary_point", "beta"), ("required", "damping"), ("required", "delay")}
+OPTIONAL = {("boundary_point", "alpha"), ("boundary_point", "beta")}
 KINDS = {"b": np.bool_, "f": np.float64, "c": np.complex128}
 
 

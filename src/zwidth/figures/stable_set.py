@@ -44,7 +44,10 @@ def draw_region(ax: Axes, outlines: Outlines, face: Any, *, under: float = 1.0, 
 def shade_region(ax: Axes, outlines: Outlines, face: Any, *, alpha: float | None = None, zorder: float = 1.0) -> None:
     """Shade what lies within outlines, and not in their holes."""
     if outlines and face != "none":
-        ax.add_patch(PathPatch(to_path(outlines), facecolor=face, alpha=alpha, linewidth=0.0, zorder=zorder))
+        path = to_path(outlines)
+        # `add_patch` would look for the extremes of every straight piece by itself, for as long as all else takes.
+        ax.update_datalim(path.vertices)
+        ax.add_artist(PathPatch(path, facecolor=face, alpha=alpha, linewidth=0.0, zorder=zorder))
 
 
 def to_path(outlines: Outlines) -> Path:
