@@ -9,18 +9,17 @@ kernel is called and the ambient precision holds.
 from __future__ import annotations
 
 import math
-import os
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from functools import cache, partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from zwidth.arrays.threads import run_in_threads
 from zwidth.arrays.xp import WIDE, is_jax, is_traced, tree_map
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.quantities import SIZES
@@ -372,28 +371,6 @@ def map_blocks(
     return whole
 
 
-def run_in_threads(function: Callable[[Any], Any], items: Sequence[Any], threads: int | None = None) -> list[Any]:
-    """The function's results for all items, computed on every processor."""
-    threads = min(threads or processors(), len(items))
-    if threads < 2:
-        return list(map(function, items))
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(function, items))
-
-
-@contextmanager
-def work_beside() -> Iterator[Callable[..., Any]]:
-    """What begins to call functions, one after the other, in a thread of their own; at the end all have come back."""
-    if processors() < 2:
-        yield lambda function, *arguments: function(*arguments)
-        return
-    calls: list[Any] = []
-    with ThreadPoolExecutor(1) as pool:
-        yield lambda function, *arguments: calls.append(pool.submit(function, *arguments))
-        for call in calls:
-            call.result()
-
-
 def _length(columns: Sequence[np.ndarray]) -> int:
     return np.broadcast_shapes(*(column.shape for column in columns))[0]
 
@@ -405,11 +382,3 @@ def _piece(column: np.ndarray, start: int, size: int) -> np.ndarray:
         return part
     # The last point is repeated: a neutral filler would need to be known to be good for every kernel.
     return np.concatenate([part, np.full(missing, part[-1] if part.size else 0.0)])
-
-
-def processors() -> int:
-    """How many processors this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS
-        return os.cpu_count() or 1

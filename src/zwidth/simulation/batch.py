@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.evaluate import compute_concretely, processors
+from zwidth.arrays.evaluate import compute_concretely
+from zwidth.arrays.threads import run_in_threads
 from zwidth.loops.linear.chain import chain_of
 from zwidth.parts.device import Device
 from zwidth.parts.paths import Parts, replace_parameters
@@ -165,11 +165,8 @@ def run_batch(
     size = min(TOGETHER, 1 << (count - 1).bit_length())
     # The last piece is filled up with its last simulation: one size is one compilation.
     pieces = [np.minimum(np.arange(first, first + size), count - 1) for first in range(0, count, size)]
-    found = [batch.run(pieces[0])]
-    if len(pieces) > 1:
-        # The first piece has compiled the program; JAX lets go of the interpreter while it computes.
-        with ThreadPoolExecutor(processors()) as pool:
-            found.extend(pool.map(batch.run, pieces[1:]))
+    # The first piece compiles the program; JAX lets go of the interpreter while it computes.
+    found = [batch.run(pieces[0]), *run_in_threads(batch.run, pieces[1:])]
     return {name: np.concatenate([each[name] for each in found])[:count] for name in found[0]}
 
 

@@ -8,7 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64, compute_concretely, join_shapes, processors
+from zwidth.arrays.evaluate import as_float64, compute_concretely, join_shapes
+from zwidth.arrays.threads import processors
 from zwidth.arrays.xp import is_traced
 from zwidth.parts.checks import check_whole, read_texts
 from zwidth.parts.linear_device import LinearDevice

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import processors, run_in_threads, work_beside
+from zwidth.arrays.threads import processors, run_in_threads, work_beside
 from zwidth.loops.rigid.circle import Loop, count_in_cell, factor_loop
 from zwidth.loops.rigid.pole_groups import (
     DOUBTFUL,

@@ -1,0 +1,39 @@
+"""Threads: functions on every processor, and one beside what is done here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS
+        return os.cpu_count() or 1
+
+
+def run_in_threads(function: Callable[[Any], Any], items: Sequence[Any], threads: int | None = None) -> list[Any]:
+    """The function's results for all items, computed on every processor."""
+    threads = min(threads or processors(), len(items))
+    if threads < 2:
+        return list(map(function, items))
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, items))
+
+
+@contextmanager
+def work_beside() -> Iterator[Callable[..., Any]]:
+    """What begins to call functions, one after the other, in a thread of their own; at the end all have come back."""
+    if processors() < 2:
+        yield lambda function, *arguments: function(*arguments)
+        return
+    calls: list[Any] = []
+    with ThreadPoolExecutor(1) as pool:
+        yield lambda function, *arguments: calls.append(pool.submit(function, *arguments))
+        for call in calls:
+            call.result()
