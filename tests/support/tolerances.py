@@ -115,8 +115,8 @@ RIDGE_CURVATURE = Tolerance(
 )
 RIDGE_CURVATURE_FLOOR = rounding_errors(
     20,
-    "Relative to |alpha| + |beta| over the units of both variables: about 16 terms of that size are added up. At delta ="
-    " 1e6 the spread is 3.4, and the largest of 800 was 16.4, forward, backward or one in the other.",
+    "Relative to |alpha| + |beta| over the units of both variables: about 16 terms of that size are added up. At"
+    " delta = 1e6 the spread is 3.4, and the largest of 800 was 16.4, forward, backward or one in the other.",
 )
 RIDGE_ORACLE = Tolerance(1e-11, "Relative: bisection of a slope leaves omega with sqrt(eps) of the curve's curvature.")
 LIMIT_SLOPE = rounding_errors(8, "Relative: the same method as RIDGE, on a plant of three numbers.")
