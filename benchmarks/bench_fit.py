@@ -198,7 +198,14 @@ def judge(seed: int, span: tuple[float, float]) -> dict[str, Any]:
         "doubts": fit.doubts,
         "safe": bool(scene.is_stable(safe.stiffness, safe.virtual_damping)) if safe.stiffness > 0 else None,
         "share": safe.stiffness / truth["stiffness_max"],
+        "width": measure_width(fit),
     }
+
+
+def measure_width(fit: zwidth.DeviceFit) -> float:
+    """Of the interval of K_max, over K_max; NaN where none is given."""
+    low, high = fit.intervals["stiffness_max"]
+    return (high - low) / fit.stiffness_max
 
 
 def judge_device(seed: int) -> dict[str, Any]:
@@ -227,6 +234,7 @@ def judge_device(seed: int) -> dict[str, Any]:
     return row | {
         "given": True,
         "held": bar.low <= limit <= bar.high,
+        "width": measure_width(fit),
         "safe": true.is_stable(*safe[:2]) if safe.stiffness > 0 else None,
         "share": safe.stiffness / limit,
         # Without a wall that drawn devices bear there is none to judge.
@@ -271,14 +279,15 @@ def tabulate_kinds(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 def tabulate_devices(rows: list[dict[str, Any]]) -> Iterator[str]:
     """How logs of devices with lags and resonances fared, in Markdown."""
-    yield "| device | logs | with K_max | it holds | safe walls | their share of K_max: median | were it rigid |"
-    yield "|---|--:|--:|--:|--:|--:|--:|"
-    for kind in sorted({row["kind"] for row in rows}):
-        those = [row for row in rows if row["kind"] == kind]
+    yield "| device | logs | with K_max | it holds | its width | safe walls | their share of K_max | were it rigid |"
+    yield "|---|--:|--:|--:|--:|--:|--:|--:|"
+    for kind in (*sorted({row["kind"] for row in rows}), "all"):
+        those = [row for row in rows if kind in (row["kind"], "all")]
         given = [row for row in those if row["given"]]
         walls = [row for row in given if row["safe"] is not None]
         shares = f"{np.median([row['share'] for row in walls]):.2f}" if walls else ""
-        cells = [len(those), len(given), share([row["held"] for row in given]),
+        width = f"{100 * np.median([row['width'] for row in given]):.1f} %" if given else ""
+        cells = [len(those), len(given), share([row["held"] for row in given]), width,
                  f"{sum(row['safe'] for row in walls)} of {len(walls)}", shares,
                  f"{sum(row['rigid'] for row in given)} of {len(given)}"]  # fmt: skip
         yield f"| {kind} | {' | '.join(map(str, cells))} |"
@@ -294,6 +303,13 @@ def share(found: list[bool]) -> str:
     return f"{100 * np.mean(found):.1f} % of {len(found):,}" if found else "none of 0"
 
 
+def spell_widths(rows: list[dict[str, Any]]) -> str:
+    """How wide intervals of K_max are."""
+    widths = [row["width"] for row in rows if np.isfinite(row["width"])]
+    middle, high = 100 * np.quantile(widths, [0.5, 0.9])
+    return f"{middle:.1f} % of it wide in the median, a tenth of them more than {high:.0f} %"
+
+
 def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
     """What is refused and doubted, and what is wrong without a word."""
     sure = [row for row in fitted if row["status"] == 0 and not row["doubts"]]
@@ -304,6 +320,7 @@ def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
     doubted, troubled = sum(bool(row["doubts"]) for row in fitted), sum(row["status"] != 0 for row in fitted)
     return "\n".join([
         f"Refused: {len(rows) - len(fitted)}; with a doubt: {doubted}; with a status that is not OK: {troubled}.",
+        f"Intervals of K_max are {spell_widths(fitted)}.",
         f"Without either, off by more than 5 standard errors in anything: {len(wrong)} of {len(sure)}.",
         f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}. They have {spread}",
         "of its K_max, for the logs do not show which resonances it has not.",
@@ -353,9 +370,10 @@ def report(count: int, parts: int, processes: int) -> str:
         "",
         f"{parts:,} logs of devices that may have an amplifier's lag of 0.1 to 1 ms, and one or two resonances",
         "of 30 to 400 Hz and 0.5 to 10 % damping, moved to and fro, read with 1 to 40 µm and noise as above.",
-        "K_max is given where nothing is doubted, with the lag and the resonances that the log asks for.",
-        "`safe_wall()` bears what may hide in the log. The last column has `safe_wall(rigid=True)`, which does",
-        "not: how many of those walls are stable.",
+        "K_max is given where nothing is doubted, with the lag and the resonances that the log asks for; its interval",
+        "counts a further resonance as likely as none, but for what the log says of it.",
+        "Widths and shares are medians, of K_max. `safe_wall()` bears what may hide in the log. The last column has",
+        "`safe_wall(rigid=True)`, which does not: how many of those walls are stable.",
         "",
         *tabulate_devices(devices),
         "",

@@ -14,6 +14,8 @@ from zwidth.fitting.structure import StructuredRecordings
 
 # So many parts, lags and resonances, are added at most; so many positions of each log tell which one.
 _MOST, _TOLD = 4, 2500
+# Steps from every start, and then from the best one of each kind of device.
+_BEGUN, _COMPARED = 20, 40
 # Sums of what the fit leaves may spread so many times more than noise's, before it is doubted.
 ALIKE = 1.5
 # Smaller residuals, as a share of the way moved, are rounding.
@@ -49,21 +51,20 @@ def choose_structure(
     if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * way**2:
         return best, None, []
     pole, banks = find_hidden(best)
-    rigid = best, pole, banks
+    rigid, rival = (best, pole, banks), None
     for _ in range(_MOST):
         # A lag has no size of its own, and so is seen where a pole of any size is not.
         lags = not best.model.lag and look_for_lags(best).toward.max() ** 2 > 2.0 * np.log(best.count)
-        if pole is None and not lags:
+        if rival is not None or (pole is None and not lags):
             break
         richer, rival = _grow(best, banks, longest, resolution)
         if richer is None:
             break
         best = richer
         pole, banks = find_hidden(best)
-        if rival is not None:
-            return best, rival, banks
     known = best.arrived and not best.inverse.open[: best.model.parts.stop].any()
-    return (best, pole, banks) if pole is None and best.excess <= ALIKE and known else rigid
+    explained = rival is not None or (pole is None and best.excess <= ALIKE)
+    return (best, rival or pole, banks) if explained and known else rigid
 
 
 def _grow(
@@ -74,10 +75,15 @@ def _grow(
     A resonance that a log hardly shows looks like a lag, which has fewer numbers, but quite another K_max. So a lag is
     doubted where the further numbers of a resonance explain more than chance does.
     """
-    tried = []
+    begun: dict[tuple[int, int], tuple[float, StructuredRecordings, np.ndarray]] = {}
     for lag, modes, start in _start(best, banks):
         model = StructuredRecordings(best.model.logs, None, lag, modes).begin(_TOLD)
-        theta, squares = follow_start(model, start, longest)
+        theta, squares = follow_start(model, start, longest, _BEGUN)
+        if squares < begun.get((lag, modes), (np.inf,))[0]:
+            begun[lag, modes] = squares, model, theta
+    tried = []
+    for _, model, start in begun.values():
+        theta, squares = follow_start(model, start, longest, _COMPARED)
         tried.append(_Trial(model.measured.size * np.log(squares), np.log(model.measured.size), model, theta))
     likeliest = min(tried, key=lambda trial: trial.cost)
     model = replace(likeliest.model, logs=best.model.logs)

@@ -22,12 +22,14 @@ from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
-    from zwidth.fitting.hidden import HiddenLag
+    from zwidth.fitting.hidden import HiddenLag, HiddenResonances
     from zwidth.fitting.safe_wall import SafeWall
 
 NAMES = ("mass", "damping", "delay")
 # Of the intervals.
 _CONFIDENCE = 0.95
+# Standard errors within which everything lies.
+_FAR = 1e3
 # Of standard errors, for differences.
 _STEP = 0.1
 # A standard error beyond this share leaves a value open.
@@ -123,6 +125,9 @@ class DeviceFit:
         lag: of a log, ``(time_constant, delay, stiffness_max)`` of the longest lag of an amplifier that it does not
             tell from a delay, in s and N/m; the interval of K_max reaches there. None as ``response``, and where none
             is so.
+        hidden: of a log, ``(odds, stiffness_max)``: how likely the device has a resonance more than the log asks for
+            against none, and K_max with such ones over that without, all equally likely; the interval of K_max is that
+            of all these devices. None as ``response``.
         freedom: degrees of freedom that the noise was estimated with; None where it is known.
     """
 
@@ -150,6 +155,7 @@ class DeviceFit:
     actuator: Actuator | None = None
     modes: tuple[Mode, ...] = ()
     lag: HiddenLag | None = None
+    hidden: HiddenResonances | None = None
 
     @property
     def numbers(self) -> tuple[str, ...]:
@@ -256,7 +262,7 @@ class DeviceFit:
 
     @property
     def intervals(self) -> dict[str, ErrorBar]:
-        """95 % intervals by name: of what ``errors`` has, and of "stiffness_max", up to that with ``lag``."""
+        """95 % intervals by name: of what ``errors`` has, and of "stiffness_max", with ``hidden`` and up to ``lag``."""
         errors = self.errors | {"stiffness_max": self.stiffness_error}
         reaches = {name: (self.value_of(name), self.reach * error) for name, error in errors.items()}
         # A NaN stays one; a constant force and the mass of a mode may be negative.
@@ -264,10 +270,30 @@ class DeviceFit:
             name: ErrorBar(float(value - far if _may_be_negative(name) else np.maximum(0.0, value - far)), value + far)
             for name, (value, far) in reaches.items()
         }
+        if self.hidden is not None and self.stiffness_error > 0:
+            bars["stiffness_max"] = self._average(*self.hidden)
         if self.lag is not None:
             bar, more = bars["stiffness_max"], self.lag.stiffness_max - self.stiffness_max
             bars["stiffness_max"] = ErrorBar(bar.low, bar.high + max(more, 0.0))
         return bars
+
+    def _average(self, odds: float, ratios: np.ndarray) -> ErrorBar:
+        """The interval of K_max over the device without a hidden resonance and those with one."""
+        from scipy.optimize import brentq
+        from scipy.special import stdtr
+
+        middles = self.stiffness_max * np.append(ratios, 1.0)
+        weights = np.append(np.full(ratios.size, odds / ratios.size), 1.0) / (1.0 + odds)
+        far = middles.max() + _FAR * self.stiffness_error
+
+        def exceed(stiffness: float, share: float) -> float:
+            return float(weights @ stdtr(self.freedom, (stiffness - middles) / self.stiffness_error)) - share
+
+        low, high = (
+            float(brentq(exceed, -far, far, args=(0.5 + side * 0.5 * _CONFIDENCE,)))  # pyright: ignore[reportArgumentType]  (a number unless asked)
+            for side in (-1.0, 1.0)
+        )
+        return ErrorBar(max(0.0, low), high)
 
     def safe_wall(
         self, reliability: float = 0.99, *, samples: int | None = None, seed: int = 0, rigid: bool = False
@@ -280,7 +306,8 @@ class DeviceFit:
 
         Args:
             reliability: the share, between 0.5 and 1.
-            samples: how many devices are drawn, 100 to 100,000; left out, 8,000, or 1,000 with a velocity filter.
+            samples: how many devices are drawn, 100 to 100,000; left out, 8,000, 1,000 with a velocity filter, or 400
+                with an amplifier or resonances.
             seed: of the draws; equal seeds give equal walls.
             rigid: whether the device is known to be a rigid mass. Many have resonances of 50 to 300 Hz; a wall that one
                 makes unstable may be far softer than the stiffest one of the mass.

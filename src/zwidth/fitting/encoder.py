@@ -93,6 +93,14 @@ class MeasurementNoise:
             total = total + weight * (np.real(np.outer(along, along.conj())) - plain)
         return total
 
+    def spread_each(self, columns: np.ndarray) -> np.ndarray:
+        """The diagonal of `spread`."""
+        plain = np.sum(columns**2, 0)
+        total = self.variance * plain
+        for wave, weight in self._waves():
+            total = total + weight * (np.abs(columns.T @ wave) ** 2 - plain)
+        return total
+
     def spread_of_sums(self, count: int, weights: MeasurementNoise) -> float:
         """The mean square of sums of ``count`` neighbors, weighed as those of other positions would be."""
         starts = np.arange(0, self.position.size - count + 1, count)

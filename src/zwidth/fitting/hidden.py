@@ -14,6 +14,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from zwidth.arrays.circle import circle
+from zwidth.fitting.device_rows import DeviceRows
+from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
 from zwidth.fitting.structure import add_lag, to_scene
 from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
@@ -31,15 +34,19 @@ _OWN = 1e-6
 # look like one.
 _TRIED, _ELSEWHERE = 3, 1.1
 # So many of the first samples of each log are looked at, and so many numbers at once.
-_LOOKED, _AT_ONCE = 20_000, 4_000_000
+_LOOKED, _AT_ONCE = 20_000, 400_000
 # A resonance may be larger than the residuals say by so many standard errors; these are those of frequencies so near.
 _SURELY, _NEAR = 4.0, 15
-# Of the response: its lowest line, how many there are below the bank, and by what its delay turns it between two lines.
-_FIRST, _BELOW, _TURN = 2e-4, 40, 0.3
+# Of the response: its lowest line, how many there are below the bank, and by what its delay turns it between two lines,
+# of a band and where lines are drawn between them.
+_FIRST, _BELOW, _TURN, _LITTLE = 2e-4, 40, 0.3, 0.06
+# Resonances that a device is as likely to have as not: frequencies over the sampling rate; what they move beside the
+# whole mass, those beyond nodes less often; and how many of them are drawn.
+_MODES, _SHARES, _BEYOND_NODES, _DRAWN = (0.03, 0.4), np.geomspace(1.0 / 30.0, 1.0, 9), 0.3, 200
 # Lags that are looked for, in periods, as long as the delay and this at least.
 _SHORTEST, _LONGEST, _LONGEST_LAG, _LAGS = 0.03, 0.05, 3.0, 40
 # Beside a resonance, in half-widths; steps of theta's differences.
-_BESIDE, _STEP = np.sinh(np.linspace(-4.0, 4.0, 61)), 1e-5
+_BESIDE, _STEP = np.sinh(np.linspace(-4.0, 4.0, 61)), 1e-6
 
 
 class HiddenLag(NamedTuple):
@@ -48,6 +55,13 @@ class HiddenLag(NamedTuple):
     time_constant: float
     delay: float
     stiffness_max: float
+
+
+class HiddenResonances(NamedTuple):
+    """How likely one resonance more is against none, and K_max with it over that without, for equally likely ones."""
+
+    odds: float
+    stiffness_max: np.ndarray
 
 
 class HiddenPole(NamedTuple):
@@ -69,6 +83,8 @@ class PoleBank:
     frequency: np.ndarray
     explained: np.ndarray  # squares of the residuals that each pole explains
     whole: np.ndarray  # what a mode of each would leave that moves as the whole mass does
+    toward: np.ndarray  # how much of the residuals is such as that mode would leave
+    kindred: np.ndarray  # how many times as large its errors are, as kindred as the encoder's
     absorbed: np.ndarray  # by how much it would move each number of theta
 
     @property
@@ -108,7 +124,7 @@ def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
         if any(max(frequency / other, other / frequency) < _ELSEWHERE for other in tried):
             continue
         tried.append(frequency)
-        cleared = _filter_forces(best, ratio, PoleBank.rates_of(ratio, np.array([frequency])))
+        cleared = _filter_forces(best, ratio, PoleBank.rates_of(ratio, np.array([frequency])))[..., 0].T
         cleared, _ = np.linalg.qr(cleared - basis @ (basis.T @ cleared))
         along = cleared.T @ rest
         # In squares of standard errors, of errors as kindred as the encoder's and as the sums of neighbors are.
@@ -144,7 +160,7 @@ def look_for_lags(best: FittedModel) -> LagTest:
     left, rest = columns - best.columns[0] @ absorbed, best.model.weigh(best.residuals)
     whole = np.linalg.norm(left, axis=0)
     # Of errors as kindred as the encoder's, where these are larger.
-    kindred = np.diag(best.noise.spread(best.model.weigh(left))) / whole**2
+    kindred = best.noise.spread_each(best.model.weigh(left)) / whole**2
     error = np.sqrt(np.maximum(kindred, best.variance) * best.excess)
     moved = best.theta[:, None] - absorbed / best.columns[1][:, None]
     moved[2] -= lags
@@ -164,7 +180,8 @@ def bound_lag(best: FittedModel, scene: Scene, reach: float) -> HiddenLag | None
     if not count:
         return None
     lag = float(test.lag[count - 1] * period)
-    there = to_scene(best.model, test.theta[:, count - 1], period, scene.velocity)
+    # What a lag moves of resonances is small, and may be more than there is.
+    there = to_scene(best.model, np.clip(test.theta[:, count - 1], *best.model.bounds()), period, scene.velocity)
     there = replace(there, device=replace(there.device, actuator=Actuator(time_constant=lag)))
     return HiddenLag(lag, float(there.timing.delay), float(there.max_stiffness().stiffness))
 
@@ -174,36 +191,79 @@ def respond_as_fitted(best: FittedModel, scene: Scene, banks: list[PoleBank]) ->
 
     What such a resonance moves the other numbers by, they have been found with.
     """
-    period, top = scene.timing.period, _HIGHEST
-    even = np.arange(1.0, 2.0 * np.pi * top * (1.0 + scene.d) / _TURN) * _TURN / (2.0 * np.pi * (1.0 + scene.d))
-    below = np.geomspace(_FIRST, _LOWEST, _BELOW)[:-1]
-    near = [mode.frequency * period * (1.0 + mode.damping_ratio * _BESIDE) for mode in scene.device.modes]
-    lines = np.concatenate([below, even[even > _LOWEST], banks[0].frequency, *near])
-    lines = np.unique(lines[(lines >= _FIRST) & (lines <= top)])
-    response = scene.frequency_response(1.0, 0.0, lines / period)
-    radius, z = np.zeros(lines.size), np.exp(2j * np.pi * lines)[:, None]
-    slopes = _differ_response(best, scene, lines / period)
+    lines = np.unique(np.concatenate([_lay_lines(scene, _TURN), banks[0].frequency]))
+    response, slopes = _respond(best, scene, lines)
+    radius = np.zeros(lines.size)
     for bank in banks[:_RINGING]:
-        poles, size = np.exp(bank.rates), _size_modes(best, bank)
-        moved = (size / (z - poles) - size.conj() / (z - poles.conj())) / 2j * z ** -float(int(best.theta[2]))
-        moved = moved - slopes @ bank.absorbed[: best.model.parts.stop]
-        radius = np.maximum(radius, np.max(np.abs(moved) * bank.bound_modes(), axis=1))
-    return MeasuredDevice(lines / period, response, radius)
+        moved = _add_modes(best, lines, bank.rates[:, None]) - bank.absorbed[: best.model.parts.stop].T @ slopes.T
+        radius = np.maximum(radius, np.max(np.abs(moved) * bank.bound_modes()[:, None], 0))
+    return MeasuredDevice(lines / scene.timing.period, response, radius)
 
 
-def _differ_response(best: FittedModel, scene: Scene, frequency: np.ndarray) -> np.ndarray:
-    """The derivatives of the response in the first numbers of theta, a column each."""
-    columns = []
+def weigh_resonances(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> HiddenResonances | None:
+    """What one resonance more may make of K_max, as likely as none before the log; None where no damper helps."""
+    banks, period = banks[:-1], scene.timing.period
+    odds, drawn, share = _draw_modes(banks)
+    # The first one is none, to compare with.
+    which, share = np.append(drawn[0], drawn), np.append(0.0, share)[:, None]
+    rates = np.concatenate([bank.rates for bank in banks])[which, None]
+    absorbed = np.concatenate([bank.absorbed[: best.model.parts.stop] for bank in banks], 1)[:, which].T[..., None]
+    # Every resonance has lines of its own, within its width.
+    beside = (np.abs(rates) - rates.real * _BESIDE[::2]) / (2.0 * np.pi)
+    all_lines = _lay_lines(scene, _LITTLE)[None], np.clip(beside, _FIRST, _HIGHEST)
+    responses, count = [], len(which)
+    for lines in all_lines:
+        response, slopes = _respond(best, scene, lines)
+        responses.append(response + share * (_add_modes(best, lines, rates) - (slopes @ absorbed)[..., 0]))
+    lines = np.concatenate([np.broadcast_to(all_lines[0], (count, all_lines[0].size)), all_lines[1]], -1)
+    order = np.argsort(lines, -1)
+    lines, response = (np.take_along_axis(each, order, -1) for each in (lines, np.concatenate(responses, -1)))
+    velocity = scene.velocity.estimate(period).jet(circle(2.0 * np.pi * lines)).value
+    own, *others = DeviceRows(-1.0 / response, velocity / period).stiffest()
+    return HiddenResonances(odds, np.array(others) / own) if own > 0 else None
+
+
+def _lay_lines(scene: Scene, turn: float) -> np.ndarray:
+    """Lines over the sampling rate between which the delay turns a fitted response by no more."""
+    even = np.arange(1.0, 2.0 * np.pi * _HIGHEST * (1.0 + scene.d) / turn) * turn / (2.0 * np.pi * (1.0 + scene.d))
+    below = np.geomspace(_FIRST, _LOWEST, _BELOW)[:-1]
+    widths = [(mode.frequency * scene.timing.period, mode.damping_ratio * _BESIDE) for mode in scene.device.modes]
+    lines = np.concatenate([below, even[even > _LOWEST], *[middle * (1.0 + width) for middle, width in widths]])
+    return lines[(lines >= _FIRST) & (lines <= _HIGHEST)]
+
+
+def _add_modes(best: FittedModel, lines: np.ndarray, rates: npt.NDArray[np.complex128]) -> np.ndarray:
+    """What modes that move as the whole mass does add to its response."""
+    z, poles, (size, late) = np.exp(2j * np.pi * lines), np.exp(rates), _size_modes(best, rates)
+    return ((size / (z - poles) - size.conj() / (z - poles.conj())) / 2j - late / z) * z ** -float(int(best.theta[2]))
+
+
+def _draw_modes(banks: list[PoleBank]) -> tuple[float, np.ndarray, np.ndarray]:
+    """How likely a mode is against none after the log, if it was as likely before; equally likely poles and shares."""
+    inside = [(bank.frequency >= _MODES[0]) & (bank.frequency <= _MODES[1]) for bank in banks]
+    before = np.concatenate([each / each.sum() for each in inside]) / len(banks)
+    chance = np.repeat([1.0 - _BEYOND_NODES, _BEYOND_NODES], _SHARES.size) / _SHARES.size
+    whole, toward = (
+        np.concatenate([getattr(bank, name) / bank.kindred for bank in banks]) for name in ("whole", "toward")
+    )
+    shares = np.concatenate([_SHARES, -_SHARES])
+    left = np.outer(whole, shares)
+    reached = np.cumsum(np.outer(before, chance) * np.exp(toward[:, None] * left - 0.5 * left**2))
+    drawn = np.searchsorted(reached, reached[-1] * (np.arange(_DRAWN) + 0.5) / _DRAWN)
+    return float(reached[-1]), drawn // shares.size, shares[drawn % shares.size]
+
+
+def _respond(best: FittedModel, scene: Scene, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The response at lines, and its derivatives in the first numbers of theta, along the last axis."""
+    period, columns = scene.timing.period, []
+    frequency = lines / period
+    response = scene.frequency_response(1.0, 0.0, frequency)
     for k in range(best.model.parts.stop):
-        step, ends = _STEP * max(abs(best.theta[k]), 1e-3 if k in (1, 2) else 0.0), []
-        for side in (1.0, 0.0) if k in (1, 2) else (1.0, -1.0):
-            theta = best.theta.copy()
-            theta[k] += side * step
-            ends.append(
-                to_scene(best.model, theta, scene.timing.period, scene.velocity).frequency_response(1.0, 0.0, frequency)
-            )
-        columns.append((ends[0] - ends[1]) / (step if k in (1, 2) else 2.0 * step))
-    return np.stack(columns, -1)
+        theta = best.theta.copy()
+        theta[k] += (step := _STEP * max(abs(best.theta[k]), 1e-3 if k in (1, 2) else 0.0))
+        there = to_scene(best.model, theta, period, scene.velocity)
+        columns.append((there.frequency_response(1.0, 0.0, frequency) - response) / step)
+    return response, np.stack(columns, -1)
 
 
 def _glimpse(best: FittedModel) -> FittedModel:
@@ -219,44 +279,46 @@ def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, 
     """Compare the residuals with the forces filtered by poles of one damping ratio."""
     parts = 1 if ratio == 1.0 else 2
     frequency = np.geomspace(_LOWEST, _HIGHEST, 1 + round(np.log(_HIGHEST / _LOWEST) / np.log(_APART[ratio])))
-    explained, whole = np.zeros((2, frequency.size))
-    bank = PoleBank(ratio, frequency, explained, whole, np.zeros((best.theta.size, frequency.size)))
-    sizes = _size_modes(best, bank)
+    bank = PoleBank(
+        ratio, frequency, *np.zeros((4, frequency.size)), absorbed=np.zeros((best.theta.size, frequency.size))
+    )
+    sizes, late = _size_modes(best, bank.rates)
+    last = _filter_forces(best, 1.0, np.array([-np.inf]))[0]
     modes = np.stack([sizes.imag, sizes.real], -1)[:, -parts:]
     count = max(1, _AT_ONCE // (2 * rest.size))
     for first in range(0, frequency.size, count):
         part = slice(first, first + count)
-        columns = _filter_forces(best, ratio, bank.rates[part])
-        raw = np.linalg.norm(columns, axis=0).reshape(-1, parts)
-        cleared = (columns - basis @ (basis.T @ columns)).reshape(rest.size, -1, parts)
-        own = np.linalg.norm(cleared, axis=0).min(-1) <= _OWN * raw.max(-1)
-        square, along = np.einsum("nki,nkj->kij", cleared, cleared), np.einsum("nki,n->ki", cleared, rest)
-        by, mode = np.linalg.pinv(square, rcond=_OWN**2, hermitian=True), modes[part]
+        columns, mode = _filter_forces(best, ratio, bank.rates[part]), modes[part].T
+        cleared = columns - basis @ (basis.T @ columns)
+        own = np.linalg.norm(cleared, axis=1).min(0) <= _OWN * np.linalg.norm(columns, axis=1).max(0)
+        square = np.array([[np.sum(one * other, 0) for other in cleared] for one in cleared]).T
+        along, by = (rest @ cleared).T, np.linalg.pinv(square, rcond=_OWN**2, hermitian=True)
         bank.explained[part] = np.where(own, 0.0, np.einsum("ki,kij,kj->k", along, by, along)) / noise
-        bank.whole[part] = np.sqrt(np.einsum("ki,kij,kj->k", mode, square, mode) / noise)
-        moved = np.einsum("nki,ki->nk", columns.reshape(rest.size, -1, parts), mode)
+        moved = np.sum(columns * mode[:, None], 0) - last * late[part]
+        left = moved - basis @ (basis.T @ moved)
+        size = np.linalg.norm(left, axis=0)
+        bank.whole[part], size = size / np.sqrt(noise), np.where(own | (size == 0), np.inf, size)
+        bank.toward[part] = rest @ left / size / np.sqrt(noise)
+        errors = best.noise.spread_each(best.model.weigh(left)) * best.excess
+        bank.kindred[part] = np.sqrt(np.maximum(errors / size**2 / noise, 1.0))
         bank.absorbed[:, part] = best.inverse.matrix @ moved / best.columns[1][:, None]
     return bank
 
 
 def _filter_forces(best: FittedModel, ratio: float, rates: np.ndarray) -> np.ndarray:
-    """What poles make of all forces, at the positions: real and imaginary part side by side, or one of a real pole."""
-    from scipy.signal import lfilter
-
+    """What poles make of all forces, at the positions, a column each; imaginary parts behind the real ones."""
     ends = np.cumsum([0, *(log.position.size for log in best.model.logs)])
-    parts, whole = 1 if ratio == 1.0 else 2, int(best.theta[2])
-    columns = np.empty((ends[-1], rates.size * parts))
+    whole, late = int(best.theta[2]), np.empty((ends[-1], rates.size), np.complex128)
     for k, pole in enumerate(np.exp(rates)):
         for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
-            late = np.asarray(lfilter([0.0, 1.0], [1.0, -pole], log.force), np.complex128)[log.skip - whole :][
-                : end - start
-            ]
-            columns[start:end, k * parts] = late.real
-            if parts == 2:
-                columns[start:end, 2 * k + 1] = late.imag
-    return best.model.weigh(columns)
+            late[start:end, k] = recur(pole, np.append(0.0, log.force[:-1]))[log.skip - whole :][: end - start]
+    parts = [late.real] if ratio == 1.0 else [late.real, late.imag]
+    return np.array([best.model.weigh(part) for part in parts])
 
 
-def _size_modes(best: FittedModel, bank: PoleBank) -> npt.NDArray[np.complex128]:
-    """Of a mode of each pole that moves as the whole mass does, under a force that is held for a period."""
-    return best.theta[0] / (2.0 * np.pi * bank.frequency) * (np.exp(bank.rates) - 1.0) / bank.rates
+def _size_modes(
+    best: FittedModel, rates: npt.NDArray[np.complex128]
+) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.float64]]:
+    """Of a mode of each pole that moves as the whole mass does, and what of it the last force alone moves not yet."""
+    unit, late = best.theta[0] / np.abs(rates) / rates, np.exp(-(best.theta[2] % 1.0) * rates)
+    return unit * (np.exp(rates) - 1.0) * late, (unit * (1.0 - late)).imag

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,9 @@ from zwidth.fitting.device_fit import (
     VAGUE,
     DeviceFit,
     FittedMotion,
-    reach_of,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
-from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted
+from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted, weigh_resonances
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
 from zwidth.fitting.stiffness_estimate import StiffnessEstimate
@@ -103,11 +103,14 @@ def fit_log(
         length. Friction makes false optima, one for every turn or rest that is missed: starts of no friction and of 0.3
         to 35 % of the largest force are followed from the first 300 samples to ever more. Where none at all explains
         the log nearly as well, the errors reach to it; they know that an encoder errs alike in neighboring samples, of
-        which a rest counts as one. How often the intervals hold the true device is measured in docs/fitting.md.
+        which a rest counts as one. A resonance more than the log asks for counts as likely as none before the log is
+        known: the interval of K_max is that of 200 devices with one, weighed by how the residuals fit it, and of the
+        device without. How often the intervals hold the true device is measured in docs/fitting.md.
 
     References:
         Ljung 1999, System Identification, section 4.2 (output error). Leeb, Poetscher 2005, Econometric Theory 21,
-        21-59 (intervals after a choice of models do not hold). Schwarz 1978, Annals of Statistics 6, 461-464 (further
+        21-59 (intervals after a choice of models do not hold). Hoeting, Madigan, Raftery, Volinsky 1999, Statistical
+        Science 14, 382-417 (intervals over all models). Schwarz 1978, Annals of Statistics 6, 461-464 (further
         numbers that explain no more than chance). Widrow, Kollar 2008, Quantization Noise (an encoder's error). Hulin,
         Preusche, Hirzinger 2006, eq. (9).
 
@@ -143,10 +146,9 @@ def fit_log(
     values = np.array([own[name] for name in stiffest.numbers])
     by_period, known = wavers * values * power, slice(0, values.size)
     covariance = by_theta @ best.covariance[known, known] @ by_theta.T + np.outer(by_period, by_period)
-    errors = np.sqrt(np.diag(covariance))
     freedom = max(1, best.count - theta.size)
     unexplained = _find_unexplained(best, pole, period) if banks else []
-    doubts = odd + doubts + _doubt(values, errors, best, logs, rotary) + unexplained
+    doubts = odd + doubts + _doubt(values, np.sqrt(np.diag(covariance)), best, logs, rotary) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     # The device that bears K_max is another one then.
     status = Status.UNDECIDED if status == Status.OK and unexplained else status
@@ -155,20 +157,22 @@ def fit_log(
         doubts.append(
             f"the delay ends the range looked in, {with_unit(longest * period, 's')}; give a longer max_delay"
         )
-    motions = _place(best, logs, skip, period)
-    return stiffest.conclude(
+    motions, (offset, friction) = _place(best, logs, skip, period), (_in_newton(best, k) for k in (-2, -1))
+    fit = stiffest.conclude(
         covariance,
         noise=float(np.sqrt(best.variance)),
         residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
         doubts=doubts,
         status=status,
         freedom=freedom,
-        parts={"offset": _in_newton(best, -2), "friction": _in_newton(best, -1)},
-        resolution=step,
-        motions=motions,
-        response=respond_as_fitted(best, stiffest.scene, banks) if banks and not unexplained else None,
-        lag=bound_lag(best, stiffest.scene, reach_of(freedom)) if banks and not unexplained else None,
     )
+    errors = fit.errors | {"offset": offset[1], "friction": friction[1]}
+    fit = replace(fit, errors=errors, offset=offset[0], friction=friction[0], resolution=step, motions=motions)
+    if unexplained or not banks:
+        return fit
+    asked = best, stiffest.scene
+    response, hidden = respond_as_fitted(*asked, banks), weigh_resonances(*asked, banks)
+    return replace(fit, response=response, hidden=hidden, lag=bound_lag(*asked, fit.reach))
 
 
 def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float) -> list[str]:

@@ -84,7 +84,7 @@ class Recording:
 
 def _glide(push: np.ndarray, length: np.ndarray, delta: float, v0: float) -> Pieces:
     at = phi_functions(delta * length)
-    end = _recur(at.c, length * at.phi1 * push, v0)
+    end = recur(at.c, length * at.phi1 * push, v0)
     start = np.concatenate([[v0], end[:-1]])
     never, still = np.zeros(push.shape, bool), np.zeros_like(push)
     return Pieces(start, end, never, length, still, still, never, never)
@@ -164,7 +164,7 @@ def _follow(
     # A part that lasts longer goes on as it ended.
     by_speed[:, 2], by_place[:, 2] = longer * speed, longer * end
     begin = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
-    speeds = _recur(slow, by_speed, begin)
+    speeds = recur(slow, by_speed, begin)
     speeds = np.concatenate([begin[None], speeds[:-1]])
     return np.cumsum(moved), np.cumsum(again[:, None] * speeds + by_place, axis=0)
 
@@ -190,15 +190,17 @@ def _derive(
     return by_speed, by_place
 
 
-def _recur(factor: np.ndarray, added: np.ndarray, begin: float | np.ndarray) -> np.ndarray:
-    """``y_k = factor_k y_(k-1) + added_k``."""
-    from scipy.linalg.lapack import dtbtrs  # pyright: ignore[reportAttributeAccessIssue]  (made at import)
+def recur(factor: np.ndarray | complex, added: np.ndarray, begin: float | np.ndarray = 0.0) -> np.ndarray:
+    """``y_k = factor_k y_(k-1) + added_k``, of real or complex numbers."""
+    from scipy.linalg.lapack import dtbtrs, ztbtrs  # pyright: ignore[reportAttributeAccessIssue]  (made at import)
 
-    band = np.ones((2, factor.size))
-    band[1, :-1] = -factor[1:]
-    right = np.array(added, dtype=float)
+    factor = np.broadcast_to(factor, len(added))
+    right = np.array(added, dtype=np.result_type(factor, added, float))
     right[0] += factor[0] * begin
-    return dtbtrs(band, right.reshape(factor.size, -1), uplo="L", diag="U")[0].reshape(right.shape)
+    band = np.ones((2, factor.size), right.dtype)
+    band[1, :-1] = -factor[1:]
+    solve = ztbtrs if right.dtype == complex else dtbtrs
+    return solve(band, right.reshape(factor.size, -1), uplo="L", diag="U")[0].reshape(right.shape)
 
 
 @dataclass(frozen=True)

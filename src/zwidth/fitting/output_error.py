@@ -25,8 +25,8 @@ _STARTS, _APART = 3, 2
 _GLIMPSE, _FIRST = 600, 4
 # So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
-# Devices with other parts are compared after so many steps, or at this promised reduction.
-_COMPARED, _CLOSELY = 40, 2e-5
+# Devices with other parts are compared at this promised reduction.
+_CLOSELY = 2e-5
 # Promised reductions of the squares that end the search, and excuse a corner; steps; how they are damped.
 _ARRIVED, _NEARLY, _STEPS = 1e-12, 1e-6, 100
 _EASY, _LIGHT, _STUBBORN = 1e-4, 1e-6, 1e12
@@ -254,9 +254,9 @@ def _follow(model: Recordings, starts: list[np.ndarray], longest: float) -> np.n
     return starts[0]
 
 
-def follow_start(model: Recordings, start: np.ndarray, longest: float) -> tuple[np.ndarray, float]:
-    """Some steps from a start, as far as devices are compared by: theta and the sum of squares."""
-    return _refine(model, start, longest, (), _COMPARED, _CLOSELY)[:2]
+def follow_start(model: Recordings, start: np.ndarray, longest: float, steps: int) -> tuple[np.ndarray, float]:
+    """Some steps from a start, as close as devices are compared by: theta and the sum of squares."""
+    return _refine(model, start, longest, (), steps, _CLOSELY)[:2]
 
 
 def _fit(

@@ -4,9 +4,8 @@ Raised from below: a device bears (K, B) where every softer wall of that B is st
 and columns of the stable set are intervals (docs/theory/one-lobe.md), so that at each K the dampings that most devices
 bear are counted from the ends of their columns, and K is halved between what they bear and what they do not.
 
-With a velocity filter a row ends at its first crossing: the smallest K > 0 at which a pole reaches the unit circle,
-from K -> 0+, where it is stable for all B below the first that puts a pole on the circle there. Both are looked for on
-a grid of frequencies; eigenvalues then judge the wall on every device.
+With a velocity filter rows are looked for on a grid of frequencies (`zwidth.fitting.device_rows`); eigenvalues then
+judge the wall on every device.
 
 A log bounds resonances as well: how large one may be and not show. The fitted response with that radius decides walls
 as a measured one does (docs/theory/measured.md), and a wall counts that it decides too.
@@ -20,6 +19,7 @@ import numpy as np
 
 from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import NeededAnswer
+from zwidth.fitting.device_rows import DeviceRows, find_highest
 from zwidth.fitting.scenes import scene_of
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.loop import RigidVariants
@@ -33,12 +33,13 @@ from zwidth.words.errors import InputError
 from zwidth.words.quantities import SI_RANGE
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
-from zwidth.words.types import Array
 
 if TYPE_CHECKING:
     from zwidth.fitting.device_fit import DeviceFit
 
 _SAMPLES, _MOST_SAMPLES = 8000, 100_000
+# How many draws a kind of device takes, times the loop's own number: to find a wall, and only to confirm one.
+_FOUND, _CONFIRMED = 5, 2
 # Rounds of draws; where most are impossible, the estimate says nothing.
 _ROUNDS = 50
 # In parts of the sampling rate.
@@ -47,8 +48,8 @@ _HIGHEST = 0.499
 _CLOSE, _NOTHING = 1e-3, 1e-4
 # Below the edge of the device that binds.
 _BELOW = 1e-9
-# Frequencies: of slow loops, evenly, and more for each period of delay; dampings, then refined so often.
-_SLOWEST, _SLOW, _EVEN, _EVEN_PER_PERIOD, _DAMPINGS, _REFINED, _TIMES = 1e-4, 60, 400, 40, 33, 9, 3
+# Frequencies: of slow loops, evenly, and more for each period of delay.
+_SLOWEST, _SLOW, _EVEN, _EVEN_PER_PERIOD = 1e-4, 60, 400, 40
 # The longest delay looked at, in periods, and for each period of the estimated one.
 _FARTHEST = (20.0, 1.5)
 # Judged at K and at this share of it; how many devices eigenvalues may judge otherwise than the grid.
@@ -74,9 +75,8 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
     if isinstance(reliability, bool | str) or not 0.5 <= reliability < 1:
         raise InputError(f"reliability: got {reliability!r}; a share from 0.5 to below 1 is needed, as 0.99")
     scene = fit.scene
-    count = (
-        min(_SAMPLES, 5 * scene.loop.draws) if samples is None else check_whole("samples", samples, 100, _MOST_SAMPLES)
-    )
+    usual = (_CONFIRMED if fit.is_structured else _FOUND) * scene.loop.draws
+    count = min(_SAMPLES, usual) if samples is None else check_whole("samples", samples, 100, _MOST_SAMPLES)
     seed = check_whole("seed", seed, 0, 2**63 - 1)
     if fit.is_doubted:
         return SafeWall(np.nan, np.nan, np.nan, fit.status if fit.status != Status.OK else int(Status.UNDECIDED))
@@ -220,55 +220,30 @@ class _FilteredDevices:
         known &= (drawn[:, 0] > SI_RANGE[0]) & (drawn[:, 0] < SI_RANGE[1]) & (d < _FARTHEST[0] + _FARTHEST[1] * scene.d)
         # Beyond what is looked at nothing is believed to be borne.
         self.others = np.zeros(np.count_nonzero(~known))
-        drawn, self.rate, d = drawn[known], rate[known], d[known]
-        delta = drawn[:, 1] / self.rate
+        drawn, d = drawn[known], d[known]
+        delta = drawn[:, 1] / rate[known]
         self.scenes = [scene_of(values, self.period, scene.velocity) for values in drawn]
         even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max(initial=0.0)))[1:]
         at = circle(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
         some = self.scenes if unknown_cutoff else [scene]
         with np.errstate(all="ignore"):
-            self.f = np.array([one.velocity.estimate(self.period).jet(at).value for one in some])
-            self.q = NeededAnswer(delta[:, None], d[:, None]).jet(at).value
+            velocity = np.array([one.velocity.estimate(self.period).jet(at).value for one in some]) / self.period
+            needed = NeededAnswer(delta[:, None], d[:, None]).jet(at).value * (rate[known] / self.period)[:, None]
             # At z = -1 both are real.
-            self.q[:, -1], self.f[:, -1] = np.real(self.q[:, -1]), np.real(self.f[:, -1])
-            self.ends = self._first(self.q * self.f.conj(), self.q / self.f) * self.rate
-
-    @staticmethod
-    def _first(turning: Array, value: Array) -> np.ndarray:
-        """The smallest real part > 0 of ``value`` where ``turning`` is real; inf where there is none."""
-        left, right = turning.imag[:, :-1], turning.imag[:, 1:]
-        share = np.where(left == right, 0.0, left / (left - right))
-        between = value.real[:, :-1] + share * (value.real[:, 1:] - value.real[:, :-1])
-        crossed = (left * right <= 0) & (between > 0)
-        first = np.where(crossed, between, np.inf).min(1)
-        last = value.real[:, -1]
-        return np.where((last > 0) & np.isfinite(last), np.minimum(first, last), first)
+            needed[:, -1], velocity[:, -1] = np.real(needed[:, -1]), np.real(velocity[:, -1])
+            self.rows = DeviceRows(needed, velocity)
 
     def find(self, reliability: float) -> tuple[float, float]:
         """K and B, both 0 where there is none."""
-        top = self._borne_by(self.ends, reliability)
+        top = self._borne_by(self.rows.ends, reliability)
         if not np.isfinite(top):
-            top = float(np.max(self.ends, where=np.isfinite(self.ends), initial=0.0))
-        width, found, damping = top / (_DAMPINGS - 1), {}, 0.0
-        tried = np.linspace(0.0, top, _DAMPINGS)
-        for _ in range(1 + _TIMES):
-            found |= {damping: self.limit(damping, reliability) for damping in tried.tolist()}
-            damping = max(found, key=lambda one: found[one])
-            tried = np.clip(np.linspace(damping - width, damping + width, _REFINED), 0.0, top)
-            width /= 0.5 * (_REFINED - 1)
-        return (found[damping], damping) if found[damping] > 0 else (0.0, 0.0)
+            top = float(np.max(self.rows.ends, where=np.isfinite(self.rows.ends), initial=0.0))
+        limits, dampings = find_highest(lambda tried: np.array([self.limit(tried[0], reliability)]), np.array([top]))
+        return (float(limits[0]), float(dampings[0])) if limits[0] > 0 else (0.0, 0.0)
 
     def limit(self, virtual_damping: float, reliability: float) -> float:
         """The K up to which so many devices bear walls of a damping."""
-        return self._borne_by(self._row_ends(virtual_damping), reliability)
-
-    def _row_ends(self, damping: float) -> np.ndarray:
-        wall = self.q - (damping / self.rate)[:, None] * self.f
-        with np.errstate(all="ignore"):
-            ends = self._first(wall, wall) * self.rate / self.period
-        # A slower crossing than the grid's slowest, or no end at all, is not believed.
-        real = (wall.imag[:, 0] < 0) & (damping < self.ends) & np.isfinite(ends)
-        return np.where(real, ends, 0.0)
+        return self._borne_by(self.rows.row_ends(np.array([virtual_damping])), reliability)
 
     def share(self, stiffness: float, virtual_damping: float) -> float:
         """Of the devices on which the wall and softer ones of its damping are stable, by eigenvalues."""

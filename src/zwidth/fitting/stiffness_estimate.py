@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from zwidth.fitting.device_fit import DeviceFit, FittedMotion, FurtherExperiment, RivalDevice
+from zwidth.fitting.device_fit import DeviceFit, FurtherExperiment, RivalDevice
 from zwidth.fitting.scenes import name_numbers
-from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.scene import Scene
 from zwidth.words.formatting import with_unit
 from zwidth.words.status import Status
-
-if TYPE_CHECKING:
-    from zwidth.fitting.hidden import HiddenLag
 
 # Sampling periods of loops, in s: outside a unit is suspected.
 _QUICKEST, _SLOWEST = 5e-6, 0.02
@@ -49,14 +43,9 @@ class StiffnessEstimate:
         status: int,
         freedom: int | None = None,
         further: FurtherExperiment | None = None,
-        parts: Mapping[str, tuple[float, float]] = MappingProxyType({}),
-        resolution: float = 0.0,
-        motions: tuple[FittedMotion, ...] = (),
         rivals: tuple[RivalDevice, ...] = (),
-        response: MeasuredDevice | None = None,
-        lag: HiddenLag | None = None,
     ) -> DeviceFit:
-        """The result; ``parts`` are a log's offset and friction with their errors, ``freedom`` as for `reach_of`."""
+        """The result, without what only logs tell; ``freedom`` as for `reach_of`."""
         scene = self.scene
         doubts = [*doubts, *_doubt_period(scene.timing.period)]
         names = [name.removeprefix("velocity.") for name in self.numbers]
@@ -68,7 +57,7 @@ class StiffnessEstimate:
             mass=scene.device.mass,
             damping=scene.device.damping,
             delay=scene.timing.delay,
-            errors=errors | {name: error for name, (_, error) in parts.items()},
+            errors=errors,
             covariance=covariance,
             stiffness_max=known * self.value,
             stiffness_error=known * error,
@@ -77,18 +66,16 @@ class StiffnessEstimate:
             doubts=tuple(doubts),
             status=int(status),
             next=further and further._replace(error_afterwards=known * further.error_afterwards),
-            offset=parts["offset"][0] if parts else 0.0,
-            friction=parts["friction"][0] if parts else 0.0,
-            resolution=resolution,
-            motions=motions,
+            offset=0.0,
+            friction=0.0,
+            resolution=0.0,
+            motions=(),
             period=scene.timing.period,
             velocity=scene.velocity,
             freedom=freedom,
             rivals=rivals,
-            response=response,
             actuator=scene.device.actuator,
             modes=scene.device.modes,
-            lag=lag,
         )
 
 

@@ -17,7 +17,7 @@ from functools import partial
 
 import numpy as np
 
-from zwidth.fitting.moving import Recording, Recordings
+from zwidth.fitting.moving import Recording, Recordings, recur
 from zwidth.loops.rigid.device import phi_functions
 from zwidth.parts.actuator import Actuator
 from zwidth.parts.device import Device
@@ -75,7 +75,7 @@ class StructuredRecordings(Recordings):
                 place = place + columns @ theta[sizes]
                 slope[:, sizes] += columns
                 for k in moving:
-                    slope[:, k] += _differ(function, theta, k) @ theta[sizes]
+                    slope[:, k] += _differ(function, theta, k, columns) @ theta[sizes]
             places.append(place)
             slopes.append(slope)
         return np.concatenate(places), np.concatenate(slopes)
@@ -156,21 +156,19 @@ def _roots(w: float, ratio: float) -> np.ndarray:
     return w * np.array([-ratio + root, -ratio - root])
 
 
-def _differ(function: Callable[[np.ndarray], np.ndarray], theta: np.ndarray, k: int) -> np.ndarray:
-    """The derivative in one number of theta."""
+def _differ(function: Callable[[np.ndarray], np.ndarray], theta: np.ndarray, k: int, columns: np.ndarray) -> np.ndarray:
+    """The derivative in one number of theta, of which the columns are known."""
     step = np.zeros(theta.size)
     step[k] = _STEP * max(abs(float(theta[k])), 1.0 if k < 3 else 0.0)
-    return (function(theta + step) - function(theta - step)) / (2.0 * step[k])
+    return (function(theta + step) - columns) / step[k]
 
 
 def _follow(log: Recording, pole: complex, d: float) -> np.ndarray:
     """``E_p`` at the positions, from rest at the log's first sample."""
-    from scipy.signal import lfilter
-
     whole = int(np.floor(d))
-    f, pole = d - whole, complex(pole)
+    f, pole, force = d - whole, complex(pole), np.append([0.0, 0.0], _prolong(log))
     late, first = _held(pole, f) * np.exp(pole * (1.0 - f)), _held(pole, 1.0 - f)
-    moved = np.asarray(lfilter([0.0, first, late], [1.0, -np.exp(pole)], _prolong(log)))
+    moved = recur(np.exp(pole), first * force[1:-1] + late * force[:-2])
     return moved[log.skip - whole :][: log.position.size]
 
 

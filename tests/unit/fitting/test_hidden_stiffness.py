@@ -1,0 +1,103 @@
+"""K_max of devices with a resonance that a log does not show, against scenes that have it; and its interval."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from measured_devices import PERIOD, TrueDevice
+
+import zwidth
+from zwidth.fitting.choosing import choose_structure
+from zwidth.fitting.device_rows import DeviceRows
+from zwidth.fitting.hidden import HiddenResonances, weigh_resonances
+from zwidth.fitting.moving import Recording
+from zwidth.fitting.output_error import fit_model
+from zwidth.fitting.structure import to_scene
+
+SKIP, DELAY = 22, 1.3e-3
+SCENES = {
+    "rigid": {},
+    "resonance": {"modes": (zwidth.Mode(frequency=150, damping_ratio=0.02, mass=0.5),)},
+    "beyond a node": {"modes": (zwidth.Mode(frequency=150, damping_ratio=0.02, mass=-1.0),)},
+    "lag": {"actuator": zwidth.Actuator(time_constant=1e-3)},
+}
+
+
+@pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=200)])
+def test_rows_on_a_grid_have_the_stiffest_walls_of_scenes(velocity):
+    lines = np.concatenate([np.geomspace(0.2, 499.0, 1500), 150.0 + np.linspace(-15.0, 15.0, 301)])
+    lines, timing = np.unique(lines), zwidth.Timing(period=PERIOD, delay=DELAY)
+    scenes = [zwidth.Scene(zwidth.Device(0.1, 3.0, **parts), timing, velocity=velocity) for parts in SCENES.values()]
+    answers = np.array([[scene.frequency_response(*wall, lines) for scene in scenes] for wall in ((1, 0), (0, 1))])
+    found = DeviceRows(-1.0 / answers[0], answers[1] / answers[0]).stiffest()
+    exact = [float(scene.max_stiffness(negative_damping=False).stiffness) for scene in scenes]
+    np.testing.assert_allclose(found, exact, rtol=5e-3)
+
+
+def play(modes, encoder, seed=0, count=2000):
+    """A device, its fit and the log."""
+    true = TrueDevice("", 0.1, 3.0, 0.0, modes, DELAY, PERIOD, encoder, 3.0)
+    rng = np.random.default_rng(seed)
+    force = 3.0 * np.repeat(rng.choice([-1.0, 1.0], count // 25), 25)
+    exact = true.play(force, read=False)
+    return true, force, encoder * np.round(exact / encoder + 0.5 * rng.standard_normal(force.size))
+
+
+def test_what_a_resonance_makes_of_the_stiffest_wall_is_that_of_the_scene_with_it(monkeypatch):
+    _, force, position = play((), 1e-4)
+    best = fit_model((Recording(force, position[SKIP:], SKIP),), 20, 1e-4)
+    best, _, banks = choose_structure(best, 20, 1e-4)
+    velocity = zwidth.BackwardDifference()
+    scene = to_scene(best.model, best.theta, PERIOD, velocity)
+    share, places = 0.05, [(0, 300), (0, 360), (1, 45), (2, 50)]
+    ends = np.cumsum([0, *(bank.frequency.size for bank in banks)])
+    rows = np.array([ends[k] + j for k, j in places])
+    monkeypatch.setattr("zwidth.fitting.hidden._draw_modes", lambda _: (1.0, rows, np.full(len(rows), share)))
+    found = weigh_resonances(best, scene, banks)
+    assert found is not None
+    ratios = found.stiffness_max
+    for ratio, (k, j) in zip(ratios, places, strict=True):
+        # The other numbers move as the log asks with such a resonance in it.
+        moved = to_scene(
+            best.model, best.theta - share * np.append(banks[k].absorbed[:3, j], np.zeros(4)), PERIOD, velocity
+        )
+        mode = zwidth.Mode(banks[k].frequency[j] / PERIOD, banks[k].ratio, scene.device.mass / share)
+        there = replace(moved, device=replace(moved.device, modes=(mode,)))
+        exact = there.max_stiffness(negative_damping=False).stiffness / scene.max_stiffness().stiffness
+        assert ratio == pytest.approx(float(exact), rel=0.01)
+
+
+def test_the_interval_is_that_of_all_devices_alike():
+    _, force, position = play((), 1e-4)
+    fit = zwidth.fit_log(PERIOD, position, force)
+    assert fit.hidden is not None
+    assert fit.freedom is not None
+    rng, count = np.random.default_rng(0), 400_000
+    for odds, ratios in ((0.0, [0.5]), (0.3, [0.4, 0.9, 1.2]), (4.0, [0.2, 1.0])):
+        alike = replace(fit, hidden=HiddenResonances(odds, np.array(ratios)), lag=None)
+        hides = rng.random(count) < odds / (1.0 + odds)
+        middle = fit.stiffness_max * np.where(hides, rng.choice(ratios, count), 1.0)
+        drawn = middle + fit.stiffness_error * rng.standard_t(fit.freedom, count)
+        low, high = np.quantile(drawn, [0.025, 0.975])
+        found = alike.intervals["stiffness_max"]
+        assert found == pytest.approx((low, high), abs=0.1 * fit.stiffness_error)
+    lost = replace(fit, stiffness_max=np.nan, stiffness_error=np.nan)
+    assert np.isnan(lost.intervals["stiffness_max"]).all()
+
+
+def test_the_interval_holds_what_a_resonance_that_does_not_show_leaves():
+    held, clear = 0, []
+    modes = ((270.0, 0.02, 0.15),)
+    for seed in range(4):
+        true, force, position = play(modes, 2e-4, seed)
+        fit = zwidth.fit_log(PERIOD, position, force)
+        assert not fit.modes
+        low, high = fit.intervals["stiffness_max"]
+        limit = true.limit_of_walls()
+        held += fit.is_doubted or low <= limit <= high
+        assert abs(limit - fit.stiffness_max) > fit.reach * fit.stiffness_error or fit.is_doubted
+        # An encoder that would show it leaves the interval as it is.
+        fit = zwidth.fit_log(PERIOD, play((), 1e-7, seed)[2], force)
+        clear.append(np.ptp(fit.intervals["stiffness_max"]) / (2.0 * fit.reach * fit.stiffness_error))
+    assert held == 4
+    assert max(clear) < 20.0
