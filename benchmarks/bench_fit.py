@@ -316,14 +316,14 @@ def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
     wrong = [row for row in sure if max(row["away"].values()) > 5]
     safe = [row["safe"] for row in fitted if row["safe"] is not None]
     low, middle, high = np.quantile([row["share"] for row in fitted if row["safe"] is not None], [0.1, 0.5, 0.9])
-    spread = f"{middle:.2f} (a tenth below {low:.2f}, a tenth above {high:.2f})"
+    spread = f"{middle:.2f} of its K_max in the median, a tenth less than {low:.2f}, a tenth more than {high:.2f}"
     doubted, troubled = sum(bool(row["doubts"]) for row in fitted), sum(row["status"] != 0 for row in fitted)
     return "\n".join([
         f"Refused: {len(rows) - len(fitted)}; with a doubt: {doubted}; with a status that is not OK: {troubled}.",
         f"Intervals of K_max are {spell_widths(fitted)}.",
         f"Without either, off by more than 5 standard errors in anything: {len(wrong)} of {len(sure)}.",
-        f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}. They have {spread}",
-        "of its K_max, for the logs do not show which resonances it has not.",
+        f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}. They have {spread}:",
+        "the logs do not show which resonances it has not.",
     ])  # fmt: skip
 
 

@@ -16,7 +16,6 @@ from zwidth.parts.mode import Mode
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
-from zwidth.words.errors import InputError
 from zwidth.words.formatting import to_json
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
@@ -192,15 +191,18 @@ class DeviceFit:
 
         Of a device with an amplifier or resonances, the radius has what their numbers may be, too.
         """
-        return None if self.response is None else self.respond(_RELIABILITY, True)
+        return self.respond(_RELIABILITY, True)
 
-    def respond(self, reliability: float, hidden: bool) -> Scene:
-        """The loop of the response; within its radius are so many devices that the log allows, and what it may hide."""
+    def respond(self, reliability: float, hidden: bool) -> Scene | None:
+        """The loop of the response; within its radius are so many devices that the log allows, and what it may hide.
+
+        None without a response, and where the numbers are too open for a radius.
+        """
         from scipy.special import fdtri
 
         known = self.response
         if known is None:
-            raise InputError("log: this fit has no response")
+            return None
         radius = known.deviation if hidden else 0.0 * known.deviation
         if self.is_structured:
             changes = self.differ(lambda scene: scene.frequency_response(1.0, 0.0, known.frequency))
@@ -209,6 +211,8 @@ class DeviceFit:
             count = len(self.numbers)
             reach = count * fdtri(count, self.freedom, reliability)
             radius = radius + np.sqrt(0.5 * (square + across) * reach)
+        if not np.all(np.isfinite(radius)):
+            return None
         device = MeasuredDevice(known.frequency, known.response, radius)
         return Scene(device, Timing(self.period), velocity=self.velocity)
 

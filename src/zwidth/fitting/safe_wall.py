@@ -105,9 +105,10 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
 
 def _bear_response(fit: DeviceFit, reliability: float, rigid: bool, drawn: np.ndarray) -> SafeWall:
     """The stiffest wall of the response of a device that is more than rigid, with what its numbers may be as radius."""
-    if fit.response is None:
+    scene = fit.respond(reliability, not rigid)
+    if scene is None:
         return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
-    top = fit.respond(reliability, not rigid).max_stiffness(negative_damping=False)
+    top = scene.max_stiffness(negative_damping=False)
     if top.status != Status.OK:
         return SafeWall(0.0, 0.0, 1.0, int(Status.OK), float(top.frequency))
     wall = float(top.stiffness), float(top.virtual_damping)

@@ -54,6 +54,17 @@ def test_a_resonance_is_found_with_its_numbers_and_written_into_the_scene(tmp_pa
         assert getattr(written, name) == pytest.approx(fit.value_of(f"modes.0.{name}"), rel=1e-4)
 
 
+def test_a_resonance_whose_numbers_are_open_has_no_safe_wall():
+    # Four modes that nearly cancel: no step along some axis of the covariance leaves all of them devices.
+    force, position = record(OTHERS["compliance of 50 Hz, encoder at the motor"], 0, step=2e-4)
+    fit = zwidth.fit_log(PERIOD, position, force)
+    safe = fit.safe_wall()
+    assert fit.is_doubted or fit.respond(0.99, True) is None
+    assert safe.status == Status.UNDECIDED
+    assert np.isnan(safe.stiffness)
+    assert choose_wall(fit) is None
+
+
 def test_a_lag_is_found_and_the_delay_without_it():
     force, position = record(OTHERS["amplifier, lag of 1 ms"], 1)
     fit = zwidth.fit_log(PERIOD, position, force)
