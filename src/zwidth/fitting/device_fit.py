@@ -275,7 +275,9 @@ class DeviceFit:
             for name, (value, far) in reaches.items()
         }
         if self.hidden is not None and self.stiffness_error > 0:
-            bars["stiffness_max"] = self._average(*self.hidden)
+            bar = self._average(*self.hidden)
+            # What is printed beside the interval lies in it, also where most devices have another K_max.
+            bars["stiffness_max"] = ErrorBar(min(bar.low, self.stiffness_max), max(bar.high, self.stiffness_max))
         if self.lag is not None:
             bar, more = bars["stiffness_max"], self.lag.stiffness_max - self.stiffness_max
             bars["stiffness_max"] = ErrorBar(bar.low, bar.high + max(more, 0.0))

@@ -81,6 +81,9 @@ def test_the_interval_is_that_of_all_devices_alike():
         low, high = np.quantile(drawn, [0.025, 0.975])
         found = alike.intervals["stiffness_max"]
         assert found == pytest.approx((low, high), abs=0.1 * fit.stiffness_error)
+    # The K_max that is printed lies in it all the same.
+    likely = replace(fit, hidden=HiddenResonances(1e4, np.array([0.5])), lag=None)
+    assert likely.intervals["stiffness_max"].high == fit.stiffness_max
     lost = replace(fit, stiffness_max=np.nan, stiffness_error=np.nan)
     assert np.isnan(lost.intervals["stiffness_max"]).all()
 
