@@ -171,7 +171,7 @@ def fit_buzz(
             ]
     stiffest = StiffnessEstimate.at(scene_of(values, period, velocity), unknown_cutoff)
     further = _further(onsets, stiffest, best.theta, information, stiffest.gradient @ by_theta, weights**2 / scale)
-    return stiffest.conclude(
+    found = stiffest.conclude(
         covariance,
         noise=share or (float(np.sqrt(scale)), float(np.sqrt(scale))),
         residuals=best.residuals / np.sqrt(scale),
@@ -181,6 +181,7 @@ def fit_buzz(
         further=None if status == Status.NO_BOUNDARY else further,
         rivals=tuple(rivals),
     )
+    return replace(found, damping_tried=float(table[:, 1].max()))
 
 
 def _choose(

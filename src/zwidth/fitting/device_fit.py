@@ -127,6 +127,7 @@ class DeviceFit:
         hidden: of a log, ``(odds, stiffness_max)``: how likely the device has a resonance more than the log asks for
             against none, and K_max with such ones over that without, all equally likely; the interval of K_max is that
             of all these devices. None as ``response``.
+        damping_tried: of walls that buzzed, the largest B among them, in N s/m; None of a log.
         freedom: degrees of freedom that the noise was estimated with; None where it is known.
     """
 
@@ -155,6 +156,7 @@ class DeviceFit:
     modes: tuple[Mode, ...] = ()
     lag: HiddenLag | None = None
     hidden: HiddenResonances | None = None
+    damping_tried: float | None = None
 
     @property
     def numbers(self) -> tuple[str, ...]:
@@ -308,7 +310,8 @@ class DeviceFit:
 
         Devices are drawn around the estimate; K is the largest for which there is one B that this share of them bears,
         at K and at every softer wall of that B, for a person raises K from below. Of a log, the wall bears every
-        resonance too that may be in the device and not show in the log.
+        resonance too that may be in the device and not show in the log. Of walls that buzzed, B is at most the largest
+        that was tried: beyond, a resonance that none of them shows may shake any wall.
 
         Args:
             reliability: the share, between 0.5 and 1.

@@ -88,6 +88,9 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
     filtered = scene.velocity != BackwardDifference()
     devices = _FilteredDevices(drawn, scene, "cutoff" in fit.errors) if filtered else _RigidDevices(drawn, scene)
     (stiffness, virtual_damping), resonance = devices.find(reliability), np.nan
+    if not rigid and fit.damping_tried is not None and virtual_damping > fit.damping_tried:
+        virtual_damping = fit.damping_tried
+        stiffness = devices.limit(virtual_damping, reliability)
     if not rigid and fit.responding is not None and not bears_resonances(fit, stiffness, virtual_damping):
         # Nothing is sure of walls with B < 0 that is not of those with B = 0.
         top = fit.responding.max_stiffness(negative_damping=False)
@@ -119,7 +122,9 @@ def _bear_response(fit: DeviceFit, reliability: float, rigid: bool, drawn: np.nd
 
 
 def bears_resonances(fit: DeviceFit, stiffness: float, virtual_damping: float) -> bool:
-    """Whether a wall and the softer ones of its damping bear every resonance that the log does not show."""
+    """Whether a wall and the softer ones of its damping bear every resonance that the records do not show."""
+    if fit.damping_tried is not None and virtual_damping > fit.damping_tried:
+        return False
     scene = fit.responding
     if scene is None or stiffness == 0:
         return True
