@@ -79,10 +79,14 @@ def choose_wall(fit: DeviceFit, rigid: bool = False) -> WallChoice | None:
     if safe.status != Status.OK or not safe.stiffness > 0:
         return None
     usual = RECOMMENDED_SHARE * fit.stiffness_max, fit.virtual_damping
+    share = f"{100 * RECOMMENDED_SHARE:g} % of K_max"
     if usual[0] <= safe.stiffness and fit.scene.is_stable(*usual) and (rigid or bears_resonances(fit, *usual)):
-        return WallChoice(*usual, f"{100 * RECOMMENDED_SHARE:g} % of K_max")
+        return WallChoice(*usual, share)
     if math.isnan(safe.resonance):
-        return WallChoice(safe.stiffness, safe.virtual_damping, "what 99 % of the devices bear, less than usual")
+        why = "what 99 % of the devices bear, less than usual"
+        if usual[0] <= safe.stiffness:
+            why = f"{share}, at {'a safer B' if rigid or fit.damping_tried is None else 'the largest B tried'}"
+        return WallChoice(min(usual[0], safe.stiffness), safe.virtual_damping, why)
     share = f"{100 * RECOMMENDED_SHARE:g} % of the safe wall"
     return WallChoice(RECOMMENDED_SHARE * safe.stiffness, safe.virtual_damping, share)
 

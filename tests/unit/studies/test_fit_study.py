@@ -125,7 +125,7 @@ def test_walls_alone_are_fitted_as_in_python():
     assert outcome.table["mass_error_kg"].tolist() == [expected.errors["mass"]]
     assert outcome.answer[0].startswith("m = 99.98 g, b = 10.01 N s/m, t_d = ")
     assert outcome.answer[1].startswith("K_max = 19.87 kN/m (95 % between ")
-    assert outcome.answer[2].startswith("set K = 14.9")
+    assert outcome.answer[2] == "set K = 14.90 kN/m, B = 37.40 N s/m: 75 % of K_max, at the largest B tried"
     assert any("measure next" in note for note in outcome.notes)
     assert len(outcome.figures[""]()) == 2
     assert list(outcome.documents) == ["f_boundary.csv", "f_walls.csv", "f_scene.yaml"]
