@@ -1,11 +1,10 @@
-"""Threads: functions on every processor, and one beside what is done here."""
+"""Functions on every processor."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import Any
 
 
@@ -24,16 +23,3 @@ def run_in_threads(function: Callable[[Any], Any], items: Sequence[Any], threads
         return list(map(function, items))
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(function, items))
-
-
-@contextmanager
-def work_beside() -> Iterator[Callable[..., Any]]:
-    """What begins to call functions, one after the other, in a thread of their own; at the end all have come back."""
-    if processors() < 2:
-        yield lambda function, *arguments: function(*arguments)
-        return
-    calls: list[Any] = []
-    with ThreadPoolExecutor(1) as pool:
-        yield lambda function, *arguments: calls.append(pool.submit(function, *arguments))
-        for call in calls:
-            call.result()

@@ -40,8 +40,8 @@ _LARGEST_SHARE = 1e-3
 _REAL = 1e-6
 # Smaller maps are not worth their cells.
 SMALLEST_MAP = 1 << 11
-# Listed walls whose poles are found at one time without a compiler.
-_AT_ONCE = 1 << 10
+# Listed walls whose poles are found at one time without a compiler: half or twice as many take longer.
+_AT_ONCE = 1 << 13
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
 
@@ -87,8 +87,12 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: in
             # Plain numbers are several times faster than arrays of one.
             found = [np.reshape(leaf, 1) for leaf in _quick([column[0] for column in columns], accuracy, kind)]
         elif size <= few:
-            quick = lambda *piece: _quick(list(piece), accuracy, kind)  # noqa: E731
-            found = map_blocks(quick, columns, _AT_ONCE, within=partial(np.errstate, all="ignore"))
+            full = [column[fill_up(np.arange(size))] for column in columns]
+            blocks = [
+                _quick([column[start : start + _AT_ONCE] for column in full], accuracy, kind)
+                for start in range(0, max(size, 1), _AT_ONCE)
+            ]
+            found = [np.concatenate(leaves)[:size] for leaves in zip(*blocks, strict=True)]
         else:
             # Always of one size: other batches may round differently.
             short = max(0, PIECE - size)

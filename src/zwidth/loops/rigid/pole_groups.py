@@ -22,7 +22,7 @@ from zwidth.loops.rigid.pole_step import join
 
 # Orders of the polynomials in xi and eta; each group takes the least that will do.
 ORDERS = (2, 4, 8, 12, 20)
-# Terms of A by u, and points of a mean for each pole; of both half as many where less is asked for than that.
+# Terms of A by u, and points of a mean for each pole; what is asked for less than that need not tell all poles apart.
 _TERMS, _POINTS, _COARSE = 36, 48, 1e-5
 # So near to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is: of the
 # radii of walls with alpha from 1e-18 on one in ten rounds to 1, of those within 1e-10 of the boundary as many err.
@@ -54,7 +54,7 @@ class AllowedErrors(NamedTuple):
 
     @property
     def is_coarse(self) -> bool:
-        """Whether half of the terms and points will do, and poles need not be told apart that are as large as that."""
+        """Whether poles need not be told apart that are as large as that."""
         return self.accuracy > _COARSE and not self.with_rate
 
     @property
@@ -175,10 +175,8 @@ def find_middle(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool) ->
 
 def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional: bool, wanted: AllowedErrors) -> Group:
     """The circle on which the group's term of A is the largest, over all of the others and what walls change (C2)."""
-    fewer = 2 if wanted.is_coarse and poles == 1 else 1
-    loop, terms, points = cells.loop, _TERMS // fewer, _POINTS // fewer * poles
-    places = np.arange(terms + 1)
-    a, f, w, (near, off, lead, rho, late) = _expand(re, im, loop, fractional, terms)
+    loop, points, places = cells.loop, _POINTS * poles, np.arange(_TERMS + 1)
+    a, f, w, (near, off, lead, rho, late) = _expand(re, im, loop, fractional, _TERMS)
     r, level, by, sizes = np.exp(re), np.abs(f), np.abs(w), np.abs(a)
     limit = 1.0 / np.maximum(1.0, np.maximum(rho, late) if fractional else rho)
     largest = np.minimum(2.0 / loop.turns, 0.4 * limit)
@@ -188,7 +186,7 @@ def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional
     most = lead * np.exp(loop.turns * wide) * (near + r * wide) * (off + r * wide) / (1.0 - rho * wide)
     if fractional:
         most *= (1.0 + wide) / (1.0 - late * wide)
-    rest = (most + np.abs(loop.beta) * by / (1.0 - wide)) * (disk / wide) ** (terms + 1)
+    rest = (most + np.abs(loop.beta) * by / (1.0 - wide)) * (disk / wide) ** (_TERMS + 1)
     total = ((sizes * largest ** places[:, None]).T[:, None] @ _CIRCLES ** places[:, None])[:, 0].T
     # Of P's own rounding errors what `pole_step` says, too.
     rounding = 2.0**-52 * (16.0 + loop.turns * (np.abs(re) + im))
@@ -253,8 +251,8 @@ def _points(poles: int, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def sum_up(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
     """The log |1 + u| of one pole, or sums of u/disk and its square over two, by powers of eta and xi (C1)."""
-    terms, poles = group.a.shape[0], group.poles
-    count, powers = _POINTS * (terms - 1) // _TERMS * poles, np.arange(terms)
+    poles, powers = group.poles, np.arange(_TERMS + 1)
+    count = _POINTS * poles
     points, weights = _points(poles, count)
     u = group.disk[:, None] * points
     coefficients = (group.a * group.disk ** powers[:, None]).T

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.threads import processors, run_in_threads, work_beside
 from zwidth.loops.rigid.circle import Loop, count_in_cell, factor_loop
 from zwidth.loops.rigid.pole_groups import (
     DOUBTFUL,
@@ -28,15 +27,16 @@ from zwidth.loops.rigid.pole_groups import (
     pick,
     sum_up,
 )
-from zwidth.loops.rigid.pole_search import both_starts
+from zwidth.loops.rigid.pole_search import all_starts
 from zwidth.loops.rigid.pole_step import halley_step
 
 # Sides of cells, in walls.
 _SIDES = (128, 64, 32, 16, 8)
 # Cells of one list, and of those how many have their sums made at one time, and walls: what they need stays in caches.
 _LIST, _BATCH, _WALLS = 1 << 9, 1 << 7, 1 << 14
-# Of Halley's method on both starts.
-_STEPS = 5
+# Of Halley's method on every start; where the last one was shorter than this share of the distance between the poles of
+# a long delay it has arrived, and starts that end nearer to each other than that have found one pole.
+_STEPS, _NEARBY = 5, 1e-2
 # How far inside of the groups the circles of a count are, in units of how far the groups move in the cell.
 _INSIDE = (0.3, 1.5, 6.0)
 
@@ -100,13 +100,20 @@ def _on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_poles(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The slow pole and the first pair of the ring, nearly, the larger one first: (2, cells)."""
-    re, im = map(np.stack, zip(*both_starts(loop, fractional), strict=True))
+    """The largest pole to which a start leads, and the largest of the others, nearly: (2, cells)."""
+    before = re, im = all_starts(loop, fractional)
+    nearby = _NEARBY / loop.turns
     for _ in range(_STEPS):
+        before = re, im
         re, im = halley_step(re, im, loop, fractional)
+    arrived = np.abs(re - before[0]) + np.abs(im - before[1]) < nearby
     im = np.where(im < REAL, 0.0, np.where(np.pi - im < REAL, np.pi, im))
-    larger = (re[0] >= re[1]) | np.isnan(re[1])
-    return np.where(larger, re, re[::-1]), np.where(larger, im, im[::-1])
+    re, cells = np.where(arrived, re, -np.inf), np.arange(re.shape[1])
+    first = re.argmax(0)
+    same = np.abs(re - re[first, cells]) + np.abs(im - im[first, cells]) < nearby
+    second = np.where(same, -np.inf, re).argmax(0)
+    best = np.stack([first, second])
+    return re[best, cells], im[best, cells]
 
 
 class FollowedPoles(NamedTuple):
@@ -137,12 +144,12 @@ class _Level:
         inside &= (self.side * column < columns.stop) & (self.side * (column + 1) > columns.start)
         return np.stack([device, row, column])[:, inside]
 
-    def solve_all(self, places: np.ndarray, fractional: bool, begin: Any) -> np.ndarray:
-        """`solve` list by list; ``begin`` writes beside what is done here."""
+    def solve_all(self, places: np.ndarray, fractional: bool) -> np.ndarray:
+        """`solve` list by list."""
         lists = (places[:, start : start + _LIST] for start in range(0, places.shape[1], _LIST))
-        return np.concatenate([places[:, :0], *(self.solve(some, fractional, begin) for some in lists)], axis=1)
+        return np.concatenate([places[:, :0], *(self.solve(some, fractional) for some in lists)], axis=1)
 
-    def solve(self, places: np.ndarray, fractional: bool, begin: Any) -> np.ndarray:
+    def solve(self, places: np.ndarray, fractional: bool) -> np.ndarray:
         """Write the poles of the cells of which all is proved; the others are returned."""
         count = places.shape[1]
         places = places[:, fill_up(np.arange(count))]
@@ -153,11 +160,11 @@ class _Level:
         cells = Cells(loop, *half)
         re, im = _find_poles(loop, fractional)
         single = enclose(1, re[0], im[0], cells, fractional, self.wanted)
-        done = self._prove([single], places, cells, fractional, begin)
+        done = self._prove([single], places, cells, fractional)
         if self.wanted.is_coarse:
             index = fill_up(np.flatnonzero(~done))
             if index.size:
-                done[index] = self._prove_flat(re[0, index], places[:, index], pick(cells, index), fractional, begin)
+                done[index] = self._prove_flat(re[0, index], places[:, index], pick(cells, index), fractional)
         known = (single.order < len(ORDERS)) | done
         # Where another pole is about to take over, both are followed; next to a double pole the two together.
         for left, poles in ((known & ~done, 1), (~known, 2)):
@@ -170,7 +177,7 @@ class _Level:
             else:
                 middle = find_middle(re[0, index], im[0, index], some.loop, fractional)
                 followed = [enclose(2, *middle, some, fractional, self.wanted)]
-            done[index] = self._prove(followed, places[:, index], some, fractional, begin)
+            done[index] = self._prove(followed, places[:, index], some, fractional)
         return places[:, :count][:, ~done[:count]]
 
     def _along(self, places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -181,7 +188,7 @@ class _Level:
             for axis, place in zip(self.axes, (column, row), strict=True)
         ]
 
-    def _prove(self, groups: list[Group], places: np.ndarray, cells: Cells, fractional: bool, begin: Any) -> np.ndarray:
+    def _prove(self, groups: list[Group], places: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
         """Write the cells in which groups are known and hold the outermost pole whatever the wall (C4 to C6)."""
         known = np.logical_and.reduce([group.order < len(ORDERS) for group in groups])
         if len(groups) == 2:
@@ -203,20 +210,20 @@ class _Level:
         proved[index[(sure.reshape(shape) & (outside.reshape(shape) == many)).any(0)]] = True
         where, places, cells = np.flatnonzero(proved[index]), places[:, index], pick(cells, index)
         for k, group in enumerate(groups):
-            begin(self._follow, group, where, places, cells, k > 0)
+            self._follow(group, where, places, cells, k > 0)
         return proved
 
-    def _prove_flat(self, re: np.ndarray, places: np.ndarray, cells: Cells, fractional: bool, begin: Any) -> np.ndarray:
+    def _prove_flat(self, re: np.ndarray, places: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
         """Write one value in the cells in which all outermost poles are as large within the accuracy (C6)."""
         loop, a, b = pick(cells, np.tile(np.arange(re.size), 2))
         circles = np.concatenate(_on_one_side(re, self.wanted.accuracy))
         outside, sure = (part.reshape(2, -1) for part in count_in_cell(circles, loop, (a, b), fractional))
         flat = sure.all(0) & (outside[0] > 0) & (outside[1] == 0)
-        begin(self._fill, np.where(re > 0, *_on_one_side(re, 0.0))[flat], places[:, flat])
+        self._fill(np.where(re > 0, *_on_one_side(re, 0.0))[flat], places[:, flat])
         return flat
 
     def _fill(self, re: np.ndarray, places: np.ndarray) -> None:
-        for value, cell in zip(np.exp(re).tolist(), places.T, strict=True):
+        for value, cell in zip(np.exp(re).tolist(), places.T.tolist(), strict=True):
             self.radius[self._place(cell)[0]] = value
 
     def _follow(self, group: Group, where: np.ndarray, places: np.ndarray, cells: Cells, merge: bool) -> None:
@@ -257,7 +264,7 @@ class _Level:
                     known = disk / (1.0 - disk) * error + ROUNDING * np.abs(re) <= self.wanted.allowed(np.abs(values))
                 values[~known] = np.nan
             self._note(some, values)
-            for cell, value in zip(some.T, values, strict=True):
+            for cell, value in zip(some.T.tolist(), values, strict=True):
                 tile, inside = self._place(cell)
                 # Of whole cells, then to their places: how numbers are rounded may depend on how many there are, and
                 # NumPy 2.4 negates strided ones wrongly.
@@ -267,22 +274,21 @@ class _Level:
                 radius = np.exp(value, out=value)[inside]
                 self.radius[tile] = np.maximum(self.radius[tile], radius) if merge else radius
 
-    def _place(self, cell: np.ndarray) -> tuple[Any, Any]:
-        """Where a cell lies in the window, and what of it does."""
-        device, *corner = cell.tolist()
-        starts = [self.side * k - axis.start for k, axis in zip(corner, self.area.window, strict=True)]
-        tile = [
-            slice(max(0, start), min(start + self.side, axis.stop - axis.start))
-            for start, axis in zip(starts, self.area.window, strict=True)
-        ]
-        return (device, *tile), tuple(
-            slice(part.start - start, part.stop - start) for part, start in zip(tile, starts, strict=True)
-        )
+    def _place(self, cell: list[int]) -> tuple[Any, Any]:
+        """Where a cell, by device, row and column, lies in the window; and what of it does."""
+        tile: list[Any] = cell[:1]
+        inside = []
+        for index, axis in zip(cell[1:], self.area.window, strict=True):
+            start = self.side * index - axis.start
+            first, stop = max(0, start), min(start + self.side, axis.stop - axis.start)
+            tile.append(slice(first, stop))
+            inside.append(slice(first - start, stop - start))
+        return tuple(tile), tuple(inside)
 
     def forget(self, places: np.ndarray) -> None:
         """NaN for all walls of some cells."""
         self._note(places, np.full((places.shape[1], self.side, self.side), np.nan))
-        for cell in places.T:
+        for cell in places.T.tolist():
             tile, _ = self._place(cell)
             self.radius[tile] = np.nan
 
@@ -290,7 +296,7 @@ class _Level:
         """Note the walls whose side of the circle is in doubt, or that are NaN."""
         flat, doubt = logarithms.reshape(-1, self.side**2), self.wanted.doubt
         for index in np.flatnonzero(~((flat.min(1) > doubt) | (flat.max(1) < -doubt))):
-            (device, rows, columns), inside = self._place(places[:, index])
+            (device, rows, columns), inside = self._place(places[:, index].tolist())
             row, column = np.nonzero(~(np.abs(logarithms[index][inside]) > doubt))
             self.special.append(np.stack([np.full(row.size, device), row + rows.start, column + columns.start]))
 
@@ -307,20 +313,14 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
     held = area.d != np.floor(area.d)
     levels = [_Level(area, side, AllowedErrors(accuracy, with_rate), radius, rate) for side in sides]
 
-    def follow(kind: bool, cells: np.ndarray) -> None:
-        with np.errstate(all="ignore"), work_beside() as begin:
-            for level in levels:
-                cells = level.solve_all(cells if level is levels[0] else level.split(cells), kind, begin)
-            levels[-1].forget(cells)
-
-    pieces, corners = [], [np.arange(part.start // sides[0], -(-part.stop // sides[0])) for part in area.window]
+    corners = [np.arange(part.start // sides[0], -(-part.stop // sides[0])) for part in area.window]
     for kind in (False, True):
         devices = np.flatnonzero(held == kind)
         cells = np.stack([part.reshape(-1) for part in np.meshgrid(devices, *corners, indexing="ij")])
-        # What is hard lies together: each thread gets its share of it. Two are needed to find poles and to write them.
-        count = min(max(1, processors() // 2), cells.shape[1])
-        pieces += [(kind, cells[:, k::count]) for k in range(count)]
-    run_in_threads(lambda piece: follow(*piece), pieces)
+        with np.errstate(all="ignore"):
+            for level in levels:
+                cells = level.solve_all(cells if level is levels[0] else level.split(cells), kind)
+            levels[-1].forget(cells)
     special = np.concatenate([np.empty((3, 0), int), *(part for level in levels for part in level.special)], axis=1)
     # Walls at which two groups were compared may be there twice.
     flat = np.unique(np.ravel_multi_index(tuple(special), shape))

@@ -161,14 +161,19 @@ def certify_again(re: Array, im: Array, tolerance: Array, loop: Loop, fractional
     return certify_pole(*halley_step(re, im, loop, fractional), tolerance, loop, fractional, False)
 
 
-def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> Found:
-    """What the starts lead to, the slow one also put on the real axis or off it, which steps do not leave or meet."""
+def all_starts(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Both starts, then the slow one also put on the real axis or off it, which steps do not leave or meet: (4, loops).
+
+    Where the slow one is off the axis it is put on it, and the other way round.
+    """
     (slow, turn), pair = both_starts(loop, fractional)
-    start = (
-        np.stack([slow, pair[0], slow, 0.0 * slow]),
-        np.stack([turn, pair[1], np.where(turn > 0, 0.0, _OFF * pair[1]), _BETWEEN * pair[1]]),
-    )
-    at = repeat(_PATIENT, lambda at: halley_step(*at, loop, fractional), start, np)
+    other = np.where(turn > 0, 0.0, _OFF * pair[1])
+    return np.stack([slow, pair[0], slow, 0.0 * slow]), np.stack([turn, pair[1], other, _BETWEEN * pair[1]])
+
+
+def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> Found:
+    """What all of the starts lead to."""
+    at = repeat(_PATIENT, lambda at: halley_step(*at, loop, fractional), all_starts(loop, fractional), np)
     found = certify_pole(*at, tolerance, loop, fractional, False)
     best = np.where(found.proved, np.inf, np.nan_to_num(found.re, nan=-np.inf)).argmax(0)
     return Found(*(leaf[best, np.arange(best.size)] for leaf in found))
