@@ -163,3 +163,13 @@ def test_poles_of_nearly_one_size_need_not_be_told_apart(d, low):
     stable = zwidth.is_stable(alpha[column], beta[row], 0.5, d)
     sure = np.abs(alone.re) > 1.1e-5
     np.testing.assert_array_equal((found[known] < 1)[sure], stable[sure])
+
+
+def test_cells_know_the_pair_of_a_short_delay_that_is_neither_slow_nor_of_the_ring():
+    """From half the angle of the ring's first pair; from that pair and from the slow one steps lead to real poles."""
+    alpha, beta, device = np.linspace(0.31, 0.37, 100), np.linspace(0.55, 0.62, 100), (0.1, 0.37)
+    found = follow_poles(Area.whole(alpha[None], beta[None], *np.transpose([device])), 1e-9).radius[0]
+    assert np.isfinite(found).mean() > 0.95
+    row, column = np.nonzero(np.isfinite(found))
+    alone = outermost_poles([alpha[column], beta[row], *(np.full(row.size, x) for x in device)], 1e-9)
+    assert (np.abs(np.log(found[row, column]) - alone.re) <= 1e-9 + alone.error).all()
