@@ -6,7 +6,7 @@ On maps of alpha and beta they come from series (`loops.rigid.pole_map`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,34 +112,38 @@ def _finish_poles(columns: list[np.ndarray], found: Found, accuracy: float, kind
     left = np.flatnonzero(~found.proved)
     # Nothing is proved of bad walls.
     left = left[np.asarray(wall_status(*(column[left] for column in columns))) == Status.OK]
+    attempts: list[Any] = [certify_again, certify_starts, 1.0, search, *_LADDER[accuracy * _LADDER <= _LARGEST_ERROR]]
     with np.errstate(all="ignore"):
-        for start in range(0, left.size, FEW):
-            _patiently(columns, found, error, left[start : start + FEW], accuracy, kind)
+        for attempt in attempts:
+            pieces = [left[start : start + FEW] for start in range(0, left.size, FEW)]
+            tried = [_attempt(attempt, columns, found, error, piece, accuracy, kind) for piece in pieces]
+            left = np.concatenate([left[:0], *tried])
     return OutermostPoles(found.re, found.im, error, found.doubt)
 
 
-def _patiently(
-    columns: list[np.ndarray], found: Found, error: np.ndarray, left: np.ndarray, accuracy: float, kind: bool
-) -> None:
-    begun = fill_up(left)
-    again = partial(certify_again, found.re[begun], found.im[begun])
-    attempts: list[Any] = [again, certify_starts, 1.0, search, *_LADDER[accuracy * _LADDER <= _LARGEST_ERROR]]
-    for attempt in attempts:
-        if not left.size:
-            return
-        full = fill_up(left)
-        loop = factor_loop(*(column[full] for column in columns), kind)
-        if not isinstance(attempt, float):
-            new = Found(*(leaf[: left.size] for leaf in attempt(accuracy, loop, kind)))
-            good = np.isfinite(new.re)
-            for whole, leaf in zip(found, new, strict=True):
-                whole[left[good]] = leaf[good]
-            error[left[new.proved]] = accuracy
-            left = left[~new.proved]
-        else:
-            here = has_bound(found.re[full], attempt * accuracy, loop, kind)[: left.size]
-            error[left[here]], found.doubt[left[here]] = attempt * accuracy, np.inf
-            left = left[~here]
+def _attempt(
+    attempt: Any,
+    columns: list[np.ndarray],
+    found: Found,
+    error: np.ndarray,
+    left: np.ndarray,
+    accuracy: float,
+    kind: bool,
+) -> np.ndarray:
+    """Try to prove some poles, by another method or to a multiple of the accuracy, in place; what is left of them."""
+    full = fill_up(left)
+    loop = factor_loop(*(column[full] for column in columns), kind)
+    if isinstance(attempt, float):
+        proved = has_bound(found.re[full], attempt * accuracy, loop, kind)[: left.size]
+        error[left[proved]], found.doubt[left[proved]] = attempt * accuracy, np.inf
+    else:
+        begun: Any = (found.re[full], found.im[full]) if attempt is certify_again else ()
+        new = Found(*(leaf[: left.size] for leaf in attempt(*begun, accuracy, loop, kind)))
+        good, proved = np.isfinite(new.re), new.proved
+        for whole, leaf in zip(found, new, strict=True):
+            whole[left[good]] = leaf[good]
+        error[left[proved]] = accuracy
+    return left[~proved]
 
 
 def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
