@@ -137,8 +137,11 @@ def _attempt(
         proved = has_bound(found.re[full], attempt * accuracy, loop, kind)[: left.size]
         error[left[proved]], found.doubt[left[proved]] = attempt * accuracy, np.inf
     else:
-        begun: Any = (found.re[full], found.im[full]) if attempt is certify_again else ()
-        new = Found(*(leaf[: left.size] for leaf in attempt(*begun, accuracy, loop, kind)))
+        if attempt is certify_again:
+            poles = certify_again(found.re[full], found.im[full], accuracy, loop, kind)
+        else:
+            poles = attempt(accuracy, loop, kind)
+        new = Found(*(leaf[: left.size] for leaf in poles))
         good, proved = np.isfinite(new.re), new.proved
         for whole, leaf in zip(found, new, strict=True):
             whole[left[good]] = leaf[good]
