@@ -132,7 +132,7 @@ def _attempt(
 ) -> np.ndarray:
     """Try to prove some poles, by another method or to a multiple of the accuracy, in place; what is left of them."""
     full = fill_up(left)
-    loop = factor_loop(*(column[full] for column in columns), kind)
+    loop = factor_loop(*(column[full] for column in columns), fractional=kind)
     if isinstance(attempt, float):
         proved = has_bound(found.re[full], attempt * accuracy, loop, kind)[: left.size]
         error[left[proved]], found.doubt[left[proved]] = attempt * accuracy, np.inf
