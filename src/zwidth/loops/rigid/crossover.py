@@ -69,12 +69,14 @@ def short_verdict(alpha: Any, beta: Any, here: Any) -> Verdict:
     square = linear * linear - start * lead * 4.0
     y = start * 2.0 / (linear + roots(square)[0])
     left, right = alpha * horner(y, size), y * horner(y, shape) * 4.0
-    reached, missed = (square > 0) & (y < 1.0), (square < 0) | (y > 1.0)
+    meets, missed = square > 0, (square < 0) | (y > 1.0)
+    reached = meets & (y < 1.0)
     # Beyond the lobe's end a row is stable up to the line, if the lobe ends at z = -1, or nowhere. It ends before where
     # alpha would be negative at z = -1, or the line would lie below.
     end = shape[0] + shape[1] + shape[2]
     cornered, ended = (end > 0) & (here.gap > 0), (end < 0) | (here.gap < 0)
-    stable = below & ((reached & (left < right)) | (missed & cornered))
+    # At the damping of a corner y is 1, or for all that is certain on either side of it.
+    stable = below & ((reached & (left < right)) | (cornered & (missed | (meets & (left < right)))))
     return Verdict(stable, without | (reached & (left > right)) | (ended & (missed | (left > right))))
 
 

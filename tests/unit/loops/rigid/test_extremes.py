@@ -31,6 +31,20 @@ def test_every_method_holds_where_it_says(d, monkeypatch):
         assert np.isnan(outcome.farthest) or outcome.farthest <= HELD[outcome.method], outcome
 
 
+def test_softer_walls_at_the_damping_of_a_corner_are_stable():
+    """There the lobe meets the line of z = -1, at y = 1 but for rounding errors, and both end the row."""
+    random = np.random.default_rng(5)
+    delta, d = 10 ** random.uniform(-3, 3, 6000), np.append(random.uniform(0, 1, 5990), np.zeros(10))
+    top = zwidth.alpha_max(delta, d)
+    corner = np.flatnonzero(top.kind == zwidth.RidgeKind.CORNER)
+    assert corner.size > 400
+    alpha, beta, delta, d = top.alpha[corner], top.beta[corner], delta[corner], d[corner]
+    for share in (1e-9, 0.5, 1.0 - 1e-9):
+        assert zwidth.is_stable(share * alpha, beta, delta, d).all()
+        assert zwidth.decide_stability(share * alpha, beta, delta, d, method="certified").stable.all()
+    assert not zwidth.is_stable((1.0 + 1e-9) * alpha, beta, delta, d).any()
+
+
 @pytest.mark.parametrize("method", ["crossover", "companion", "certified"])
 def test_bad_input_among_good(method):
     bad = [np.nan, np.inf, -np.inf]
