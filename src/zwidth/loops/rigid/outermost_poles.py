@@ -20,7 +20,7 @@ from zwidth.loops.rigid.folding import Points, fold
 from zwidth.loops.rigid.pole_groups import DOUBTFUL
 from zwidth.loops.rigid.pole_map import Area, fill_up, follow_poles
 from zwidth.loops.rigid.pole_search import (
-    Found,
+    OutermostPoles,
     certification_width,
     certify_again,
     certify_starts,
@@ -49,15 +49,6 @@ PIECE = BLOCK >> 3
 _NONE = np.empty(0)
 # Of the pole of one wall, its radius and its rate.
 SLOWEST_ACCURACY = 1e-9
-
-
-class OutermostPoles(NamedTuple):
-    """Outermost poles ``e^(re + j im)`` of flat arrays, the relative error proved, infinite where none is."""
-
-    re: np.ndarray
-    im: np.ndarray
-    error: np.ndarray
-    doubt: np.ndarray  # how far re may be from the pole; infinite where the proof is of the radius alone
 
 
 @cache
@@ -98,55 +89,46 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: in
             short = max(0, PIECE - size)
             padded = [np.pad(c, (0, short), mode="edge") for c in (*columns, np.full(size, accuracy))]
             found = [leaf[:size] for leaf in map_blocks(_compile_quick(kind), padded, PIECE)]
-    return _finish_poles(columns, Found(*(np.array(leaf) for leaf in found)), accuracy, kind)
+    return _finish_poles(columns, OutermostPoles(*(np.array(leaf) for leaf in found)), accuracy, kind)
 
 
-def _quick(columns: list[Any], accuracy: float, kind: bool) -> Found:
+def _quick(columns: list[Any], accuracy: float, kind: bool) -> OutermostPoles:
     alpha, beta, delta, d = columns
     return quick_kernel(alpha, beta, delta, d, accuracy + 0.0 * alpha, kind)
 
 
-def _finish_poles(columns: list[np.ndarray], found: Found, accuracy: float, kind: bool) -> OutermostPoles:
+def _finish_poles(columns: list[np.ndarray], poles: OutermostPoles, accuracy: float, kind: bool) -> OutermostPoles:
     """What is not proved once more, in place: with all crossovers, by halvings, then with larger errors."""
-    error = np.where(found.proved, accuracy, np.inf)
-    left = np.flatnonzero(~found.proved)
+    left = np.flatnonzero(~poles.proved)
     # Nothing is proved of bad walls.
     left = left[np.asarray(wall_status(*(column[left] for column in columns))) == Status.OK]
     attempts: list[Any] = [certify_again, certify_starts, 1.0, search, *_LADDER[accuracy * _LADDER <= _LARGEST_ERROR]]
     with np.errstate(all="ignore"):
         for attempt in attempts:
             pieces = [left[start : start + FEW] for start in range(0, left.size, FEW)]
-            tried = [_attempt(attempt, columns, found, error, piece, accuracy, kind) for piece in pieces]
+            tried = [_attempt(attempt, columns, poles, piece, accuracy, kind) for piece in pieces]
             left = np.concatenate([left[:0], *tried])
-    return OutermostPoles(found.re, found.im, error, found.doubt)
+    return poles
 
 
 def _attempt(
-    attempt: Any,
-    columns: list[np.ndarray],
-    found: Found,
-    error: np.ndarray,
-    left: np.ndarray,
-    accuracy: float,
-    kind: bool,
+    attempt: Any, columns: list[np.ndarray], poles: OutermostPoles, left: np.ndarray, accuracy: float, kind: bool
 ) -> np.ndarray:
     """Try to prove some poles, by another method or to a multiple of the accuracy, in place; what is left of them."""
     full = fill_up(left)
     loop = factor_loop(*(column[full] for column in columns), fractional=kind)
     if isinstance(attempt, float):
-        proved = has_bound(found.re[full], attempt * accuracy, loop, kind)[: left.size]
-        error[left[proved]], found.doubt[left[proved]] = attempt * accuracy, np.inf
+        proved = has_bound(poles.re[full], attempt * accuracy, loop, kind)[: left.size]
+        poles.error[left[proved]], poles.doubt[left[proved]] = attempt * accuracy, np.inf
+        return left[~proved]
+    if attempt is certify_again:
+        new = certify_again(poles.re[full], poles.im[full], accuracy, loop, kind)
     else:
-        if attempt is certify_again:
-            poles = certify_again(found.re[full], found.im[full], accuracy, loop, kind)
-        else:
-            poles = attempt(accuracy, loop, kind)
-        new = Found(*(leaf[: left.size] for leaf in poles))
-        good, proved = np.isfinite(new.re), new.proved
-        for whole, leaf in zip(found, new, strict=True):
-            whole[left[good]] = leaf[good]
-        error[left[proved]] = accuracy
-    return left[~proved]
+        new = attempt(accuracy, loop, kind)
+    good = np.isfinite(new.re[: left.size])
+    for whole, leaf in zip(poles, new, strict=True):
+        whole[left[good]] = leaf[: left.size][good]
+    return left[~new.proved[: left.size]]
 
 
 def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:

@@ -44,13 +44,18 @@ _OFF = 0.1
 _BETWEEN = 0.5
 
 
-class Found(NamedTuple):
-    """The outermost pole ``e^(re + j im)``, 0 <= im <= pi, and whether it is proved to be that."""
+class OutermostPoles(NamedTuple):
+    """Outermost poles ``e^(re + j im)``, 0 <= im <= pi, by the relative error proved of the radius."""
 
     re: Array
     im: Array
-    proved: Array
-    doubt: Array  # of rounding errors in re
+    error: Array  # infinite where none is proved
+    doubt: Array  # how far re may be from the pole; infinite where the proof is of the radius alone
+
+    @property
+    def proved(self) -> Array:
+        """Whether some error is."""
+        return self.error < np.inf
 
 
 def _largest(loop: Loop) -> Array:
@@ -131,7 +136,7 @@ def certification_width(re: Array, tolerance: Any) -> Array:
     return xp.minimum(tolerance, xp.maximum(_COUNTED * epsilon(re), _RELATIVE * xp.abs(re)))
 
 
-def certify_pole(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool, single: bool) -> Found:
+def certify_pole(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool, single: bool) -> OutermostPoles:
     """The pole after one more step, and whether its modulus is proved to be the radius within the tolerance."""
     xp = namespace(re, loop.alpha)
     # A wall without stiffness has a pole at 1.
@@ -140,10 +145,12 @@ def certify_pole(re: Array, im: Array, tolerance: Array, loop: Loop, fractional:
     re, im = (xp.where(at_one, 0.0, part) for part in move_pole(re, im, step.re, step.im))
     seen = count(re + certification_width(re, tolerance), loop, fractional, single)
     proved = (at_one | (_AFTER * step.within <= tolerance)) & seen.full & seen.sure
-    return Found(re, im, proved, xp.where(at_one, 0.0, step.doubt))
+    return OutermostPoles(re, im, xp.where(proved, tolerance, np.inf), xp.where(at_one, 0.0, step.doubt))
 
 
-def quick_kernel(alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool) -> Found:
+def quick_kernel(
+    alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool
+) -> OutermostPoles:
     """The outermost pole of most points."""
     loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
     return certify_pole(*candidate(loop, fractional), tolerance, loop, fractional, fractional)
@@ -156,7 +163,7 @@ def has_bound(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Arr
     return above.full & above.sure & ~below.full & below.sure
 
 
-def certify_again(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool) -> Found:
+def certify_again(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool) -> OutermostPoles:
     """Where the quick kernel ended after one step more, with a count that may meet several crossovers."""
     return certify_pole(*halley_step(re, im, loop, fractional), tolerance, loop, fractional, False)
 
@@ -171,15 +178,15 @@ def all_starts(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([slow, pair[0], slow, 0.0 * slow]), np.stack([turn, pair[1], other, _BETWEEN * pair[1]])
 
 
-def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> Found:
+def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> OutermostPoles:
     """What all of the starts lead to."""
     at = repeat(_PATIENT, lambda at: halley_step(*at, loop, fractional), all_starts(loop, fractional), np)
     found = certify_pole(*at, tolerance, loop, fractional, False)
     best = np.where(found.proved, np.inf, np.nan_to_num(found.re, nan=-np.inf)).argmax(0)
-    return Found(*(leaf[best, np.arange(best.size)] for leaf in found))
+    return OutermostPoles(*(leaf[best, np.arange(best.size)] for leaf in found))
 
 
-def search(tolerance: Array, loop: Loop, fractional: bool) -> Found:
+def search(tolerance: Array, loop: Loop, fractional: bool) -> OutermostPoles:
     """The outermost pole by halvings of the interval that counts leave, then a few steps."""
     xp = namespace(loop.alpha)
     # Of few walls NumPy has several radii counted in the time of one.
@@ -220,7 +227,7 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
     eps = epsilon(still.c)
     found = certify_pole(*candidate(still, fractional), eps**0.58, still, fractional, False)
     late = cond(found.proved.all(), lambda: found, lambda: search(eps**0.58, still, fractional))
-    start, im, simple, _ = frozen(Found(*(xp.where(found.proved, *pair) for pair in zip(found, late, strict=True))), xp)
+    start, im, error, _ = frozen(tuple(xp.where(found.proved, *pair) for pair in zip(found, late, strict=True)), xp)
 
     def step(at: tuple[Array, Array]) -> tuple[Array, Array]:
         by = newton_step(*at, loop, fractional)
@@ -228,6 +235,7 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
 
     # Each step doubles the order to which the derivatives are right: two make first and second ones exact.
     re, _ = repeat(2, step, (start, im), xp)
+    simple = error < np.inf
     known = simple | has_bound(start, eps**0.25, still, fractional)
     (change,) = nan_unless(simple, re - start)
     value = frozen(xp.where(simple, re, start), xp)
