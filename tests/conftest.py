@@ -57,6 +57,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_finish() -> None:
     """Python looks for garbage less often: tracing makes so many objects that every sixth second went into it."""
     gc.collect()
+    # What is loaded by now stays.
+    gc.freeze()
     gc.set_threshold(50_000, 20, 20)
 
 
@@ -74,6 +76,15 @@ def _nothing_is_left_open():
     if what_is_open().beyond(before):
         gc.collect()
     wait_for(lambda: not what_is_open().beyond(before), lambda: f"still open: {what_is_open().beyond(before)}")
+
+
+@pytest.fixture
+def fitted_once():
+    """What commands, studies and pages say of a log, or of walls, is asked of one fit."""
+    from fitted_once import fitting_once
+
+    with fitting_once():
+        yield
 
 
 @pytest.fixture

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 
 import pytest
 import yaml
-from sweeping import AXES, assert_same, chunk_file, command, failing_on_2, flags, flip, main_of, study
+from chunks import failing_on_2
+from sweeping import AXES, assert_same, chunk_file, command, flags, flip, main_of, study
 from waiting import LONGEST
 
 # A limit set between fork and exec would have Python code run in a copy of a process with JAX's threads.

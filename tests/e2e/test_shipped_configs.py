@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import zwidth
+from zwidth.figures import style
 from zwidth.runs.draw import Drawing, draw_stores
 from zwidth.sweep.dataset import to_csv, to_netcdf, verify
 from zwidth.words.errors import InputError
@@ -41,7 +42,13 @@ def config(request, tmp_path):
     return tmp_path / "own.yaml"
 
 
-def test_a_shipped_configuration_goes_all_the_way(config, tmp_path):
+@pytest.fixture
+def few_dots(monkeypatch):
+    """Pictures are compared byte by byte, of whatever size they are."""
+    monkeypatch.setattr(style, "PNG_DPI", 40)
+
+
+def test_a_shipped_configuration_goes_all_the_way(config, tmp_path, few_dots, fitted_once):
     first = zwidth.run(config, out=tmp_path / "first")
     assert [study.error for study in first.failed] == []
     assert {study.state for study in first.studies} == {"done"}

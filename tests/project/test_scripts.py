@@ -13,6 +13,7 @@ from waiting import LONGEST
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = ROOT / "tests" / "quick.txt"
+LISTS = sorted((ROOT / "tests").glob("*.txt"))
 ON_EVERY_CORE = ["--numprocesses", "auto", "--dist", "loadfile"]
 # What the quick tests must hold something of.
 ROOMS = sorted(path.name for path in (ROOT / "tests" / "unit").iterdir() if path.is_dir() and path.name[0] != "_")
@@ -66,9 +67,13 @@ def calls_of(root, script, *arguments, cwd=None, path=None):
     return done.returncode, [line.split() for line in lines]
 
 
-def test_every_quick_test_exists():
-    lines = QUICK.read_text(encoding="utf-8").splitlines()
-    assert [line for line in lines if not (ROOT / line.partition("::")[0]).exists()] == []
+@pytest.mark.parametrize("listed", LISTS, ids=lambda path: path.stem)
+def test_every_listed_test_exists(listed):
+    lines = listed.read_text(encoding="utf-8").splitlines()
+    for line in lines:
+        file, _, test = line.partition("::")
+        assert (ROOT / file).exists(), line
+        assert not test or f"def {test}(" in (ROOT / file).read_text(encoding="utf-8"), line
     assert len(lines) == len(set(lines)) > 0
 
 
@@ -118,7 +123,7 @@ def test_a_path_is_looked_for_where_one_is_and_then_in_the_project(project):
 @pytest.mark.parametrize("which, resolution", [("oldest", "lowest-direct"), ("newest", "highest")])
 def test_versions_are_installed_once_and_tested_every_time(project, which, resolution):
     venv = f".venv-{which}"
-    tested = ["pytest", *ON_EVERY_CORE, "@tests/quick.txt", "-x"]
+    tested = ["pytest", *ON_EVERY_CORE, "@tests/versions.txt", "-x"]
     made = ["uv", "venv", "--quiet", "--clear", "--python", ".venv/bin/python", venv]
     code, calls = calls_of(project, "test-versions", which, "-x")
     assert code == 0
@@ -138,12 +143,10 @@ def test_every_processor_is_tried_even_when_one_fails(project):
     held = f"echo ${{XLA_FLAGS##*=}} $OPENBLAS_CORETYPE >> '{calls}'; [ $OPENBLAS_CORETYPE != Haswell ]\n"
     stand_in(project / ".venv" / "bin" / "pytest", calls, held)
     code, called = calls_of(project, "test-processors", "-x")
-    # The longest file begins, lest it end alone.
-    pages = ["tests/project/test_docs.py", "tests/project/test_readme.py"]
-    left_out = ["--deselect", "tests/project/test_project.py"]
-    tested = ["pytest", *ON_EVERY_CORE, *pages, "@tests/quick.txt", *left_out, "-x"]
     assert (code, called[0]) == (1, ["setup", "test"])
-    assert called[1::2] == [tested, tested]
+    numbers = "@tests/numbers.txt"
+    assert called[1] == ["pytest", *ON_EVERY_CORE, numbers, "-x"]
+    assert called[3] == ["pytest", *ON_EVERY_CORE, "@tests/printed.txt", numbers, "-x"]
     assert called[2::2] == [["AVX2", "Haswell"], ["SSE4_2", "Nehalem"]]
 
 

@@ -151,6 +151,8 @@ def fit(
         wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
     if as_yaml:
         lines = write_scene(found, source, units)
+    elif as_json:
+        lines = wrote
     else:
         lines = [*(row(*each) for each in describe_fit(found, source, units)), *wrote]
     tell({**found.as_dict(), "units": units._asdict()}, lines, as_json)

@@ -10,11 +10,13 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
+from zwidth.fitting.buzz import fit_buzz
 from zwidth.studies.document import load_config
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 WALLS = ["--buzz", "K=6.846kN/m B=0 f=40.1Hz", "--buzz", "K = 15.86 kN/m, B = 18.7, f = 68.6"]
 POINTS = [(6846.0, 0.0, 40.1), (15860.0, 18.7, 68.6)]
+pytestmark = pytest.mark.usefixtures("fitted_once")
 
 
 def run(*arguments):
@@ -36,18 +38,13 @@ def log(tmp_path_factory):
 
 def test_walls_are_fitted_as_in_python():
     found = json.loads(run(*WALLS, "--period", "1 ms", "--noise", "2%", "--json"))
-    expected = zwidth.fit_buzz(POINTS, period=1e-3, noise=0.02)
+    expected = fit_buzz(POINTS, period=1e-3, noise=0.02)
     assert found["mass"] == expected.mass
     assert found["next"] == expected.as_dict()["next"] != {}
     assert found["safe_wall"]["stiffness"] == expected.safe_wall().stiffness
     words = run(*WALLS, "--period", "1 ms", "--noise", "0.02")
     assert "m                     100.0 g (95 % between" in words
     assert "measure next" in words
-
-
-def test_the_velocity_estimate_counts():
-    found = json.loads(run(*WALLS, "--period", "1 ms", "--velocity-cutoff", "300", "--json"))
-    assert found["mass"] == zwidth.fit_buzz(POINTS, period=1e-3, velocity=zwidth.LowPass(cutoff=300)).mass
 
 
 def test_a_log_in_millimeters_and_milliseconds(log):
@@ -59,8 +56,15 @@ def test_a_log_in_millimeters_and_milliseconds(log):
     assert "fitted to             log.csv" in run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f")
 
 
-@pytest.mark.parametrize("more", [[], ["--velocity-cutoff", "300"], ["--velocity-samples", "3"]])
-def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, tmp_path):
+@pytest.mark.parametrize(
+    "more, velocity",
+    [
+        ([], zwidth.BackwardDifference()),
+        (["--velocity-cutoff", "300"], zwidth.LowPass(cutoff=300)),
+        (["--velocity-samples", "3"], zwidth.WindowedDifference(samples=3)),
+    ],
+)
+def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, velocity, tmp_path):
     text = run(*WALLS, "--period", "1 ms", "--yaml", *more)
     assert text.startswith("# Fitted to 2 buzzing walls: 95 % between")
     assert text.count("# fitted, 95 % between") == 3
@@ -68,6 +72,7 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, 
     file.write_text(text, encoding="utf-8")
     assert load_config(file).name == "fitted_device"
     fitted = json.loads(run(*WALLS, "--period", "1 ms", "--json", *more))
+    assert fitted["mass"] == fit_buzz(POINTS, period=1e-3, velocity=velocity).mass
     for name in ("mass", "damping", "delay"):
         written = float(re.findall(rf"{name}: (\S+) ", text)[0])
         # Digits beyond a thousandth of the error say nothing.
@@ -166,7 +171,7 @@ def test_walls_of_a_rotary_axis():
     walls = ["--buzz", "K=6.846 N m/rad B=0 f=40.1Hz", "--buzz", "K=276.809mNm/deg B=18.7 mNms/rad f=68.6"]
     options = ["--period", "1 ms", "--noise", "2%"]
     found = json.loads(run(*walls, *options, "--json"))
-    expected = zwidth.fit_buzz([(6.846, 0.0, 40.1), (0.276809 * 180 / np.pi, 0.0187, 68.6)], period=1e-3, noise=0.02)
+    expected = fit_buzz([(6.846, 0.0, 40.1), (0.276809 * 180 / np.pi, 0.0187, 68.6)], period=1e-3, noise=0.02)
     assert found["mass"] == pytest.approx(expected.mass, rel=1e-12)
     assert found["units"]["stiffness"] == "N m/rad"
     words = run(*walls, *options)

@@ -4,8 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from chunks import failing_on_2
 from matplotlib.figure import Figure
-from sweeping import config_of, failing_on_2, main_of, run_sweeps, study
+from sweeping import config_of, main_of, run_sweeps, study
 
 from zwidth.figures import draw_curves, draw_outlines, draw_plane
 from zwidth.runs import draw

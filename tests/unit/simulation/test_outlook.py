@@ -219,7 +219,7 @@ def test_a_held_body_is_let_go_by_what_swings_behind_it():
     given = {"start_velocity": 0.2, "coulomb": np.linspace(0.05, 6.0, 60)}
     later = coupled.simulate(2e3, 5.0, **given, periods=1500)
     told, broken, clear = 0, 0, 0.0
-    for periods in range(10, 100, 10):
+    for periods in range(10, 100, 20):
         now = coupled.simulate(2e3, 5.0, **given, periods=periods, record=False)
         held, loose = later.sticking[:, periods - 1], ~later.sticking[:, periods:].all(1)
         settles = np.isin(now.outcome, [CODES.REST, CODES.DECAYING])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fitted_once import fitting_once
 
 import zwidth
 from zwidth.config.reader import read_mapping
@@ -21,6 +22,7 @@ WALLS = [
     {"stiffness": "19.7 kN/m", "virtual_damping": 37.4, "frequency": 89.1},
 ]
 HEARD = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]
+pytestmark = pytest.mark.usefixtures("fitted_once")
 LOG = "version: 1\nname: a\nstudies:\n  - kind: fit\n    name: f\n"
 
 
@@ -37,7 +39,8 @@ def study_of(**keys):
 @pytest.fixture(scope="module")
 def both():
     """The study of configs/fit.yaml."""
-    return only_study(load_config(ROOT / "configs" / "fit.yaml")).compute(None, True)
+    with fitting_once():
+        return only_study(load_config(ROOT / "configs" / "fit.yaml")).compute(None, True)
 
 
 @pytest.fixture

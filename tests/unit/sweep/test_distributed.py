@@ -11,21 +11,8 @@ from typing import Any
 
 import pytest
 import yaml
-from sweeping import (
-    assert_same,
-    config_of,
-    config_of_everything,
-    cut,
-    doing_nothing,
-    flags,
-    killed_on_2,
-    killed_once_on_2,
-    killing_the_scheduler_on_2,
-    main_of,
-    run_sweeps,
-    stopping_the_scheduler_on_2,
-    study,
-)
+from chunks import doing_nothing, killed_on_2, killed_once_on_2, killing_the_scheduler_on_2, stopping_the_scheduler_on_2
+from sweeping import assert_same, config_of, config_of_everything, cut, flags, main_of, run_sweeps, study
 
 from zwidth.words.errors import InputError
 
@@ -34,8 +21,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pyte
 
 
 @pytest.fixture(scope="module")
-def cluster():
-    """The address of a scheduler with two workers, each of which is replaced when it dies."""
+def workers():
+    """A scheduler with two workers, each of which is replaced when it dies."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from dask import config
@@ -48,7 +35,13 @@ def cluster():
         with few:
             cluster = LocalCluster(processes=True, **options)
             with cluster:
-                yield cluster.scheduler_address
+                yield cluster
+
+
+@pytest.fixture
+def cluster(workers):
+    """The address of its scheduler."""
+    return workers.scheduler_address
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +67,11 @@ def test_work_of_a_killed_worker_is_done_by_another(cluster, finished, tmp_path)
     assert_same(finished, tmp_path)
 
 
-def test_a_chunk_that_always_kills_its_worker_is_named_and_the_exit_code_is_1(cluster, tmp_path, monkeypatch, capsys):
+def test_a_chunk_that_always_kills_its_worker_is_named_and_the_exit_code_is_1(
+    workers, cluster, tmp_path, monkeypatch, capsys
+):
+    # With a first death dask gives up the chunk, and those that its worker had begun; one by one they are tried again.
+    monkeypatch.setattr(workers.scheduler, "allowed_failures", 0)
     monkeypatch.setattr("zwidth.sweep.jobs.perform", killed_on_2)
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump({"version": 1, "name": "sweep", "studies": [study()]}), encoding="utf-8")
