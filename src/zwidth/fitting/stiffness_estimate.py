@@ -88,11 +88,21 @@ def _doubt_period(period: float) -> list[str]:
     ]
 
 
-def in_si(theta: Iterable[float], period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mass, damping and delay of ``(ln m, delta, d)``, and their derivatives in these; ``ln cutoff`` may follow."""
-    log_mass, delta, d, *log_cutoff = theta
-    mass, rest = float(np.exp(log_mass)), np.exp(log_cutoff)
-    rate = mass / period
-    by_theta = np.diag([mass, rate, period, *rest])
-    by_theta[1, 0] = delta * rate
-    return np.array([mass, delta * rate, d * period, *rest]), by_theta
+def in_si(theta: np.ndarray, period: float, lag: int = 0, modes: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """What `scene_of` takes, of ``theta`` as `zwidth.fitting.buzzing` has it, and its derivatives in that."""
+    values, units = theta.copy(), np.ones(theta.size)
+    logarithmic = np.arange(theta.size) > 2
+    share = np.arange(theta.size - 1, theta.size - 1 - 3 * modes, -3)
+    logarithmic[share], logarithmic[0] = False, True
+    first = theta.size - lag - 3 * modes
+    units[first : first + 1] = period if lag else 1.0
+    units[share - 2] = 0.5 / (np.pi * period)
+    values[logarithmic] = np.exp(values[logarithmic])
+    mass, rate = values[0], values[0] / period
+    values *= units
+    by_theta = np.diag(np.where(logarithmic, values, units))
+    values[1:3] *= rate, period
+    by_theta[1, 0], by_theta[1, 1], by_theta[2, 2] = values[1], rate, period
+    values[share] = mass / theta[share]
+    by_theta[share, share], by_theta[share, 0] = -values[share] / theta[share], values[share]
+    return values, by_theta

@@ -177,6 +177,7 @@ def spell_rival(rival: RivalDevice, units: AxisUnits = LINEAR) -> str:
     """Its numbers in a line."""
     parts = {SYMBOLS[name]: units.spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
     parts |= {} if rival.cutoff is None else {SYMBOLS["cutoff"]: units.spell("cutoff", rival.cutoff)}
+    parts |= {_name_part(name, 1).strip(): units.spell(name, value) for name, value in (rival.parts or {}).items()}
     parts[SYMBOLS["stiffness_max"]] = units.spell("stiffness", rival.stiffness_max)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 
