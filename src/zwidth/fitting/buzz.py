@@ -44,11 +44,14 @@ def fit_buzz(
     noise: float | tuple[float, float] | None = None,
     unknown_cutoff: bool = False,
 ) -> DeviceFit:
-    """Find mass, damping and delay from walls at the onset of buzzing and their frequencies.
+    """Find mass, damping and delay from walls at the onset of buzzing, and a lag or a resonance where they ask for it.
 
-    On ``z = e^(j 2 pi f T)`` each wall gives two real equations, ``K + B F(z)/T = (m/T^2) q(z; b T/m, t_d/T)``, the
-    closed form of `zwidth.boundary`. Two walls of different damping determine m, b and t_d; more are least squares of
-    the relative deviations of K and f, with B exact.
+    On ``z = e^(j 2 pi f T)`` each wall gives two real equations, ``K + B F(z)/T = (m/T^2) q(z)`` with ``q = -1/G``, the
+    closed form of `zwidth.boundary`. Two walls of different damping determine m, b and t_d of a rigid mass; more are
+    least squares of the relative deviations of K and f, with B exact. Where a rigid mass leaves more than noise, an
+    amplifier's lag (first or second order), a resonance, or a first-order lag and a resonance are tried, as far as the
+    walls are more than the unknowns: each number more has to explain what Schwarz's criterion asks for, and what chance
+    explains in one of 100 cases.
 
     Args:
         points: walls, each (K in N/m, B in N s/m, f in Hz) or a `zwidth.BuzzPoint`; K > 0, 0 < f < 1/(2 T). At least
@@ -60,14 +63,15 @@ def fit_buzz(
             to the last digit then counts once.
         unknown_cutoff: whether the cut-off of ``velocity``, a `zwidth.LowPass` or `zwidth.Butterworth`, is a fourth
             unknown, and the one given only a place to look at. It asks for three walls or more, at two dampings B > 0
-            at least: a wall of B = 0 says nothing about the filter.
+            at least: a wall of B = 0 says nothing about the filter. Lags and resonances are not looked for then.
 
     Returns:
-        DeviceFit: ``mass``, ``damping``, ``delay``, their ``errors`` and ``covariance``; ``stiffness_max`` with
-        ``stiffness_error``; ``intervals``, 95 %; ``residuals``; ``doubts``; ``next``, the experiment that narrows K_max
-        most; ``status``: UNDECIDED where another device fits as well (those are ``rivals``), NO_BOUNDARY where the
-        walls do not lie on the edge of its stable set or contradict each other; K_max is NaN then, see
-        `zwidth.DeviceFit`.
+        DeviceFit: ``mass``, ``damping``, ``delay``, ``actuator``, ``modes``, their ``errors`` and ``covariance``;
+        ``stiffness_max`` with ``stiffness_error``; ``intervals``, 95 %, that of K_max down to what buzzed at the
+        largest B where K_max has more; ``residuals``; ``doubts``; ``next``, the experiment that narrows K_max most, or
+        tells the device from one of another kind; ``status``: UNDECIDED where another device fits as well (those are
+        ``rivals``), NO_BOUNDARY where the walls do not lie on the edge of its stable set or contradict each other;
+        K_max is NaN then, see `zwidth.DeviceFit`.
 
     Raises:
         InputError: a number is impossible, or an experiment is missing, which the message names.
@@ -83,6 +87,7 @@ def fit_buzz(
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V (the boundary). Boggs, Rogers 1990 (errors in both coordinates).
+        Schwarz 1978, Annals of Statistics 6, 461-464 (further numbers).
 
     Example:
         >>> import zwidth

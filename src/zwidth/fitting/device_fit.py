@@ -101,7 +101,7 @@ class DeviceFit:
 
     Attributes:
         mass, damping, delay: estimates in kg, N s/m, s.
-        actuator, modes: of a log, the amplifier's lag and the resonances that it asks for, a `zwidth.Actuator` or None
+        actuator, modes: the amplifier's lag and the resonances that the records ask for, a `zwidth.Actuator` or None
             and `zwidth.Mode`; the sensor of a positive modal mass is at the motor, of a negative one beyond a node.
         errors: standard errors of the three, by name, of "cutoff" where that was unknown, and of the parts by their
             paths, as "actuator.time_constant" and "modes.0.frequency".
@@ -116,7 +116,8 @@ class DeviceFit:
         status: of `zwidth.Status`: UNDECIDED where another device fits as well, or where a log shows more than the
             model has.
         rivals: those devices, a `zwidth.RivalDevice` each.
-        next: the further experiment that narrows K_max most; None of a log.
+        next: the further experiment that narrows K_max most, or tells the device from a rival of another kind; None of
+            a log.
         offset: constant force in N beside the commanded one, of a log; its error in ``errors``.
         friction: Coulomb friction in N, of a log; its error in ``errors``, NaN where the log leaves it open.
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
@@ -353,9 +354,10 @@ class DeviceFit:
             ln m, b, t_d (and 1/cutoff) normal with the fit's covariance, or Student's t where the noise was estimated;
             draws of negative ones are drawn again. A rigid device: rows and columns in closed form, K to 0.1 %, in
             about 0.1 s; of 20,000 other devices of 69 fits each, 98.5 to 99.2 % bore it, and of 2 % more stiffness at
-            most 91.4 % at any B. With a filter: boundaries on a grid of frequencies, judged by eigenvalues, in some
-            seconds. Hidden resonances, one at a time with damping ratios from 0.005 on, by ``response`` and its radius:
-            what the residuals show of each and four standard errors, as `zwidth.MeasuredDevice` decides.
+            most 91.4 % at any B. With a filter, and of walls with an amplifier or a resonance: boundaries on a grid of
+            frequencies, judged by eigenvalues, in some seconds. Hidden resonances, one at a time with damping ratios
+            from 0.005 on, by ``response`` and its radius: what the residuals show of each and four standard errors, as
+            `zwidth.MeasuredDevice` decides.
 
         References:
             Hulin, Preusche, Hirzinger 2006, section V (the stable set). Kotz, Nadarajah 2004 (the t distribution).
@@ -366,7 +368,7 @@ class DeviceFit:
             >>> fit = zwidth.fit_buzz(heard, period="1 ms", noise=0.02)
             >>> wall = fit.safe_wall()
             >>> print(f"{wall.stiffness / 1e3:.1f} of {fit.stiffness_max / 1e3:.1f} kN/m")
-            19.0 of 19.9 kN/m
+            18.8 of 19.9 kN/m
         """
         from zwidth.fitting.safe_wall import find_safe_wall
 

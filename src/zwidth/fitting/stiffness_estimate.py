@@ -90,19 +90,18 @@ def _doubt_period(period: float) -> list[str]:
 
 def in_si(theta: np.ndarray, period: float, lag: int = 0, modes: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """What `scene_of` takes, of ``theta`` as `zwidth.fitting.buzzing` has it, and its derivatives in that."""
-    values, units = theta.copy(), np.ones(theta.size)
-    logarithmic = np.arange(theta.size) > 2
-    share = np.arange(theta.size - 1, theta.size - 1 - 3 * modes, -3)
-    logarithmic[share], logarithmic[0] = False, True
-    first = theta.size - lag - 3 * modes
-    units[first : first + 1] = period if lag else 1.0
-    units[share - 2] = 0.5 / (np.pi * period)
-    values[logarithmic] = np.exp(values[logarithmic])
-    mass, rate = values[0], values[0] / period
-    values *= units
-    by_theta = np.diag(np.where(logarithmic, values, units))
-    values[1:3] *= rate, period
-    by_theta[1, 0], by_theta[1, 1], by_theta[2, 2] = values[1], rate, period
-    values[share] = mass / theta[share]
-    by_theta[share, share], by_theta[share, 0] = -values[share] / theta[share], values[share]
+    ringing = theta.size - 3 * modes
+    mass = float(np.exp(theta[0]))
+    units = np.array([mass / period, period])
+    # A cut-off, the numbers of a lag, and of modes are the exponentials of theta, but for what a mode moves.
+    values = np.concatenate([[mass], theta[1:3] * units, np.exp(theta[3:])])
+    if lag:
+        values[ringing - lag] *= period
+    values[ringing::3] *= 0.5 / (np.pi * period)
+    shares = theta[ringing + 2 :: 3]
+    values[ringing + 2 :: 3] = mass / shares
+    slopes = values.copy()
+    slopes[1:3], slopes[ringing + 2 :: 3] = units, -mass / shares**2
+    by_theta = np.diag(slopes)
+    by_theta[1, 0], by_theta[ringing + 2 :: 3, 0] = values[1], values[ringing + 2 :: 3]
     return values, by_theta
