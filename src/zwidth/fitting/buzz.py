@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.circle import circle
-from zwidth.fitting.buzz_choosing import AS_GOOD, EXACT, Trial, choose_device, find_edges
+from zwidth.fitting.buzz_choosing import AS_GOOD, EXACT, FittedKind, choose_device, find_edges
 from zwidth.fitting.buzz_devices import Candidate, is_blind, weigh
 from zwidth.fitting.buzz_points import BuzzPoint as BuzzPoint
 from zwidth.fitting.buzz_points import read_noise, read_points
@@ -51,7 +51,7 @@ def fit_buzz(
     least squares of the relative deviations of K and f, with B exact. Where a rigid mass leaves more than noise, an
     amplifier's lag (first or second order), a resonance, or a first-order lag and a resonance are tried, as far as the
     walls are more than the unknowns: each number more has to explain what Schwarz's criterion asks for, and what chance
-    explains in one of 100 cases.
+    explains in one of 300 cases.
 
     Args:
         points: walls, each (K in N/m, B in N s/m, f in Hz) or a `zwidth.BuzzPoint`; K > 0, 0 < f < 1/(2 T). At least
@@ -143,7 +143,7 @@ def fit_buzz(
     stiffest = StiffnessEstimate.at(chosen.scene(best.theta), unknown_cutoff)
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
     gradient = stiffest.gradient @ by_theta
-    rivals: list[tuple[Trial, np.ndarray]] = []
+    rivals: list[tuple[FittedKind, np.ndarray]] = []
     apart = [best.theta]
     for other in equals[1:] if status == Status.OK else ():
         # Not along the flat floor of the same valley.
@@ -151,10 +151,10 @@ def fit_buzz(
             apart.append(other.theta)
             rivals.append((chosen, other.theta))
     error = float(np.sqrt(stiffest.gradient @ covariance @ stiffest.gradient))
-    for trial in others if status == Status.OK else ():
+    for kind in others if status == Status.OK else ():
         # Devices of other kinds whose K_max is the same say nothing else of walls.
-        if abs(float(trial.scene(trial.best.theta).max_stiffness().stiffness) - stiffest.value) > error:
-            rivals.append((trial, trial.best.theta))
+        if abs(float(kind.scene(kind.best.theta).max_stiffness().stiffness) - stiffest.value) > error:
+            rivals.append((kind, kind.best.theta))
     told = tuple(_describe_rival(*rival) for rival in rivals)
     if rivals:
         status = Status.UNDECIDED
@@ -187,9 +187,9 @@ def fit_buzz(
     return replace(found, damping_tried=damping, stiffness_tried=stiffness)
 
 
-def _describe_rival(trial: Trial, theta: np.ndarray) -> RivalDevice:
-    scene = trial.scene(theta)
-    names = name_numbers(scene, trial.onsets.unknown_cutoff)
+def _describe_rival(kind: FittedKind, theta: np.ndarray) -> RivalDevice:
+    scene = kind.scene(theta)
+    names = name_numbers(scene, kind.onsets.unknown_cutoff)
     own = {name: scene.parameters()[name] for name in names}
     cutoff, parts = own.pop("velocity.cutoff", None), dict(list(own.items())[3:])
     stiffness = float(scene.max_stiffness().stiffness)
@@ -219,12 +219,12 @@ def _refuse_blind(slopes: np.ndarray, theta: np.ndarray, table: np.ndarray, on_e
 
 
 def _further(
-    chosen: Trial,
+    chosen: FittedKind,
     stiffest: float,
     information: np.ndarray,
     wanted: np.ndarray,
     precision: np.ndarray,
-    rivals: list[tuple[Trial, np.ndarray]],
+    rivals: list[tuple[FittedKind, np.ndarray]],
 ) -> FurtherExperiment | None:
     """The wall of the device's own boundary, B >= 0, after which K_max is known best.
 
@@ -252,9 +252,9 @@ def _further(
     more = np.einsum("nki,k,nkj->nij", rows, precision, rows)
     after = np.linalg.solve(information + more, wanted[:, None])[..., 0] @ wanted
     best = int(np.argmin(after))
-    for trial, other in rivals[:1]:
-        if trial is not chosen:
-            there = replace(trial.onsets, kappa=walls.kappa, rub=walls.rub, w=walls.w).follow(other)
+    for kind, other in rivals[:1]:
+        if kind is not chosen:
+            there = replace(kind.onsets, kappa=walls.kappa, rub=walls.rub, w=walls.w).follow(other)
             away = np.log([there.kappa / walls.kappa, there.w / walls.w]) ** 2
             best = int(np.nanargmax(np.where(there.found, precision @ away, 0.0)))
     return FurtherExperiment(

@@ -19,15 +19,15 @@ AS_GOOD = 5.99
 EXACT = 1e-12
 # An edge of the stable set lies between walls so much softer and stiffer.
 _BESIDE = 1e-6
-# Lags' orders and numbers of modes that are tried, the fewest numbers first.
+# Orders of lags and numbers of modes that are tried, the fewest unknowns first.
 _KINDS = ((1, 0), (2, 0), (0, 1), (1, 1))
 # Few walls: what further numbers explain of noise more often than this is no evidence of them.
-_CHANCE = 0.01
+_CHANCE = 0.003
 # Residuals that are rounding alone.
 _ROUNDING = 1e-9
 
 
-class Trial(NamedTuple):
+class FittedKind(NamedTuple):
     """A kind of device at its best: the variance in units of the weights, and all devices of it that fit as well.
 
     None are equal where no device has the walls on the edge of its stable set.
@@ -78,53 +78,57 @@ class Trial(NamedTuple):
         return scene_of(values, onsets.period, onsets.velocity, onsets.lag, onsets.modes)
 
 
-def choose_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> tuple[Trial, list[Trial]]:
+def choose_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> tuple[FittedKind, list[FittedKind]]:
     """The likeliest kind of device, and others that are about as likely where it is no rigid one.
 
     Parts are looked for where they could explain more than chance does, beside a known cut-off alone.
     """
-    tried = [chosen] = [_try(onsets, weights, known_noise)]
+    rigid = chosen = _try(onsets, weights, known_noise)
+    tried = [rigid]
     for lag, modes in () if onsets.unknown_cutoff else _KINDS:
         richer = replace(onsets, lag=lag, modes=modes)
         more = richer.unknowns - chosen.onsets.unknowns
+        if chosen.freedom <= more:
+            continue
+        price = chosen.price(more)
+        # No device leaves less than this.
         least = 0.0 if known_noise else chosen.equations * np.log(chosen.equations * _ROUNDING**2)
-        if chosen.freedom <= more or chosen.misfit - least <= chosen.price(more):
+        if chosen.misfit - least <= price:
             continue
         tried.append(_try(richer, weights, known_noise))
-        if chosen.misfit - tried[-1].misfit > chosen.price(more):
+        if chosen.misfit - tried[-1].misfit > price:
             chosen = tried[-1]
-    rigid = chosen is tried[0]
-    others = [trial for trial in tried if trial is not chosen and trial.cost < chosen.cost + AS_GOOD]
-    return chosen, [] if rigid else others
+    others = [kind for kind in tried if kind is not chosen and kind.cost < chosen.cost + AS_GOOD]
+    return chosen, [] if chosen is rigid else others
 
 
-def _try(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> Trial:
+def _try(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> FittedKind:
     """The best device of a kind, and all that fit as well."""
     nothing = Candidate(np.zeros(onsets.unknowns), np.inf, np.full((onsets.w.size, 2), np.nan), (), False)
     found = find_candidates(onsets, weights) or [nothing]
     freedom = 2 * onsets.w.size - onsets.unknowns
-    trial = Trial(onsets, found[0], 1.0, [], known_noise)
+    kind = FittedKind(onsets, found[0], 1.0, [], known_noise)
     scale = 1.0
     for fit in found:
-        if not fit.found or (trial.equals and fit.squares - trial.equals[0].squares >= AS_GOOD * scale):
+        if not fit.found or (kind.equals and fit.squares - kind.equals[0].squares >= AS_GOOD * scale):
             continue
         # Parts are found where the walls tell their numbers; of a rigid device it is said which wall is missing.
         parts = onsets.lag + onsets.modes > 0
-        if _at_edge(trial, fit) and not (parts and is_blind(weigh(onsets.follow(fit.theta).slopes, weights))):
-            trial.equals.append(fit)
+        if _at_edge(kind, fit) and not (parts and is_blind(weigh(onsets.follow(fit.theta).slopes, weights))):
+            kind.equals.append(fit)
             if not known_noise:
-                scale = max(trial.equals[0].squares / freedom, EXACT**2)
-    best = (trial.equals or found)[0]
-    return trial._replace(best=best, scale=1.0 if known_noise else max(best.squares / freedom, EXACT**2))
+                scale = max(kind.equals[0].squares / freedom, EXACT**2)
+    best = (kind.equals or found)[0]
+    return kind._replace(best=best, scale=1.0 if known_noise else max(best.squares / freedom, EXACT**2))
 
 
-def _at_edge(trial: Trial, fit: Candidate) -> bool:
+def _at_edge(kind: FittedKind, fit: Candidate) -> bool:
     """Whether the fitted walls are where stability ends as K rises: other lobes hold walls that buzzed long before."""
-    onsets = trial.onsets
+    onsets = kind.onsets
     kappa, period = onsets.follow(fit.theta).kappa, onsets.period
     if not np.all(kappa > 0):
         return False
-    return bool(np.all(find_edges(trial.scene(fit.theta), kappa / period**2, onsets.rub / period)))
+    return bool(np.all(find_edges(kind.scene(fit.theta), kappa / period**2, onsets.rub / period)))
 
 
 def find_edges(scene: Scene, stiffness: np.ndarray, virtual_damping: np.ndarray) -> np.ndarray:
