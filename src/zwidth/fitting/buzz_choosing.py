@@ -122,6 +122,7 @@ def _try(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> FittedKind:
     return kind._replace(best=best, scale=1.0 if known_noise else max(best.squares / freedom, EXACT**2))
 
 
+@np.errstate(all="ignore")  # Of parts that no device has, zeros overflow.
 def _at_edge(kind: FittedKind, fit: Candidate) -> bool:
     """Whether the fitted walls are where stability ends as K rises: other lobes hold walls that buzzed long before."""
     onsets = kind.onsets
