@@ -12,9 +12,13 @@ from zwidth.fitting.buzzing import Onsets
 # The dampings b T/m that are started from where nothing buzzes slowly, the number of cut-offs, and how many of the
 # dips.
 _DELTAS = np.geomspace(1e-4, 30.0, 45)
-_CUTOFFS, _STARTS = 16, (6, 12)
+_CUTOFFS, _STARTS, _EVERY = 16, (6, 12), 4
+# Beyond this condition number some direction is not seen at all.
+_BLIND = 1e6
 # Tolerances of a first look and of the end, and the evaluations they may take.
 _NEARLY, _ARRIVED, _MOST_STEPS = 1e-4, 1e-12, (100, 40)
+# Devices with parts that a first look leaves so many times as far away as others are no more followed.
+_FAR = 100.0
 # After so many devices in a row without such walls there is no way back.
 _LOST = 8
 _NAMES = ("mass", "damping", "delay", "cut-off")
@@ -39,13 +43,28 @@ def weigh(slopes: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return (slopes * weights[:, None]).reshape(-1, slopes.shape[-1])
 
 
+def is_blind(slopes: np.ndarray) -> bool:
+    """Whether they do not tell all numbers apart."""
+    sizes = np.linalg.norm(slopes, axis=0)
+    return not np.all(sizes > 0) or bool(np.linalg.cond(slopes / sizes) > _BLIND)
+
+
 def find_candidates(onsets: Onsets, weights: np.ndarray) -> list[Candidate]:
     """Local best fits, the best first. Where damping or delay would be negative, it is held at 0."""
     found: list[Candidate] = []
     # Half a turn over the delay, and some more for noise.
     longest = 1.2 * np.pi / float(onsets.w.max())
-    for start in onsets.starts(_dampings(onsets), longest, _cutoffs(onsets), _STARTS[onsets.unknown_cutoff]):
+    parts = onsets.lag + onsets.modes > 0
+    if parts:
+        starts = onsets.starts_beside(_DELTAS[::_EVERY], longest, _STARTS[0])
+    else:
+        starts = onsets.starts(_dampings(onsets), longest, _cutoffs(onsets), _STARTS[onsets.unknown_cutoff])
+    least = np.inf
+    for start in starts:
         near = _solve(onsets, weights, start, (), _NEARLY)
+        least = min(least, near.squares)
+        if parts and not (near.found and near.squares <= _FAR * least):
+            continue
         if near.found:
             if any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found):
                 continue
@@ -86,12 +105,14 @@ def _solve(
 
     lost = 0
 
+    possible = np.errstate(all="ignore")(onsets.is_possible)
+
     @lru_cache(maxsize=1)  # The solver asks for values and slopes apart.
     def evaluate(values: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
         nonlocal lost
         at = theta.copy()
         at[free] = values
-        if onsets.is_possible(at):
+        if possible(at):
             with np.errstate(all="ignore"):
                 walls = onsets.follow(at)
                 ratios = np.stack([np.log(walls.kappa / onsets.kappa), np.log(walls.w / onsets.w)], -1)

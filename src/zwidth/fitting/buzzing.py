@@ -2,14 +2,22 @@
 
 With z = e^(jw), w = 2 pi f T, a pole pair is on the circle exactly where
 
-    K T^2 + B T F(z) = m q(z; delta, d),     q = -1/G,
+    K T^2 + B T F(z) = m q(z),     q = -1/G,
 
-two real equations a wall. At a known B they determine w and K (docs/theory/scenes.md). A device is looked for as
-``theta = (ln m, delta, d)``, and ``ln cutoff`` where the velocity's cut-off is unknown.
+two real equations a wall, whatever G is. At a known B they determine w and K (docs/theory/scenes.md). A device is
+looked for as ``theta = (ln m, delta, d)``, then ``ln cutoff`` where the velocity's cut-off is unknown, the logarithms
+of an amplifier's time constant in periods and damping ratio, and of each mode those of its frequency in radians a
+period and its damping ratio, and ``m/m_i``.
+
+The lag and the modes add to the response of the mass a sum over their poles p of ``r h(p; z)``, what a force held and
+late by d = n + f moves of ``E' = p E + F``, with zeta = z - 1:
+
+    h = (zeta (e^((1 - f) p) - 1) + e^p - 1)/(p (zeta + 1 - e^p) z^(n + 1))
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -19,6 +27,7 @@ import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle, lag_jet
 from zwidth.fitting.scenes import with_cutoff
+from zwidth.fitting.structure import LAGS, RATIOS, TURNS, amplify, find_roots
 from zwidth.loops.rigid.device import held_plant, split_delay
 from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.velocity import Estimate, Velocity
@@ -26,38 +35,88 @@ from zwidth.parts.velocity import Estimate, Velocity
 # Newton's steps towards w, the longest of them as a share of w, the last one's share (it squares), and the share
 # beyond which w was not found.
 _STEPS, _LONGEST, _ARRIVED, _FOUND = 25, 0.15, 1e-9, 1e-6
-# The step in ln cutoff of a difference of fourth order, and its weights.
-_STEP, _WEIGHTS = 1e-3, {-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12}
+# The step of differences of fourth order, and their weights.
+_STEP, _SIDES, _WEIGHTS = 1e-3, np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
 # No cut-off is looked for above this share of half the sampling rate, or below this one of the lowest frequency heard,
 # where a filter makes of the damper a spring.
 _HIGHEST, _LOWEST = 0.99, 1e-3
 
+# Starts of lags of each order, in periods, and of damping ratios; how many delays and frequencies are looked at, and
+# how far apart the logarithms of starts lie.
+_LAGS: list[list[tuple[float, ...]]] = [[()], [(0.3,), (1.0,), (3.0,)], [(0.3, 0.7), (1.0, 0.7), (3.0, 0.7)]]
+_RATIOS, _DELAYS, _FREQUENCIES, _ALIKE = (0.01, 0.05, 0.3), 16, 24, 0.3
+
 
 class NeededAnswer:
-    """``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)`` of devices, arrays that broadcast with the points asked for."""
+    """``q = -1/G`` of devices, arrays that broadcast with the points asked for.
 
-    def __init__(self, delta: Any, d: Any) -> None:
-        """Of delta and d, described once for all frequencies."""
+    Of a rigid one ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``; ``lag`` is an amplifier's time constant in periods
+    and, of second order, its damping ratio; ``modes`` are frequencies in radians a period, damping ratios, ``m/m_i``.
+    """
+
+    def __init__(self, delta: Any, d: Any, lag: Sequence[Any] = (), modes: Sequence[Sequence[Any]] = ()) -> None:
+        """Of devices, described once for all frequencies."""
         self.whole, fraction = split_delay(np.asarray(d, float))
         self.delta, self.fraction = delta, fraction
         self.plant = held_plant(delta, fraction)
+        pairs = list(_find_poles(delta, lag, modes))
+        self.beside = len(pairs) > 0
+        if pairs:
+            both = np.array(
+                np.broadcast_arrays(fraction + np.zeros(1), *(each for pair in pairs for each in pair))[1:], complex
+            )
+            poles, self.residues = np.where(both[::2] == 0, 1e-300, both[::2]), both[1::2]
+            self.turns, self.full = np.expm1(poles), np.expm1(poles) / poles
+            self.late = np.expm1((1.0 - fraction) * poles) / poles
 
     def jet(self, at: CirclePoints) -> Jet:
         """q and its derivative in w."""
+        rigid = self.rigid_jet(at)
+        if not self.beside:
+            return rigid
+        more = self.add(at)
+        share = 1.0 / (1.0 - rigid.value * more.value)
+        return Jet(rigid.value * share, share**2 * (rigid.slope + rigid.value**2 * more.slope))
+
+    def rigid_jet(self, at: CirclePoints) -> Jet:
+        """The same of the mass alone."""
         plant, turn = self.plant, 1j * at.z
         total, below = _answer(plant, at), at.before + plant.em
         q = -lag_jet(at, self.whole).value * at.before * below / total
         slopes = turn / at.before + turn / below - 1j * (plant.a2 * at.z - plant.a0 / at.z) / total
         return Jet(q, q * (1j * self.whole + slopes))
 
-    def moves(self, at: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The derivatives of q in delta and d."""
+    def add(self, at: CirclePoints) -> Jet:
+        """What lag and modes add to the response, and its derivative in w."""
+        above, below = at.before * self.late + self.full, at.before - self.turns
+        each = self.residues * (lag_jet(at, -self.whole - 1.0).value * above / below)
+        slopes = 1j * (at.z * (self.late / above - 1.0 / below) - self.whole - 1.0)
+        return Jet(each.sum(0), (each * slopes).sum(0))
+
+    def moves(self, at: CirclePoints) -> tuple[np.ndarray, np.ndarray]:
+        """The derivatives in delta and d of q, of the rigid device alone."""
         by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
-        total = _answer(self.plant, at)
+        total, q = _answer(self.plant, at), self.rigid_jet(at).value
         return (
             q * (by_delta.em / (at.before + self.plant.em) - _answer(by_delta, at) / total),
             -q * _answer(by_fraction, at) / total,
         )
+
+
+def _find_poles(delta: Any, lag: Sequence[Any], modes: Sequence[Sequence[Any]]) -> Iterator[tuple[Any, Any]]:
+    """Poles and residues of ``A(s) (1/(s (s + delta)) + sum of modes)`` but for ``1/(s (s + delta))``."""
+    lags = list(zip(*amplify(lag), strict=True))
+    weights = [residue / pole / (pole + delta) for pole, residue in lags]
+    yield from [(pole, weight) for (pole, _), weight in zip(lags, weights, strict=True)]
+    if lags:
+        yield -delta + 0j, -sum(weights)
+    for turns, ratio, share in modes:
+        own = find_roots(turns, ratio)
+        for pole, other in (own, own[::-1]):
+            gain = sum(residue / (pole - late) for late, residue in lags) if lags else 1.0
+            yield pole, share * gain / (pole - other)
+        for pole, residue in lags:
+            yield pole, share * residue / (pole - own[0]) / (pole - own[1])
 
 
 def _answer(plant: Any, at: CirclePoints) -> Any:
@@ -75,7 +134,10 @@ class Followed(NamedTuple):
 
 @dataclass(frozen=True)
 class Onsets:
-    """Measured walls: ``kappa = K T^2`` in kg, ``rub = B T`` in kg, w; and how the velocity was estimated."""
+    """Measured walls: ``kappa = K T^2`` in kg, ``rub = B T`` in kg, w; how the velocity was estimated; which device.
+
+    ``lag`` is the order of its amplifier, 0 for none.
+    """
 
     kappa: np.ndarray
     rub: np.ndarray
@@ -83,6 +145,8 @@ class Onsets:
     velocity: Velocity
     period: float
     unknown_cutoff: bool = False
+    lag: int = 0
+    modes: int = 0
 
     @cached_property
     def _estimate(self) -> Estimate:
@@ -91,6 +155,11 @@ class Onsets:
     @property
     def unknowns(self) -> int:
         """How many numbers are looked for."""
+        return self._rigid + self.lag + 3 * self.modes
+
+    @property
+    def _rigid(self) -> int:
+        """Those before lag and modes."""
         return 4 if self.unknown_cutoff else 3
 
     @property
@@ -105,12 +174,27 @@ class Onsets:
         return with_cutoff(self.velocity, float(np.exp(theta[3]))).estimate(self.period)
 
     def is_possible(self, theta: np.ndarray) -> bool:
-        """Whether a filter of this cut-off is looked for."""
-        return not self.unknown_cutoff or bool(np.log(self.cutoffs[0]) < theta[3] < np.log(self.cutoffs[1]))
+        """Whether a filter of this cut-off, and such parts, are looked for."""
+        ends = [LAGS, RATIOS][: self.lag] + self.modes * [TURNS, RATIOS, (0.0, np.inf)]
+        low, high = np.reshape(ends, (-1, 2)).T
+        parts = np.abs(np.concatenate([np.ravel(part) for part in self._read(theta)]))
+        cutoff = not self.unknown_cutoff or np.log(self.cutoffs[0]) < theta[3] < np.log(self.cutoffs[1])
+        return bool(cutoff and np.all((low < parts) & (parts < high)))
+
+    def _read(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The numbers of the amplifier, and of each mode; of thetas along the first axis."""
+        lag, modes = np.split(theta[self._rigid :], [self.lag])
+        modes = modes.reshape(self.modes, 3, *theta.shape[1:]).copy()
+        modes[:, :2] = np.exp(modes[:, :2])
+        return np.exp(lag), modes
+
+    def answer(self, theta: np.ndarray) -> NeededAnswer:
+        """What devices need, one or several along further axes of theta."""
+        return NeededAnswer(theta[1], theta[2], *map(list, self._read(theta)))
 
     def follow(self, theta: np.ndarray) -> Followed:
         """The walls of theta at these dampings, w nearest to the measured ones."""
-        mass, answer, estimate = np.exp(theta[0]), NeededAnswer(theta[1], theta[2]), self._estimate_at(theta)
+        mass, answer, estimate = np.exp(theta[0]), self.answer(theta), self._estimate_at(theta)
         w = self.w
         step = np.full(w.shape, np.inf)
         for _ in range(_STEPS):
@@ -125,11 +209,20 @@ class Onsets:
         f, q = estimate.jet(at), answer.jet(at)
         kappa = (mass * q.value - self.rub * f.value).real
         # kappa and w as theta moves: d kappa + e_w dw = m dq - rub dF with e_w = rub F' - m q'.
-        moved = mass * np.stack([q.value, *answer.moves(at, q.value)], -1)
+        change = np.stack([q.value, *answer.moves(at)], -1)
+        if answer.beside:
+            # q = -1/G: what moves the mass alone counts by the square of its share.
+            change[:, 1:] *= (q.value / answer.rigid_jet(at).value)[:, None] ** 2
+            k = np.r_[1, 2, self._rigid : self.unknowns]
+            sides = theta[:, None, None, None] + _STEP * np.eye(theta.size)[:, k, None, None] * _SIDES[:, None]
+            more = np.einsum("kjn,j->nk", self.answer(sides).add(at).value, _WEIGHTS) / _STEP
+            more *= (q.value**2)[:, None]
+            change[:, 1:] += more[:, :2]
+            change = np.concatenate([change, more[:, 2:]], -1)
+        moved = mass * change
         if self.unknown_cutoff:
-            sides = {k: self._estimate_at(theta + _STEP * k * np.eye(4)[3]).jet(at).value for k in _WEIGHTS}
-            change = sum(weight * sides[k] for k, weight in _WEIGHTS.items()) / _STEP
-            moved = np.concatenate([moved, -(self.rub * change)[:, None]], -1)
+            sides = [self._estimate_at(theta + _STEP * k * np.eye(theta.size)[3]).jet(at).value for k in _SIDES]
+            moved = np.insert(moved, 3, -self.rub * (_WEIGHTS @ sides) / _STEP, -1)
         by_w = (self.rub * f.slope - mass * q.slope)[:, None]
         dw = moved.imag / by_w.imag
         slopes = np.stack([(moved.real - by_w.real * dw) / kappa[:, None], dw / w[:, None]], 1)
@@ -158,3 +251,37 @@ class Onsets:
         return [
             np.array([log_mass[c, i, j], deltas[i], delays[j], np.log(cutoffs[c])][: self.unknowns]) for c, i, j in dips
         ]
+
+    def starts_beside(self, deltas: np.ndarray, longest: float, count: int) -> list[np.ndarray]:
+        """Devices with lag and modes to start from: the lowest dips over their time constants and frequencies.
+
+        Where the walls have the responses ``-1/(K T^2 + B T F)``, ``1/m`` and ``1/m_i`` are linear least squares.
+        """
+        delays = np.linspace(0.0, longest, _DELAYS)
+        at = circle(self.w)
+        wanted = -1.0 / (self.kappa + self.rub * self._estimate.jet(at).value)
+        frequencies = np.geomspace(max(0.5 * self.w.min(), 1.1 * TURNS[0]), 0.9 * TURNS[1], _FREQUENCIES)
+        found: list[tuple[float, np.ndarray]] = []
+        for lag, ratio in product(_LAGS[self.lag], _RATIOS[: None if self.modes else 1]):
+            grid = deltas[:, None, None, None], delays[:, None, None]
+            mass = -1.0 / NeededAnswer(*grid, lag).jet(at).value / wanted
+            ringing = [(frequencies[:, None], ratio, 1.0)][: self.modes]
+            mode = -1.0 / NeededAnswer(*grid, lag, ringing).jet(at).value / wanted - mass
+            (aa, bb, ab), (a, b) = (
+                [(one * other.conj()).real.sum(-1) for one, other in ((mass, mass), (mode, mode), (mass, mode))],
+                [each.real.sum(-1) for each in (mass, mode)],
+            )
+            with np.errstate(all="ignore"):
+                share = (aa * b - ab * a) / (bb * a - ab * b) if self.modes else 0.0 * bb
+                inverse = (a + share * b) / (aa + share * (2.0 * ab + share * bb))
+                cost = np.where(inverse > 0, self.w.size - inverse * (a + share * b), np.inf)
+            for k in range(cost.shape[2]):
+                i, j = np.unravel_index(np.nanargmin(cost[:, :, k]), cost.shape[:2])
+                rest = [np.log(frequencies[k]), np.log(ratio), share[i, j, k]][: 3 * self.modes]
+                theta = [-np.log(inverse[i, j, k]), deltas[i], delays[j], *np.log(lag), *rest]
+                found.append((float(cost[i, j, k]), np.array(theta)))
+        kept: list[np.ndarray] = []
+        for _, theta in sorted(found, key=lambda each: each[0]):
+            if all(np.abs(theta - other)[3:].max() > _ALIKE for other in kept):
+                kept.append(theta)
+        return kept[:count]

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from zwidth.fitting.safe_wall import SafeWall
 
 NAMES = ("mass", "damping", "delay")
-# Of the intervals.
-_CONFIDENCE = 0.95
+# Of the intervals, and of their upper ends.
+_CONFIDENCE, _UPPER = 0.95, 0.975
 # Standard errors within which everything lies.
 _FAR = 1e3
 # Of standard errors, for differences.
@@ -72,13 +72,17 @@ class FittedMotion(NamedTuple):
 
 
 class RivalDevice(NamedTuple):
-    """Another device that fits as well: kg, N s/m, s, its K_max in N/m, its cut-off in Hz where that was unknown."""
+    """Another device that fits as well: kg, N s/m, s, its K_max in N/m, its cut-off in Hz where that was unknown.
+
+    ``parts`` are the numbers of its amplifier and its resonance by their paths, None of a rigid one.
+    """
 
     mass: float
     damping: float
     delay: float
     stiffness_max: float
     cutoff: float | None = None
+    parts: dict[str, float] | None = None
 
 
 @shown(
@@ -97,7 +101,7 @@ class DeviceFit:
 
     Attributes:
         mass, damping, delay: estimates in kg, N s/m, s.
-        actuator, modes: of a log, the amplifier's lag and the resonances that it asks for, a `zwidth.Actuator` or None
+        actuator, modes: the amplifier's lag and the resonances that the records ask for, a `zwidth.Actuator` or None
             and `zwidth.Mode`; the sensor of a positive modal mass is at the motor, of a negative one beyond a node.
         errors: standard errors of the three, by name, of "cutoff" where that was unknown, and of the parts by their
             paths, as "actuator.time_constant" and "modes.0.frequency".
@@ -112,7 +116,8 @@ class DeviceFit:
         status: of `zwidth.Status`: UNDECIDED where another device fits as well, or where a log shows more than the
             model has.
         rivals: those devices, a `zwidth.RivalDevice` each.
-        next: the further experiment that narrows K_max most; None of a log.
+        next: the further experiment that narrows K_max most, or tells the device from a rival of another kind; None of
+            a log.
         offset: constant force in N beside the commanded one, of a log; its error in ``errors``.
         friction: Coulomb friction in N, of a log; its error in ``errors``, NaN where the log leaves it open.
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
@@ -127,7 +132,8 @@ class DeviceFit:
         hidden: of a log, ``(odds, stiffness_max)``: how likely the device has a resonance more than the log asks for
             against none, and K_max with such ones over that without, all equally likely; the interval of K_max is that
             of all these devices. None as ``response``.
-        damping_tried: of walls that buzzed, the largest B among them, in N s/m; None of a log.
+        damping_tried, stiffness_tried: of walls that buzzed, the largest B among them, in N s/m, and the K in N/m that
+            buzzed there; None of a log.
         freedom: degrees of freedom that the noise was estimated with; None where it is known.
     """
 
@@ -157,6 +163,7 @@ class DeviceFit:
     lag: HiddenLag | None = None
     hidden: HiddenResonances | None = None
     damping_tried: float | None = None
+    stiffness_tried: float | None = None
 
     @property
     def numbers(self) -> tuple[str, ...]:
@@ -268,7 +275,10 @@ class DeviceFit:
 
     @property
     def intervals(self) -> dict[str, ErrorBar]:
-        """95 % intervals by name: of what ``errors`` has, and of "stiffness_max", with ``hidden`` and up to ``lag``."""
+        """95 % intervals by name: of what ``errors`` has, and of "stiffness_max", with ``hidden`` and up to ``lag``.
+
+        Where K_max has more damping than the walls that buzzed, it reaches down to what buzzed at the most of them.
+        """
         errors = self.errors | {"stiffness_max": self.stiffness_error}
         reaches = {name: (self.value_of(name), self.reach * error) for name, error in errors.items()}
         # A NaN stays one; a constant force and the mass of a mode may be negative.
@@ -280,10 +290,19 @@ class DeviceFit:
             bar = self._average(*self.hidden)
             # What is printed beside the interval lies in it, also where most devices have another K_max.
             bars["stiffness_max"] = ErrorBar(min(bar.low, self.stiffness_max), max(bar.high, self.stiffness_max))
+        if self.damping_tried is not None and self.virtual_damping > self.damping_tried:
+            # Beyond the dampings tried K_max is what the model says; it is at least what buzzed there.
+            bar, tried = bars["stiffness_max"], self.bear_tried(_UPPER)
+            bars["stiffness_max"] = ErrorBar(min(bar.low, tried), bar.high)
         if self.lag is not None:
             bar, more = bars["stiffness_max"], self.lag.stiffness_max - self.stiffness_max
             bars["stiffness_max"] = ErrorBar(bar.low, bar.high + max(more, 0.0))
         return bars
+
+    def bear_tried(self, confidence: float) -> float:
+        """What the K that buzzed at the largest damping tried is at least, by its noise."""
+        noise = self.noise[0] if isinstance(self.noise, tuple) else 0.0
+        return max(0.0, (self.stiffness_tried or 0.0) * (1.0 - reach_of(self.freedom, confidence) * noise))
 
     def _average(self, odds: float, ratios: np.ndarray) -> ErrorBar:
         """The interval of K_max over the device without a hidden resonance and those with one."""
@@ -335,9 +354,10 @@ class DeviceFit:
             ln m, b, t_d (and 1/cutoff) normal with the fit's covariance, or Student's t where the noise was estimated;
             draws of negative ones are drawn again. A rigid device: rows and columns in closed form, K to 0.1 %, in
             about 0.1 s; of 20,000 other devices of 69 fits each, 98.5 to 99.2 % bore it, and of 2 % more stiffness at
-            most 91.4 % at any B. With a filter: boundaries on a grid of frequencies, judged by eigenvalues, in some
-            seconds. Hidden resonances, one at a time with damping ratios from 0.005 on, by ``response`` and its radius:
-            what the residuals show of each and four standard errors, as `zwidth.MeasuredDevice` decides.
+            most 91.4 % at any B. With a filter, and of walls with an amplifier or a resonance: boundaries on a grid of
+            frequencies, judged by eigenvalues, in some seconds. Hidden resonances, one at a time with damping ratios
+            from 0.005 on, by ``response`` and its radius: what the residuals show of each and four standard errors, as
+            `zwidth.MeasuredDevice` decides.
 
         References:
             Hulin, Preusche, Hirzinger 2006, section V (the stable set). Kotz, Nadarajah 2004 (the t distribution).
@@ -348,7 +368,7 @@ class DeviceFit:
             >>> fit = zwidth.fit_buzz(heard, period="1 ms", noise=0.02)
             >>> wall = fit.safe_wall()
             >>> print(f"{wall.stiffness / 1e3:.1f} of {fit.stiffness_max / 1e3:.1f} kN/m")
-            19.0 of 19.9 kN/m
+            18.8 of 19.9 kN/m
         """
         from zwidth.fitting.safe_wall import find_safe_wall
 
@@ -390,9 +410,8 @@ def _may_be_negative(name: str) -> bool:
     return name == "offset" or (name.startswith("modes") and name.endswith("mass"))
 
 
-def reach_of(freedom: int | None) -> float:
-    """Standard errors to either side: of a known noise, or of one estimated with so many degrees of freedom."""
+def reach_of(freedom: int | None, upper: float = _UPPER) -> float:
+    """Standard errors to a side: of a known noise, or of one estimated with so many degrees of freedom."""
     from scipy.special import ndtri, stdtrit
 
-    upper = 0.5 + 0.5 * _CONFIDENCE
     return float(ndtri(upper) if freedom is None else stdtrit(freedom, upper))

@@ -4,8 +4,8 @@ Raised from below: a device bears (K, B) where every softer wall of that B is st
 and columns of the stable set are intervals (docs/theory/one-lobe.md), so that at each K the dampings that most devices
 bear are counted from the ends of their columns, and K is halved between what they bear and what they do not.
 
-With a velocity filter rows are looked for on a grid of frequencies (`zwidth.fitting.device_rows`); eigenvalues then
-judge the wall on every device.
+With a velocity filter, an amplifier or resonances rows are looked for on a grid of frequencies
+(`zwidth.fitting.device_rows`); eigenvalues then judge the wall on every device.
 
 A log bounds resonances as well: how large one may be and not show. The fitted response with that radius decides walls
 as a measured one does (docs/theory/measured.md), and a wall counts that it decides too.
@@ -20,7 +20,6 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import NeededAnswer
 from zwidth.fitting.device_rows import DeviceRows, find_highest
-from zwidth.fitting.scenes import scene_of
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.loop import RigidVariants
 from zwidth.loops.rigid.device import device_status
@@ -50,6 +49,8 @@ _CLOSE, _NOTHING = 1e-3, 1e-4
 _BELOW = 1e-9
 # Frequencies: of slow loops, evenly, and more for each period of delay.
 _SLOWEST, _SLOW, _EVEN, _EVEN_PER_PERIOD = 1e-4, 60, 400, 40
+# Beside a resonance, in half-widths.
+_BESIDE = np.sinh(np.linspace(-4.0, 4.0, 241))
 # The longest delay looked at, in periods, and for each period of the estimated one.
 _FARTHEST = (20.0, 1.5)
 # Judged at K and at this share of it; how many devices eigenvalues may judge otherwise than the grid.
@@ -83,14 +84,15 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
     drawn = draw_devices(fit, count, seed)
     if drawn is None:
         return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
-    if fit.is_structured:
+    if fit.is_structured and fit.damping_tried is None:
         return _bear_response(fit, reliability, rigid, drawn)
-    filtered = scene.velocity != BackwardDifference()
-    devices = _FilteredDevices(drawn, scene, "cutoff" in fit.errors) if filtered else _RigidDevices(drawn, scene)
-    (stiffness, virtual_damping), resonance = devices.find(reliability), np.nan
-    if not rigid and fit.damping_tried is not None and virtual_damping > fit.damping_tried:
-        virtual_damping = fit.damping_tried
-        stiffness = devices.limit(virtual_damping, reliability)
+    searched = fit.is_structured or scene.velocity != BackwardDifference()
+    devices = _SearchedDevices(drawn, fit) if searched else _RigidDevices(drawn, scene)
+    most = np.inf if rigid or fit.damping_tried is None else fit.damping_tried
+    (stiffness, virtual_damping), resonance = devices.find(reliability, most), np.nan
+    if virtual_damping == most:
+        # A resonance may bend the edge there already, and leave the walls as a rigid device does.
+        stiffness = min(stiffness, fit.bear_tried(reliability))
     if not rigid and fit.responding is not None and not bears_resonances(fit, stiffness, virtual_damping):
         # Nothing is sure of walls with B < 0 that is not of those with B = 0.
         top = fit.responding.max_stiffness(negative_damping=False)
@@ -101,7 +103,7 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
         return SafeWall(0.0, 0.0, 1.0, int(Status.OK), resonance)
     stiffness *= 1.0 - _BELOW
     share = devices.share(stiffness, virtual_damping)
-    if share < reliability - _ASTRAY:
+    if share < reliability - max(_ASTRAY, 1.0 / count):
         return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
     return SafeWall(stiffness, virtual_damping, share, int(Status.OK), resonance)
 
@@ -180,8 +182,8 @@ class _RigidDevices:
     def __init__(self, drawn: np.ndarray, scene: Scene) -> None:
         self.devices = RigidVariants(scene, dict(zip(("mass", "damping", "delay"), drawn.T, strict=True)))
 
-    def find(self, reliability: float) -> tuple[float, float]:
-        """K and B, both 0 where there is none."""
+    def find(self, reliability: float, most: float) -> tuple[float, float]:
+        """K and B, which is ``most`` at most; both 0 where there is none."""
         low, high, damping = 0.0, borne_by(self.devices.stiffest()[0], reliability), 0.0
         least = _NOTHING * high
         while high > max((1.0 + _CLOSE) * low, least):
@@ -192,6 +194,8 @@ class _RigidDevices:
                 low, damping = borne, tried
             if borne < stiffness:
                 high = stiffness
+        if damping > most:
+            low, damping = self.limit(most, reliability), most
         return (low, damping) if low > least else (0.0, 0.0)
 
     def limit(self, virtual_damping: float, reliability: float) -> float:
@@ -215,36 +219,43 @@ class _RigidDevices:
         return float(self.devices.labels(stiffness, virtual_damping).mean())
 
 
-class _FilteredDevices:
-    """Devices with any velocity filter, by their boundaries on a grid of frequencies; only B >= 0 counts."""
+class _SearchedDevices:
+    """Devices with a filter or parts, by their boundaries on a grid of frequencies; only B >= 0 counts."""
 
-    def __init__(self, drawn: np.ndarray, scene: Scene, unknown_cutoff: bool) -> None:
-        self.period = scene.timing.period
+    def __init__(self, drawn: np.ndarray, fit: DeviceFit) -> None:
+        period, scene = fit.period, fit.scene
         with np.errstate(all="ignore"):
-            rate, d = drawn[:, 0] / self.period, drawn[:, 2] / self.period
+            rate, d = drawn[:, 0] / period, drawn[:, 2] / period
             known = device_status(drawn[:, 1] / rate, d) == Status.OK
         known &= (drawn[:, 0] > SI_RANGE[0]) & (drawn[:, 0] < SI_RANGE[1]) & (d < _FARTHEST[0] + _FARTHEST[1] * scene.d)
         # Beyond what is looked at nothing is believed to be borne.
         self.others = np.zeros(np.count_nonzero(~known))
-        drawn, d = drawn[known], d[known]
-        delta = drawn[:, 1] / rate[known]
-        self.scenes = [scene_of(values, self.period, scene.velocity) for values in drawn]
+        drawn, d, rate = drawn[known], d[known], rate[known]
+        self.scenes = [fit.vary(values) for values in drawn]
         even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max(initial=0.0)))[1:]
-        at = circle(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
-        some = self.scenes if unknown_cutoff else [scene]
+        w = np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even])
+        lag, modes = _read_parts(drawn, fit)
+        if modes:
+            beside = [np.clip(turns * (1.0 + ratio * _BESIDE), _SLOWEST, np.pi) for turns, ratio, _ in modes]
+            w = np.sort(np.concatenate([np.broadcast_to(w, (len(drawn), w.size)), *beside], -1), -1)
+        at = circle(w)
+        some = self.scenes if "cutoff" in fit.errors else [scene]
         with np.errstate(all="ignore"):
-            velocity = np.array([one.velocity.estimate(self.period).jet(at).value for one in some]) / self.period
-            needed = NeededAnswer(delta[:, None], d[:, None]).jet(at).value * (rate[known] / self.period)[:, None]
+            velocity = np.array([one.velocity.estimate(period).jet(at).value for one in some]) / period
+            velocity = velocity.reshape(-1, w.shape[-1])
+            answer = NeededAnswer((drawn[:, 1] / rate)[:, None], d[:, None], lag, modes)
+            needed = answer.jet(at).value * (rate / period)[:, None]
             # At z = -1 both are real.
             needed[:, -1], velocity[:, -1] = np.real(needed[:, -1]), np.real(velocity[:, -1])
             self.rows = DeviceRows(needed, velocity)
 
-    def find(self, reliability: float) -> tuple[float, float]:
-        """K and B, both 0 where there is none."""
+    def find(self, reliability: float, most: float) -> tuple[float, float]:
+        """K and B, which is ``most`` at most; both 0 where there is none."""
         top = self._borne_by(self.rows.ends, reliability)
         if not np.isfinite(top):
             top = float(np.max(self.rows.ends, where=np.isfinite(self.rows.ends), initial=0.0))
-        limits, dampings = find_highest(lambda tried: np.array([self.limit(tried[0], reliability)]), np.array([top]))
+        top = np.array([min(top, most)])
+        limits, dampings = find_highest(lambda tried: np.array([self.limit(tried[0], reliability)]), top)
         return (float(limits[0]), float(dampings[0])) if limits[0] > 0 else (0.0, 0.0)
 
     def limit(self, virtual_damping: float, reliability: float) -> float:
@@ -258,6 +269,18 @@ class _FilteredDevices:
 
     def _borne_by(self, limits: np.ndarray, reliability: float) -> float:
         return borne_by(np.concatenate([limits, self.others]), reliability)
+
+
+def _read_parts(drawn: np.ndarray, fit: DeviceFit) -> tuple[list[np.ndarray], list[tuple[np.ndarray, ...]]]:
+    """Lag and modes of drawn devices as `NeededAnswer` has them, each number a column."""
+    columns = {name: values[:, None] for name, values in zip(fit.numbers, drawn.T, strict=True)}
+    units = {"actuator.time_constant": 1.0 / fit.period, "actuator.damping_ratio": 1.0}
+    lag = [columns[name] * unit for name, unit in units.items() if name in columns]
+    modes = []
+    for k in range(len(fit.modes)):
+        hertz, ratio, mass = (columns[f"modes.{k}.{name}"] for name in ("frequency", "damping_ratio", "mass"))
+        modes.append((2.0 * np.pi * fit.period * hertz, ratio, columns["mass"] / mass))
+    return lag, modes
 
 
 def _bears(scene: Scene, stiffness: float, virtual_damping: float) -> bool:

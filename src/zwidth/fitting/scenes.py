@@ -6,18 +6,28 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
+from zwidth.parts.actuator import Actuator
 from zwidth.parts.device import Device
+from zwidth.parts.mode import Mode
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
 
 
-def scene_of(values: Iterable[float], period: float, velocity: Velocity) -> Scene:
-    """A device of this mass, damping and delay with its timing; a fourth value is the velocity's cut-off."""
-    mass, damping, delay, *cutoff = map(float, values)
-    if cutoff:
-        velocity = with_cutoff(velocity, cutoff[0])
-    return Scene(Device(mass, damping), Timing(period=period, delay=delay), velocity=velocity)
+def scene_of(values: Iterable[float], period: float, velocity: Velocity, lag: int = 0, modes: int = 0) -> Scene:
+    """A device with its timing, of numbers that go as `name_numbers` names them; ``lag`` is an amplifier's order.
+
+    One number more is the velocity's cut-off.
+    """
+    mass, damping, delay, *beside = map(float, values)
+    first = len(beside) - lag - 3 * modes
+    if first:
+        velocity = with_cutoff(velocity, beside[0])
+    constant, *ratio = beside[first : first + lag] or [None]
+    actuator = Actuator(None, constant, lag, *ratio) if lag else None
+    ringing = [Mode(*beside[k : k + 3]) for k in range(first + lag, len(beside), 3)]
+    device = Device(mass, damping, actuator=actuator, modes=ringing)
+    return Scene(device, Timing(period=period, delay=delay), velocity=velocity)
 
 
 def name_numbers(scene: Scene, cutoff: bool = False) -> tuple[str, ...]:

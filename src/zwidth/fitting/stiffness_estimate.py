@@ -88,11 +88,20 @@ def _doubt_period(period: float) -> list[str]:
     ]
 
 
-def in_si(theta: Iterable[float], period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mass, damping and delay of ``(ln m, delta, d)``, and their derivatives in these; ``ln cutoff`` may follow."""
-    log_mass, delta, d, *log_cutoff = theta
-    mass, rest = float(np.exp(log_mass)), np.exp(log_cutoff)
-    rate = mass / period
-    by_theta = np.diag([mass, rate, period, *rest])
-    by_theta[1, 0] = delta * rate
-    return np.array([mass, delta * rate, d * period, *rest]), by_theta
+def in_si(theta: np.ndarray, period: float, lag: int = 0, modes: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """What `scene_of` takes, of ``theta`` as `zwidth.fitting.buzzing` has it, and its derivatives in that."""
+    ringing = theta.size - 3 * modes
+    mass = float(np.exp(theta[0]))
+    units = np.array([mass / period, period])
+    # A cut-off, the numbers of a lag, and of modes are the exponentials of theta, but for what a mode moves.
+    values = np.concatenate([[mass], theta[1:3] * units, np.exp(theta[3:])])
+    if lag:
+        values[ringing - lag] *= period
+    values[ringing::3] *= 0.5 / (np.pi * period)
+    shares = theta[ringing + 2 :: 3]
+    values[ringing + 2 :: 3] = mass / shares
+    slopes = values.copy()
+    slopes[1:3], slopes[ringing + 2 :: 3] = units, -mass / shares**2
+    by_theta = np.diag(slopes)
+    by_theta[1, 0], by_theta[ringing + 2 :: 3, 0] = values[1], values[ringing + 2 :: 3]
+    return values, by_theta

@@ -11,25 +11,23 @@ frequencies, -A'(0), which is the same but for the bends of the force within a t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from zwidth.fitting.moving import Recording, Recordings, recur
+from zwidth.fitting.scenes import scene_of
 from zwidth.loops.rigid.device import phi_functions
-from zwidth.parts.actuator import Actuator
-from zwidth.parts.device import Device
-from zwidth.parts.mode import Mode
-from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
 
 # Of theta's differences: of delta and d absolute, of all else relative.
 _STEP = 1e-6
 # Time constants of amplifiers in periods, frequencies in radians a period, damping ratios.
-_LAGS, _TURNS, _RATIOS = (0.02, 5.0), (0.0125, 3.11), (5e-4, 4.0)
+LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (5e-4, 4.0)
 # A double pole has no partial fractions.
 _DOUBLE = 1e-5
 
@@ -48,7 +46,7 @@ class StructuredRecordings(Recordings):
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         low, high = super().bounds()
-        ends = [_LAGS, _RATIOS][: self.lag] + self.modes * [_TURNS, _RATIOS, (-np.inf, np.inf)]
+        ends = [LAGS, RATIOS][: self.lag] + self.modes * [TURNS, RATIOS, (-np.inf, np.inf)]
         low[self.parts], high[self.parts] = np.reshape(ends, (-1, 2)).T
         return low, high
 
@@ -84,12 +82,11 @@ class StructuredRecordings(Recordings):
 def to_scene(model: Recordings, theta: np.ndarray, period: float, velocity: Velocity) -> Scene:
     """The scene of theta; its numbers go as `zwidth.fitting.scenes.name_numbers` names them."""
     mass, (lag, modes) = period**2 / theta[0], np.split(theta[model.parts], [model.lag])
-    ratio = float(lag[1]) if model.lag == 2 else None
-    actuator = Actuator(None, float(lag[0] * period), model.lag, ratio) if model.lag else None
-    in_si = modes.reshape(-1, 3) * [0.5 / (np.pi * period), 1.0, period**-2]
-    modes = [Mode(float(hertz), float(ratio), float(1.0 / gain)) for hertz, ratio, gain in in_si]
-    device = Device(float(mass), float(theta[1] * mass / period), actuator=actuator, modes=modes)
-    return Scene(device, Timing(period=period, delay=float(theta[2] * period)), velocity=velocity)
+    late = lag * [period, 1.0][: model.lag]
+    ringing = modes.reshape(-1, 3) * [0.5 / (np.pi * period), 1.0, period**-2]
+    ringing[:, 2] = 1.0 / ringing[:, 2]
+    values = [mass, theta[1] * mass / period, theta[2] * period, *late, *ringing.ravel()]
+    return scene_of(values, period, velocity, model.lag, model.modes)
 
 
 def derive_numbers(model: Recordings, theta: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +102,7 @@ def derive_numbers(model: Recordings, theta: np.ndarray, period: float) -> tuple
 def add_lag(theta: np.ndarray, log: Recording, order: int) -> np.ndarray:
     """What an amplifier adds to the motion of the mass with g = 1 whose force comes later, a column."""
     delta, d = theta[1:3]
-    poles, residues = _amplifier(theta, order)
+    poles, residues = amplify(theta[3 : 3 + order])
     weights = residues / poles / (poles + delta)
     ways = [np.real(weight * _follow(log, pole, d)) for pole, weight in zip(poles, weights, strict=True)]
     later = _slide(log, delta, d) - _slide(log, delta, d + _delay(theta, order, log)[0])
@@ -124,8 +121,8 @@ def _delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.nda
 
 def _ring(theta: np.ndarray, log: Recording, order: int, mode: int) -> np.ndarray:
     """What a mode with ``T^2/m = 1`` adds, behind the amplifier, a column."""
-    own = _roots(*theta[mode : mode + 2])
-    poles, residues = _amplifier(theta, order)
+    own = find_roots(*theta[mode : mode + 2])
+    poles, residues = amplify(theta[3 : 3 + order])
     place = np.zeros(log.position.size)
     for pole, residue in zip(poles, residues, strict=True):
         place += (residue / np.prod(pole - own) * _follow(log, pole, theta[2])).real
@@ -137,23 +134,23 @@ def _ring(theta: np.ndarray, log: Recording, order: int, mode: int) -> np.ndarra
 
 def _ring_on(theta: np.ndarray, log: Recording, mode: int) -> np.ndarray:
     """How a mode moves that did so before, two columns."""
-    own, other = np.exp(np.arange(log.position.size)[:, None] * _roots(*theta[mode : mode + 2])).T
+    own, other = np.exp(np.arange(log.position.size)[:, None] * find_roots(*theta[mode : mode + 2])).T
     return np.stack([own.real, own.imag if own.imag.any() else other.real], -1)
 
 
-def _amplifier(theta: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Poles and residues of A."""
-    if order == 0:
+def amplify(lag: Sequence[Any] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poles and residues of A, along the first axis, by its time constant and damping ratio; none without them."""
+    if len(lag) == 0:
         return np.zeros(0), np.zeros(0)
-    poles = _roots(1.0 / theta[3], theta[4]) if order == 2 else -1.0 / theta[3:4] + 0j
-    return poles, np.prod(-poles) / np.array([np.prod(pole - poles[poles != pole]) for pole in poles])
+    poles = find_roots(1.0 / lag[0], lag[1]) if len(lag) == 2 else np.array([-1.0 / lag[0] + 0j])
+    return poles, np.prod(-poles, 0) / (poles - poles[::-1] if len(lag) == 2 else np.ones_like(poles))
 
 
-def _roots(w: float, ratio: float) -> np.ndarray:
-    """Of ``s^2 + 2 zeta w s + w^2``; a double one is parted a little."""
+def find_roots(w: Any, ratio: Any) -> np.ndarray:
+    """Of ``s^2 + 2 zeta w s + w^2``, along the first axis; a double one is parted a little."""
     inside = ratio**2 - 1.0
-    root = np.sqrt((inside if abs(inside) > _DOUBLE else _DOUBLE) + 0j)
-    return w * np.array([-ratio + root, -ratio - root])
+    root = np.sqrt(np.where(np.abs(inside) > _DOUBLE, inside, _DOUBLE) + 0j)
+    return np.array([w * (-ratio + root), w * (-ratio - root)])
 
 
 def _differ(function: Callable[[np.ndarray], np.ndarray], theta: np.ndarray, k: int, columns: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ _TROUBLES = {
     Status.UNREACHABLE: "the delay ends the range looked in",
 }
 _SEE_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
+_TRY_MORE = "try walls of more damping"
 NO_WALL = "under a doubt no safe wall is given, and none to set; do what it says, and record again"
 
 
@@ -134,6 +135,8 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     if not fit.is_doubted and (rigid := choose_wall(fit, rigid=True)) not in (None, wall):
         at = "" if math.isnan(safe.resonance) else f" near {with_unit(safe.resonance, 'Hz', 3)}"
         hidden = f"a resonance{at} may make stiffer walls unstable, K_max too, and not show in this log: {_SEE_MORE}"
+        if fit.damping_tried is not None:
+            hidden = f"a resonance may make other walls unstable, K_max too, and not show in these: {_TRY_MORE}"
         alone = "if nothing hides" if fit.is_structured else "if it is rigid"
         rows += [("not seen", hidden), (alone, f"{_spell_wall(rigid, units)}: {rigid.why}")]
     if fit.next is not None:
@@ -177,6 +180,7 @@ def spell_rival(rival: RivalDevice, units: AxisUnits = LINEAR) -> str:
     """Its numbers in a line."""
     parts = {SYMBOLS[name]: units.spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
     parts |= {} if rival.cutoff is None else {SYMBOLS["cutoff"]: units.spell("cutoff", rival.cutoff)}
+    parts |= {_name_part(name, 1).strip(): units.spell(name, value) for name, value in (rival.parts or {}).items()}
     parts[SYMBOLS["stiffness_max"]] = units.spell("stiffness", rival.stiffness_max)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 

@@ -316,7 +316,7 @@ def _compare(one: DeviceFit, other: DeviceFit) -> str:
     """Whether two fits of one device agree, by how far apart they are in their common covariance."""
     values = [np.array([fit.mass, fit.damping, fit.delay]) for fit in (one, other)]
     away = values[0] - values[1]
-    spread = sum((fit.reach / _NORMAL) ** 2 * fit.covariance for fit in (one, other))
+    spread = sum((fit.reach / _NORMAL) ** 2 * fit.covariance[:3, :3] for fit in (one, other))
     # Exact records would leave nothing to divide by.
     floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
     far = float(away @ np.linalg.solve(spread + np.diag(floor), away))

@@ -258,7 +258,7 @@ def test_noise_is_a_share(noise):
 
 
 def test_the_result_as_plain_numbers():
-    fit = zwidth.fit_buzz(HEARD, period=1e-3, noise=0.02)
+    fit = zwidth.fit_buzz([*HEARD, (19307.6, 50.0, 101.017455)], period=1e-3, noise=0.02)
     plain = fit.as_dict()
     assert plain["mass"] == fit.mass
     assert plain["intervals"]["stiffness_max"] == [

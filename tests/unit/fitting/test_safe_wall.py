@@ -35,7 +35,8 @@ def share_of(devices, stiffness, virtual_damping):
 
 
 def test_other_devices_bear_it_and_hardly_more_they_do_not(fit):
-    wall, devices = fit.safe_wall(), draw(fit, 20_000, 99)
+    # Of a rigid device the noise of the one wall with most damping is no limit.
+    wall, devices = fit.safe_wall(rigid=True), draw(fit, 20_000, 99)
     assert wall.status == Status.OK
     # 0.1 % is the error of a share of 99 % among 8,000 devices.
     assert share_of(devices, wall.stiffness, wall.virtual_damping) == pytest.approx(0.99, abs=0.004)
