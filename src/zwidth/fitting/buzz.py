@@ -19,9 +19,8 @@ from zwidth.fitting.device_fit import (
     MASS_OPEN,
     VAGUE,
     DeviceFit,
-    FurtherExperiment,
-    RivalDevice,
 )
+from zwidth.fitting.fit_records import FurtherExperiment, RivalDevice
 from zwidth.fitting.scenes import name_numbers
 from zwidth.fitting.stiffness_estimate import StiffnessEstimate, in_si
 from zwidth.fitting.words import spell_rival

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zwidth.fitting.fit_records import ErrorBar, FittedMotion, FurtherExperiment, RivalDevice
 from zwidth.fitting.scenes import name_numbers, scene_of
 from zwidth.parts.actuator import Actuator
 from zwidth.parts.measured import MeasuredDevice
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from zwidth.fitting.safe_wall import SafeWall
 
 NAMES = ("mass", "damping", "delay")
-# Of the intervals, and of their upper ends.
-_CONFIDENCE, _UPPER = 0.95, 0.975
+# Of the upper ends of intervals of 95 %.
+_UPPER = 0.975
 # Standard errors within which everything lies.
 _FAR = 1e3
 # Of standard errors, for differences.
@@ -38,51 +39,6 @@ BEYOND = 3.0
 # Of the usual safe wall.
 _RELIABILITY = 0.99
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of it"
-
-
-class ErrorBar(NamedTuple):
-    """An interval that holds the true value with 95 % confidence."""
-
-    low: float
-    high: float
-
-
-class FurtherExperiment(NamedTuple):
-    """Raise K at this damping until the wall buzzes: N s/m, the N/m and Hz expected, and K_max's error afterwards.
-
-    That error is NaN where K_max is.
-    """
-
-    virtual_damping: float
-    stiffness: float
-    frequency: float
-    error_afterwards: float
-
-
-class FittedMotion(NamedTuple):
-    """One log beside its fit, a number a sample: times in s, forces in N, positions in m.
-
-    ``modelled`` is NaN at the first samples, whose past forces are unknown, and behind the first 200,000.
-    """
-
-    time: np.ndarray
-    force: np.ndarray
-    position: np.ndarray
-    modelled: np.ndarray
-
-
-class RivalDevice(NamedTuple):
-    """Another device that fits as well: kg, N s/m, s, its K_max in N/m, its cut-off in Hz where that was unknown.
-
-    ``parts`` are the numbers of its amplifier and its resonance by their paths, None of a rigid one.
-    """
-
-    mass: float
-    damping: float
-    delay: float
-    stiffness_max: float
-    cutoff: float | None = None
-    parts: dict[str, float] | None = None
 
 
 @shown(
@@ -317,7 +273,7 @@ class DeviceFit:
             return float(weights @ stdtr(self.freedom, (stiffness - middles) / self.stiffness_error)) - share
 
         low, high = (
-            float(brentq(exceed, -far, far, args=(0.5 + side * 0.5 * _CONFIDENCE,)))  # pyright: ignore[reportArgumentType]  (a number unless asked)
+            float(brentq(exceed, -far, far, args=(0.5 + side * (_UPPER - 0.5),)))  # pyright: ignore[reportArgumentType]  (a number unless asked)
             for side in (-1.0, 1.0)
         )
         return ErrorBar(max(0.0, low), high)

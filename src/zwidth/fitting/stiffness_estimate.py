@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zwidth.fitting.device_fit import DeviceFit, FurtherExperiment, RivalDevice
+from zwidth.fitting.device_fit import DeviceFit
+from zwidth.fitting.fit_records import FurtherExperiment, RivalDevice
 from zwidth.fitting.scenes import name_numbers
 from zwidth.scenes.scene import Scene
 from zwidth.words.formatting import with_unit

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.device_fit import DeviceFit, RivalDevice
+from zwidth.fitting.device_fit import DeviceFit
+from zwidth.fitting.fit_records import RivalDevice
 from zwidth.fitting.safe_wall import SafeWall, bears_resonances
 from zwidth.parts.paths import spell_estimate
 from zwidth.words import rotation

@@ -40,7 +40,7 @@ _LARGEST_SHARE = 1e-3
 _REAL = 1e-6
 # Smaller maps are not worth their cells.
 SMALLEST_MAP = 1 << 11
-# Listed walls whose poles are found at one time without a compiler: half or twice as many take longer.
+# Listed walls whose poles are found at one time without a compiler: in smaller lists they take longer.
 _AT_ONCE = 1 << 13
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3

@@ -239,8 +239,9 @@ def _powers(x: Any, count: int, first: Any = 1.0) -> np.ndarray:
 
 
 @cache
-def _points(poles: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _points(poles: int) -> tuple[np.ndarray, np.ndarray]:
     """Points on a circle and their weights: all around for one pole, and above the real axis for two."""
+    count = _POINTS * poles
     points = np.exp(2j * np.pi * np.arange(count) / count)
     weights = np.full(count, 1.0 / count)
     if poles == 2:
@@ -253,7 +254,7 @@ def sum_up(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
     """The log |1 + u| of one pole, or sums of u/disk and its square over two, by powers of eta and xi (C1)."""
     poles, powers = group.poles, np.arange(_TERMS + 1)
     count = _POINTS * poles
-    points, weights = _points(poles, count)
+    points, weights = _points(poles)
     u = group.disk[:, None] * points
     coefficients = (group.a * group.disk ** powers[:, None]).T
     inverse = 1.0 / np.fft.ifft(coefficients, count, norm="forward")[:, : points.size]
