@@ -134,7 +134,13 @@ def broadcast_traced(values: Iterable[ArrayLike]) -> list[Any]:
     dtype = jnp.result_type(float)
     if dtype == np.float32:
         _warn_of_float32()
-    return jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
+    # Each operation on a concrete value outside of `jit` is a program to compile: what is right is left as it is.
+    arrays = [
+        value if getattr(value, "dtype", None) == dtype else (jnp if is_jax(value) else np).asarray(value, dtype)
+        for value in values
+    ]
+    shape = np.broadcast_shapes(*map(np.shape, arrays))
+    return [array if np.shape(array) == shape else jnp.broadcast_to(array, shape) for array in arrays]
 
 
 _warned = threading.Event()
@@ -287,19 +293,23 @@ def compile_traced(
         active = tuple(not isinstance(tangent, jax.custom_derivatives.SymbolicZero) for tangent in tangents)
         if not any(active):
             return function(*primals), tree_map(_no_change, function(*primals))
-        if slopes is None or is_traced(*primals) or primals[0].size > FEW:
+        if slopes is None or is_traced(*primals) or np.size(primals[0]) > FEW:
             value, sides = sloped(active)(*primals)
         else:
             with np.errstate(all="ignore"):
                 value, sides = slopes(*(np.asarray(primal, np.float64) for primal in primals), *static)
-            value = tree_map(lambda leaf: jax.numpy.asarray(leaf, _type_of(leaf, primals[0])), value)
-            sides = tree_map(lambda *leaves: leaves, *(by for by, moves in zip(sides, active, strict=True) if moves))
+            value, *sides = (
+                tree_map(partial(_as_precise, argument=primals[0]), leaves)
+                for leaves in (value, *(by for by, moves in zip(sides, active, strict=True) if moves))
+            )
+            sides = tree_map(lambda *leaves: leaves, *sides)
         moving = [tangent for tangent, moves in zip(tangents, active, strict=True) if moves]
 
         def change(leaf: Any, by: Any) -> Any:
             if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
                 return _no_change(leaf)
-            parts = [jax.numpy.asarray(by[k], leaf.dtype) * tangent for k, tangent in enumerate(moving)]
+            # Not jax.numpy's product, which compiles a program for what of it does not move: nothing.
+            parts = [jax.lax.mul(by[k], tangent) for k, tangent in enumerate(moving)]
             return sum(parts[1:], parts[0])
 
         return value, tree_map(change, value, sides)
@@ -308,9 +318,13 @@ def compile_traced(
     return function
 
 
-def _type_of(leaf: Any, argument: Any) -> Any:
-    """The type of a result: real numbers are as precise as the argument."""
-    return argument.dtype if np.issubdtype(leaf.dtype, np.inexact) else leaf.dtype
+def _as_precise(leaf: Any, argument: Any) -> Any:
+    """A result of NumPy for JAX: real numbers are as precise as the argument."""
+    import jax
+
+    # Converted by NumPy: by JAX it would be a program to compile.
+    kind = argument.dtype if np.issubdtype(leaf.dtype, np.inexact) else leaf.dtype
+    return jax.numpy.asarray(np.asarray(leaf, kind))
 
 
 def _no_change(leaf: Any) -> Any:
