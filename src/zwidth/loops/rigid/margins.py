@@ -102,8 +102,7 @@ def margins_kernel(
     crossover = gain_crossover(alpha, beta, here)
     crosses = crossover.exists
     w = xp.where(crosses, find_angle(crossover), 1.0)
-    decisive = crosses & (beta > -delta)
-    phase = xp.where(decisive, size_and_phase(w, alpha, beta, here)[1], xp.nan)
+    phase = size_and_phase(w, alpha, beta, here)[1]
     stable = stable_at(alpha, beta, here, ANY)
     gain, phase_crossover = _gain_margin(alpha, beta, here, xp)
     delay = distance = closest = xp.nan * alpha
@@ -114,13 +113,14 @@ def margins_kernel(
         delay = xp.where(stable, _delay_margin(tuple(wall), lag, lead, xp), 0.0)
     if with_modulus:
         distance, closest = modulus(alpha, beta, here)
+    decided = nan_with_nan_slopes(crosses & (beta > -delta), alpha, beta, delta, d)
     fields = (
         _on_the_side(gain, 1.0, epsilon(gain), stable, xp),
-        _on_the_side(phase * (180.0 / np.pi), 0.0, _LEAST_MARGIN, stable, xp),
-        xp.where(stable, xp.maximum(delay, _LEAST_MARGIN), delay),
+        _on_the_side(phase * (180.0 / np.pi), 0.0, _LEAST_MARGIN, stable, xp) + decided,
+        _on_the_side(delay, 0.0, _LEAST_MARGIN, stable, xp),
         distance,
         phase_crossover,
-        xp.where(crosses, w, xp.nan),
+        w + nan_with_nan_slopes(crosses, alpha, beta, delta, d),
         closest,
     )
     return Margins(*(field + spoiled for field in fields))
@@ -128,7 +128,9 @@ def margins_kernel(
 
 def _on_the_side(margin: Array, edge: float, least: float, stable: Array, xp: Any) -> Array:
     """A margin on the verdict's side of the edge: within rounding of it the two would contradict each other."""
-    return xp.where(stable, xp.maximum(margin, edge + least), xp.minimum(margin, edge))
+    nearest = xp.where(stable, edge + least, edge)
+    # It keeps its slopes there.
+    return xp.where((margin < nearest) == stable, nearest + (margin - frozen(margin, xp)), margin)
 
 
 def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple[Array, Array]:
@@ -160,7 +162,7 @@ def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple
     line = xp.abs(here.gap * (alpha + 2.0 * beta))
     last = xp.where(line > 0, 2.0 * (1.0 + here.c) / xp.where(line > 0, line, 1.0), xp.inf)
     gain = xp.where(none, 0.0, xp.minimum(first, last))
-    return gain, xp.where(none, xp.nan, xp.where(last < first, np.pi, w))
+    return gain, xp.where(last < first, np.pi, w) + nan_with_nan_slopes(~none, alpha, beta, here.em)
 
 
 def _falling(slope: Array, step: Array) -> Array:

@@ -239,6 +239,18 @@ def test_traced(x64):
         # The frequency of a minimum is known to half of the digits.
         np.testing.assert_allclose(slopes[:6], expected[:6], rtol=1e-6, atol=1e-7)
         np.testing.assert_allclose(slopes[6], expected[6], rtol=1e-2, atol=1e-2)
+    # Margins that are not there have no slopes: too much gain at every frequency, none that is stable, beta <= -delta.
+    for wall in ((100.0, 100.0, 1.0, 0.0), (0.1, 0.1, 0.0, 1.0), (0.1, -2.0, 1.0, 0.0)):
+        for side in np.eye(4):
+            values, slopes = along(np.array(wall), side)
+            missing = np.isnan(values)
+            assert missing.any()
+            assert np.isnan(slopes[missing]).all()
+    # Where rounding decides on which side of 0 a margin is, its slopes are those beside it.
+    edge = zwidth.boundary(0.5, 0.3, 1.0)
+    for side in np.eye(4)[:3]:
+        slopes, beside = (along(np.array([edge.alpha * by, edge.beta, 0.3, 1.0]), side)[1] for by in (1.0, 1.0 - 1e-7))
+        np.testing.assert_allclose(slopes[:2], beside[:2], rtol=1e-5)
 
 
 def test_the_margin_is_the_distance_of_p_over_its_open_loop():
