@@ -102,16 +102,18 @@ def false_position(
     """Where a function that is positive at ``low`` and not at ``high`` changes sign.
 
     False position with halved weights, every sixth step a bisection. NumPy stops when every point is done: its value
-    no more than rounding, or the bracket no wider than ``width``.
+    no more than rounding, or the bracket no wider than two of ``width``; so far from its ends it is cut at least, or
+    the end that is not next to the zero would stay.
     """
     xp = namespace(low, at_low)
 
     def done(at: _Bracket) -> Array:
-        return (xp.abs(at.value) <= _ROUNDING) | (at.high - at.low <= width)
+        return (xp.abs(at.value) <= _ROUNDING) | (at.high - at.low <= 2.0 * width)
 
     def step(k: Any, at: _Bracket) -> _Bracket:
         gap = at.at_low - at.at_high
         trial = at.low + (at.high - at.low) * (at.at_low / xp.where(gap > 0, gap, 1.0))
+        trial = xp.minimum(xp.maximum(trial, at.low + width), at.high - width)
         inside = (trial > at.low) & (trial < at.high) & (k % 6 != 5)
         # A scalar of NumPy is five times faster than an array of no dimension.
         trial = xp.where(inside, trial, 0.5 * (at.low + at.high))[()]

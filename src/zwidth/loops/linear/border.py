@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import circle
-from zwidth.arrays.roots import false_position
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import CrossingLine, curve_at, zeros_of
 from zwidth.loops.linear.rows import Island, StablePieces, bound_intervals
@@ -19,8 +18,9 @@ from zwidth.words.showing import shown
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.
 _ROUNDS = 11
-# Steps towards a corner, and how far beside it, as a share of w, the edge must be seen to end.
-_STEPS, _BESIDE = 60, 1e-11
+# Steps towards a corner at most, and the one, as a share of w, after which it is reached; how far beside it the edge
+# must be seen to end.
+_STEPS, _ARRIVED, _BESIDE = 20, 1e-15, 1e-11
 _SHARES = np.arange(1, 32) / 32.0
 # How often rows are looked at beside the ends of edges, and how far beside, as a share of what these span; edges of few
 # nodes get so many.
@@ -143,33 +143,43 @@ class Border:
     def _corner(self, inside: float, outside: float) -> float:
         """Where the curve stops to be an edge between two angles: another crossing of its row meets it there."""
         b = self.boundary
-        inside, outside = _narrow(b.borders, inside, outside, 1)
-        own = int(b.arc_at(np.array(inside)))
-
-        def gaps(w: np.ndarray) -> np.ndarray:
-            here = curve_at(b.loop, w)
-            return b.crossings(here.beta).alpha - here.alpha[:, None]
-
-        ends = gaps(np.array([inside, outside]))
-        ends[:, own] = np.nan
-        meets = np.flatnonzero(np.sign(ends[0]) * np.sign(ends[1]) == -1)
+        ends = np.array(_narrow(b.borders, inside, outside, 1))
+        here = curve_at(b.loop, ends)
+        rows = b.crossings(here.beta)
+        gaps = rows.alpha - here.alpha[:, None]
+        gaps[:, int(b.arc_at(ends[0]))] = np.nan
+        meets = np.flatnonzero(np.sign(gaps[0]) * np.sign(gaps[1]) == -1)
         if meets.size == 1:
-            (column,), sign = meets, np.sign(ends[0, meets[0]])
-            first, last = (np.abs(ends[k, column]) for k in (0, 1))
-            low, high, at_low, at_high = np.array([[inside], [outside], [first], [-last]])
-            found = false_position(
-                lambda w: sign * gaps(w)[:, column] / (first + last),
-                low,
-                high,
-                at_low / (first + last),
-                at_high / (first + last),
-                _STEPS,
-                2e-16 * outside,
-            )
-            w = float(found[0])
+            other = int(meets[0])
+            w = self._meeting(np.stack([ends, rows.w[:, other]]), gaps[:, other], other)
             if list(b.borders(np.array([w - _BESIDE * w, w + _BESIDE * w]))) in ([True, False], [False, True]):
                 return w
-        return _narrow(b.borders, inside, outside, _ROUNDS)[0]
+        return _narrow(b.borders, *ends.tolist(), _ROUNDS)[0]
+
+    def _meeting(self, ends: np.ndarray, gaps: np.ndarray, other: int) -> float:
+        """Where the curve meets another crossing of its rows, by Newton's method.
+
+        ``ends`` has the angles of both between which they meet, ``gaps`` how far their alphas are apart there.
+        """
+        b = self.boundary
+        line = b.lines[other - len(b.arcs)] if other >= len(b.arcs) else None
+        low, high = ends.min(1), ends.max(1)
+        w = ends[:, 0] + gaps[0] / (gaps[0] - gaps[1]) * (ends[:, 1] - ends[:, 0])
+        for _ in range(_STEPS):
+            at = curve_at(b.loop, w)
+            with np.errstate(all="ignore"):
+                beta_slope = at.turn / at.fall**2
+                if line is not None:
+                    step = (line.q - at.beta * line.f - at.alpha) / (at.alpha_slope + line.f * beta_slope)
+                    step[1] = 0.0
+                else:
+                    gap, apart = np.diff(at.alpha)[0], np.diff(at.beta)[0]
+                    across = gap * beta_slope[::-1] - apart * at.alpha_slope[::-1]
+                    step = across / (at.alpha_slope[0] * beta_slope[1] - at.alpha_slope[1] * beta_slope[0])
+                before, w = w, np.clip(w + step, low, high)
+            if not abs(w[0] - before[0]) > _ARRIVED * w[0]:
+                break
+        return float(w[0])
 
     @cached_property
     def pieces(self) -> StablePieces:

@@ -118,7 +118,9 @@ def _tops(border: Border, least: float) -> list[_Top]:
         if alpha > 0 and beta >= least:
             line = next(k for k, line in enumerate(b.lines) if line.w == w)
             found.append(_Top(alpha, beta, w, len(b.arcs) + line, False))
-    return sorted(found + (_ends_of_row(b, least) if np.isfinite(least) else []), key=lambda top: -top.alpha)
+    # Along the edge of a real pole that does not depend on B, corners differ by rounding: the most damping counts.
+    ends = _ends_of_row(b, least) if np.isfinite(least) else []
+    return sorted(found + ends, key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta))
 
 
 def _describe(border: Border, top: _Top, negative: bool) -> BoundRidge:
