@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle
-from zwidth.arrays.roots import bisect, false_position
+from zwidth.arrays.roots import false_position
 from zwidth.arrays.xp import within
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import AnyChain
@@ -104,9 +104,16 @@ class OpenLoop(NamedTuple):
             w = np.sort(np.concatenate([w, dips]))
             value, slope = read(self.at(w))
         k = np.flatnonzero((value[:-1] > 0) != (value[1:] > 0))
-        sign = np.where(value[k] > 0, 1.0, -1.0)
-        ends = sign * value[k], sign * value[k + 1]
-        return false_position(lambda x: sign * read(self.at(x))[0], w[k], w[k + 1], *ends, _STEPS, _CLOSED * w[k])
+        return self._zeros(lambda jet: read(jet)[0], w, value, k)
+
+    def _zeros(self, read: Callable[[Jet], np.ndarray], w: np.ndarray, value: np.ndarray, k: np.ndarray) -> np.ndarray:
+        """Where what is read of L changes its sign behind nodes ``k``."""
+        if not k.size:
+            return w[k]
+        sizes = np.abs(value[k]) + np.abs(value[k + 1])
+        sign = np.where(value[k] > 0, 1.0, -1.0) / np.where(sizes > 0, sizes, 1.0)
+        ends = w[k], w[k + 1], sign * value[k], sign * value[k + 1]
+        return false_position(lambda x: sign * read(self.at(x)), *ends, _STEPS, _CLOSED * w[k])
 
     def _dips(
         self, read: Callable[[Jet], tuple[np.ndarray, np.ndarray]], w: np.ndarray, value: np.ndarray, slope: np.ndarray
@@ -118,22 +125,18 @@ class OpenLoop(NamedTuple):
         # At half the rate L may be 0: no tangent of its logarithm leads anywhere from there.
         with np.errstate(invalid="ignore"):
             lowest = np.minimum(size[:-1] - fall[:-1] * step, size[1:] - fall[1:] * step)
-        k = np.flatnonzero(toward & (lowest < 0))
-        return bisect(lambda x: sign[k] * read(self.at(x))[1] < 0, w[k], w[k + 1]) if k.size else w[k]
+        return self._zeros(lambda jet: read(jet)[1], w, slope, np.flatnonzero(toward & (lowest < 0)))
 
     def least_distance(self) -> tuple[float, float]:
         """The least ``|1 + L|`` and its angle."""
-        value, slope = 1.0 + self.L.value, self.L.slope
-        distance = np.abs(value)
-        rising = (value.conj() * slope).real > 0
-        k = np.flatnonzero(~rising[:-1] & rising[1:])
+
+        def slope(jet: Jet) -> np.ndarray:
+            return ((1.0 + jet.value).conj() * jet.slope).real
+
+        distance, rising = np.abs(1.0 + self.L.value), np.nan_to_num(slope(self.L))
+        k = np.flatnonzero((rising[:-1] <= 0) & (rising[1:] > 0))
         k = k[np.minimum(distance[k], distance[k + 1]) < 2.0 * np.nanmin(distance)]
-
-        def nears(w: np.ndarray) -> np.ndarray:
-            jet = self.at(w)
-            return ~(((1.0 + jet.value).conj() * jet.slope).real > 0)
-
-        places = np.concatenate([self.w, bisect(nears, self.w[k], self.w[k + 1]) if k.size else self.w[k]])
+        places = np.concatenate([self.w, self._zeros(slope, self.w, rising, k)])
         distances = np.concatenate([distance, np.abs(1.0 + self.at(places[self.w.size :]).value)])
         rest = self.at_rest()
         if rest is not None:
