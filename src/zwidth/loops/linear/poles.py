@@ -27,6 +27,8 @@ from zwidth.words.types import Array
 _STEPS, _ARRIVED = 60, 4e-16
 # Where the distance from z = 1 has digits of its own that eigenvalues do not know.
 _NEAR_ONE = 1e-6
+# Imaginary parts that are none, as a share.
+_REAL = 1e-13
 # Numbers that a block of walls holds: eigenvalues and the distances between poles take order^2 each.
 _NUMBERS = 1 << 20
 
@@ -149,6 +151,8 @@ def poles_less_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
                 out[some] = _polish(loop, a, b, _start(loop, a, b))
             else:
                 out[some] = _springs(loop, a)
+    # Steps leave rounding on real poles; those of a pair that meets there are 1e-8 apart.
+    out.imag[np.abs(out.imag) <= _REAL * np.abs(out)] = 0.0
     return out.reshape(*shape, order)
 
 
