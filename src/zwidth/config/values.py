@@ -6,6 +6,7 @@ An axis is written as one number, a list, ``{linear: {start, stop, num}}`` or ``
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -157,15 +158,19 @@ Delay = Annotated[Span, quantity_of("delay")]
 Duration = Annotated[Span, Quantity("s", POSITIVE, periods=True)]
 
 
+def share(name: str, schema: dict[str, Any]) -> dict[str, Any]:
+    """A part of the JSON Schema that `zwidth.studies.document.config_json_schema` writes once, under this name."""
+    return {"allOf": [{"shared": re.sub(r"\W+", "_", name.replace("/", " per ")), **schema}]}
+
+
 def describe_entry(unit: str, *more: str) -> dict[str, Any]:
     """The JSON Schema of a number in an SI unit, or with one of the units beside it."""
     dimension = find_dimension(unit)
     pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
-    return {
-        "description": f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}.",
-        "examples": [dimension.example],
-        "anyOf": [{"type": "number"}, {"type": "string", "pattern": pattern}],
-    }
+    words = f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}."
+    forms = [{"type": "number"}, {"type": "string", "pattern": pattern}]
+    name = f"number in {unit}{f' or {more[0]}' if more else ''}"
+    return share(name, {"description": words, "examples": [dimension.example], "anyOf": forms})
 
 
 @dataclass(frozen=True)
@@ -294,9 +299,14 @@ class AxisOf:
         count = {"type": "integer", "minimum": 2, "maximum": LONGEST_AXIS}
         ends = {form: quantity.schema for form, quantity in self._forms.items()}
         keyed = [mapping(**{form: mapping(start=end, stop=end, num=count)}) for form, end in ends.items()]
-        entry = self.quantity.schema
+        entry, unit = self.quantity.schema, self.quantity.unit
         listed = {"type": "array", "items": entry, "minItems": 1, "uniqueItems": True}
-        return {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]}
+        kind = (
+            f"in {unit}{' or periods' * self.quantity.periods}"
+            if unit != "1"
+            else f"of numbers {self.quantity.allowed}".strip()
+        )
+        return share(f"axis {kind}", {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]})
 
 
 def _model_spacing(form: str, entry: Entry) -> Any:
