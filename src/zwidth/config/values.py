@@ -184,7 +184,7 @@ def _read_end(raw: Any, info: ValidationInfo) -> float:
     return cast(Entry, info.context)(raw)
 
 
-class _Linear(Strict):
+class _EqualSteps(Strict):
     """The mapping below ``linear``."""
 
     what: ClassVar[str] = "an axis with 'linear'"
@@ -211,13 +211,16 @@ class _Linear(Strict):
         return []
 
 
-class _Log(_Linear):
+class _EqualRatios(_EqualSteps):
     """The mapping below ``log``."""
 
     what: ClassVar[str] = "an axis with 'log'"
 
 
-_SPACINGS: dict[str, tuple[Any, type[_Linear]]] = {"linear": (np.linspace, _Linear), "log": (np.geomspace, _Log)}
+_SPACINGS: dict[str, tuple[Any, type[_EqualSteps]]] = {
+    "linear": (np.linspace, _EqualSteps),
+    "log": (np.geomspace, _EqualRatios),
+}
 
 
 def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool = True) -> tuple[float, ...]:
