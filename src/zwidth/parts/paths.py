@@ -73,12 +73,12 @@ def list_parameters(scene: Parts) -> dict[str, Any]:
         for prefix, name, part in _parts(scene)
         for item in fields(part)
     }
-    ordered = sorted(found, key=lambda key: key[1] == "wall")
-    return {key[0]: found[key] for key in ordered if _is_number(found[key])}
-
-
-def _is_number(value: Any) -> bool:
-    return is_jax(value) or (isinstance(value, int | float | np.number) and not isinstance(value, bool))
+    ordered = sorted(found.items(), key=lambda item: item[0][1] == "wall")
+    return {
+        path: value
+        for (path, _), value in ordered
+        if is_jax(value) or (isinstance(value, int | float | np.number) and not isinstance(value, bool))
+    }
 
 
 def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
