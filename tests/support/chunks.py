@@ -1,11 +1,33 @@
 """Chunks that go wrong, in a file that a run's processes load in no time: they find them by their names."""
 
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
 
 from zwidth.sweep.jobs import perform
+from zwidth.sweep.plan import Task
+from zwidth.sweep.store import Store
+
+
+def replay_from(finished, out):
+    """Let chunks that kill others be taken from a finished run: a process that soon dies need not load JAX before."""
+    out.with_name(f"{out.name}.finished").write_text(str(finished), encoding="utf-8")
+
+
+def replay(path, family, index):
+    """A chunk of a finished run, its mark at last; computed where none was named."""
+    store, task = Store(Path(path)), Task(family, index)
+    named = store.path.parent.with_name(f"{store.path.parent.name}.finished")
+    if not named.exists():
+        perform(path, family, index)
+    elif not store.is_done(task):
+        source = Store(Path(named.read_text(encoding="utf-8")) / store.path.name)
+        files = [*source.files(task), source.flag(task)], [*store.files(task), store.flag(task)]
+        for theirs, ours in zip(*files, strict=True):
+            ours.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(theirs, ours)
 
 
 def slowly(path, family, index):
@@ -25,7 +47,7 @@ def killed_on_2(path, family, index):
     """Chunk 2 always kills the process that computes it."""
     if index == 2:
         os.kill(os.getpid(), signal.SIGKILL)
-    perform(path, family, index)
+    replay(path, family, index)
 
 
 def killed_once_on_2(path, family, index):
@@ -34,7 +56,7 @@ def killed_once_on_2(path, family, index):
     if index == 2 and not mark.exists():
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    perform(path, family, index)
+    replay(path, family, index)
 
 
 def disturb(path, number):
@@ -47,14 +69,14 @@ def killing_the_scheduler_on_2(path, family, index):
     """The scheduler dies while chunk 2 is computed."""
     if index == 2:
         disturb(path, signal.SIGKILL)
-    perform(path, family, index)
+    replay(path, family, index)
 
 
 def stopping_the_scheduler_on_2(path, family, index):
     """The scheduler falls silent while chunk 2 is computed."""
     if index == 2:
         disturb(path, signal.SIGSTOP)
-    perform(path, family, index)
+    replay(path, family, index)
 
 
 def doing_nothing(path, family, index):

@@ -60,16 +60,11 @@ def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
             raise InputError(f"{name}: got {value!r}; it must be {allowed}")
 
 
-def refuse_masked(name: str, value: ArrayLike) -> None:
-    """Raise `InputError` for a masked array; the module that defines them is loaded by those who make some."""
-    masked = sys.modules.get("numpy.ma")
-    if masked is not None and isinstance(value, masked.MaskedArray):
-        raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
-
-
 def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     """Convert one concrete argument to float64, or say what is wrong with it."""
-    refuse_masked(name, value)
+    # The module that defines masked arrays is loaded by those who make some.
+    if isinstance(value, getattr(sys.modules.get("numpy.ma"), "MaskedArray", ())):
+        raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
     if is_traced(value):
         raise InputError(f"{name}: got a value that JAX traces; give numbers, outside of jit, vmap and grad")
     try:
@@ -354,16 +349,17 @@ def map_blocks(
     block: int,
     threads: int | None = None,
     within: Callable[[], Any] = compute_concretely,
+    exact: bool = False,
 ) -> Any:
     """Apply a function of columns to equally long ones, block by block on every processor; NumPy arrays come back.
 
     One array of a million points is 2.5 times slower for the ridge (benchmarks/bench_xla.py):
     what the function holds meanwhile leaves the cache.
-    Columns of one value are handed over as they are.
+    Columns of one value are handed over as they are. ``exact``: few points fill up a whole block too.
     """
     count = _length(columns)
     # A power of two, so that batches of many sizes share a few compilations.
-    size = min(block, 1 << max(count - 1, _LEAST - 1).bit_length())
+    size = block if exact else min(block, 1 << max(count - 1, _LEAST - 1).bit_length())
     flagged = [(column, column.size == 1 < count) for column in columns]
 
     def run(start: int) -> Any:

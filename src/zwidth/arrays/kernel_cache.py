@@ -48,20 +48,16 @@ def use_compilation_cache(folder: str | Path | None = None) -> KernelCache:
         # Every kernel is worth keeping: the many small ones add up to most of a cold start.
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+        # JAX reads its variables when it is imported; later it must be told.
         if "jax" in sys.modules:
-            _tell_jax(os.environ[_VARIABLE])
+            import jax
+
+            jax.config.update("jax_compilation_cache_dir", os.environ[_VARIABLE])
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+            jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     mend_compilation_cache()
     used = Path(os.environ[_VARIABLE])
     return KernelCache(used, sum(entry.stat().st_size for entry in used.glob("*") if entry.is_file()))
-
-
-def _tell_jax(folder: str) -> None:
-    """JAX reads its variables when it is imported; later it must be told."""
-    import jax
-
-    jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def mend_compilation_cache() -> None:

@@ -14,7 +14,7 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonS
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
-from zwidth.config.values import quantity_of, read_entries
+from zwidth.config.values import quantity_of, read_entries, share
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, read_rows, resembling, split_title, suggestion
 from zwidth.words.quantities import PARAMETERS
@@ -213,7 +213,7 @@ def _to_value(cell: str, unit: str) -> float | str:
 
 
 def _make_schema() -> dict[str, Any]:
-    column = {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}}
+    column = share("column", {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}})
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
     names = {"type": "object", "additionalProperties": {"type": "string"}}
     lists = {LABEL: labels, **dict.fromkeys(PARAMETERS, column)}

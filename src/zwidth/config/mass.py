@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
+from pydantic import ConfigDict, Field, PlainValidator, ValidationInfo, WrapValidator
 
 from zwidth.config.devices import DeviceForm
 from zwidth.config.faults import LocatedProblem, problem, validation_error
 from zwidth.config.fields import Strict
 from zwidth.config.parts import PART_NAMES
-from zwidth.config.values import Delay, describe_entry, quantity_of
+from zwidth.config.values import Delay, quantity_of
 from zwidth.parts.checks import Span
 from zwidth.parts.devices import DEVICES
 from zwidth.parts.paths import PARTS
@@ -45,10 +45,10 @@ class OneKind(Strict):
         )
 
 
-def _period(value: Any, info: ValidationInfo) -> float:
+def _period(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float:
     """The period itself, or one over the rate."""
     if value is not None:
-        return quantity_of("period").read(value)
+        return read(value)
     # A rate that failed its own check is absent from the data; that fault is enough.
     rate = info.data.get("rate", 1.0)
     if rate is None:
@@ -56,10 +56,10 @@ def _period(value: Any, info: ValidationInfo) -> float:
     return 1.0 / rate
 
 
-def _mass(value: Any, info: ValidationInfo) -> float | None:
+def _mass(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float | None:
     """The mass itself; none of a device that is given as a whole."""
     if value is not None:
-        return quantity_of("mass").read(value)
+        return read(value)
     if info.data.get("device", ...) is None:
         allowed = "a device has mass and period or rate, or, normalized, delta"
         raise problem("missing", allowed, "add 'mass: 0.1 kg'")
@@ -125,7 +125,7 @@ class SampledMass(OneKind):
     """Name of a published device, whose mass and damping are taken where none are written; or a device that is no mass
     with damping: a linear system ('1 / 0.1 10 0' in s, or a mapping), or a measured response (FILE.csv)."""
 
-    mass: Annotated[float | None, BeforeValidator(_mass), WithJsonSchema(quantity_of("mass").schema)] = Field(
+    mass: Annotated[float | None, quantity_of("mass"), WrapValidator(_mass)] = Field(
         default=None, validate_default=True
     )
     """Moving mass m of the device in kg, > 0; of a rotary one its inertia in kg m^2."""
@@ -139,9 +139,7 @@ class SampledMass(OneKind):
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
     """Sampling rate 1/T in Hz; give it or the period."""
 
-    period: Annotated[float, BeforeValidator(_period), WithJsonSchema(describe_entry("s"))] = Field(
-        default=None, validate_default=True
-    )
+    period: Annotated[float, quantity_of("period"), WrapValidator(_period)] = Field(default=None, validate_default=True)
     """Sampling period T in s; give it or the rate. Always set once the file is loaded."""
 
     delay: Delay = Span(0.0, "s")

@@ -6,7 +6,7 @@ Each section below has the keys of the part of that name in `zwidth.parts`, and 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, fields
 from functools import cached_property
 from math import isfinite
 from typing import Annotated, Any, ClassVar, Literal, Union
@@ -14,13 +14,12 @@ from typing import Annotated, Any, ClassVar, Literal, Union
 from pydantic import (
     BeforeValidator,
     Field,
-    GetCoreSchemaHandler,
+    GetPydanticSchema,
     PlainSerializer,
     WithJsonSchema,
+    WrapValidator,
     create_model,
 )
-from pydantic_core import CoreSchema
-from pydantic_core.core_schema import no_info_wrap_validator_function
 
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Strict, describe_parameter, find_kind
@@ -137,21 +136,15 @@ def read_velocity(raw: Any, known: dict[str, type[PartSection]] = _LINEAR) -> An
     return section.model_validate(raw)
 
 
-@dataclass(frozen=True)
-class _AnyEstimate:
-    """Makes a section one of a velocity estimate, of any kind that the linear loop knows or of all kinds."""
-
-    linear: bool
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        known = _LINEAR if self.linear else _ESTIMATES
-        every = Annotated[Union[tuple(known.values())], Field(discriminator="kind")]  # noqa: UP007
-        read = no_info_wrap_validator_function
-        return read(lambda raw, _: read_velocity(raw, known), handler.generate_schema(every))
+def _make_one_of(known: dict[str, type[PartSection]]) -> GetPydanticSchema:
+    """Make a field one of these estimates; the schema tells them apart by their kind."""
+    every = Annotated[Union[tuple(known.values())], Field(discriminator="kind")]  # noqa: UP007
+    read = Annotated[every, WrapValidator(lambda raw, _: read_velocity(raw, known))]
+    return GetPydanticSchema(lambda _, handler: handler.generate_schema(read))
 
 
-VelocityField = Annotated[PartSection, _AnyEstimate(linear=True)]
-SimulatedVelocityField = Annotated[PartSection, _AnyEstimate(linear=False)]
+VelocityField = Annotated[PartSection, _make_one_of(_LINEAR)]
+SimulatedVelocityField = Annotated[PartSection, _make_one_of(_ESTIMATES)]
 _SECTIONS: Any = {
     name: make_section(part, name, f"{'an' if name[0] in 'aeiou' else 'a'} {name}") for name, part in PARTS.items()
 }

@@ -258,16 +258,14 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
         mark = error.problem_mark or error.context_mark
         what = printable((error.problem or "unreadable").replace("\n", " "))
         remedy = "check the indentation, the colons and the quotes here"
+        opened = "line {}, column {}".format(*_mark_place(error.context_mark)) if error.context_mark else ""
         if r"'\t'" in what:
             what, remedy = "got a tab where the line is indented", "indent with spaces"
-        elif error.context_mark is not None and "flow" in (error.context or ""):
-            line, column = _mark_place(error.context_mark)
-            remedy = f"close the bracket opened at line {line}, column {column}"
-        elif error.context_mark is not None and "quoted" in (error.context or ""):
-            line, column = _mark_place(error.context_mark)
-            remedy = f"check the quoted text that begins at line {line}, column {column}"
-        place = _mark_place(mark) if mark else (1, 1)
-        return _fail(self.file, place, "not valid YAML", what, remedy)
+        elif opened and "flow" in (error.context or ""):
+            remedy = f"close the bracket opened at {opened}"
+        elif opened and "quoted" in (error.context or ""):
+            remedy = f"check the quoted text that begins at {opened}"
+        return _fail(self.file, _mark_place(mark) if mark else (1, 1), "not valid YAML", what, remedy)
 
     def _read(self, path: FieldPath, events: Iterator[Any], event: Any = None, in_alias: bool = False) -> Any:
         """The value that begins with an event, the next one if none is given; places go to ``values`` and ``keys``."""

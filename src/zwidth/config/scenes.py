@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -93,7 +94,14 @@ class _PhysicalPlant(_Parts, SampledMass):
         return self.delay.periods(self.period)
 
     def to_scene(self) -> Scene:
-        """The device and its timing in SI units."""
+        """The device, its timing and, where it has one, its wall in SI units."""
+        return self._scene
+
+    @cached_property
+    def _scene(self) -> Scene:
+        return self._make_scene()
+
+    def _make_scene(self) -> Scene:
         timing = Timing(period=self.period, delay=self.delay.seconds(self.period))
         # A device that is given as a whole is one of the parts, and takes the place of this one.
         device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
@@ -204,9 +212,9 @@ class PhysicalScene(_PhysicalPlant):
     delay_model: DelayModel = "held"
     """How a delay that is not whole is modeled."""
 
-    def to_scene(self) -> Scene:
-        """Device, timing and wall; a wall that is not given has no stiffness and no damping."""
-        bare = super().to_scene()
+    def _make_scene(self) -> Scene:
+        bare = super()._make_scene()
+        # One that is not given has no stiffness and no damping.
         wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
         return replace(bare, timing=replace(bare.timing, delay_model=self.delay_model), wall=wall)
 

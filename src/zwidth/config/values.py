@@ -6,14 +6,15 @@ An axis is written as one number, a list, ``{linear: {start, stop, num}}`` or ``
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, ClassVar, TypeAlias, cast
 
 import numpy as np
-from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, create_model
+from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from zwidth.config.faults import LocatedProblem, problem, problems_of, raise_problems, validation_error
@@ -40,43 +41,6 @@ Entry: TypeAlias = Callable[[Any], float]
 """Reads one value of an axis, or raises a problem."""
 
 _FORMS = "a number, a list of numbers, {linear: {start, stop, num}} or {log: {start, stop, num}}"
-_SPACINGS = {"linear": np.linspace, "log": np.geomspace}
-
-
-def _number(allowed: Range, remedy: str) -> Callable[[Any], float]:
-    """A validator for a number without a unit."""
-
-    def read(value: Any) -> float:
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            return check_range(to_float(value), allowed, remedy=remedy)
-        hint = "write a number such as 0.5"
-        if isinstance(value, str):
-            if looks_like_number(value):
-                hint = "drop the quotes"
-            elif value.lower() in _NOT_FINITE_TEXT:
-                hint = "write a finite number"
-            elif looks_like_number(value.split(" ")[0]):
-                hint = "this field has no unit; write the number alone"
-        raise problem(f"got {describe(value)}", "it must be one number", hint)
-
-    return raise_problems(read)
-
-
-def _whole_number(allowed: Range) -> Callable[[Any], int]:
-    """A validator for a whole number."""
-
-    def read(value: Any) -> int:
-        if isinstance(value, int) and not isinstance(value, bool):
-            check_range(to_float(value), allowed)
-            return value
-        hint = f"write a whole number such as {max(allowed.low, 10):g}"
-        if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
-            hint = f"write {value:.0f}"
-        elif isinstance(value, str) and looks_like_number(value):
-            hint = "drop the quotes"
-        raise problem(f"got {describe(value)}", "it must be a whole number", hint)
-
-    return raise_problems(read)
 
 
 @dataclass(frozen=True)
@@ -103,9 +67,7 @@ class Quantity:
     def read(self) -> Callable[[Any], Any]:
         if self.periods:
             return raise_problems(lambda value: read_span(value, self.allowed))
-        if self.unit == "1":
-            return _whole_number(self.allowed) if self.whole else _number(self.allowed, self.remedy)
-        return raise_problems(self._read_quantity)
+        return raise_problems(self._read_number if self.unit == "1" else self._read_quantity)
 
     def read_alike(self) -> tuple[Entry, set[str]]:
         """What reads several values, lengths of time all in seconds or all in periods; and the unit of those read."""
@@ -120,6 +82,25 @@ class Quantity:
             return value
 
         return entry if self.periods else self.read, units
+
+    def _read_number(self, value: Any) -> float:
+        """A number without a unit."""
+        if isinstance(value, int if self.whole else int | float) and not isinstance(value, bool):
+            number = check_range(to_float(value), self.allowed, remedy=self.remedy)
+            return value if self.whole else number
+        hint = (
+            f"write a {f'whole number such as {max(self.allowed.low, 10):g}' if self.whole else 'number such as 0.5'}"
+        )
+        if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
+            hint = f"write {value:.0f}"
+        elif isinstance(value, str):
+            if looks_like_number(value):
+                hint = "drop the quotes"
+            elif value.lower() in _NOT_FINITE_TEXT:
+                hint = "write a finite number"
+            elif looks_like_number(value.split(" ")[0]):
+                hint = "this field has no unit; write the number alone"
+        raise problem(f"got {describe(value)}", f"it must be {'a whole' if self.whole else 'one'} number", hint)
 
     def _read_quantity(self, value: Any) -> float:
         with use_kind(self.turns and is_rotary()):
@@ -157,15 +138,19 @@ Delay = Annotated[Span, quantity_of("delay")]
 Duration = Annotated[Span, Quantity("s", POSITIVE, periods=True)]
 
 
+def share(name: str, schema: dict[str, Any]) -> dict[str, Any]:
+    """A part of the JSON Schema that `zwidth.studies.document.config_json_schema` writes once, under this name."""
+    return {"allOf": [{"shared": re.sub(r"\W+", "_", name.replace("/", " per ")), **schema}]}
+
+
 def describe_entry(unit: str, *more: str) -> dict[str, Any]:
     """The JSON Schema of a number in an SI unit, or with one of the units beside it."""
     dimension = find_dimension(unit)
     pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
-    return {
-        "description": f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}.",
-        "examples": [dimension.example],
-        "anyOf": [{"type": "number"}, {"type": "string", "pattern": pattern}],
-    }
+    words = f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}."
+    forms = [{"type": "number"}, {"type": "string", "pattern": pattern}]
+    name = f"number in {unit}{f' or {more[0]}' if more else ''}"
+    return share(name, {"description": words, "examples": [dimension.example], "anyOf": forms})
 
 
 @dataclass(frozen=True)
@@ -179,7 +164,7 @@ class Axis:
 
     def values(self) -> np.ndarray:
         if self.form in _SPACINGS:
-            return _SPACINGS[self.form](*self.entries, self.size)
+            return _SPACINGS[self.form][0](*self.entries, self.size)
         return np.array(self.entries, dtype=np.float64)
 
     @property
@@ -194,15 +179,26 @@ class Axis:
         return written if self.form == "list" else written[0]
 
 
-class _Spacing(Strict):
-    """Base of the mappings below ``linear`` and ``log``."""
+def _read_end(raw: Any, info: ValidationInfo) -> float:
+    """An end of an axis, as what is swept reads it."""
+    return cast(Entry, info.context)(raw)
+
+
+class _EqualSteps(Strict):
+    """The mapping below ``linear``."""
+
+    what: ClassVar[str] = "an axis with 'linear'"
+
+    start: Annotated[float, BeforeValidator(_read_end)]
+    stop: Annotated[float, BeforeValidator(_read_end)]
+    num: Annotated[int, Quantity(allowed=Range(2, LONGEST_AXIS), whole=True)]
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
         return "an axis of equal steps or ratios has start, stop and num", f"add {name!r}"
 
     def limits(self) -> list[LocatedProblem]:
-        start, stop, num = (getattr(self, name) for name in ("start", "stop", "num"))
+        start, stop, num = self.start, self.stop, self.num
         if start == stop:
             where = "start and stop must differ"
             return [(("stop",), problem(f"got {short(stop)}, as start", where, "write a number alone"))]
@@ -213,6 +209,18 @@ class _Spacing(Strict):
         if num > 1 and abs(stop - start) / (num - 1) <= 4 * np.spacing(max(abs(start), abs(stop))):
             return [(("num",), problem(f"got {num}", "the steps are below float64's resolution", "lower num"))]
         return []
+
+
+class _EqualRatios(_EqualSteps):
+    """The mapping below ``log``."""
+
+    what: ClassVar[str] = "an axis with 'log'"
+
+
+_SPACINGS: dict[str, tuple[Any, type[_EqualSteps]]] = {
+    "linear": (np.linspace, _EqualSteps),
+    "log": (np.geomspace, _EqualRatios),
+}
 
 
 def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool = True) -> tuple[float, ...]:
@@ -262,13 +270,15 @@ class AxisOf:
                 unknown = problem("unknown key", f"an axis is {_FORMS}", remedy, on_key=True)
                 raise validation_error("axis", [((form,), unknown)])
         quantity = self._forms.get(form, self.quantity)
-        entry, units = quantity.read_alike()
-        if quantity.whole:
+        read, units = quantity.read_alike()
+
+        def entry(raw: Any) -> float:
             # 5.0 is 5, as a store spells the ends of equal steps.
-            entry = _accept_whole_floats(entry)
+            return read(int(raw) if quantity.whole and isinstance(raw, float) and raw.is_integer() else raw)
+
         if form in self._forms:
             try:
-                spaced = _model_spacing(form, entry).model_validate(ends)
+                spaced = _SPACINGS[form][1].model_validate(ends, context=entry)
             except ValidationError as error:
                 raise validation_error("axis", problems_of(error, form)) from None
             entries, size = (spaced.start, spaced.stop), spaced.num
@@ -294,22 +304,11 @@ class AxisOf:
         count = {"type": "integer", "minimum": 2, "maximum": LONGEST_AXIS}
         ends = {form: quantity.schema for form, quantity in self._forms.items()}
         keyed = [mapping(**{form: mapping(start=end, stop=end, num=count)}) for form, end in ends.items()]
-        entry = self.quantity.schema
+        entry, unit = self.quantity.schema, self.quantity.unit
         listed = {"type": "array", "items": entry, "minItems": 1, "uniqueItems": True}
-        return {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]}
-
-
-def _model_spacing(form: str, entry: Entry) -> Any:
-    """The mapping below ``linear`` or ``log`` for ends that ``entry`` reads."""
-    end = Annotated[float, BeforeValidator(entry)]
-    count = Annotated[int, Quantity(allowed=Range(2, LONGEST_AXIS), whole=True)]
-    model = create_model(form, __base__=_Spacing, start=(end, ...), stop=(end, ...), num=(count, ...))
-    model.what = f"an axis with {form!r}"
-    return model
-
-
-def _accept_whole_floats(entry: Entry) -> Entry:
-    return lambda raw: entry(int(raw) if isinstance(raw, float) and raw.is_integer() else raw)
+        kind = f"of numbers {self.quantity.allowed}".strip() if unit == "1" else f"in {unit}"
+        name = f"axis {kind}{' or periods' if self.quantity.periods else ''}"
+        return share(name, {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]})
 
 
 def axis_of(name: str) -> AxisOf:

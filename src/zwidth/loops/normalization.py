@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import join_shapes, refuse_masked
+from zwidth.arrays.evaluate import as_float64, join_shapes
 from zwidth.arrays.xp import is_jax, is_traced, namespace, nan_unless, within
 from zwidth.parts.checks import accept_units, in_periods
 from zwidth.words.errors import InputError
@@ -52,14 +52,7 @@ def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
     """Return ``value`` as float64; a scalar out of range raises. A traced value is left to JAX."""
     if is_traced(value):
         return value
-    refuse_masked(name, value)
-    try:
-        number = np.asarray(value)
-    except ValueError as error:
-        raise InputError(f"{name}: got {value!r}, a rectangular array of real numbers is needed") from error
-    if number.dtype.kind not in "biuf":
-        raise InputError(f"{name}: got {value!r}, a real number or an array of them is needed")
-    number = number.astype(np.float64, copy=False)
+    number = as_float64(name, value)
     if number.ndim == 0:
         parameter, (least, most) = PARAMETERS[name], _magnitudes(name)
         unit = f" (in {parameter.unit})" if parameter.unit != "1" else ""

@@ -30,8 +30,19 @@ class RationalResponse(NamedTuple):
     dt: float | None  # s
 
 
+class WholeDevice:
+    """Base of devices that are given as a whole: what a `Device` has beside its mass, and no body of these has."""
+
+    coupling: ClassVar[None] = None
+    actuator: ClassVar[None] = None
+    modes: ClassVar[tuple[()]] = ()
+    rotary: ClassVar[bool] = False
+    # What damping there is stands in the response.
+    damping: ClassVar[float] = 0.0
+
+
 @dataclass(frozen=True, repr=False)
-class LinearDevice:
+class LinearDevice(WholeDevice):
     """A device as any strictly proper linear system from commanded force (N) to sensed position (m).
 
     Every question about walls is answered of it; its numbers are taken as exact. Nothing is known of bodies: a hand,
@@ -53,13 +64,6 @@ class LinearDevice:
         >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
         19865 N/m
     """
-
-    # What a `Device` has, and no body of this one.
-    coupling: ClassVar[None] = None
-    actuator: ClassVar[None] = None
-    modes: ClassVar[tuple[()]] = ()
-    rotary: ClassVar[bool] = False
-    damping: ClassVar[float] = 0.0
 
     system: Any
 

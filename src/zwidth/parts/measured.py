@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
+from zwidth.parts.linear_device import WholeDevice
 from zwidth.parts.response_table import ResponseTable, read_response_table, write_response_table
 from zwidth.words.errors import InputError
 
@@ -16,7 +17,7 @@ _FEWEST = 8
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredDevice:
+class MeasuredDevice(WholeDevice):
     """A frequency response from commanded force to sampled position, at the controller's own rate.
 
     Hold, amplifier, mechanics, encoder and every delay are in it: the ratio of the position that the program reads to
@@ -44,12 +45,6 @@ class MeasuredDevice:
         >>> f"{device.mass:.3f} kg, {device.frequency.size} lines"
         '0.100 kg, 300 lines'
     """
-
-    # What a model has.
-    coupling: ClassVar[None] = None
-    actuator: ClassVar[None] = None
-    modes: ClassVar[tuple[()]] = ()
-    rotary: ClassVar[bool] = False
 
     frequency: Any
     response: Any
@@ -104,11 +99,6 @@ class MeasuredDevice:
     def mass(self) -> float:
         """The mass in kg that moves as far in the middle of the band: the unit of normalized walls, no estimate."""
         return 1.0 / float(np.median(np.abs(self.response) * (2.0 * np.pi * self.frequency) ** 2))
-
-    @property
-    def damping(self) -> float:
-        """0: what damping there is stands in the response."""
-        return 0.0
 
     @classmethod
     def read(cls, file: str | Path) -> MeasuredDevice:

@@ -73,12 +73,12 @@ def list_parameters(scene: Parts) -> dict[str, Any]:
         for prefix, name, part in _parts(scene)
         for item in fields(part)
     }
-    ordered = sorted(found, key=lambda key: key[1] == "wall")
-    return {key[0]: found[key] for key in ordered if _is_number(found[key])}
-
-
-def _is_number(value: Any) -> bool:
-    return is_jax(value) or (isinstance(value, int | float | np.number) and not isinstance(value, bool))
+    ordered = sorted(found.items(), key=lambda item: item[0][1] == "wall")
+    return {
+        path: value
+        for (path, _), value in ordered
+        if is_jax(value) or (isinstance(value, int | float | np.number) and not isinstance(value, bool))
+    }
 
 
 def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
@@ -89,6 +89,7 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     own = {name: changes[name] for name in (*_OF_DEVICE, "modes") if name in changes}
     if own:
         scene = replace(scene, device=replace(scene.device, **own))
+    parts = {name: part for _, name, part in _parts(scene)}
     owners = {
         prefix + item.name: (name, item.name)
         for prefix, name, part in _parts(scene)
@@ -105,16 +106,16 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     if "rate" in changed.get("timing", {}):
         # Period and rate are one thing; what was given last counts.
         changed["timing"].setdefault("period", None)
-    if "wall" in changed and isinstance(scene.wall, NoWall):
-        scene = replace(scene, wall=VirtualWall(0.0))
-    for name in _OF_DEVICE:
-        if name in changed:
-            changed.setdefault("device", {})[name] = replace(getattr(scene.device, name), **changed.pop(name))
-    names = [f"modes.{k}" for k in range(len(scene.device.modes))]
-    if changed.keys() & set(names):
-        modes = zip(scene.device.modes, (changed.pop(name, {}) for name in names), strict=True)
-        changed.setdefault("device", {})["modes"] = tuple(replace(mode, **new) for mode, new in modes)
-    return replace(scene, **{part: replace(getattr(scene, part), **own) for part, own in changed.items()})
+    if isinstance(scene.wall, NoWall):
+        parts["wall"] = VirtualWall(0.0)
+    own = changed.pop("device", {})
+    made = {name: replace(parts[name], **new) for name, new in changed.items()}
+    own |= {name: made.pop(name) for name in _OF_DEVICE if name in made}
+    if any(name.startswith("modes.") for name in made):
+        own["modes"] = tuple(made.pop(f"modes.{k}", mode) for k, mode in enumerate(scene.device.modes))
+    if own:
+        made["device"] = replace(scene.device, **own)
+    return replace(scene, **made)
 
 
 def spell_scene(scene: Any) -> dict[str, Any]:

@@ -31,7 +31,11 @@ _NAMES = {
     "response": ("response", "complex", "frf", "g", "h"),
     "deviation": ("deviation", "radius", "uncertainty"),
 }
-_ANGULAR = ("rad/s", "1/s", "krad/s")
+_TURN = 2.0 * math.pi
+_FREQUENCY = Dimension(RATE.powers, RATE.example, {"rad/s": 1.0 / _TURN, "1/s": 1.0 / _TURN, "krad/s": 1e3 / _TURN})
+_COMPLIANCE = Dimension(
+    {f"{length}/{force}": p - q for length, p in LENGTH.powers.items() for force, q in FORCE.powers.items()}, "1 mm/N"
+)
 _DECIBELS = re.compile(r"dB(?:\s*(?:\(?re\.?\s*)?(?:1\s*)?(m\s*/\s*N|mm\s*/\s*N|um\s*/\s*N|µm\s*/\s*N)\)?)?")
 
 
@@ -64,7 +68,7 @@ def read_response_table(file: str | Path) -> ResponseTable:
     names = [name for name in ("frequency", *parts, "deviation") if name in found and name != "response"]
     columns = dict(zip(names, table.numbers([found[name] for name in names]), strict=True))
     units = {name: heads[at][1] for name, at in found.items()}
-    hertz = columns["frequency"] * _hertz(file, units["frequency"])
+    hertz = columns["frequency"] * _size(file, "frequency", units["frequency"], _FREQUENCY, _FREQUENCY.units)
     scale = _compliance(file, parts[0], units[parts[0]])
     if parts[0] == "magnitude":
         size = columns["magnitude"]
@@ -93,32 +97,17 @@ def write_response_table(file: str | Path, table: ResponseTable, remarks: tuple[
     Path(file).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _hertz(file: Path, unit: str) -> float:
-    if unit in _ANGULAR:
-        return (1e3 if unit[0] == "k" else 1.0) / (2.0 * math.pi)
-    return _size(file, "frequency", unit, RATE, (*RATE.units, *_ANGULAR))
-
-
 def _size(file: Path, name: str, unit: str, dimension: Dimension, known: tuple[str, ...]) -> float:
     """What one of a unit is in the SI unit."""
     size = dimension.in_base("1", 0, unit) if unit else None
     if size is None:
-        raise InputError(f"{file}: {name} in {unit or 'no unit'}; {_remedy(unit, known)}")
+        remedy = suggestion(unit, known, f"write one of {', '.join(known)} in brackets behind the name")
+        raise InputError(f"{file}: {name} in {unit or 'no unit'}; {remedy}")
     return size
 
 
 def _compliance(file: Path, name: str, unit: str) -> float:
     """What one of a unit of length over force is in m/N; of decibels the unit that they are over."""
     decibels = _DECIBELS.fullmatch(unit) if name == "magnitude" else None
-    if decibels:
-        unit = decibels[1] or "m/N"
-    length, _, force = (unit or "m/N").partition("/")
-    sizes = LENGTH.in_base("1", 0, length.strip()), FORCE.in_base("1", 0, force.strip())
-    if sizes[0] is None or sizes[1] is None:
-        known = ("m/N", "mm/N", "um/N", *(("dB",) if name == "magnitude" else ()))
-        raise InputError(f"{file}: {name} in {unit}; {_remedy(unit, known)}")
-    return float(f"{sizes[0] / sizes[1]:.15g}")
-
-
-def _remedy(unit: str, known: tuple[str, ...]) -> str:
-    return suggestion(unit, known, f"write one of {', '.join(known)} in brackets behind the name")
+    known = ("m/N", "mm/N", "um/N", *(("dB",) if name == "magnitude" else ()))
+    return _size(file, name, (decibels[1] if decibels else unit) or "m/N", _COMPLIANCE, known)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,6 +23,10 @@ from zwidth.words.types import Array, ArrayLike
 
 if TYPE_CHECKING:
     import control
+
+# K or B of walls, texts with a unit as well; None means those of the scene's own wall.
+Walls: TypeAlias = ArrayLike | None
+Wall: TypeAlias = float | str | None
 
 
 @shown(dt="s")
@@ -68,7 +72,7 @@ class SceneAnswers:
     """
 
     def normalize_walls(
-        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+        self: Any, stiffness: Walls = None, virtual_damping: Walls = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
         units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping, self.device.rotary)
@@ -80,7 +84,7 @@ class SceneAnswers:
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
-    def poles(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> np.ndarray:
+    def poles(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
         """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.
 
         Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
@@ -88,9 +92,7 @@ class SceneAnswers:
         """
         return self.loop.poles(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
 
-    def pole_table(
-        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
-    ) -> PoleTable:
+    def pole_table(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> PoleTable:
         """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         zeta: Array = poles_less_one(self.loop.roots, alpha, beta)
@@ -104,9 +106,7 @@ class SceneAnswers:
             ratio = np.where((size == 0) & (turn == 0), 0.0, ratio)
             return PoleTable(1.0 + zeta, turn / (2.0 * np.pi * period), ratio, -period / size)
 
-    def spectral_radius(
-        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
-    ) -> Array:
+    def spectral_radius(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
 
         From all poles; beyond 150 of them by counting poles in circles, at a cost that does not grow with the delay.
@@ -137,9 +137,7 @@ class SceneAnswers:
         found = self.loop.islands(-np.inf if allows_negative(self, negative_damping) else 0.0)
         return [Island(*(tuple(pair.tolist()) for pair in np.array(one) * units)) for one in found]
 
-    def state_space(
-        self: Any, stiffness: float | str | None = None, virtual_damping: float | str | None = None
-    ) -> StateSpace:
+    def state_space(self: Any, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
         """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
 
         Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
@@ -147,17 +145,12 @@ class SceneAnswers:
         compliance = self.timing.period**2 / float(self.mass)
         return _realize(self, closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
-    def open_loop(
-        self: Any, stiffness: float | str | None = None, virtual_damping: float | str | None = None
-    ) -> StateSpace:
+    def open_loop(self: Any, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
         """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
         return _realize(self, open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
     def frequency_response(
-        self: Any,
-        stiffness: ArrayLike | None = None,
-        virtual_damping: ArrayLike | None = None,
-        frequency: ArrayLike | None = None,
+        self: Any, stiffness: Walls = None, virtual_damping: Walls = None, frequency: ArrayLike | None = None
     ) -> Array:
         """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
 
@@ -177,11 +170,7 @@ class SceneAnswers:
         return np.where(inside, value, complex(np.nan, np.nan))[()]
 
     def is_stable(
-        self: Any,
-        stiffness: ArrayLike | None = None,
-        virtual_damping: ArrayLike | None = None,
-        *,
-        method: StabilityMethod = "auto",
+        self: Any, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
     ) -> Array:
         """Whether walls are stable: every pole strictly inside the unit circle.
 
@@ -221,7 +210,7 @@ class SceneAnswers:
         both = self.loop.row(beta.reshape(-1)) * self.units.stiffness
         return both.reshape(*beta.shape, *both.shape[1:])
 
-    def stable_damping(self: Any, stiffness: float | str | None = None) -> np.ndarray:
+    def stable_damping(self: Any, stiffness: Wall = None) -> np.ndarray:
         """The stable intervals of the virtual damping at one stiffness, several where there are several.
 
         Args:
@@ -235,11 +224,7 @@ class SceneAnswers:
         return self.loop.column(alpha) * self.units.virtual_damping
 
     def decide_stability(
-        self: Any,
-        stiffness: ArrayLike | None = None,
-        virtual_damping: ArrayLike | None = None,
-        *,
-        method: StabilityMethod = "auto",
+        self: Any, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
     ) -> Stability:
         """Labels of walls with a status and what decided each, as `zwidth.decide_stability` has them.
 
@@ -251,18 +236,14 @@ class SceneAnswers:
         walls = [np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping)]
         return self.loop.decide(alpha, beta, method, tuple(np.broadcast_arrays(*walls)))
 
-    def explain_undecided(
-        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
-    ) -> list[str]:
+    def explain_undecided(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> list[str]:
         """Why the measured response of a device leaves one wall UNDECIDED, and at which frequencies to measure.
 
         A sentence each; none where the wall is decided, as it is of every device that is a model.
         """
         return self.loop.explain(*one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))))
 
-    def passivity_margin(
-        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
-    ) -> Array:
+    def passivity_margin(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is not finite.
 
         Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
@@ -276,13 +257,11 @@ class SceneAnswers:
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         return self.loop.passivity_margin(alpha, beta) * self.units.virtual_damping
 
-    def is_passive(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> Array:
+    def is_passive(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
         return np.asarray(self.passivity_margin(stiffness, virtual_damping)) > 0
 
-    def margins(
-        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
-    ) -> SceneMargins:
+    def margins(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> SceneMargins:
         """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
 
         Of several crossovers the nearest counts, as in python-control: ``gain_margin`` is the factor nearest to 1 on K
@@ -318,9 +297,7 @@ def _realize(scene: Any, build: Callable[..., Matrices], unit: float, alpha: Any
     return StateSpace(A, B, loop.C / scale, loop.D * unit, period)
 
 
-def to_control(
-    scene: Any, stiffness: float | str | None = None, virtual_damping: float | str | None = None
-) -> control.StateSpace:
+def to_control(scene: Any, stiffness: Wall = None, virtual_damping: Wall = None) -> control.StateSpace:
     """Return the closed loop of a scene and a wall as a model of python-control.
 
     From a force held on the device (N) to the sensed position (m), exactly discretized: ``scene.state_space``.

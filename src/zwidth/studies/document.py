@@ -232,17 +232,30 @@ def config_json_schema() -> dict[str, Any]:
         >>> sorted(config_json_schema()["required"])
         ['name', 'studies', 'version']
     """
-    schema = _drop_null(Config.model_json_schema())
+    shared: dict[str, Any] = {}
+    schema = _tidy(Config.model_json_schema(), shared)
+    schema["$defs"] |= dict(sorted(shared.items()))
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-def _drop_null(schema: Any) -> Any:
-    """The schema without null, which stands for "not given" in the models and is never written in a file."""
+def _tidy(schema: Any, shared: dict[str, Any]) -> Any:
+    """The schema without null, which stands for "not given" in the models and is never written in a file.
+
+    What is to be shared is moved to ``shared``, and a reference takes its place.
+    """
     if isinstance(schema, list):
-        return [_drop_null(item) for item in schema if item != {"type": "null"}]
+        return [_tidy(item, shared) for item in schema if item != {"type": "null"}]
     if not isinstance(schema, dict):
         return schema
-    return {key: _drop_null(value) for key, value in schema.items() if key != "default" or value is not None}
+    kept = {key: _tidy(value, shared) for key, value in schema.items() if key != "default" or value is not None}
+    if "shared" in kept:
+        name = kept.pop("shared")
+        return {"$ref": f"#/$defs/{name}"} if shared.setdefault(name, kept) == kept else kept
+    for key in ("allOf", "anyOf"):
+        # One form alone is no choice.
+        if len(kept.get(key, ())) == 1:
+            return {**kept.pop(key)[0], **kept}
+    return kept
 
 
 def load_config(path: str | bytes | os.PathLike[str]) -> Config:

@@ -7,13 +7,15 @@ batches of two sizes, may round differently.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from itertools import product
 from typing import TypeAlias
 
 import numpy as np
 
+from zwidth.arrays.evaluate import map_blocks
 from zwidth.loops.rigid.margins import margins_kernel
 from zwidth.loops.rigid.outermost_poles import area_poles, list_poles
 from zwidth.loops.rigid.passivity import margin_at_one_delay
@@ -25,7 +27,8 @@ from zwidth.sweep.grid import Block
 from zwidth.words.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.words.status import Status
 
-Columns: TypeAlias = tuple[np.ndarray, ...]
+Columns: TypeAlias = list[np.ndarray]
+Leaves: TypeAlias = Sequence[np.ndarray]
 
 # Small where a point is expensive, for a sweep of a few points pays for a whole piece; the last one is for rows.
 _PIECE = 1 << 9
@@ -38,28 +41,17 @@ _SMALLEST_PLANE = 1 << 8
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
 
+_map_pieces = partial(map_blocks, threads=1, within=nullcontext, exact=True)
+
+
 def compute(family: Family, outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
     """Every output of a family on a block, and its status; walls in shape (D, A, B), devices in shape (D,)."""
     found = _devices(block) if family == "device" else _walls(outputs, block, accuracy)
     return {name: found[name] for name in (*outputs, STATUS_OF[family])}
 
 
-def in_pieces(function: Callable[..., tuple[np.ndarray, ...]], columns: Columns, size: int) -> tuple[np.ndarray, ...]:
-    """Apply a function of equally long columns to pieces of exactly ``size`` points; the last one is filled up."""
-    count = columns[0].size
-    parts = []
-    for start in range(0, count, size):
-        piece = [column[start : start + size] for column in columns]
-        kept = piece[0].size
-        filled = [np.pad(column, (0, size - kept), mode="edge") for column in piece]
-        parts.append(tuple(np.asarray(leaf)[:kept] for leaf in function(*filled)))
-    return parts[0] if len(parts) == 1 else tuple(np.concatenate(leaves) for leaves in zip(*parts, strict=True))
-
-
 def _devices(block: Block) -> dict[str, np.ndarray]:
-    alpha, beta, _, kind, status = in_pieces(
-        lambda *columns: tuple(alpha_max(*columns)), (block.delta, block.d), _PIECE
-    )
+    alpha, beta, _, kind, status = _map_pieces(alpha_max, (block.delta, block.d), _PIECE)
     good = status == Status.OK
     found = {
         "alpha_max": alpha,
@@ -79,9 +71,13 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
     unproved = False
     if RADIUS_OUTPUTS & set(outputs):
         if block.plane.alpha.shape[1] * block.plane.beta.shape[1] >= _SMALLEST_PLANE:
-            radius, proved, rate = _radius_planes(accuracy, block)
+            alpha, beta, alphas, betas = block.plane
+            poles = area_poles(Area(alpha, beta, block.delta, block.d, (betas, alphas)), accuracy, with_rate=True)
+            radius, proved, rate = (leaf.transpose(0, 2, 1) for leaf in poles)
         else:
-            radius, proved, rate = _by_device(partial(_radius_columns, accuracy), block, shape, leaves=3)
+            # Always compiled, however few they are: a value must not depend on the size of its chunk.
+            listed = partial(list_poles, accuracy=accuracy, with_rate=True, few=0)
+            radius, proved, rate = _by_device(listed, block, shape, leaves=3)
         found["spectral_radius"], unproved = radius, proved == 0
         # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
         found["decay_rate"] = rate / block.period[:, None, None] if block.period.size else rate
@@ -133,27 +129,24 @@ def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
 
 def _limits(block: Block) -> np.ndarray:
     """The stiffest stable alpha of every device and beta, shape (D, B)."""
-    columns = tuple(
-        np.broadcast_to(part, block.beta.shape).ravel() for part in (block.beta, block.delta[:, None], block.d[:, None])
-    )
+    columns = [part.ravel() for part in np.broadcast_arrays(block.beta, block.delta[:, None], block.d[:, None])]
     limit = np.empty(block.beta.size)
     # Delays below one period have a kernel of their own: with both in a piece, its size would vary.
     for long in (False, True):
         # As `row_limits` itself tells them apart: a delay that is NaN is not long.
         index = np.flatnonzero((columns[2] >= 1) == long)
         if index.size:
-            picked = tuple(column[index] for column in columns)
-            limit[index] = in_pieces(lambda *piece: (row_limits(*piece),), picked, _ROW_PIECE)[0]
+            limit[index] = _map_pieces(row_limits, [column[index] for column in columns], _ROW_PIECE)
     return limit.reshape(block.beta.shape)
 
 
 def _by_device(
-    function: Callable[[Columns], Columns],
+    function: Callable[[Columns], Leaves],
     block: Block,
     shape: tuple[int, ...],
     leaves: int = 1,
     one_delay: bool = False,
-) -> Columns:
+) -> Leaves:
     """Apply a function of columns, of one delay or of all of them, to the walls of a block; it gives so many arrays."""
     results = tuple(np.empty(shape) for _ in range(leaves))
     rows = min(shape[1], max(1, _LAID_OUT // shape[2]))
@@ -168,36 +161,23 @@ def _by_device(
                 block.delta[devices, None, None],
                 block.d[devices, None, None],
             )
-            columns = tuple(parameter.ravel() for parameter in parameters)
+            columns = [parameter.ravel() for parameter in parameters]
             for result, leaf in zip(results, function(columns), strict=True):
                 result[devices, alphas] = leaf.reshape(parameters[0].shape)
     return results
 
 
-def _radius_planes(accuracy: float, block: Block) -> Columns:
-    """The spectral radii of maps, whether they are proved to an accuracy, and the rates of decay."""
-    alpha, beta, alphas, betas = block.plane
-    found = area_poles(Area(alpha, beta, block.delta, block.d, (betas, alphas)), accuracy, with_rate=True)
-    return tuple(leaf.transpose(0, 2, 1) for leaf in found)
-
-
-def _radius_columns(accuracy: float, columns: Columns) -> Columns:
-    """The same of listed walls."""
-    # Always compiled, however few they are: a value must not depend on the size of its chunk.
-    return list_poles(list(columns), accuracy, with_rate=True, few=0)
-
-
-def _margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Columns:
+def _margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Leaves:
     """The four margins; the two that take a search are NaN where nobody asks for them."""
 
-    def of_piece(*piece: np.ndarray) -> Columns:
+    def of_piece(*piece: np.ndarray) -> Leaves:
         with np.errstate(all="ignore"):
             found = margins_kernel(*piece, with_delay=with_delay, with_modulus=with_modulus)
         return tuple(np.asarray(getattr(found, name)) for name in _MARGINS)
 
-    return in_pieces(of_piece, columns, _PIECE)
+    return _map_pieces(of_piece, columns, _PIECE)
 
 
-def _passivity(columns: Columns) -> Columns:
+def _passivity(columns: Columns) -> Leaves:
     *walls, d = columns
-    return in_pieces(lambda *piece: (margin_at_one_delay(*piece, d=float(d[0])),), tuple(walls), _WALL_PIECE)
+    return (_map_pieces(partial(margin_at_one_delay, d=float(d[0])), walls, _WALL_PIECE),)

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,9 +29,6 @@ from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import InputError, StoreError
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.words.rotation import own_unit
-
-if TYPE_CHECKING:
-    import zarr
 
 SUFFIX = ".zarr"
 FORMAT = 1
@@ -106,17 +103,12 @@ class Store:
         return Grid(self.study)
 
     @cached_property
-    def _group(self) -> zarr.Group:
+    def _arrays(self) -> dict[str, Any]:
         import zarr
 
         with silence_zarr():
-            return zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=False)
-
-    @cached_property
-    def _arrays(self) -> dict[str, Any]:
-        names = [name for family in self.plan.families for name in family.variables]
-        with silence_zarr():
-            arrays: dict[str, Any] = {name: self._group[name] for name in names}
+            group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=False)
+            arrays: dict[str, Any] = {name: group[name] for family in self.plan.families for name in family.variables}
         # To look whether a chunk holds its fill value alone takes Zarr longer than to write it.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 

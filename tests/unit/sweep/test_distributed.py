@@ -11,7 +11,14 @@ from typing import Any
 
 import pytest
 import yaml
-from chunks import doing_nothing, killed_on_2, killed_once_on_2, killing_the_scheduler_on_2, stopping_the_scheduler_on_2
+from chunks import (
+    doing_nothing,
+    killed_on_2,
+    killed_once_on_2,
+    killing_the_scheduler_on_2,
+    replay_from,
+    stopping_the_scheduler_on_2,
+)
 from sweeping import assert_same, config_of, config_of_everything, cut, flags, main_of, run_sweeps, study
 
 from zwidth.words.errors import InputError
@@ -62,17 +69,19 @@ def test_no_output_depends_on_the_cluster_and_chunks(cluster, tmp_path, monkeypa
 
 
 def test_work_of_a_killed_worker_is_done_by_another(cluster, finished, tmp_path):
+    replay_from(finished, tmp_path)
     result = run_sweeps(config_of(), tmp_path, scheduler=cluster, perform=killed_once_on_2)
     assert result.ok
     assert_same(finished, tmp_path)
 
 
 def test_a_chunk_that_always_kills_its_worker_is_named_and_the_exit_code_is_1(
-    workers, cluster, tmp_path, monkeypatch, capsys
+    workers, cluster, finished, tmp_path, monkeypatch, capsys
 ):
     # With a first death dask gives up the chunk, and those that its worker had begun; one by one they are tried again.
     monkeypatch.setattr(workers.scheduler, "allowed_failures", 0)
     monkeypatch.setattr("zwidth.sweep.jobs.perform", killed_on_2)
+    replay_from(finished, tmp_path / "out")
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump({"version": 1, "name": "sweep", "studies": [study()]}), encoding="utf-8")
     assert main_of("run", path, "--out", tmp_path / "out", "--scheduler", cluster) == 1
@@ -127,6 +136,7 @@ def test_a_scheduler_that_dies_or_falls_silent_ends_the_run_in_one_line(
 ):
     monkeypatch.setattr("zwidth.sweep.jobs.perform", disturbed)
     path, out = tmp_path / "sweep.yaml", tmp_path / "out"
+    replay_from(finished, out)
     path.write_text(yaml.safe_dump({"version": 1, "name": "test", "studies": [study()]}), encoding="utf-8")
     with own_cluster(tmp_path) as address:
         assert main_of("run", path, "--out", out, "--scheduler", address) == 1

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from chunks import disk_full_on_2, failing_on_2, interrupted_on_2, killed_on_2, killed_once_on_2
+from chunks import disk_full_on_2, failing_on_2, interrupted_on_2, killed_on_2, killed_once_on_2, replay_from
 from sweeping import (
     AXES,
     DEVICES,
@@ -169,13 +169,15 @@ def test_a_chunk_that_fails_is_named_and_the_rest_completes(finished, tmp_path):
 
 def test_a_worker_that_is_killed_is_replaced(finished, tmp_path):
     config, folder = finished
+    replay_from(folder, tmp_path)
     result = run_sweeps(config, tmp_path, workers=1, perform=killed_once_on_2)
     assert result.ok
     assert_same(folder, tmp_path)
 
 
 def test_a_chunk_that_always_kills_its_worker_is_named(finished, tmp_path):
-    config, _ = finished
+    config, folder = finished
+    replay_from(folder, tmp_path)
     result = run_sweeps(config, tmp_path, workers=1, perform=killed_on_2)
     ((chunk, error),) = result.failed.items()
     assert chunk.startswith("map/wall/2 ")

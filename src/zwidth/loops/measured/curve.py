@@ -79,7 +79,10 @@ class ResponseCurve:
         u = _square(w)
         S, R = u * G, u * r
         E = _gaps(w, S)
-        count = np.maximum(2.0 * np.diff(w) / w[1:], _change(S, R)) / _STEP
+        # By what share the curve changes from line to line, beyond what its deviation explains.
+        change = np.maximum(np.abs(np.diff(S)) - 2.0 * (R[1:] + R[:-1]), 0.0)
+        change = change / (np.maximum(np.abs(S[1:]), np.abs(S[:-1])) + 1e-300)
+        count = np.maximum(2.0 * np.diff(w) / w[1:], change) / _STEP
         count = np.clip(np.ceil(count), 1, _MOST).astype(int)
         line = np.repeat(np.arange(w.size - 1), count)
         share = (np.arange(line.size) - np.repeat(np.cumsum(count) - count, count)) / count[line]
@@ -130,12 +133,6 @@ def _bound_beyond(w: np.ndarray, size: np.ndarray, r: np.ndarray) -> float:
         return np.inf
     halves = (part for part in np.array_split(last, 2) if part.size)
     return _BEYOND * max(float(np.sqrt(np.mean(size[part] ** 2))) for part in halves)
-
-
-def _change(S: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """By what share the curve changes from line to line, beyond what its deviation explains."""
-    size = np.maximum(np.abs(S[1:]), np.abs(S[:-1])) + 1e-300
-    return np.maximum(np.abs(np.diff(S)) - 2.0 * (R[1:] + R[:-1]), 0.0) / size
 
 
 def _gaps(w: np.ndarray, S: np.ndarray) -> np.ndarray:
