@@ -8,7 +8,7 @@ import pytest
 
 import zwidth
 from zwidth.figures import style
-from zwidth.runs.draw import Drawing, draw_stores
+from zwidth.runs.draw import draw_stores
 from zwidth.sweep.dataset import to_csv, to_netcdf, verify
 from zwidth.words.errors import InputError
 
@@ -71,7 +71,7 @@ def test_a_shipped_configuration_goes_all_the_way(config, tmp_path, few_dots, fi
         to_csv(store, tmp_path / f"{store.stem}.csv")
     if list(moved.glob("*.zarr")):
         assert all(found.ok for found in verify(moved))
-        assert draw_stores(moved, drawing=Drawing(formats=("png",)))
+        assert draw_stores(moved, formats=("png",))
     page = zwidth.write_report(moved).read_text(encoding="utf-8")
     assert all(f'id="{study.name}"' in page for study in first.studies)
 

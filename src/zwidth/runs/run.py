@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias
 
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.study import Study
-from zwidth.figures.style import figure_width
+from zwidth.figures.style import style_sheet
 from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
 from zwidth.studies.outcome import LISTENER, ComputedStudy, Outcome
@@ -246,34 +246,36 @@ class _Run:
                 return
 
     def _compute(self, study: ComputedStudy) -> StudyResult:
-        clock, outcome = time.perf_counter(), Outcome()
-        entry = {"name": study.name, "kind": study.kind_name(), "state": "failed", "inputs": self.inputs[study.name]}
+        clock, outcome, error = time.perf_counter(), Outcome(), None
+        entry = {"name": study.name, "kind": study.kind_name(), "inputs": self.inputs[study.name]}
         alone = sum(type(other) is type(study) for other in self.config.studies) == 1
-        error: Exception | None = None
+
+        def tell(error: Exception | None) -> dict[str, Any]:
+            ended = {"error": _describe_error(error), "state": "failed" if error else "done"}
+            seconds = round(time.perf_counter() - clock, 3)
+            return {**entry, "seconds": seconds, "notes": [*outcome.notes], "answer": [*outcome.answer], **ended}
+
         with self.record.staging(study.name) as stage:
             try:
                 look = self.config.figure or FigureLook()
-                with use_kind(self.config.rotary), figure_width(look.inches):
+                with use_kind(self.config.rotary), style_sheet(size=look.size):
                     outcome = study.compute(self.config.scene, alone)
                     outcome.write(stage, study.name, look.formats)
             except Exception as caught:
                 error = caught
-            told = {"notes": list(outcome.notes), "answer": list(outcome.answer), "error": _describe_error(error)}
-            entry |= {"seconds": round(time.perf_counter() - clock, 3), **told, "state": "failed" if error else "done"}
             try:
-                self.record.keep(stage, entry)
+                self.record.keep(stage, tell(error))
             except Exception as caught:
                 error = error or caught
                 before = self.record.entry(study.name) or {}
-                entry |= {"error": _describe_error(error), "state": "failed", "files": before.get("files", {})}
                 with suppress(OSError):
-                    self.record.note(entry)
+                    self.record.note({**tell(error), "files": before.get("files", {})})
         if error is not None and hopeless(error):
             self.hopeless = _describe_error(error)
         kept = self.record.entry(study.name) or {"files": ()}
-        state, seconds, files = "failed" if error else "done", time.perf_counter() - clock, tuple(kept["files"])
-        about = study.name, study.kind_name(), state, seconds, files
-        return StudyResult(*about, outcome.notes, outcome.answer, _describe_error(error), error)
+        ended = "failed" if error else "done", time.perf_counter() - clock, tuple(kept["files"])
+        told = outcome.notes, outcome.answer, _describe_error(error), error
+        return StudyResult(study.name, study.kind_name(), *ended, *told)
 
     def sweep(self, plans: list[Plan], about: dict[str, Any], **options: Any) -> None:
         """Compute the sweeps, all together, so that workers are started once."""

@@ -33,7 +33,7 @@ def test_a_legend_is_no_wider_than_its_figure(words, columns):
 
 
 def test_a_legend_fits_the_size_that_is_wanted():
-    with style.style_sheet(None, (3.0, 2.0)):
+    with style.style_sheet(size=(3.0, 2.0)):
         panels = style.panels(None, 1, 6.4, 4.0)
     figure = style.figure_of(panels)
     assert figure.get_size_inches().tolist() == [3.0, 2.0]

@@ -12,7 +12,7 @@ from zwidth.figures import draw_curves, draw_plane
 from zwidth.figures.grid import name_panels
 from zwidth.figures.style import figure_of, new_figure
 from zwidth.runs import draw
-from zwidth.runs.draw import Drawing, draw_stores
+from zwidth.runs.draw import draw_stores
 from zwidth.sweep.dataset import open_dataset
 from zwidth.words.errors import InputError
 
@@ -46,7 +46,7 @@ def drawn(monkeypatch, tmp_path):
     def draw_over(path, at=None, **axes):
         found.clear()
         notes.clear()
-        draw_stores(path, tmp_path, at=at, drawing=Drawing(**axes), note=notes.append)
+        draw_stores(path, tmp_path, at=at, axes=axes, note=notes.append)
         return found, notes
 
     return draw_over

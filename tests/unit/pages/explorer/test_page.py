@@ -73,8 +73,8 @@ def test_what_is_of_another_device_is_taken_away_at_once(page):
 def test_what_is_no_longer_wanted_is_not_shown(page):
     say(page, set={"damping": 20}, rest=True)
     say(page, set={"damping": 30}, rest=True)
-    (old, _), page.queue.tasks = page.queue.tasks, page.queue.tasks[1:]
-    old[0](*old[1])
+    old, *page.queue.tasks = page.queue.tasks
+    old()
     assert "verdict" not in page.texts
     page.queue.work()
     assert "b = 30.00 N s/m" in page.texts["verdict"]
