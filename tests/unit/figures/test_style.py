@@ -5,8 +5,7 @@ from itertools import combinations
 import matplotlib.style
 import numpy as np
 import pytest
-from figure_tables import EVERY_FIGURE, RIDGE
-from matplotlib.text import Annotation, Text
+from figure_tables import RIDGE
 
 from zwidth import figures
 from zwidth.figures import grid, style
@@ -59,16 +58,6 @@ def test_a_logarithmic_axis_has_plain_numbers(low, high):
     shown = [tick for tick in ticks if low <= tick.get_position()[0] <= high]
     assert 2 <= len(shown) <= 9
     assert [float(tick.get_text()) for tick in shown] == pytest.approx([tick.get_position()[0] for tick in shown])
-
-
-@pytest.mark.parametrize("name", EVERY_FIGURE)
-def test_no_two_names_overlap(name):
-    drawn = getattr(figures, name.split()[0])(*EVERY_FIGURE[name])
-    figure = style.figure_of(drawn)
-    figure.draw_without_rendering()
-    for ax in figure.axes:
-        boxes = [Text.get_window_extent(text) for text in ax.texts if isinstance(text, Annotation)]
-        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
 
 
 @pytest.mark.parametrize(
