@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from decimal import Decimal
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -97,12 +97,7 @@ def line_appears() -> float:
     The boundary curve ends at omega = pi, in the corner where two poles meet at z = -1. The line starts there, so it
     bounds the stable set (alpha > 0) from the delta on at which the corner crosses alpha = 0.
     """
-    # Slow to load, and no other kind of study has a use for it.
-    from scipy.optimize import root_scalar
-
-    # To the last digits of float64.
-    exact: dict[str, Any] = {"bracket": (1.0, 6.0), "method": "brentq", "xtol": 1e-15, "rtol": 1e-15}
-    return float(root_scalar(lambda delta: float(boundary(np.pi, delta, 0).alpha), **exact).root)
+    return float(bisect(lambda delta: float(boundary(np.pi, delta, 0).alpha) < 0, np.float64(1.0), np.float64(6.0)))
 
 
 def corner_takes_over() -> float:
@@ -156,17 +151,11 @@ def sharpened_numbers() -> list[Sharpened]:
 
 
 def as_json(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
-    example: dict[str, Any] = {
-        "mass_kg": MASS,
-        "period_s": PERIOD,
-        "d": DELAY_FACTOR,
-        "damping_N_s_per_m": list(DAMPINGS),
-        "stiffness_fraction": STIFFNESS_FRACTION,
-    }
+    given = {"where": "section VIII", "mass_kg": MASS, "period_s": PERIOD, "d": DELAY_FACTOR}
     content = {
         "source": SOURCE,
         "all_agree": all(row.agrees for row in printed),
-        "given": {"where": "section VIII", **example},
+        "given": {**given, "damping_N_s_per_m": list(DAMPINGS), "stiffness_fraction": STIFFNESS_FRACTION},
         "published": [{**asdict(row), "agrees": row.agrees} for row in printed],
         "sharpened": [asdict(row) for row in sharpened],
     }
@@ -219,14 +208,7 @@ class PublishedStudy(ComputedStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         printed, sharpened = published_numbers(), sharpened_numbers()
-        return Outcome(
-            documents={
-                f"{self.name}.md": as_markdown(printed, sharpened),
-                f"{self.name}.json": as_json(printed, sharpened),
-            },
-            notes=tuple(
-                f"{row.quantity}: printed {row.printed}, computed {row.computed:.10g}"
-                for row in printed
-                if not row.agrees
-            ),
-        )
+        texts = {"md": as_markdown(printed, sharpened), "json": as_json(printed, sharpened)}
+        away = [f"{row.quantity}: printed {row.printed}, computed {row.computed:.10g}"
+                for row in printed if not row.agrees]  # fmt: skip
+        return Outcome(documents={f"{self.name}.{ending}": text for ending, text in texts.items()}, notes=tuple(away))

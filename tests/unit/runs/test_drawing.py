@@ -194,7 +194,8 @@ def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys, store, 
 def test_text_stays_text_where_a_style_sheet_says_so(folder, tmp_path):
     sheet = tmp_path / "text.mplstyle"
     sheet.write_text("svg.fonttype: none\n", encoding="utf-8")
-    assert main_of("figures", folder, "--out", tmp_path, "--format", "svg", "--style", sheet) == 0
+    words = ["--at", "delay=0", "--at", "mass=0.1", "--format", "svg", "--style", sheet]
+    assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path) == 0
     files = list(tmp_path.glob("*.svg"))
     assert files
     assert all("<text" in file.read_text(encoding="utf-8") for file in files)
