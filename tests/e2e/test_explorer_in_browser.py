@@ -167,7 +167,7 @@ def test_arrow_keys_move_the_wall(page):
     assert (wall["x"][0], wall["y"][0]) == (after.stiffness, after.virtual_damping)
 
 
-def test_what_is_copied_runs(page, tmp_path):
+def test_what_is_copied_runs(page, tmp_path, unpainted):
     page.fill("#damping", "7.5")
     page.press("#damping", "Enter")
     page.select_option("#velocity", "LowPass")
