@@ -18,7 +18,7 @@ from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
 from zwidth.studies.outcome import LISTENER, ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
-from zwidth.sweep.files import holding, hopeless
+from zwidth.sweep.files import hidden_beside, holding, hopeless
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.sweep.study import SweepStudy
@@ -255,7 +255,8 @@ class _Run:
             seconds = round(time.perf_counter() - clock, 3)
             return {**entry, "seconds": seconds, "notes": [*outcome.notes], "answer": [*outcome.answer], **ended}
 
-        with self.record.staging(study.name) as stage:
+        with hidden_beside(self.record.folder / study.name) as stage:
+            stage.mkdir()
             try:
                 look = self.config.figure or FigureLook()
                 with use_kind(self.config.rotary), style_sheet(size=look.size):

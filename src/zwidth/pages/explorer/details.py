@@ -11,7 +11,7 @@ import numpy as np
 from zwidth.pages.explorer import model
 from zwidth.pages.words import check_lines, list_slopes
 from zwidth.parts.device import Device
-from zwidth.scenes.assessment import Assessment, assess, limits_of
+from zwidth.scenes.assessment import assess, limits_of
 from zwidth.scenes.scene import Scene
 
 # Held while JAX is being imported: what looks for it meanwhile would find half of it.
@@ -45,10 +45,15 @@ def compute_details(
     lines = own or check_lines(scene, verdict, [])
     word = model.word_of(verdict)
     captions = {"poles_words": model.caption_poles(scene.poles(), word), **model.caption_curves(verdict, normalized)}
-    yield {"word": word, "verdict": "\n".join(lines), **captions, **_wall_curves(scene, verdict, length)}
+    time, position = model.step_motion(scene, model.length_of(scene, verdict))
+    curves = {
+        **model.open_loop(scene, verdict),
+        "step": {"x": time, "y": position * length},
+        "best": {"x": [verdict.stiffness_max], "y": [verdict.virtual_damping_at_max]},
+    }
+    yield {"word": word, "verdict": "\n".join(lines), **captions, **curves}
     if outline:
-        passive = model.passive_set(scene)
-        x, y = passive if passive is not None else (np.empty(0), np.empty(0))
+        x, y = model.passive_set(scene) or (np.empty(0), np.empty(0))
         yield {"passive": {"x": x, "y": y}, "contours": model.contours(scene, across, up)}
     if not own:
         yield {"verdict": "\n".join(check_lines(scene, verdict, limits_of(scene)))}
@@ -75,13 +80,3 @@ def show_outlines(outlines: list[model.Curve]) -> Update:
     xs, ys = ([np.append(outline[axis], outline[axis][:1]) for outline in outlines] for axis in (0, 1))
     x, y = (np.concatenate([np.append(ring, np.nan) for ring in rings] or [np.empty(0)]) for rings in (xs, ys))
     return {"area": {"xs": [[xs]], "ys": [[ys]]}, "edge": {"x": x, "y": y}}
-
-
-def _wall_curves(scene: Scene, verdict: Assessment, length: float) -> Update:
-    time, position = model.step_motion(scene, model.length_of(scene, verdict))
-    best = verdict.stiffness_max, verdict.virtual_damping_at_max
-    return {
-        **model.open_loop(scene, verdict),
-        "step": {"x": time, "y": position * length},
-        "best": {"x": [best[0]], "y": [best[1]]},
-    }
