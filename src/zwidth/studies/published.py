@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from decimal import Decimal
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -97,7 +97,12 @@ def line_appears() -> float:
     The boundary curve ends at omega = pi, in the corner where two poles meet at z = -1. The line starts there, so it
     bounds the stable set (alpha > 0) from the delta on at which the corner crosses alpha = 0.
     """
-    return float(bisect(lambda delta: float(boundary(np.pi, delta, 0).alpha) < 0, np.float64(1.0), np.float64(6.0)))
+    # Slow to load, and no other kind of study has a use for it.
+    from scipy.optimize import root_scalar
+
+    # To the last digits of float64.
+    exact: dict[str, Any] = {"bracket": (1.0, 6.0), "method": "brentq", "xtol": 1e-15, "rtol": 1e-15}
+    return float(root_scalar(lambda delta: float(boundary(np.pi, delta, 0).alpha), **exact).root)
 
 
 def corner_takes_over() -> float:
