@@ -86,6 +86,15 @@ def fitted_once():
 
 
 @pytest.fixture
+def unpainted():
+    """Pictures are not painted: what a test looks at is something else."""
+    from unpainted import painting_nothing
+
+    with painting_nothing():
+        yield
+
+
+@pytest.fixture
 def x64():
     """Enable float64 in JAX for one test, as a user who traces the library's functions would."""
     with jax.enable_x64(True):

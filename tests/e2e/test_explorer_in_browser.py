@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import Any
 
 import numpy as np
 import pytest
 from browser import open_page
 from click.testing import CliRunner
-from explorer_server import Server, serve
+from explorer_server import serve
 from waiting import wait_for
 
 import zwidth
@@ -24,20 +23,14 @@ def server(tmp_path_factory):
         yield running
 
 
-@contextlib.contextmanager
-def visit(server, browser):
+@pytest.fixture(scope="module")
+def shared(server, browser):
     permissions = ["clipboard-read", "clipboard-write"]
     with open_page(browser, viewport={"width": 1280, "height": 1000}, permissions=permissions) as opened:
         opened.sockets = []
         opened.on("websocket", lambda socket: opened.sockets.append(socket.url))
         opened.goto(server.address)
         settle(opened)
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def shared(server, browser):
-    with visit(server, browser) as opened:
         yield opened
 
 
@@ -48,15 +41,6 @@ def page(shared):
     settle(shared)
     assert shared.asked == []
     assert shared.complaints == []
-
-
-@pytest.fixture
-def fresh(server, browser):
-    """A page of its own, as it opens."""
-    with visit(server, browser) as opened:
-        yield opened
-        assert opened.asked == []
-        assert opened.complaints == []
 
 
 def wait(page, condition):
@@ -183,29 +167,31 @@ def test_arrow_keys_move_the_wall(page):
     assert (wall["x"][0], wall["y"][0]) == (after.stiffness, after.virtual_damping)
 
 
-def test_what_is_copied_runs(fresh, tmp_path):
-    fresh.fill("#damping", "7.5")
-    fresh.press("#damping", "Enter")
-    fresh.select_option("#velocity", "LowPass")
-    settle(fresh)
-    fresh.click("[data-copy=yaml]")
-    wait(fresh, "document.getElementById('copied').textContent === 'copied'")
-    text = fresh.evaluate("navigator.clipboard.readText()")
+def test_what_is_copied_runs(page, tmp_path, unpainted):
+    page.fill("#damping", "7.5")
+    page.press("#damping", "Enter")
+    page.select_option("#velocity", "LowPass")
+    settle(page)
+    page.click("[data-copy=yaml]")
+    wait(page, "document.getElementById('copied').textContent === 'copied'")
+    text, cutoff = page.evaluate("navigator.clipboard.readText()"), value_of(page, "velocity.cutoff")
+    page.select_option("#velocity", "BackwardDifference")
     file = tmp_path / "copied.yaml"
     file.write_text(text, encoding="utf-8")
     assert zwidth.run(file, out=tmp_path / "run").ok
     given: Any = zwidth.load_config(file).scene
     scene = given.to_scene()
     assert scene.device.damping == 7.5
-    assert scene.velocity == zwidth.LowPass(cutoff=value_of(fresh, "velocity.cutoff"), order=1)
+    assert scene.velocity == zwidth.LowPass(cutoff=cutoff, order=1)
 
 
-def test_a_contact_is_simulated_on_demand(fresh):
-    assert data_of(fresh, "contact")["x"].size == 0
-    fresh.check("#contact-wanted")
-    wait(fresh, "document.getElementById('contact_words').textContent !== ''")
-    settle(fresh)
-    scene, shown = shown_scene(fresh), data_of(fresh, "contact")
+def test_a_contact_is_simulated_on_demand(page):
+    assert data_of(page, "contact")["x"].size == 0
+    page.check("#contact-wanted")
+    wait(page, "document.getElementById('contact_words').textContent !== ''")
+    settle(page)
+    scene, shown = shown_scene(page), data_of(page, "contact")
+    page.uncheck("#contact-wanted")
     start = -0.5 * scene.timing.period
     hit = scene.simulate(start_position=start, start_velocity=0.1, contact="unilateral", periods=shown["x"].size)
     np.testing.assert_array_equal(shown["force"], hit.wall_force)
@@ -222,28 +208,20 @@ def test_a_refused_value_is_said_and_the_page_goes_on(page):
     assert_edge_is_of(page, shown_scene(page))
 
 
-def test_it_fits_and_can_be_read(server, browser):
-    with open_page(browser, viewport={"width": 390, "height": 900}, color_scheme="dark") as opened:
-        opened.goto(server.address)
-        settle(opened)
-        for width, scheme in ((390, "dark"), (390, "light"), (1280, "light"), (1280, "dark")):
-            opened.set_viewport_size({"width": width, "height": 900})
-            opened.emulate_media(color_scheme=scheme)
-            settle(opened)
-            assert opened.evaluate("document.documentElement.scrollWidth") <= width
-            # WCAG's contrast of the text on what it stands on: 4.5 for AA.
-            assert opened.evaluate(CONTRAST) >= 4.5
-        assert opened.complaints == []
+def test_it_fits_and_can_be_read(page):
+    for width, scheme in ((390, "dark"), (390, "light"), (1280, "light"), (1280, "dark")):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.emulate_media(color_scheme=scheme)
+        settle(page)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        # WCAG's contrast of the text on what it stands on: 4.5 for AA.
+        assert page.evaluate(CONTRAST) >= 4.5
 
 
-def test_when_the_server_ends_the_page_says_so(browser, tmp_path):
-    ending = Server(tmp_path)
-    with open_page(browser) as opened:
-        opened.goto(ending.address)
-        settle(opened)
-        out, err, code = ending.end()
-        wait(opened, "document.getElementById('error').textContent.includes('has ended')")
-    assert (out, err, code) == ("stopped\n", "", 0)
+def test_when_the_server_ends_the_page_says_so(shared, server):
+    """The last one of this file."""
+    assert server.end() == ("stopped\n", "", 0)
+    wait(shared, "document.getElementById('error').textContent.includes('has ended')")
 
 
 CONTRAST = """(() => {

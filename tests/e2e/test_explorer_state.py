@@ -9,7 +9,6 @@ import csv
 import io
 import re
 import xml.etree.ElementTree as ET
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -30,26 +29,11 @@ def address(tmp_path_factory):
         yield running.address
 
 
-@contextmanager
-def visit(browser, address):
+@pytest.fixture(scope="module")
+def shared(browser, address):
     with open_page(browser, viewport={"width": 1280, "height": 900}, accept_downloads=True) as opened:
         opened.goto(address)
         settle(opened)
-        yield opened
-        assert opened.asked == []
-        assert opened.complaints == []
-
-
-@pytest.fixture
-def fresh(browser, address):
-    """A page of its own, for a test that goes elsewhere."""
-    with visit(browser, address) as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def shared(browser, address):
-    with visit(browser, address) as opened:
         yield opened
 
 
@@ -60,6 +44,7 @@ def page(shared):
     yield shared
     settle(shared)
     assert shared.url == start
+    assert shared.asked == []
     assert shared.complaints == []
 
 
@@ -71,8 +56,19 @@ def data_of(page, name):
     )
 
 
-def test_the_address_brings_the_scene_back(fresh, browser):
-    page = fresh
+def test_one_drag_is_one_step_back(page):
+    before, length = page.url, page.evaluate("history.length")
+    page.focus("#damping-slider")
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+        settle(page)
+    assert page.evaluate("history.length") == length + 1
+    page.go_back()
+    settle(page, f"location.href === {before!r}")
+    assert value_of(page, "damping") == 10
+
+
+def test_the_address_brings_the_scene_back(page, browser):
     first = page.url
     assert first.endswith(
         "#mass=100+g&damping=10+N+s/m&period=1+ms&delay=1+ms&stiffness=10+kN/m&virtual_damping=40+N+s/m"
@@ -99,25 +95,17 @@ def test_the_address_brings_the_scene_back(fresh, browser):
     assert page.url == first
     page.go_forward()
     settle(page, "document.getElementById('velocity').value === 'LowPass'")
-
-
-def test_one_drag_is_one_step_back(page):
-    before, length = page.url, page.evaluate("history.length")
-    page.focus("#damping-slider")
-    for _ in range(4):
-        page.keyboard.press("ArrowRight")
-        settle(page)
-    assert page.evaluate("history.length") == length + 1
     page.go_back()
-    settle(page, f"location.href === {before!r}")
-    assert value_of(page, "damping") == 10
+    settle(page, "document.getElementById('velocity').value === 'BackwardDifference'")
 
 
-def test_an_address_that_is_no_scene_is_said(fresh, address):
-    page = fresh
+def test_an_address_that_is_no_scene_is_said(page, address):
+    start = page.url
     page.goto(f"{address}#mass=heavy")
     wait_for(lambda: "scene.mass: got 'heavy'" in page.inner_text("#error"), lambda: page.inner_text("header"))
     assert page.is_visible("#stale")
+    page.goto(start)
+    settle(page, "document.getElementById('error').textContent === ''")
 
 
 @pytest.mark.parametrize("entry, says", [("-5", "mass: got -0.005 kg"), ("", "no number")])
@@ -190,39 +178,38 @@ def axes_of(page):
     )
 
 
-def test_a_rotary_device_is_moved_and_told_in_its_units(browser, address):
-    with open_page(browser, viewport={"width": 1280, "height": 900}) as page:
-        page.goto(address)
-        settle(page)
-        page.select_option("#motion", "rotary")
-        settle(page)
-        page.select_option("#operator", "rigid")
-        settle(page)
-        labels = labels_of(page)
-        assert {"inertia J in g cm^2", "physical damping b in mN m s/rad", "stiffness K in N m/rad"} <= set(labels)
-        assert not LINEAR_UNITS.search("; ".join(labels))
-        assert {"stiffness K in N m/rad", "damping B in N m s/rad", "position in mrad/(N m)"} <= set(axes_of(page))
-        page.select_option("#operator", "none")
-        settle(page)
-        enter(page, "mass", "4500")
-        enter(page, "stiffness", "20")
-        settle(page, "document.getElementById('verdict').textContent.includes('what limits it')")
-        verdict = page.inner_text("#verdict")
-        assert "4500 g cm^2" in verdict
-        for text in (verdict, page.input_value("#yaml"), page.input_value("#python"), "; ".join(axes_of(page))):
-            assert not LINEAR_UNITS.search(text), text
-        scene = zwidth.Scene(zwidth.Device(4.5e-4, 0.01, rotary=True), zwidth.Timing(1e-3, 1e-3))
-        radius = float(scene.spectral_radius(20.0, value_of(page, "virtual_damping")))
-        assert f"{radius:.6f}" in page.inner_text("#radius")
-        link = page.url
-        assert "N+m/rad" in link
-        page.select_option("#motion", "linear")
-        settle(page)
-        assert "mass m in g" in labels_of(page)
-        page.go_back()
-        settle(page, "document.getElementById('motion').value === 'rotary'")
-        assert (value_of(page, "mass"), value_of(page, "stiffness")) == (4500, 20)
-        assert page.complaints == []
+def test_a_rotary_device_is_moved_and_told_in_its_units(page, browser):
+    start = page.url
+    page.select_option("#motion", "rotary")
+    settle(page)
+    page.select_option("#operator", "rigid")
+    settle(page)
+    labels = labels_of(page)
+    assert {"inertia J in g cm^2", "physical damping b in mN m s/rad", "stiffness K in N m/rad"} <= set(labels)
+    assert not LINEAR_UNITS.search("; ".join(labels))
+    assert {"stiffness K in N m/rad", "damping B in N m s/rad", "position in mrad/(N m)"} <= set(axes_of(page))
+    page.select_option("#operator", "none")
+    settle(page)
+    enter(page, "mass", "4500")
+    enter(page, "stiffness", "20")
+    settle(page, "document.getElementById('verdict').textContent.includes('what limits it')")
+    verdict = page.inner_text("#verdict")
+    assert "4500 g cm^2" in verdict
+    for text in (verdict, page.input_value("#yaml"), page.input_value("#python"), "; ".join(axes_of(page))):
+        assert not LINEAR_UNITS.search(text), text
+    scene = zwidth.Scene(zwidth.Device(4.5e-4, 0.01, rotary=True), zwidth.Timing(1e-3, 1e-3))
+    radius = float(scene.spectral_radius(20.0, value_of(page, "virtual_damping")))
+    assert f"{radius:.6f}" in page.inner_text("#radius")
+    link = page.url
+    assert "N+m/rad" in link
+    page.select_option("#motion", "linear")
+    settle(page)
+    assert "mass m in g" in labels_of(page)
+    page.go_back()
+    settle(page, "document.getElementById('motion').value === 'rotary'")
+    assert (value_of(page, "mass"), value_of(page, "stiffness")) == (4500, 20)
+    page.goto(start)
+    settle(page, "document.getElementById('motion').value === 'linear'")
     with open_page(browser) as other:
         other.goto(link)
         settle(other)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from unpainted import painting_nothing
 
 import zwidth
 from zwidth.words.errors import StoreExistsError
@@ -38,7 +39,8 @@ def paper(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def phantom(tmp_path_factory):
-    return zwidth.run(CONFIGS / "phantom.yaml", out=tmp_path_factory.mktemp("runs") / "phantom")
+    with painting_nothing():
+        return zwidth.run(CONFIGS / "phantom.yaml", out=tmp_path_factory.mktemp("runs") / "phantom")
 
 
 def table_of(run, name):

@@ -40,7 +40,7 @@ def refresh_docs(monkeypatch):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS).as_posix())
-def test_every_page_is_up_to_date(page, refresh_docs, fitted_once):
+def test_every_page_is_up_to_date(page, refresh_docs, fitted_once, unpainted):
     text = page.read_text(encoding="utf-8")
     assert refresh_docs.refreshed(text) == text
 

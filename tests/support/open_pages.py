@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from typing import Any
 
 from bokeh.document import Document
@@ -17,13 +18,13 @@ class Queue:
     def __init__(self):
         self.tasks = []
 
-    def submit(self, task, *arguments):
-        self.tasks.append((task, arguments))
+    def submit(self, task, *arguments, **options):
+        self.tasks.append(partial(task, *arguments, **options))
 
     def work(self):
         tasks, self.tasks = self.tasks, []
-        for task, arguments in tasks:
-            task(*arguments)
+        for task in tasks:
+            task()
 
 
 def open_page(controls: Controls) -> Any:

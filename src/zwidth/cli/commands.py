@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import textwrap
@@ -87,7 +86,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --period (with --damping and --delay)")
-    normalized = scene is None
+    given = scene
     scene = Scene(Device(1.0, delta), Timing(1.0, d)) if scene is None else scene
     scene = replace(scene, timing=replace(scene.timing, delay_model=delay_model))
     wall = scene.max_stiffness()
@@ -95,25 +94,20 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
         none = int(wall.status) == Status.NO_BOUNDARY
         what = "no wall with K > 0 is stable on this device" if none else "K_max of this device was not found"
         raise click.UsageError(f"{what}: {Status(int(wall.status)).message}")
-    top, kind = scene.normalize_walls(wall.stiffness, wall.virtual_damping), name_kind(wall)
-    by_mass = isinstance(scene.device, Device)
-    result: dict[str, Any] = {
-        "delta": float(scene.delta),
-        "d": float(scene.d),
-        "alpha_max": float(top[0]),
-        "beta": float(top[1]),
-        "omega": float(wall.frequency * (2.0 * math.pi * scene.timing.period)),
-        "kind": kind,
-    }
-    lines = [
-        row("normalized", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"),
-        row("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
-        row("beta", f"{result['beta']:.12g}"),
-    ]
-    if not by_mass:
-        # No mass is known, in whose units normalized numbers are.
-        result, lines = {"kind": kind}, []
-    if not normalized:
+    (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
+    result: dict[str, Any] = {}
+    if isinstance(scene.device, Device):
+        # Else no mass is known, in whose units normalized numbers are.
+        omega = wall.frequency * (2.0 * math.pi * scene.timing.period)
+        numbers = {"delta": scene.delta, "d": scene.d, "alpha_max": alpha, "beta": beta, "omega": omega}
+        result = {name: float(number) for name, number in numbers.items()}
+        lines = [
+            row("normalized", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"),
+            row("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
+            row("beta", f"{result['beta']:.12g}"),
+        ]
+    result["kind"] = kind
+    if given is not None:
         slopes, notes = words.list_slopes(scene), words.scene_notes(scene) + _say_stiffer(scene)
         found = wall.stiffness, wall.virtual_damping, wall.frequency
         named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, found), strict=True))
@@ -122,15 +116,16 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
         }
-        labels = zip(("B", "frequency"), list(named.values())[1:], ("N s/m", "Hz"), strict=True)
         lines = [
             *words.scene_lines(scene),
             *lines,
             row("K_max", spell_stiffness(named["stiffness_max"])),
-            *(row(label, with_unit(value, unit)) for label, value, unit in labels),
+            row("B", with_unit(named["virtual_damping"], "N s/m")),
+            row("frequency", with_unit(named["frequency"], "Hz")),
             row("what to set", "at wanted margins: zwidth recommend, with the same options"),
+            *(slope.line() for slope in slopes),
+            *words.note_lines(notes),
         ]
-        lines += [*(slope.line() for slope in slopes), *words.note_lines(notes)]
     words.tell(result, lines, as_json)
 
 
@@ -168,25 +163,20 @@ def devices(name: str | None, as_json: bool) -> None:
     from zwidth.parts.devices import DEVICES, Published, find_device
 
     chosen = DEVICES if name is None else (find_device(name),)
-    if as_json:
-        click.echo(json.dumps([device.as_dict() for device in chosen], indent=1, allow_nan=False))
-        return
-    if name is not None:
-        device = chosen[0]
-        click.echo(f"{device.title} ({device.motion})")
-        for quantity, number in device.numbers.items():
-            note = f" ({number.note})" if number.note else ""
-            click.echo(row(quantity, f"{number.spell()}{note}; {number.source}"))
-        return
 
     def cell(number: Published | None) -> str:
         return "-" if number is None else number.spell()
 
-    lines = [("name", *(column.replace("_", " ") for column in _COLUMNS))]
-    lines += [(device.name, *(cell(getattr(device, column)) for column in _COLUMNS)) for device in chosen]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    for line in lines:
-        click.echo("  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip())
+    if name is None:
+        table = [("name", *(column.replace("_", " ") for column in _COLUMNS))]
+        table += [(device.name, *(cell(getattr(device, column)) for column in _COLUMNS)) for device in chosen]
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        lines = ["  ".join(map(str.ljust, texts, widths)).rstrip() for texts in table]
+    else:
+        notes = {quantity: f" ({number.note})" if number.note else "" for quantity, number in chosen[0].numbers.items()}
+        lines = [f"{chosen[0].title} ({chosen[0].motion})"]
+        lines += [row(key, f"{each.spell()}{notes[key]}; {each.source}") for key, each in chosen[0].numbers.items()]
+    words.tell([device.as_dict() for device in chosen], lines, as_json)
 
 
 def _complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
@@ -223,12 +213,12 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     # The schema's place is known in a checkout alone, and each configuration has results of its own.
     text = re.sub(r"\A# yaml-language-server:.*\n(?:#\n)?", "", text)
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", text, count=1)
-    files = {Path(f"{name}.yaml"): text}
-    files |= {
-        Path(table): known[example].with_name(table).read_text(encoding="utf-8") for table in _TABLE.findall(text)
-    }
-    # A table that is there as it would be written serves as it is.
-    wanted = {file: text for file, text in files.items() if file.suffix == ".yaml" or not _holds(file, text)}
+    wanted = {Path(f"{name}.yaml"): text}
+    for table in map(Path, _TABLE.findall(text)):
+        content = known[example].with_name(table.name).read_text(encoding="utf-8")
+        # A table that is there as it would be written serves as it is.
+        if not table.is_file() or table.read_bytes() != content.encode():
+            wanted[table] = content
     for file in wanted:
         if file.exists() or file.is_symlink():
             raise InputError(f"{file}: is there already and stays as it is; give another NAME, or move it away")
@@ -237,10 +227,6 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
             stream.write(content)
         click.echo(f"wrote {file}")
     click.echo(f"run it with: zwidth run {name}.yaml   (results go to runs/{name})")
-
-
-def _holds(file: Path, text: str) -> bool:
-    return file.is_file() and file.read_bytes() == text.encode("utf-8")
 
 
 def find_examples() -> dict[str, Path]:
@@ -273,8 +259,6 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
     import threading
     import webbrowser
 
-    from zwidth.words.errors import InputError
-
     try:
         from zwidth.pages.explorer.server import Explorer
     except ModuleNotFoundError as error:
@@ -304,4 +288,4 @@ def report(folder: Path, out: Path | None, as_json: bool) -> None:
     from zwidth.pages.report.page import write_report
 
     file = write_report(folder, out)
-    click.echo(json.dumps({"file": str(file), "bytes": file.stat().st_size}) if as_json else f"wrote {file}")
+    words.tell({"file": str(file), "bytes": file.stat().st_size}, [f"wrote {file}"], as_json)

@@ -45,13 +45,7 @@ _TOLERANCE = Parsed(
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the draws.")
 @json_option
 def design(
-    scene: Any,
-    find: str | None,
-    tolerances: tuple[tuple[str, float], ...],
-    distribution: Any,
-    samples: int | None,
-    seed: int,
-    as_json: bool,
+    scene: Any, find: str | None, tolerances: tuple[tuple[str, float], ...], as_json: bool, **drawn: Any
 ) -> None:
     """Say what a wanted stiffness needs, or what tolerances cost.
 
@@ -61,18 +55,19 @@ def design(
     """
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")
-    found: dict[str, Any] = {}
-    lines: list[str] = []
-    if find is not None:
-        found["required"], words = _require(scene, find)
-        lines += words
-    if tolerances:
-        found["tolerances"], words = _tolerate(scene, dict(tolerances), distribution, samples, seed)
-        lines += words
-        if not scene.parts_beyond and distribution == "uniform" and all(name in _BOX for name, _ in tolerances):
-            found["every_device"], words = _prove(scene, dict(tolerances))
-            lines += words
-    tell(found, lines, as_json)
+    shares, uniform = dict(tolerances), drawn["distribution"] == "uniform"
+    provable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
+    parts = {
+        "required": _require(scene, find) if find is not None else None,
+        "tolerances": _tolerate(scene, shares, **drawn) if shares else None,
+        "every_device": _prove(scene, shares) if provable else None,
+    }
+    told = {name: part for name, part in parts.items() if part is not None}
+    tell(
+        {name: found for name, (found, _) in told.items()},
+        [line for _, said in told.values() for line in said],
+        as_json,
+    )
 
 
 def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
@@ -111,6 +106,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
 def _tolerate(
     scene: Any, shares: dict[str, float], distribution: Any, samples: int | None, seed: int
 ) -> tuple[dict[str, Any], list[str]]:
+    """What tolerances leave, by devices drawn within them."""
     from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 
     count = samples if samples is not None else scene.loop.draws

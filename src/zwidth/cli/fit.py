@@ -16,10 +16,10 @@ from zwidth.cli.options import (
     log_options,
     number_or_text,
     quantity_type,
+    read_logs,
     read_period,
     read_share,
     save_figure,
-    tell_long_logs,
     velocity_options,
 )
 from zwidth.pages.words import row, tell
@@ -89,14 +89,12 @@ def fit(
     period: float | None,
     rate: float | None,
     noise: float | None,
-    max_delay: float | None,
-    resample: bool,
-    velocity: Any,
     unknown_cutoff: bool,
+    velocity: Any,
     figure: Path | None,
     as_yaml: bool,
     as_json: bool,
-    **columns: str | None,
+    **of_logs: Any,
 ) -> None:
     """Find a device's mass, damping and delay.
 
@@ -113,8 +111,8 @@ def fit(
         raise click.UsageError("give one of --json and --yaml")
     units, points = LINEAR, ()
     if walls:
-        for name, value in {**columns, "max-delay": max_delay, "resample": resample or None}.items():
-            if value is not None:
+        for name, value in of_logs.items():
+            if value:
                 raise click.UsageError(f"--{name.replace('_', '-')} belongs to a LOG.csv")
         if period is None:
             raise click.UsageError("give --period or --rate")
@@ -132,15 +130,14 @@ def fit(
             raise click.UsageError("--noise belongs to --buzz; the noise of a log is found from it")
         if unknown_cutoff:
             raise click.UsageError("--unknown-cutoff belongs to --buzz; no velocity is estimated in a log")
-        if columns["time"] is not None and period is not None:
+        if of_logs["time"] is not None and period is not None:
             raise click.UsageError("give one of --time, --period and --rate")
-        from zwidth.fitting.columns import fit_motions, read_log
+        from zwidth.fitting.columns import fit_motions
 
-        options = {name: columns.pop(name) for name in ("resolution", "motor_constant")}
-        tell_long_logs(logs)
-        motions = [read_log(log, columns, period=period, **options) for log in logs]
+        options = {name: of_logs.pop(name) for name in ("max_delay", "resample")}
+        motions = read_logs(logs, period, **of_logs)
         units = ROTARY if motions[0].rotary else LINEAR
-        found = fit_motions(motions, period=period, velocity=velocity, max_delay=max_delay, resample=resample)
+        found = fit_motions(motions, period=period, velocity=velocity, **options)
         source = " and ".join(log.name for log in logs)
     wrote = []
     if figure is not None:

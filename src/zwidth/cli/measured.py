@@ -13,8 +13,8 @@ from zwidth.cli.options import (
     json_option,
     log_options,
     quantity_type,
+    read_logs,
     save_figure,
-    tell_long_logs,
     velocity_options,
 )
 from zwidth.pages.words import row, tell
@@ -68,13 +68,11 @@ def respond(
     logs: tuple[Path, ...],
     period: float | None,
     cycle: float | None,
-    resolution: str | None,
-    motor_constant: str | None,
     save: Path | None,
     velocity: Any,
     figure: Path | None,
     as_json: bool,
-    **columns: str | None,
+    **of_logs: str | None,
 ) -> None:
     """Find a device's frequency response, and what is safe by it.
 
@@ -82,18 +80,14 @@ def respond(
     other. What --save keeps, and any table of an analyzer, is a device of the other commands: `zwidth ridge --device
     FILE.csv` answers of it.
     """
-    from zwidth.fitting.columns import read_log
     from zwidth.fitting.respond import find_nominal_limit, respond_to_logs
     from zwidth.parts.timing import Timing
     from zwidth.parts.velocity import BackwardDifference
     from zwidth.scenes.scene import Scene
 
-    if columns["time"] is not None and period is not None:
+    if of_logs["time"] is not None and period is not None:
         raise click.UsageError("give one of --time and --period")
-    options = {"resolution": resolution, "motor_constant": motor_constant, "period": period}
-    tell_long_logs(logs)
-    motions = [read_log(log, columns, **options) for log in logs]
-    found = respond_to_logs(motions, period=period, cycle=cycle)
+    found = respond_to_logs(read_logs(logs, period, **of_logs), period=period, cycle=cycle)
     device, period, doubts = found.device, found.period, found.doubts
     kind = "stretches of a force that repeats" if found.cycle else "pieces"
     source = f"{' and '.join(log.name for log in logs)}, {found.records} {kind}"

@@ -339,9 +339,15 @@ velocity_options = _take_options(
 )
 
 
-def tell_long_logs(logs: Iterable[Path]) -> None:
-    """Say on the error stream which logs are read where that takes a while."""
+def read_logs(
+    logs: Iterable[Path], period: float | None, *, resolution: str | None, motor_constant: str | None, **columns: Any
+) -> list[Any]:
+    """The motions of logs by their `log_options`; the error stream says which are read where that takes a while."""
+    from zwidth.fitting.columns import read_log
+
     for log in logs:
         size = log.stat().st_size if log.is_file() else 0
         if size > _LONG:
             click.echo(f"zwidth: reading {log.name}, {size / 2**20:.0f} MiB; then the numbers are computed", err=True)
+    options = {"period": period, "resolution": resolution, "motor_constant": motor_constant}
+    return [read_log(log, columns, **options) for log in logs]

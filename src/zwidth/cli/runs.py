@@ -84,7 +84,6 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **op
     Data, figures and a record of the run go into one folder, the results of each sweep into a store DIR/STUDY.zarr.
     Ctrl-C keeps what is done; --resume goes on.
     """
-    from zwidth.cli.runs import reporter
     from zwidth.figures.style import style_sheet
     from zwidth.runs.run import run as run_studies
 
@@ -94,7 +93,7 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **op
     command = _spell_resume_command(path, **options)
     with _interrupt_on_sigterm() as stopped_by:
         try:
-            with reporter() as progress, style_sheet(None, size):
+            with reporter() as progress, style_sheet(size=size):
                 # The options are those of `zwidth.run`, by their names.
                 result = run_studies(path, progress=progress, **options)
         except KeyboardInterrupt:
@@ -135,13 +134,9 @@ def _print_plan(path: Path, *, out: Path | None, memory: int, workers: int | Non
     folder = out or Path("runs", config.name)
     steps = plan_run(config, memory=memory)
     for step in steps:
-        lines = (
-            step.lines()
-            if isinstance(step, Plan)
-            else [f"study {step.name}", f"  {step.points:,} points ({step.extent})"]
-        )
-        for line in lines:
-            click.echo(line)
+        plan = isinstance(step, Plan)
+        lines = step.lines() if plan else (f"study {step.name}", f"  {step.points:,} points ({step.extent})")
+        click.echo("\n".join(lines))
     click.echo(f"results go to {folder}")
     check_resources([step for step in steps if isinstance(step, Plan)], folder, workers or 1)
 
@@ -256,16 +251,12 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
     wall. --at chooses slices by the nearest value that the sweep has, in the units of the store; without it up to
     three values of a parameter have a panel each.
     """
-    from zwidth.runs.draw import Drawing, draw_stores
+    from zwidth.runs.draw import draw_stores
 
-    files = draw_stores(
-        folder,
-        out,
-        at=dict(at),
-        drawing=Drawing(**drawing),
-        progress=None if as_json else lambda file: click.echo(f"wrote {file}"),
-        note=lambda text: click.echo(f"zwidth: {text}", err=True),
-    )
+    axes = {role: drawing.pop(role) for role in ("x", "y", "hue", "col")}
+    told: dict[str, Any] = {"note": lambda text: click.echo(f"zwidth: {text}", err=True)}
+    told |= {} if as_json else {"progress": lambda file: click.echo(f"wrote {file}")}
+    files = draw_stores(folder, out, at=dict(at), axes=axes, **drawing, **told)
     if as_json:
         print_json({"files": [str(file) for file in files]})
     if not files:
@@ -305,69 +296,48 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
 
 @contextmanager
 def reporter() -> Iterator[Callable[[StudyEvent], None]]:
-    """A callback for `zwidth.run` that tells on stderr how far it is."""
-    if not sys.stderr.isatty():
-        yield _Lines()
-        return
+    """A callback for `zwidth.run` that tells on stderr how far it is: a bar on a terminal, else a line in a while."""
     from rich.console import Console
     from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    console = Console(stderr=True)
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[state]}"),
-        TimeElapsedColumn(),
-    )
-    with Bar(*columns, console=console, transient=True) as bar:
+    console, told = Console(stderr=True), time.monotonic()
+    words = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[state]}")
+    columns = SpinnerColumn(), *words, TimeElapsedColumn()
+    with Bar(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
         shown = bar.add_task("starting", total=None, state="")
 
-        def show(event: StudyEvent) -> None:
-            description = f"{event.name} ({event.kind})"
-            if event.progress is not None:
-                done, total = event.progress.points, event.progress.total_points
-                bar.update(shown, description=description, completed=done, total=total, state=_state(event.progress))
-            elif event.parts is not None:
-                bar.update(shown, description=description, completed=event.parts[0], total=event.parts[1], state="")
-            elif event.result is None:
-                bar.update(shown, description=description, completed=event.index - 1, total=event.total, state="")
+        def say(line: str) -> None:
+            if bar.disable:
+                click.echo(line, err=True)
             else:
-                bar.update(shown, completed=event.index, total=event.total, state="")
-                for line in _lines(event):
-                    console.print(line, markup=False, highlight=False)
+                console.print(line, markup=False, highlight=False)
+
+        def show(event: StudyEvent) -> None:
+            nonlocal told
+            done, total, state, line, due = event.index - (event.result is None), event.total, "", "", False
+            if event.progress is not None:
+                done, total, state = event.progress.points, event.progress.total_points, _state(event.progress)
+                line = f"{event.progress.chunks}/{event.progress.total_chunks} chunks  {state}"
+                due = event.progress.chunks == event.progress.total_chunks or bool(event.progress.error)
+            elif event.parts is not None:
+                done, total = event.parts
+                line = f"{done}/{total} done"
+            bar.update(shown, description=f"{event.name} ({event.kind})", completed=done, total=total, state=state)
+            if line and bar.disable and (due or time.monotonic() - told >= _SECONDS_BETWEEN_LINES):
+                told = time.monotonic()
+                say(f"{event.name:<20} {line}")
+            for text in _lines(event):
+                say(text)
 
         yield show
 
 
-class _Lines:
-    """Plain lines; of chunks, at most one in a while."""
-
-    def __init__(self) -> None:
-        self.last = time.monotonic()
-
-    def __call__(self, event: StudyEvent) -> None:
-        progress, now = event.progress, time.monotonic()
-        if event.parts is not None and now - self.last >= _SECONDS_BETWEEN_LINES:
-            self.last = now
-            click.echo(f"{event.name:<20} {event.parts[0]}/{event.parts[1]} done", err=True)
-        if progress is None:
-            for line in _lines(event) if event.result else ():
-                click.echo(line, err=True)
-            return
-        last = progress.chunks == progress.total_chunks
-        if last or progress.error or now - self.last >= _SECONDS_BETWEEN_LINES:
-            self.last = now
-            done = f"{progress.chunks}/{progress.total_chunks} chunks"
-            click.echo(f"{event.name:<20} {done}  {_state(progress)}", err=True)
-
-
 def _lines(event: StudyEvent) -> Iterator[str]:
-    """One finished study: its number, name, time and files, and its notes."""
+    """A study that has ended: its number, name, time and files, and its notes."""
     result = event.result
-    assert result is not None, "an event at the end of a study has its result"
+    if result is None:
+        return
     state = f"{len(result.files)} files{', kept' if result.state == 'kept' else ''}"
     if result.sweep is not None:
         state = f"{result.sweep.computed + result.sweep.skipped}/{result.sweep.total} chunks"

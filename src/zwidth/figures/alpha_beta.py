@@ -162,9 +162,9 @@ def draw_map(
         place = np.s_[:, :, column, row]
         image = _draw_cells(ax, arrays, output, arrays[output][place].T)
         exact = edges(float(delta[column]), float(d[row])) if output in SHADES else None
-        if exact is not None and stable_set.agrees(exact, arrays["alpha"], arrays["beta"], arrays[output][place].T > 0):
-            look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.2, "zorder": 2}
-            stable_set.draw_region(ax, exact, SHADES[output], label="exact edge", **look)
+        cells = arrays["alpha"], arrays["beta"], arrays[output][place].T > 0
+        look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.2, "zorder": 2}
+        if stable_set.draw_exact(ax, exact, *cells, SHADES.get(output), **look):
             image.set_cmap(ListedColormap(["white", "white"]))
         ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")
     style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)

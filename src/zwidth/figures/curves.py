@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth.figures import grid, style
 from zwidth.figures.plane import SMOOTH, Edges, boundary_level, find_outlines, panel_grid
-from zwidth.figures.stable_set import agrees, draw_region, fit_axes
+from zwidth.figures.stable_set import draw_exact
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, VARIABLES, WALL
 
@@ -115,9 +115,8 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
             level = boundary_level(name)
             stable = np.ma.filled(shown < level if OUTPUTS[name].below else shown > level, False)
             known = find_outlines(device, edges).get("stable")
-            if known is not None and agrees(known, part[x].values, part[y].values, stable):
-                draw_region(ax, fit_axes(known, ax), "none", linewidth=1.4, label="exact edge", **look)
-            elif shown.count() and shown.min() < level < shown.max():
+            exact = draw_exact(ax, known, part[x].values, part[y].values, stable, linewidth=1.4, **look)
+            if not exact and shown.count() and shown.min() < level < shown.max():
                 line = {"colors": [look["color"]], "linestyles": [look["linestyle"]], "linewidths": 1.4}
                 ax.contour(part[x].values, part[y].values, shown, levels=[level], **line)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)

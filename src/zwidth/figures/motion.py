@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -136,8 +135,7 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         ax.set_xlim(0.0, max(float(each.time_s[-1]) for each in motions) * clock)
     _mark_wall(panels[0], "y", motions)
     panels[-1].set_xlabel(f"time  $t$  in {second}")
-    handles = [*_explain(motions), *([style.line("bodies behind links", width=0.6)] if behind else [])]
-    style.legend(panels, handles, outside=axes is None, ncols=_count_columns(motions))
+    _explain(panels, motions, *([style.line("bodies behind links", width=0.6)] if behind else []), outside=axes is None)
     return panels
 
 
@@ -163,7 +161,7 @@ def draw_phase_plane(table: Table, axes: style.AnyAxes | None = None) -> np.ndar
     _mark_wall(ax, "x", motions)
     ax.set(xlabel=f"position  $x$  in {meter}", ylabel=f"velocity  $v$  in {speed}")
     start = style.line("start", "", color=style.BLACK, marker="o", markersize=4.0)
-    style.legend(panels, [*_explain(motions), start], outside=axes is None, ncols=_count_columns(motions))
+    _explain(panels, motions, start, outside=axes is None)
     return panels
 
 
@@ -236,12 +234,9 @@ def _in_math(label: str) -> str:
     return label.replace("K_max", r"$K_{\max}$")
 
 
-def _count_columns(motions: list[Any]) -> int:
-    """How many names of motions a legend has side by side."""
-    return 2 if max(len(each.label) for each in motions) > 20 else 4
-
-
-def _explain(motions: Iterable[Any]) -> list[Any]:
-    """An entry of a legend for each motion that has a name."""
+def _explain(panels: np.ndarray, motions: list[Any], *more: Line2D, outside: bool) -> None:
+    """A legend with each motion that has a name; of long ones two side by side."""
     named = [each for each in motions if each.label]
-    return [style.line(_in_math(each.label), each.look["linestyle"], color=each.look["color"]) for each in named]
+    lines = [style.line(_in_math(each.label), each.look["linestyle"], color=each.look["color"]) for each in named]
+    columns = 2 if max(len(each.label) for each in motions) > 20 else 4
+    style.legend(panels, [*lines, *more], outside=outside, ncols=columns)

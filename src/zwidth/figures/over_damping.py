@@ -36,17 +36,14 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     for interval in stable:
         if interval.delay_model == "held":
             _shade(ax, interval, colors[interval.d], zorder=1)
-        label = f"beta_upper, d = {interval.d:g}, {interval.delay_model}"
-        look = {"color": colors[interval.d], "linestyle": style.dash_of(interval), "zorder": 3}
-        ax.plot(interval.delta, interval.beta_upper, label=label, **look)
+        _draw_curve(ax, interval, interval.delta, interval.beta_upper, colors, "beta_upper")
     look = {"color": style.VERMILION, "linestyle": style.DASH_DOTTED, "linewidth": 1.3, "zorder": 4}
     for interval in passive:
         _shade(ax, interval, style.VERMILION)
         for name in ("beta_lower", "beta_upper"):
             ax.plot(interval.delta, getattr(interval, name), label=f"passive {name}, d = {interval.d:g}", **look)
     _draw_lower_bound(ax, stable[0], several=len(colors) > 1)
-    deltas = np.concatenate([interval.delta for interval in stable])
-    grid.scale_axis(ax, "x", np.unique(deltas))
+    grid.scale_axis(ax, "x", np.unique(np.concatenate([interval.delta for interval in stable])))
     values = np.concatenate([np.r_[interval.beta_lower, interval.beta_upper] for interval in stable])
     ax.set_ylim(*style.span(float(values.min()), float(values.max())))
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
@@ -58,6 +55,12 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     if handles:
         ax.legend(handles=handles, loc="upper left")
     return ax
+
+
+def _draw_curve(ax: Axes, of: Any, x: Any, y: Any, colors: dict[float, Any], words: str, **look: Any) -> None:
+    """One curve of a delay in its color, dashed in the model of the fractional power."""
+    label = ", ".join([f"{words}, d = {of.d:g}", *([of.delay_model] if hasattr(of, "delay_model") else [])])
+    ax.plot(x, y, label=label, **{"color": colors[of.d], "linestyle": style.dash_of(of), "zorder": 3, **look})
 
 
 def _shade(ax: Axes, interval: Any, color: Any, **keywords: Any) -> None:
@@ -101,11 +104,9 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
     shown = curves(columns, "d", "delay_model")
     colors = style.color_by_value([path.d for path in shown])
     for path in shown:
-        color = colors[path.d]
-        look = {"color": color, "linestyle": style.dash_of(path), "zorder": 3}
-        ax.plot(path.delta, path.alpha_max, label=f"alpha_max, d = {path.d:g}, {path.delay_model}", **look)
+        _draw_curve(ax, path, path.delta, path.alpha_max, colors, "alpha_max")
         if path.delay_model == "held":
-            ax.fill_between(path.delta, 0.0, path.alpha_max, color=color, alpha=0.07, linewidth=0.0, zorder=1)
+            ax.fill_between(path.delta, 0.0, path.alpha_max, color=colors[path.d], alpha=0.07, linewidth=0.0, zorder=1)
     ax.set_xlim(float(columns["delta"].min()), end)
     highest = float(np.nanmax(columns["alpha_max"]))
     ax.set_ylim(0.0, 1.04 * highest)
@@ -145,12 +146,11 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
 def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
     """alpha_max/delta on logarithmic axes, the limits dotted across."""
     for path in paths:
-        color, dash = colors[path.d], style.dash_of(path)
-        label = f"alpha_max/delta, d = {path.d:g}, {path.delay_model}"
         shown = path.delta >= _LEAST_DELTA
         delta = path.delta[shown]
-        ax.plot(delta, path.alpha_max[shown] / delta, color=color, linestyle=dash, label=label, zorder=3)
-        ax.axhline(path.limit, color=color, linestyle=style.DOTTED, linewidth=0.9, label=f"g, d = {path.d:g}", zorder=2)
+        _draw_curve(ax, path, delta, path.alpha_max[shown] / delta, colors, "alpha_max/delta")
+        look = {"color": colors[path.d], "linestyle": style.DOTTED, "linewidth": 0.9, "zorder": 2}
+        ax.axhline(path.limit, label=f"g, d = {path.d:g}", **look)
     limits = [path.limit for path in paths]
     ends = _LEAST_DELTA, max(float(path.delta.max()) for path in paths)
     style.use_logarithmic(ax, "x", ends)
@@ -189,8 +189,7 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     colors = style.color_by_value([cost.d for cost in costs])
     for ax, draw in zip(panels, (_draw_maxima, _draw_share), strict=False):
         draw(ax, costs, colors)
-        deltas = np.asarray(table["delta"])
-        grid.scale_axis(ax, "x", np.unique(deltas))
+        grid.scale_axis(ax, "x", np.unique(table["delta"]))
         ax.set_xlabel(style.DELTA_LABEL)
     style.letter(panels)
     return panels
@@ -198,25 +197,22 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
 
 def _draw_maxima(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
     for cost in costs:
-        color, d = colors[cost.d], f"d = {cost.d:g}"
-        ax.plot(cost.delta, cost.alpha_max, color=color, label=f"alpha_max, {d}", zorder=3)
-        passive: dict[str, Any] = {"linestyle": style.DASH_DOTTED, "label": f"alpha_max_passive, {d}"}
-        ax.plot(cost.delta, cost.alpha_max_passive, color=color, zorder=3, **passive)
-        gap = (cost.delta, cost.alpha_max_passive, cost.alpha_max)
-        ax.fill_between(*gap, color=color, alpha=0.12, linewidth=0.0, zorder=1)
+        delta, best, passive = cost.delta, cost.alpha_max, cost.alpha_max_passive
+        _draw_curve(ax, cost, delta, best, colors, "alpha_max")
+        _draw_curve(ax, cost, delta, passive, colors, "alpha_max_passive", linestyle=style.DASH_DOTTED)
+        ax.fill_between(delta, passive, best, color=colors[cost.d], alpha=0.12, linewidth=0.0, zorder=1)
     ax.set_ylim(0.0, 1.04 * max(float(np.nanmax(cost.alpha_max)) for cost in costs))
     style.label_ends(ax, costs, [cost.alpha_max[-1] for cost in costs], colors)
     ax.set_ylabel(style.ALPHA_LABEL)
-    passive_line = style.line("stiffest passive wall", style.DASH_DOTTED)
-    handles = [style.line(r"stiffest stable wall, $\alpha_{\max}$"), passive_line]
-    ax.legend(handles=handles, loc="upper left")
+    stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")
+    ax.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc="upper left")
 
 
 def _draw_share(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
     """The share of the stable stiffness that a passive wall reaches."""
     ratios = [100.0 * cost.alpha_max_passive / cost.alpha_max for cost in costs]
     for cost, ratio in zip(costs, ratios, strict=True):
-        ax.plot(cost.delta, ratio, color=colors[cost.d], label=f"passive share, d = {cost.d:g}", zorder=3)
+        _draw_curve(ax, cost, cost.delta, ratio, colors, "passive share")
     ax.set_ylim(0.0, 100.0)
     style.label_ends(ax, costs, [ratio[-1] for ratio in ratios], colors)
     ax.set_ylabel(r"stiffest passive wall in % of $\alpha_{\max}$")

@@ -39,6 +39,8 @@ _STEEP = 100.0
 _LABELLED = 0.1
 # Less than this cannot be seen.
 _SEEN = 0.003
+# The boundary where it is known.
+_EDGE: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.3, "zorder": 2.2, "under": 1.5}
 _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
 
 
@@ -178,13 +180,11 @@ def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, outlines: Mapping[s
         smooth, level = np.ma.masked_invalid(part[edge].values), boundary_level(edge)
         # Where a part is missing, its cells are all that says where.
         whole = min(smooth.shape) > 1 and shown.count() == smooth.count() == shown.size
-        exact = whole and each in outlines and stable_set.agrees(outlines[each], x, y, shown.data > 0.5)
         outside = "white" if image is None else (0, 0, 0, 0)
         shades = ListedColormap([outside, outside if whole else SHADES[each]])
         image = _draw_cells(ax, part, shown, cmap=shades, vmin=0, vmax=1)
-        if exact:
-            _draw_outline(ax, outlines[each], dash, SHADES[each])
-        else:
+        known = outlines.get(each) if whole else None
+        if not stable_set.draw_exact(ax, known, x, y, shown.data > 0.5, SHADES[each], linestyle=dash, **_EDGE):
             if whole and smooth.min() < level < smooth.max():
                 ends = [-np.inf, level] if OUTPUTS[edge].below else [level, np.inf]
                 ax.contourf(x, y, smooth, levels=ends, colors=[SHADES[each]])
@@ -193,12 +193,6 @@ def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, outlines: Mapping[s
                 image.set_cmap(ListedColormap([SHADES[each], SHADES[each]]))
             _draw_line(ax, x, y, smooth, level, dash)
     return image
-
-
-def _draw_outline(ax: Axes, outlines: stable_set.Outlines, dash: Any, shade: Any = "none") -> None:
-    """The boundary where it is known, and what lies within."""
-    look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.3, "linestyle": dash, "zorder": 2.2}
-    stable_set.draw_region(ax, stable_set.fit_axes(outlines, ax), shade, under=1.5, label="exact edge", **look)
 
 
 def _draw_line(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, level: float, dash: Any = style.SOLID) -> Any:
@@ -249,9 +243,9 @@ def _draw_edge(
     known = outlines.get("passive" if name == "passivity_margin" else "stable")
     good = values < output.center if output.below else values > output.center
     good = good if output.look == "diverging" else ~np.ma.getmaskarray(values)
-    if known is not None and stable_set.agrees(known, x, y, np.ma.filled(good, False)):
-        _draw_outline(ax, known, style.SOLID)
-        return [points for points, _ in stable_set.fit_axes(known, ax)]
+    exact = stable_set.draw_exact(ax, known, x, y, np.ma.filled(good, False), linestyle=style.SOLID, **_EDGE)
+    if exact:
+        return [points for points, _ in exact]
     drawn = _draw_line(ax, x, y, values, output.center) if output.look == "diverging" else None
     return drawn.get_paths()[0].to_polygons(closed_only=False) if drawn else []
 

@@ -17,7 +17,7 @@ applied while drawing; matplotlib's settings stay as they are. ``zwidth.figures.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,14 +28,8 @@ from zwidth.arrays.evaluate import as_float64
 from zwidth.figures import style
 from zwidth.figures.grid import scale_axis
 from zwidth.figures.motion import draw_motion, draw_step
-from zwidth.figures.stable_set import (
-    draw_recommendation,
-    draw_stable_set,
-    name_wall,
-    tabulate_walls,
-    trace_outlines,
-)
-from zwidth.figures.table import Table, stack
+from zwidth.figures.stable_set import draw_recommendation, draw_stable_set, name_wall, tabulate_sets, tabulate_walls
+from zwidth.figures.table import Parameters, Result, Table, stack
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.checks import read_texts
 from zwidth.parts.measured import MeasuredDevice
@@ -60,6 +54,11 @@ __all__ = ["bode", "motion", "nyquist", "poles", "recommendation", "region", "ri
 def __dir__() -> list[str]:
     """Its own names, and not those that it imports."""
     return sorted(__all__)
+
+
+def _draws(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Let a function draw in the house's look, in the units of its first argument."""
+    return in_own_units(style.house_style()(function))
 
 
 def _axes(ax: Axes | None) -> Axes:
@@ -88,8 +87,7 @@ def _complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: tuple[
     return ax
 
 
-@in_own_units
-@style.house_style()
+@_draws
 def region(
     scene: Scene | Mapping[str, Scene], ax: Axes | None = None, *, normalized: bool = False, passive: bool = False
 ) -> Axes:
@@ -107,24 +105,19 @@ def region(
     Raises:
         InputError: no passivity condition holds for the scene, with ``passive``.
     """
-    outlines, walls = [], []
-    for label, each in (scene if isinstance(scene, Mapping) else {"": scene}).items():
-        outlines += _trace(each, label, passive=passive)
-        walls.append({"label": label, "wall": "stiffest", **tabulate_walls(each, *each.max_stiffness()[:2])})
-    return draw_stable_set(stack(outlines), stack(walls), _axes(ax), normalized=normalized)[0]
+    scenes = scene if isinstance(scene, Mapping) else {"": scene}
+    outlines, walls = tabulate_sets(scenes)
+    edges = [_trace_passive(each, label) for label, each in (scenes if passive else {}).items()]
+    return draw_stable_set(stack([outlines, *edges]), walls, _axes(ax), normalized=normalized)[0]
 
 
-def _trace(scene: Scene, label: str, *, passive: bool) -> list[dict[str, Any]]:
-    """The outlines of the stable walls, and of the passive ones where they are asked for."""
-    outlines = list(trace_outlines(scene, label=label))
-    if passive:
-        edge = tabulate_walls(scene, *passive_edge(scene, _ANGLES))
-        outlines.append({"label": label, "number": len(outlines) + 1, "piece": "passive", **edge})
-    return outlines
+def _trace_passive(scene: Scene, label: str = "") -> dict[str, Any]:
+    """The outline of the passive walls, as columns beside those of `tabulate_sets`."""
+    edge = tabulate_walls(scene, *passive_edge(scene, _ANGLES))
+    return {"label": label, "number": 0, "piece": "passive", **edge}
 
 
-@in_own_units
-@style.house_style()
+@_draws
 def recommendation(
     found: Recommendation, axes: style.AnyAxes | None = None, *, response: Table | None = None
 ) -> np.ndarray:
@@ -135,15 +128,16 @@ def recommendation(
         axes: an Axes of yours for the walls alone, or two; a figure of pyplot's where left out.
         response: columns of a step study of this wall, in SI units; computed at the samples where left out.
     """
-    scene, told, top = found.scene, found.as_dict(), found.stiffest
+    scene, told = found.scene, found.as_dict()
     # Without a model there is no response.
     moves = not isinstance(scene.device, MeasuredDevice)
     if axes is None:
         axes = _two(None, 1, 2, (style.WIDTH, 3.5)) if found.verdict is not None and moves else _axes(None)
-    outlines = stack(_trace(scene, "", passive=not find_obstacle(**vars(scene.device)) and scene.device.damping > 0))
+    outlines, walls = tabulate_sets({"": scene})
+    if not find_obstacle(**vars(scene.device)) and scene.device.damping > 0:
+        outlines = stack([outlines, _trace_passive(scene)])
     if found.verdict is None:
-        wall = {"label": "", "wall": "stiffest", **tabulate_walls(scene, *top[:2])}
-        return draw_stable_set(outlines, stack([wall]), axes)
+        return draw_stable_set(outlines, walls, axes)
     K, B = found.stiffness, found.virtual_damping
     if response is None and moves:
         # As long as the slowest motion takes to decay, or so many periods.
@@ -155,8 +149,7 @@ def recommendation(
     return draw_recommendation(told, outlines, response, axes)
 
 
-@in_own_units
-@style.house_style()
+@_draws
 def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = None) -> Axes:
     """Draw the stiffest stable wall over one parameter of a scene, all others as they are.
 
@@ -190,8 +183,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     return ax
 
 
-@in_own_units
-@style.house_style()
+@_draws
 def step(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -232,8 +224,7 @@ def _frequencies(scene: Scene) -> np.ndarray:
     return np.concatenate([slow, fast[1:]])
 
 
-@in_own_units
-@style.house_style()
+@_draws
 def bode(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -252,10 +243,8 @@ def bode(
         The Axes of size and phase; bars mark the margins where they are taken, as `zwidth.Scene.margins` has them.
     """
     hertz = _frequencies(scene)
-    found, known = (
-        scene.frequency_response(stiffness, virtual_damping, hertz),
-        scene.margins(stiffness, virtual_damping),
-    )
+    found = scene.frequency_response(stiffness, virtual_damping, hertz)
+    known = scene.margins(stiffness, virtual_damping)
     upper, lower = _two(axes, 2, 1, None)
     gain, phase = float(known.gain_margin), float(known.phase_margin)
     at_phase, at_gain = float(known.gain_crossover), float(known.phase_crossover)
@@ -282,8 +271,7 @@ def bode(
     return np.array([upper, lower])
 
 
-@in_own_units
-@style.house_style()
+@_draws
 def nyquist(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -314,8 +302,7 @@ def nyquist(
     return ax
 
 
-@in_own_units
-@style.house_style()
+@_draws
 def poles(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -334,18 +321,15 @@ def poles(
     outside = np.abs(found) >= 1.0
     reach = 1.15 * max(1.0, float(np.abs(found).max()))
     ax = _complex_plane(ax, (-reach, reach), (-reach, reach))
-    for mask, color, mark, words in (
-        (~outside, style.BLUE, "x", "inside"),
-        (outside, style.VERMILION, "D", "not inside"),
-    ):
+    looks = (~outside, style.BLUE, "x", "inside"), (outside, style.VERMILION, "D", "not inside")
+    for mask, color, mark, words in looks:
         if mask.any():
             ax.plot(found[mask].real, found[mask].imag, mark, color=color, markersize=6, label=f"poles {words}")
     ax.legend(loc="upper left", fontsize=7)
     return ax
 
 
-@in_own_units
-@style.house_style()
+@_draws
 def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
     """Draw the position of one simulated motion, or of several, over time.
 

@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from zwidth.figures import style
 from zwidth.figures.motion import draw_positions
-from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
+from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select, stack
 from zwidth.words.formatting import with_unit
 
 if TYPE_CHECKING:
@@ -111,6 +111,17 @@ def agrees(outlines: Outlines, x: np.ndarray, y: np.ndarray, good: np.ndarray) -
     return not np.any((inside != good) & ~_changes(inside) & ~_changes(good))
 
 
+def draw_exact(
+    ax: Axes, outlines: Outlines | None, x: np.ndarray, y: np.ndarray, good: np.ndarray, face: Any = "none", **look: Any
+) -> Outlines:
+    """Draw outlines where they are known and the cells agree with them; returns what is drawn, on these axes."""
+    if outlines is None or not agrees(outlines, x, y, good):
+        return []
+    fitted = fit_axes(outlines, ax)
+    draw_region(ax, fitted, face, label="exact edge", **look)
+    return fitted
+
+
 def _changes(cells: np.ndarray) -> np.ndarray:
     """Cells that differ from one beside them."""
     around = sliding_window_view(np.pad(cells, 1, mode="edge"), (3, 3))
@@ -147,6 +158,13 @@ def tabulate_walls(scene: Scene, stiffness: Any, virtual_damping: Any) -> dict[s
     """Walls as columns, normalized and in SI units."""
     normalized = {"alpha": stiffness / scene.units.stiffness, "beta": virtual_damping / scene.units.virtual_damping}
     return {**normalized, **dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))}
+
+
+def tabulate_sets(scenes: Mapping[str, Scene]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The outlines of devices by their labels, and the stiffest wall of each, as `draw_stable_set` takes them."""
+    outlines = stack(piece for label, scene in scenes.items() for piece in trace_outlines(scene, label=label))
+    tops = {label: tabulate_walls(scene, *scene.max_stiffness()[:2]) for label, scene in scenes.items()}
+    return outlines, stack({"label": label, "wall": "stiffest", **wall} for label, wall in tops.items())
 
 
 def name_wall(stiffness: float, virtual_damping: float) -> str:

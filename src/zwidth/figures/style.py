@@ -59,10 +59,9 @@ _FEW = 5.0
 _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
+Size: TypeAlias = tuple[float, float | None]
 # What a user's style sheet changes of it, and the size of new figures that a user wants.
-_changes: ContextVar[Any] = ContextVar("changes", default=None)
-_size: ContextVar[tuple[float, float | None] | None] = ContextVar("size", default=None)
-_width: ContextVar[float | None] = ContextVar("width", default=None)
+_wanted: ContextVar[tuple[Any, Size | None]] = ContextVar("wanted", default=((), None))
 # Narrower, in inches, panels stand below each other: beside each other their labels would have no room.
 _ONE_COLUMN = 5.0
 
@@ -70,53 +69,38 @@ _ONE_COLUMN = 5.0
 @contextmanager
 def house_style() -> Iterator[None]:
     """Draw and save within this look; the settings of before return at the end. Serves as a decorator, too."""
-    with matplotlib.rc_context({**_RC, **(_changes.get() or {})}):
+    with matplotlib.rc_context({**_RC, **dict(_wanted.get()[0])}):
         yield
 
 
 @contextmanager
-def style_sheet(file: Path | None, size: tuple[float, float | None] | None = None) -> Iterator[None]:
+def style_sheet(file: Path | None = None, size: Size | None = None) -> Iterator[None]:
     """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given.
 
-    A size without a height is a width, as `figure_width` has it.
+    Of a size without a height type is as large as ever. Where there is a size already, it stays.
     """
-    token, sized = None, _size.set(size)
-    if file is not None:
-        try:
-            token = _changes.set(dict(rc_params_from_file(file, use_default_template=False)))
-        except OSError as error:
-            _size.reset(sized)
-            raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error
+    changes, known = _wanted.get()
+    try:
+        changes = changes if file is None else dict(rc_params_from_file(file, use_default_template=False))
+    except OSError as error:
+        raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error
+    token = _wanted.set((changes, known or size))
     try:
         yield
     finally:
-        _size.reset(sized)
-        if token is not None:
-            _changes.reset(token)
-
-
-@contextmanager
-def figure_width(width: float | None) -> Iterator[None]:
-    """Let new figures have this width in inches, type as large as ever."""
-    token = _width.set(width)
-    try:
-        yield
-    finally:
-        _width.reset(token)
+        _wanted.reset(token)
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **keywords: Any) -> tuple[Figure, Any]:
     """A figure of its own, unknown to pyplot, and its axes as a 2-D array."""
     engine = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05)
-    across, up = _size.get() or (_width.get(), None)
-    if up is not None:
-        width, height = across or width, up
-    elif (wanted := across) is not None:
-        narrow = wanted < _ONE_COLUMN and columns > 1 and not {"width_ratios", "height_ratios"} & set(keywords)
+    across, up = _wanted.get()[1] or (width, height)
+    if up is None:
+        narrow = across < _ONE_COLUMN and columns > 1 and not {"width_ratios", "height_ratios"} & set(keywords)
         rows, columns, height = (rows * columns, 1, height * columns) if narrow else (rows, columns, height)
         # Labels stay as high as they are: a panel is not as flat as it is narrow.
-        width, height = wanted, height * min(1.0, max(wanted * (2.0 if narrow else 1.0) / width, 0.9))
-    figure = Figure(figsize=(width, height), layout=engine)
+        up = height * min(1.0, max(across * (2.0 if narrow else 1.0) / width, 0.9))
+    figure = Figure(figsize=(across, up), layout=engine)
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
 
 
@@ -156,25 +140,24 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
         ax.set(xlabel=x, ylabel=y)
 
 
-def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: Any = "upper", **keywords: Any) -> None:
-    """Explain what is drawn, above the panels (or below) in as many columns as fit, or within the first."""
+def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, **keywords: Any) -> None:
+    """Explain what is drawn, above the panels in as many columns as fit, or within the first."""
     if not outside or not handles:
         if handles:
             axes[0].legend(handles=handles)
         return
     figure, columns = figure_of(axes), keywords.pop("ncols", 1)
-    place = f"outside {place} center"
-    drawn = figure.legend(handles=handles, loc=place, ncols=columns, **keywords)
+    keywords |= {"handles": handles, "loc": "outside upper center"}
+    drawn = figure.legend(ncols=columns, **keywords)
     while (share := drawn.get_window_extent().width / figure.bbox.width) > 1.0 and columns > 1:
         columns -= 1
         drawn.remove()
-        drawn = figure.legend(handles=handles, loc=place, ncols=columns, **keywords)
+        drawn = figure.legend(ncols=columns, **keywords)
     longest = max((len(text.get_text()) for text in drawn.get_texts()), default=0)
     for text in drawn.get_texts() if share > 1.0 else ():
-        bare = text.get_text().replace(r"\$", "")
-        if "$" not in bare:
-            plain = text.get_text().replace(r"\$", "$")
-            text.set_text(literal(fill(plain, max(int(0.9 * longest / share), 12))))
+        plain = text.get_text().replace(r"\$", "\0")
+        if "$" not in plain:
+            text.set_text(literal(fill(plain.replace("\0", "$"), max(int(0.9 * longest / share), 12))))
 
 
 def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> None:
@@ -217,12 +200,12 @@ def line(label: str, dash: Any = SOLID, width: float | None = None, color: str =
 
 
 def dash_of(curve: Any) -> Any:
-    return SOLID if curve.delay_model == "held" else DASHED
+    return SOLID if getattr(curve, "delay_model", "held") == "held" else DASHED
 
 
 def delay_model_handles(found: Sequence[Any]) -> list[Line2D]:
     """What solid and dashed mean, where the fractional power is drawn."""
-    both = any(dash_of(curve) == DASHED for curve in found)
+    both = any(curve.delay_model != "held" for curve in found)
     return [line("held delay (exact)"), line(r"fractional power $z^{1+d}$", DASHED)] if both else []
 
 

@@ -88,7 +88,7 @@ def curves(table: Table, *keys: str, **wanted: object) -> list[Any]:
 def stack(parts: Iterable[Mapping[str, object]]) -> dict[str, np.ndarray]:
     """Put curves below each other: a number or text is repeated along its curve, a column that lacks is NaN."""
     blocks = []
-    for part in parts:
+    for part in filter(None, parts):
         arrays = [np.asarray(value) for value in part.values()]
         rows = max(array.size for array in arrays)
         blocks.append({name: np.broadcast_to(array, rows) for name, array in zip(part, arrays, strict=True)})

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -15,7 +14,7 @@ from zwidth.figures.curves import draw_curves, draw_outlines, find_family
 from zwidth.figures.grid import choose_axes, list_varied
 from zwidth.figures.plane import draw_plane
 from zwidth.figures.stable_set import Outlines
-from zwidth.figures.style import save, style_sheet
+from zwidth.figures.style import Size, save, style_sheet
 from zwidth.studies.ridge import find_edges
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import SUFFIX, Store, find_stores
@@ -80,34 +79,18 @@ def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:
     return {name: [(points * units, hole) for points, hole in outlines] for name, outlines in found.items()}
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """Which parameters a figure is drawn over, and how its files are written."""
-
-    x: str | None = None  # from left to right
-    y: str | None = None  # from bottom to top, of a plane
-    hue: str | None = None  # a curve for each of its values
-    col: str | None = None  # a panel for each of its values
-    formats: tuple[str, ...] = ("png", "svg")
-    dpi: float | None = None
-    size: tuple[float, float | None] | None = None  # width and height in inches; of a width the height follows
-    style: Path | None = None  # a style sheet of matplotlib
-
-    @property
-    def axes(self) -> dict[str, str]:
-        """The parameters that are given, as stores spell them, by what they are."""
-        named = {"x": self.x, "y": self.y, "hue": self.hue, "col": self.col}
-        return {role: name.replace(".", "_") for role, name in named.items() if name}
-
-
 def draw_stores(
     path: str | os.PathLike[str],
     out: str | os.PathLike[str] | None = None,
     *,
     at: Mapping[str, float | str] | None = None,
-    drawing: Drawing | None = None,
-    progress: Callable[[Path], None] | None = None,
-    note: Callable[[str], None] | None = None,
+    axes: Mapping[str, str | None] | None = None,
+    formats: Sequence[str] = ("png", "svg"),
+    dpi: float | None = None,
+    size: Size | None = None,
+    style: Path | None = None,
+    progress: Callable[[Path], None] = lambda file: None,
+    note: Callable[[str], None] = lambda text: None,
 ) -> tuple[Path, ...]:
     """Draw the sweeps in a store, or in all stores of a folder, as PNG and SVG.
 
@@ -116,7 +99,12 @@ def draw_stores(
         out: where the figures go; ``figures`` beside the stores where left out. Figures that are there are replaced.
         at: values of parameters by name, in the units of the store, or the label of a device: the slices to draw. The
             nearest values that the sweep has are taken; of a parameter that is not given, up to three are shown.
-        drawing: the axes to draw over and the kind of files; chosen from the sweep where left out.
+        axes: the parameters to draw over: x from left to right, y from bottom to top, of a plane, hue with a curve and
+            col with a panel for each of its values; chosen from the sweep where left out.
+        formats: the kinds of files, of "png", "svg" and "pdf".
+        dpi: dots an inch.
+        size: width and height in inches; of a width alone, beside None, the height follows.
+        style: a style sheet of matplotlib.
         progress: called with every file when it is there.
         note: called with what a reader should know: values that differ from those wanted, stores without a figure.
 
@@ -128,13 +116,15 @@ def draw_stores(
         InputError: no sweep has a parameter of ``at`` or of the axes, or not the device; a value lies beyond what a
             sweep has by more than half a step; the style sheet cannot be read.
     """
-    folder, drawing, note = Path(os.fsdecode(path)), drawing or Drawing(), note or (lambda text: None)
+    folder = Path(os.fsdecode(path))
     stores = find_stores(folder)
     if not stores:
         raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
     beside = folder.parent if stores == [folder] else folder
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))
+    # As stores spell them.
     wanted = {name.replace(".", "_"): value for name, value in (at or {}).items()}
+    given = {role: name.replace(".", "_") for role, name in (axes or {}).items() if name}
     datasets = {store: open_dataset(store).reset_coords(drop=True) for store in stores}
     for store in (store for store, data in datasets.items() if not data.attrs["complete"]):
         note(f"{store.name}: chunks are missing and left blank; 'zwidth run CONFIG --resume' computes them")
@@ -143,19 +133,19 @@ def draw_stores(
     if unknown:
         raise InputError(f"at: no sweep in {folder} varies {unknown[0]!r}; choose from {', '.join(known)}")
     slices = {store: _cut(store, data, wanted, note) for store, data in datasets.items()}
-    _check_axes(drawing.axes, slices)
+    _check_axes(given, slices)
     files = []
-    with style_sheet(drawing.style, drawing.size):
+    with style_sheet(style, size):
         for store, data in slices.items():
-            drawn = list(figures_of(data, drawing.axes, make_edges(Store(store))))
+            drawn = list(figures_of(data, given, make_edges(Store(store))))
             if not drawn:
-                note(f"{store.name}: no figure, for {_explain_absence(data, drawing.axes)}")
+                note(f"{store.name}: no figure, for {_explain_absence(data, given)}")
             for name, draw in drawn:
                 target.mkdir(parents=True, exist_ok=True)
                 stem = target / f"{store.name.removesuffix(SUFFIX)}_{name}"
-                for file in save(draw(), stem, drawing.formats, drawing.dpi):
+                for file in save(draw(), stem, formats, dpi):
                     files.append(file)
-                    (progress or (lambda file: None))(file)
+                    progress(file)
     return tuple(files)
 
 
@@ -178,12 +168,9 @@ def _check_axes(axes: Mapping[str, str], slices: Mapping[Path, xarray.Dataset]) 
 def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
     # A store lists its dimensions in any order.
     varied = [name for name in ("device", *VARIABLES) if data.sizes.get(name, 0) > 1]
-    missing = ", ".join(name for name in axes.values() if name not in varied)
-    if not varied:
-        return "it is a single point"
-    return (
-        f"it varies over {', '.join(varied)}, {f'not over {missing}' if missing else 'which draws none of its outputs'}"
-    )
+    missing = [name for name in axes.values() if name not in varied]
+    why = f"not over {', '.join(missing)}" if missing else "which draws none of its outputs"
+    return f"it varies over {', '.join(varied)}, {why}" if varied else "it is a single point"
 
 
 def figures_of(

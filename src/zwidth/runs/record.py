@@ -12,8 +12,8 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
@@ -26,7 +26,6 @@ from zwidth.sweep.files import (
     check_folder,
     digest,
     held_briefly,
-    hidden_beside,
     is_plain_name,
     remove_quietly,
     versions,
@@ -198,13 +197,6 @@ class Record:
             for file, expected in files.items()
             if expected is not None and file_hash(self.folder / file) != expected
         ]
-
-    @contextmanager
-    def staging(self, name: str) -> Iterator[Path]:
-        """A hidden folder for the files of a study; it goes when the block ends."""
-        with hidden_beside(self.folder / name) as stage:
-            stage.mkdir()
-            yield stage
 
     def keep(self, stage: Path, entry: dict[str, Any]) -> None:
         """Give the files in ``stage`` their names; when the study is done, take away what else it had before.

@@ -13,12 +13,12 @@ from typing import Any, Literal, TypeAlias
 
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.study import Study
-from zwidth.figures.style import figure_width
+from zwidth.figures.style import style_sheet
 from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
 from zwidth.studies.outcome import LISTENER, ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
-from zwidth.sweep.files import holding, hopeless
+from zwidth.sweep.files import hidden_beside, holding, hopeless
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.sweep.study import SweepStudy
@@ -246,34 +246,37 @@ class _Run:
                 return
 
     def _compute(self, study: ComputedStudy) -> StudyResult:
-        clock, outcome = time.perf_counter(), Outcome()
-        entry = {"name": study.name, "kind": study.kind_name(), "state": "failed", "inputs": self.inputs[study.name]}
+        clock, outcome, error = time.perf_counter(), Outcome(), None
+        entry = {"name": study.name, "kind": study.kind_name(), "inputs": self.inputs[study.name]}
         alone = sum(type(other) is type(study) for other in self.config.studies) == 1
-        error: Exception | None = None
-        with self.record.staging(study.name) as stage:
+
+        def tell(error: Exception | None) -> dict[str, Any]:
+            ended = {"error": _describe_error(error), "state": "failed" if error else "done"}
+            seconds = round(time.perf_counter() - clock, 3)
+            return {**entry, "seconds": seconds, "notes": [*outcome.notes], "answer": [*outcome.answer], **ended}
+
+        with hidden_beside(self.record.folder / study.name) as stage:
+            stage.mkdir()
             try:
                 look = self.config.figure or FigureLook()
-                with use_kind(self.config.rotary), figure_width(look.inches):
+                with use_kind(self.config.rotary), style_sheet(size=look.size):
                     outcome = study.compute(self.config.scene, alone)
                     outcome.write(stage, study.name, look.formats)
             except Exception as caught:
                 error = caught
-            told = {"notes": list(outcome.notes), "answer": list(outcome.answer), "error": _describe_error(error)}
-            entry |= {"seconds": round(time.perf_counter() - clock, 3), **told, "state": "failed" if error else "done"}
             try:
-                self.record.keep(stage, entry)
+                self.record.keep(stage, tell(error))
             except Exception as caught:
                 error = error or caught
                 before = self.record.entry(study.name) or {}
-                entry |= {"error": _describe_error(error), "state": "failed", "files": before.get("files", {})}
                 with suppress(OSError):
-                    self.record.note(entry)
+                    self.record.note({**tell(error), "files": before.get("files", {})})
         if error is not None and hopeless(error):
             self.hopeless = _describe_error(error)
         kept = self.record.entry(study.name) or {"files": ()}
-        state, seconds, files = "failed" if error else "done", time.perf_counter() - clock, tuple(kept["files"])
-        about = study.name, study.kind_name(), state, seconds, files
-        return StudyResult(*about, outcome.notes, outcome.answer, _describe_error(error), error)
+        ended = "failed" if error else "done", time.perf_counter() - clock, tuple(kept["files"])
+        told = outcome.notes, outcome.answer, _describe_error(error), error
+        return StudyResult(study.name, study.kind_name(), *ended, *told)
 
     def sweep(self, plans: list[Plan], about: dict[str, Any], **options: Any) -> None:
         """Compute the sweeps, all together, so that workers are started once."""

@@ -16,7 +16,7 @@ from zwidth.config.fields import members, repeated
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene
 from zwidth.config.study import DelayModels, name_parts, register
-from zwidth.figures.stable_set import tabulate_walls, trace_outlines
+from zwidth.figures.stable_set import tabulate_sets
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
 from zwidth.studies.outcome import (
@@ -133,8 +133,7 @@ class BoundaryStudy(CurvesStudy):
             return Outcome(table=table, figures={"": partial(figures.draw_zero_stiffness, table)})
         parts, notes = [], []
         for model, chosen in models:
-            for d, delta in product(chosen.tolist(), deltas.tolist()):
-                parts.append(outline(delta, d, model))
+            parts += [outline(delta, d, model) for d, delta in product(chosen.tolist(), deltas.tolist())]
         for model, chosen in models if self.ridge_path else ():
             path, remarks = ridge_table(np.linspace(deltas.min(), deltas.max(), _RIDGE_POINTS), chosen, model)
             path["alpha"] = path.pop("alpha_max")
@@ -149,12 +148,11 @@ class BoundaryStudy(CurvesStudy):
 
 def outline_device(device: PhysicalDevice, label: str) -> Outcome:
     """The outlines of a device with parts, islands and holes told apart, and its stiffest wall."""
-    scene = device.to_scene()
-    found = trace_outlines(scene, label=label, d=device.d, delta=device.delta)
-    table = stack({"curve": "boundary", "delay_model": "held", **one} for one in found)
-    if not table:
+    outlines, walls = tabulate_sets({label: device.to_scene()})
+    if not outlines:
         return Outcome(notes=("no wall of this device is stable",))
-    walls = stack([{"label": label, "wall": "stiffest", **tabulate_walls(scene, *scene.max_stiffness()[:2])}])
+    about = {"curve": "boundary", "delay_model": "held", "label": label, "d": device.d, "delta": device.delta}
+    table = stack([{**about, **outlines}])
     return Outcome(table=table, figures={"": partial(figures.draw_stable_set, table, walls)})
 
 
@@ -210,22 +208,18 @@ class CompareStudy(ComputedStudy):
         return super().points * _POINTS_PER_OUTLINE
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        rows, outlines, walls = [], [], []
-        for device in self.devices:
-            label, loop = device.label, device.to_scene()
-            top = loop.max_stiffness()
-            pieces = list(trace_outlines(loop, label=label))
-            islands = sum(piece["piece"] == "island" for piece in pieces)
-            rows.append({"label": label, **summarize_stiffest(top), "islands": islands})
-            outlines += pieces
-            walls.append({"label": label, "wall": "stiffest", **tabulate_walls(loop, *top[:2])})
-        bare = [row["label"] for row in rows if row["kind"] == "none"]
-        table = stack(outlines)
+        scenes = {device.label: device.to_scene() for device in self.devices}
+        table, walls = tabulate_sets(scenes)
+        rows = []
+        for label, loop in scenes.items():
+            islands = table["number"][(table["label"] == label) & (table["piece"] == "island")] if table else []
+            top = summarize_stiffest(loop.max_stiffness())
+            rows.append({"label": label, **top, "islands": np.unique(islands).size})
         return Outcome(
             table=stack(rows),
-            figures={"": partial(figures.draw_stable_set, table, stack(walls))} if table else {},
+            figures={"": partial(figures.draw_stable_set, table, walls)} if table else {},
             documents={f"{self.name}_outlines.csv": csv_text(table)},
-            notes=tuple(f"{label}: no wall is stable" for label in bare),
+            notes=tuple(f"{row['label']}: no wall is stable" for row in rows if row["kind"] == "none"),
         )
 
 

@@ -117,9 +117,9 @@ class FigureLook(Strict):
         return ("png", "svg") if self.format is None else (self.format,)
 
     @property
-    def inches(self) -> float | None:
-        """The width as matplotlib counts it."""
-        return None if self.width is None else self.width / 0.0254
+    def size(self) -> tuple[float, None] | None:
+        """The width in inches, to which heights follow."""
+        return None if self.width is None else (self.width / 0.0254, None)
 
 
 class Config(Strict):

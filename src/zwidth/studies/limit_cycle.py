@@ -21,7 +21,7 @@ from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
-from zwidth.studies.simulate import Circumstances, SimulatedStudy, check_circumstances
+from zwidth.studies.simulate import Circumstances, SimulatedStudy
 from zwidth.words.formatting import header, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 from zwidth.words.status import Status
@@ -131,7 +131,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
             what = f"got {with_unit(self.widest, 'm')}, silence is {with_unit(self.silence, 'm')}"
             yield ("widest",), problem(what, "a buzz lies between silence and widest", "raise it")
         scene = self.device.to_scene()
-        found = [list(check_circumstances(each, scene)) for each in self.list_circumstances()]
+        found = [list(each.find_clashes(scene)) for each in self.list_circumstances()]
         for index, (condition, faults) in enumerate(zip(self.conditions, found, strict=True)):
             for path, what in faults:
                 own = getattr(condition, str(path[0])) is not None

@@ -81,6 +81,6 @@ class MapStudy(ComputedStudy):
         def find_edge(name: str, delta: float, d: float) -> Outlines | None:
             return find_edges(delta * (share if name == "passive" else 1.0), d).get(name)
 
-        edges = {name: partial(find_edge, name) for name in names}
-        draw = {f"_{name}": partial(figures.draw_map, arrays, name, edges=edge) for name, edge in edges.items()}
-        return Outcome(arrays=arrays, figures=draw)
+        draw = partial(figures.draw_map, arrays)
+        drawn = {f"_{name}": partial(draw, name, edges=partial(find_edge, name)) for name in names}
+        return Outcome(arrays=arrays, figures=drawn)

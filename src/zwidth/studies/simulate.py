@@ -92,8 +92,9 @@ class Circumstances(Strict):
     seed: Seed = 0
     """Whole number that decides the random numbers."""
 
-    def find_clashes(self, period: float) -> Iterable[LocatedProblem]:
-        """Values that do not go together, or not with this sampling period."""
+    def find_clashes(self, scene: Scene) -> Iterable[LocatedProblem]:
+        """Values that do not go together, or not with the device and its sampling period."""
+        period = scene.timing.period
         if self.static is not None and self.static < self.coulomb:
             what = f"got {self.static:g} N, below coulomb, {self.coulomb:g} N"
             yield ("static",), problem(what, "what holds is at least the friction while slipping", "raise it")
@@ -103,9 +104,14 @@ class Circumstances(Strict):
         if not 1 <= round(self.duration.periods(period)) <= LONGEST:
             what = f"got {self.duration}, which is {self.duration.periods(period):.4g} periods"
             yield ("duration",), problem(what, f"1 to {LONGEST} periods", "change the duration")
-
-    def count_periods(self, period: float) -> int:
-        return max(1, round(self.duration.periods(period)))
+        if isinstance(scene.device, MeasuredDevice):
+            allowed = "a motion needs a model: mass and damping, or a linear system"
+            yield ("device",), problem("got a measured response", allowed, "fit one to a log with the kind 'fit'")
+        if self.velocity is not None and not isinstance(placed := self.place(scene).velocity, FOAW):
+            try:
+                placed.estimate(period)
+            except InputError as error:
+                yield locate_refusal(error)
 
     def place(self, scene: Scene) -> Scene:
         """The scene with the velocity estimate of these circumstances."""
@@ -114,7 +120,8 @@ class Circumstances(Strict):
     def options(self, period: float) -> dict[str, Any]:
         names = [name for name in Circumstances.model_fields if name not in ("duration", "velocity", "jitter")]
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return {**given, "periods": self.count_periods(period), "jitter": self.jitter.seconds(period)}
+        periods = max(1, round(self.duration.periods(period)))
+        return {**given, "periods": periods, "jitter": self.jitter.seconds(period)}
 
 
 class SimulatedStudy(ComputedStudy):
@@ -129,19 +136,6 @@ class SimulatedStudy(ComputedStudy):
 
     delay_model: HeldOnly = "held"
     """How a delay that is not whole is modeled; a motion exists in the model 'held' only."""
-
-
-def check_circumstances(given: Circumstances, scene: Scene) -> Iterable[LocatedProblem]:
-    """What of the circumstances does not go together, or not with the device."""
-    yield from given.find_clashes(scene.timing.period)
-    if isinstance(scene.device, MeasuredDevice):
-        allowed = "a motion needs a model: mass and damping, or a linear system"
-        yield ("device",), problem("got a measured response", allowed, "fit one to a log with the kind 'fit'")
-    if given.velocity is not None and not isinstance(placed := given.place(scene).velocity, FOAW):
-        try:
-            placed.estimate(scene.timing.period)
-        except InputError as error:
-            yield locate_refusal(error)
 
 
 @register
@@ -163,19 +157,16 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
         scene = self.device.to_scene()
-        yield from check_circumstances(self, scene)
+        yield from self.find_clashes(scene)
         if self.stiffness_fraction is not None and isinstance(self.place(scene).velocity, FOAW):
             what = "got a share of the maximum stiffness"
             yield ("stiffness_fraction",), problem(what, f"{NO_LINEAR_FORM} and no such maximum", "write walls")
 
     @property
-    def count(self) -> int:
-        return self.stiffness_fraction.size if self.stiffness_fraction is not None else len(self.walls or ())
-
-    @property
     def sizes(self) -> dict[str, int]:
         periods = int(min(self.duration.periods(self.device.period), 1e15))
-        return {"motions": self.count, "periods": periods, "points a period": self.substeps}
+        count = self.stiffness_fraction.size if self.stiffness_fraction is not None else len(self.walls or ())
+        return {"motions": count, "periods": periods, "points a period": self.substeps}
 
     def list_walls(self, scene: Scene) -> list[tuple[str, float, float]]:
         if self.stiffness_fraction is not None:

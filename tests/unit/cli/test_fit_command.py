@@ -64,7 +64,7 @@ def test_a_log_in_millimeters_and_milliseconds(log):
         (["--velocity-samples", "3"], zwidth.WindowedDifference(samples=3)),
     ],
 )
-def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, velocity, tmp_path):
+def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(unpainted, more, velocity, tmp_path):
     text = run(*WALLS, "--period", "1 ms", "--yaml", *more)
     assert text.startswith("# Fitted to 2 buzzing walls: 95 % between")
     assert text.count("# fitted, 95 % between") == 3

@@ -20,7 +20,7 @@ SCENES = {
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
+def run(tmp_path, monkeypatch, unpainted):
     monkeypatch.chdir(tmp_path)
 
     def run_config(text, *arguments):

@@ -5,6 +5,7 @@ import inspect
 import io
 import warnings
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 
 import matplotlib
@@ -178,6 +179,13 @@ def test_every_text_stays_on_the_page(name):
         assert box.x1 <= page.x1 + 1, text.get_text()
         assert box.y0 >= page.y0 - 1, text.get_text()
         assert box.y1 <= page.y1 + 1, text.get_text()
+
+
+@pytest.mark.parametrize("name", EVERY_FIGURE)
+def test_no_two_names_overlap(name):
+    for ax in drawn(name).axes:
+        boxes = [Text.get_window_extent(text) for text in ax.texts if isinstance(text, Annotation)]
+        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
 
 
 @pytest.mark.parametrize("name", ["draw_boundary with a line", "draw_map of stable"])

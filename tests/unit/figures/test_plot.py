@@ -209,7 +209,7 @@ def test_a_rotary_device_is_drawn_in_its_units():
     assert fourth.get_ylabel().endswith("in mrad")
 
 
-def test_tables_of_rotary_devices_are_drawn_in_their_units(tmp_path):
+def test_tables_of_rotary_devices_are_drawn_in_their_units(tmp_path, unpainted):
     """What a run writes of them has columns in rad and N m, and is drawn again as it was."""
     studies = [
         {"kind": "step", "name": "step", "stiffness_fraction": 0.5},

@@ -4,6 +4,7 @@ import shutil
 
 import pytest
 from run_folders import BOTH, SMALL
+from unpainted import painting_nothing
 
 from zwidth.runs import run
 from zwidth.studies.map import MapStudy
@@ -28,7 +29,8 @@ def undisturbed(tmp_path_factory):
     """The folder of a run that nothing disturbed."""
     folder = tmp_path_factory.mktemp("undisturbed")
     (folder / "both.yaml").write_text(BOTH, encoding="utf-8")
-    result = run(folder / "both.yaml", out=folder / "out")
+    with painting_nothing():
+        result = run(folder / "both.yaml", out=folder / "out")
     assert result.ok
     assert [(study.name, study.state) for study in result.studies] == [
         (name, "done") for name in ("one", "two", "swept")

@@ -12,7 +12,7 @@ from zwidth.figures import draw_curves, draw_plane
 from zwidth.figures.grid import name_panels
 from zwidth.figures.style import figure_of, new_figure
 from zwidth.runs import draw
-from zwidth.runs.draw import Drawing, draw_stores
+from zwidth.runs.draw import draw_stores
 from zwidth.sweep.dataset import open_dataset
 from zwidth.words.errors import InputError
 
@@ -46,7 +46,7 @@ def drawn(monkeypatch, tmp_path):
     def draw_over(path, at=None, **axes):
         found.clear()
         notes.clear()
-        draw_stores(path, tmp_path, at=at, drawing=Drawing(**axes), note=notes.append)
+        draw_stores(path, tmp_path, at=at, axes=axes, note=notes.append)
         return found, notes
 
     return draw_over
@@ -194,7 +194,8 @@ def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys, store, 
 def test_text_stays_text_where_a_style_sheet_says_so(folder, tmp_path):
     sheet = tmp_path / "text.mplstyle"
     sheet.write_text("svg.fonttype: none\n", encoding="utf-8")
-    assert main_of("figures", folder, "--out", tmp_path, "--format", "svg", "--style", sheet) == 0
+    words = ["--at", "delay=0", "--at", "mass=0.1", "--format", "svg", "--style", sheet]
+    assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path) == 0
     files = list(tmp_path.glob("*.svg"))
     assert files
     assert all("<text" in file.read_text(encoding="utf-8") for file in files)

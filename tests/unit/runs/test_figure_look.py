@@ -39,7 +39,7 @@ def test_another_look_is_another_run(tmp_path):
 def test_type_is_legible_at_that_width():
     """No text is smaller than 7 points, and no label stands out of the figure."""
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
-    with style.figure_width(85 / 25.4):
+    with style.style_sheet(size=(85 / 25.4, None)):
         axes = draw(scene.recommend())
     figure = style.figure_of(axes)
     assert len(axes) == 2

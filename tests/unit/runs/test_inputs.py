@@ -12,6 +12,8 @@ from zwidth.runs.record import gather_inputs
 from zwidth.sweep.dataset import open_dataset
 from zwidth.words.errors import StoreExistsError
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 TABLE = "label,mass [kg],damping [N s/m]\none,0.1,1\ntwo,0.2,1\n"
 SWEEP = """
 version: 1

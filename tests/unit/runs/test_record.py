@@ -11,6 +11,8 @@ from zwidth.pages.report.page import write_report
 from zwidth.runs import run
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 def tree(folder):
     """All that is in a folder: what each file holds, and where each link leads."""

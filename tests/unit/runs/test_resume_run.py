@@ -14,6 +14,8 @@ from sweeping import chunk_file, flip
 from zwidth.runs import run
 from zwidth.words.errors import StoreError
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 def test_a_finished_run_is_resumed_without_any_work(finished, both):
     before = contents(finished)

@@ -17,6 +17,8 @@ from zwidth.studies.map import MapStudy
 from zwidth.sweep.dataset import verify
 from zwidth.words.errors import ConfigError, InputError, StoreError, StoreExistsError
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 def test_a_run_writes_what_its_record_lists(config, tmp_path):
     clock = time.perf_counter()

@@ -170,7 +170,7 @@ def test_several_logs_and_a_velocity_estimate(tmp_path):
     assert outcome.figures[""]()[0].get_title("left") == "(a) the first of 2 logs"
 
 
-def test_a_run_knows_when_the_log_has_changed(tmp_path):
+def test_a_run_knows_when_the_log_has_changed(tmp_path, unpainted):
     file, log = tmp_path / "a.yaml", tmp_path / "log.csv"
     text = (ROOT / "configs" / "fit_log.csv").read_text(encoding="utf-8")
     log.write_text(text, encoding="utf-8")

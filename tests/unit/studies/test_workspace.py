@@ -10,6 +10,8 @@ import zwidth
 from zwidth.studies.document import load_config
 from zwidth.words.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 POSES = (
     "shoulder [deg],elbow [deg],mass [g],damping [N s/m]\n0,30,240,1.6\n60,30,60,0.13\n0,90,150,1.2\n60,90,0.1 kg,1\n"
 )

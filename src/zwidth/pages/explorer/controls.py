@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
 from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, WindowedDifference
+from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity, WindowedDifference
 from zwidth.parts.wall import VirtualWall
 from zwidth.runs.record import CONFIG_FILE, RUN_FILE, Record
 from zwidth.scenes.scene import Scene
@@ -157,13 +158,8 @@ class Controls:
                 if not isinstance(value, str) or value not in CHOICES[name]:
                     raise InputError(f"{name}: got {str(value)[:40]!r}; choose one of {', '.join(CHOICES[name])}")
                 if value != new.shown().get(name):
-                    new = (
-                        new._turn()
-                        if name == "motion"
-                        else new._convert()
-                        if name == "mode"
-                        else new._take(name, value)
-                    )
+                    change = {"motion": new._turn, "mode": new._convert}.get(name, partial(new._take, name, value))
+                    new = change()
                 continue
             if name not in new.shown():
                 # A slider that has just gone, or none that ever was.
@@ -186,9 +182,9 @@ class Controls:
             )
         return self
 
-    def _refuse_change(self, name: str, in_parts: bool = True) -> None:
+    def _refuse_change(self, name: str) -> None:
         """Refuse what belongs to a mass where the device is given as a whole."""
-        if in_parts and isinstance(self.scene.device, LinearDevice):
+        if isinstance(self.scene.device, LinearDevice):
             raise InputError(f"{name}: this device is given as a linear system, which holds what belongs to it")
 
     def _turn(self) -> Controls:
@@ -198,24 +194,23 @@ class Controls:
         return Controls(replace(other, timing=self.scene.timing))
 
     def _take(self, name: str, kind: str) -> Controls:
-        """The scene with another part of a usual kind."""
-        return replace(self, scene=self._replace_part(name, kind))
-
-    def _replace_part(self, name: str, kind: str) -> Scene:
+        """The scene with another part of a usual kind, or another velocity estimate."""
         scene = self.scene
-        self._refuse_change(name, in_parts=name in PARTS)
-        cutoff = min(100.0, 0.1 / scene.timing.period)
-        estimates = {
-            "BackwardDifference": lambda: BackwardDifference(),
-            "WindowedDifference": lambda: WindowedDifference(5),
-            "LowPass": lambda: LowPass(cutoff=cutoff),
-            "Butterworth": lambda: Butterworth(cutoff),
-        }
         if name in PARTS:
-            return scene.replace(**{name: None if kind == "none" else self._make_usual(name, kind)})
+            self._refuse_change(name)
+            return replace(
+                self, scene=scene.replace(**{name: None if kind == "none" else self._make_usual(name, kind)})
+            )
+        cutoff = min(100.0, 0.1 / scene.timing.period)
+        estimates: dict[str, Velocity] = {
+            "BackwardDifference": BackwardDifference(),
+            "WindowedDifference": WindowedDifference(5),
+            "LowPass": LowPass(cutoff=cutoff),
+            "Butterworth": Butterworth(cutoff),
+        }
         if kind not in estimates:
             raise InputError(f"{name}: coefficients come with a configuration alone; choose another")
-        return scene.replace(velocity=estimates[kind]())
+        return replace(self, scene=scene.replace(velocity=estimates[kind]))
 
     def _make_usual(self, name: str, kind: str) -> Any:
         """A part in one of its usual forms; of a rotary device as much smaller as that is."""
@@ -356,19 +351,15 @@ def to_yaml(controls: Controls) -> str:
 def to_python(controls: Controls) -> str:
     """A script that builds the scene, judges its wall and draws the stable set."""
     with use_kind(controls.rotary):
-        return _write_script(controls)
-
-
-def _write_script(controls: Controls) -> str:
-    parts = spell_part(controls.scene)
-    units = not controls.normalized
-    paths = {name: "" if name in _BARE else name for name in parts}
-    text = "".join(f"    {name}={_spell(part, paths[name], units)},\n" for name, part in parts.items())
-    normalized = {"notes": "# Normalized: with m = 1 and T = 1, K is alpha and B is beta.\n", "unit": "(alpha)"}
-    normalized |= {"x": "normalized stiffness alpha", "y": "normalized damping beta"}
-    spring, damper = own_unit("N/m"), own_unit("N s/m")
-    physical = {"notes": "", "unit": spring, "x": f"stiffness K in {spring}", "y": f"virtual damping B in {damper}"}
-    return _SCRIPT.format(scene=f"zwidth.Scene(\n{text})", **(physical if units else normalized))
+        parts, units = spell_part(controls.scene), not controls.normalized
+        given = {name: _spell(part, "" if name in _BARE else name, units) for name, part in parts.items()}
+        notes, unit, damper = "", own_unit("N/m"), own_unit("N s/m")
+    x, y = f"stiffness K in {unit}", f"virtual damping B in {damper}"
+    if controls.normalized:
+        notes, unit = "# Normalized: with m = 1 and T = 1, K is alpha and B is beta.\n", "(alpha)"
+        x, y = "normalized stiffness alpha", "normalized damping beta"
+    text = "".join(f"    {name}={part},\n" for name, part in given.items())
+    return _SCRIPT.format(scene=f"zwidth.Scene(\n{text})", notes=notes, unit=unit, x=x, y=y)
 
 
 def _spell(value: Any, path: str, units: bool) -> str:

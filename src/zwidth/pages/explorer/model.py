@@ -14,7 +14,7 @@ from zwidth.loops.linear.curve import end_lines
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
-from zwidth.pages.words import pole_words
+from zwidth.pages.words import pole_words, row
 from zwidth.scenes.assessment import Assessment, passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import MotionKind
@@ -176,13 +176,6 @@ def passive_set(scene: Scene) -> Curve | None:
     return passive_edge(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 
 
-def radius_map(scene: Scene, across: Range, up: Range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stiffness and damping over a frame, and the spectral radius of the walls there."""
-    grid = next(grid for most, grid in _GRIDS if scene.loop.poles_sought <= most)
-    stiffness, damping = np.linspace(*across, grid[0]), np.linspace(*up, grid[1])
-    return stiffness, damping, np.asarray(scene.spectral_radius(stiffness, damping[:, None]))
-
-
 def ridge_path(scene: Scene) -> Curve:
     """The stiffest stable wall as the device's damping grows from none to four times what it is."""
     most = _MOST_DAMPING * (float(scene.device.damping) or 0.25 * scene.units.virtual_damping)
@@ -206,8 +199,10 @@ def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
     """The lines on which the spectral radius is one of the `LEVELS`, and where to write which."""
     from contourpy import contour_generator
 
-    x, y, values = radius_map(scene, across, up)
-    generator = contour_generator(x, y, np.ma.masked_invalid(values))
+    points = next(grid for most, grid in _GRIDS if scene.loop.poles_sought <= most)
+    x, y = (np.linspace(*ends, count) for ends, count in zip((across, up), points, strict=True))
+    radius = np.asarray(scene.spectral_radius(x, y[:, None]))
+    generator = contour_generator(x, y, np.ma.masked_invalid(radius))
     found: dict[str, list[Any]] = {"xs": [], "ys": [], "x": [], "y": [], "text": []}
     for k, level in enumerate(LEVELS):
         lines: Any = generator.lines(level)
@@ -244,10 +239,9 @@ def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
     if normalized and isfinite(verdict.time_constant):
         verb = "decays" if verdict.time_constant >= 0 else "grows"
         slowest = f"{verb} with time constant {plain(abs(verdict.time_constant))} periods"
+    curve = "a pole at z = 1" if verdict.marginal else f"curve and mirror image {around}"
     return {
-        "nyquist_words": f"{word}: "
-        + ("a pole at z = 1" if verdict.marginal else f"curve and mirror image {around}")
-        + ".",
+        "nyquist_words": f"{word}: {curve}.",
         "bode_words": f"Margins: {', '.join(margins) or 'none, |L| is never 1 or the wall has no stiffness'}.",
         "step_words": f"Under a constant push from 0 on, in the wall. The slowest motion {slowest}.",
     }
@@ -266,7 +260,7 @@ def normalized_lines(verdict: Assessment) -> list[str]:
         "margins": f"gain {plain(verdict.gain_margin)}, phase {plain(verdict.phase_margin)} degrees, "
         f"delay {plain(verdict.delay_margin)} periods, modulus {plain(verdict.modulus_margin)}",
     }
-    return [f"{label:<20}  {text}" for label, text in rows.items()]
+    return [row(*each) for each in rows.items()]
 
 
 def word_of(verdict: Assessment) -> str:

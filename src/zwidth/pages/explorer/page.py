@@ -18,8 +18,9 @@ from bokeh.plotting import figure
 from zwidth.figures import style
 from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls, read_link, to_link, to_python, to_yaml
-from zwidth.pages.explorer.details import IMPORTING, Update, Wish, compute_details, show_outlines
+from zwidth.pages.explorer.details import IMPORTING, Update, compute_details, show_outlines
 from zwidth.parts.wall import VirtualWall
+from zwidth.scenes.scene import Scene
 from zwidth.words.errors import ZwidthError
 from zwidth.words.rotation import is_rotary, own_unit, use_kind
 
@@ -197,21 +198,21 @@ class Page:
         self.plots["plane"].legend.label_text_color = inks["ink"]
 
     def _name_axes(self) -> None:
-        normalized = self.controls.normalized
-        hertz = "cycles per period" if normalized else "frequency in Hz"
-        spring, damper, torque, turns = own_unit("N/m"), own_unit("N s/m"), own_unit("N"), is_rotary()
-        place = "position in mrad" if turns else "position in mm"
+        spring, damper, torque = own_unit("N/m"), own_unit("N s/m"), own_unit("N")
+        hertz, time, walls = "frequency in Hz", "time in s", (f"stiffness K in {spring}", f"damping B in {damper}")
+        place, step, force = "position in mm", "position in mm/N", f"wall force in {torque}"
+        if is_rotary():
+            place, step, force = "position in mrad", f"position in mrad/({torque})", f"wall torque in {torque}"
+        if self.controls.normalized:
+            hertz, time, walls = "cycles per period", "time in periods", ("alpha", "beta")
+            place, step, force = "position", "position", "wall force"
         names = {
-            "plane": ("alpha", "beta") if normalized else (f"stiffness K in {spring}", f"damping B in {damper}"),
+            "plane": walls,
             "gain": (hertz, "|L| in dB"),
             "phase": (hertz, "phase in degrees"),
-            "step": ("time in periods", "position")
-            if normalized
-            else ("time in s", f"{place}/({torque})" if turns else f"{place}/N"),
-            "contact": ("time in periods", "position") if normalized else ("time in s", place),
-            "force": ("time in periods", "wall force")
-            if normalized
-            else ("time in s", f"wall {'torque' if turns else 'force'} in {torque}"),
+            "step": (time, step),
+            "contact": (time, place),
+            "force": (time, force),
         }
         for name, (x, y) in names.items():
             self.plots[name].xaxis.axis_label, self.plots[name].yaxis.axis_label = x, y
@@ -260,8 +261,8 @@ class Page:
             return
         if rest:
             assert self.frame is not None, "it has just been shown"
-            wish = Wish(controls.scene, controls.normalized, *self.frame, outline=not self.drawn, **self.options)
-            self.executor.submit(self._compute, self.generation, wish)
+            wanted = {"normalized": controls.normalized, "outline": not self.drawn, **self.options}
+            self.executor.submit(self._compute, self.generation, controls.scene, *self.frame, **wanted)
 
     def _show_at_once(self, controls: Controls, rest: bool) -> None:
         scene = controls.scene
@@ -282,19 +283,15 @@ class Page:
         frame = model.frame(edge, controls.wall)
         if frame != self.frame:
             self.frame = frame
-            for axis, (low, high) in zip(
-                (self.plots["plane"].x_range, self.plots["plane"].y_range), frame, strict=True
-            ):
+            plane = self.plots["plane"]
+            for axis, (low, high) in zip((plane.x_range, plane.y_range), frame, strict=True):
                 axis.update(start=low, end=high, reset_start=low, reset_end=high)
         self._point_at_wall()
         word = "stable" if stable else "UNSTABLE"
-        radius = f"spectral radius {np.abs(poles).max():.6f}"
-        spell = {"yaml": to_yaml, "python": to_python, "link": to_link} if rest else {}
-        recipes = {name: spelled(controls) for name, spelled in spell.items()}
-        said = {"error": "", "word": word, "radius": radius, "busy": True, **recipes}
-        self.tell(
-            {**said, "poles_words": model.caption_poles(poles, word.lower()), "state": controls.shown(), "frame": frame}
-        )
+        said = {"error": "", "word": word, "radius": f"spectral radius {np.abs(poles).max():.6f}", "busy": True}
+        said |= {"poles_words": model.caption_poles(poles, word.lower()), "state": controls.shown(), "frame": frame}
+        recipes = {"yaml": to_yaml, "python": to_python, "link": to_link} if rest else {}
+        self.tell({**said, **{name: spell(controls) for name, spell in recipes.items()}})
 
     def _point_at_wall(self) -> None:
         plane = self.plots["plane"]
@@ -326,11 +323,11 @@ class Page:
         """Send texts and numbers that the page writes by itself."""
         self.answer.data = {"json": [json.dumps({"serial": self.serial, **texts})]}
 
-    def _compute(self, generation: int, wish: Wish) -> None:
+    def _compute(self, generation: int, scene: Scene, *frame: model.Range, **wanted: bool) -> None:
         """In the worker's thread: compute part by part, unless something newer is wanted."""
         try:
-            with use_kind(bool(wish.scene.device.rotary)):
-                for update in compute_details(wish):
+            with use_kind(bool(scene.device.rotary)):
+                for update in compute_details(scene, *frame, **wanted):
                     if generation != self.generation:
                         return
                     self._hand_over(generation, update)

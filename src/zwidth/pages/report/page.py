@@ -103,10 +103,8 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
         "release": content["versions"].get("zwidth", ""),
         "digest": content.get("config_sha256", ""),
     }
-    rows = "".join(
-        f'<tr><th scope="row">{escape(name)}</th><td>{escape(str(version))}</td></tr>'
-        for name, version in content["versions"].items()
-    )
+    versions = content["versions"].items()
+    rows = [f'<th scope="row">{escape(name)}</th><td>{escape(str(version))}</td>' for name, version in versions]
     return Template(html).substitute(
         {name: escape(str(text)) for name, text in texts.items()},
         style=style,
@@ -116,7 +114,7 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
         contents="".join(f'<li><a href="#{escape(each["name"])}">{escape(each["name"])}</a></li>' for each in done),
         sections="".join(_section(where, entry) for entry in done),
         beside=f" Beside it goes the folder <code>{INPUTS}</code> of the run." if content.get("inputs") else "",
-        versions=_scrolling("Versions", f"<tbody>{rows}</tbody>"),
+        versions=_scrolling("Versions", rows),
         config=f'<h3>Configuration</h3><pre tabindex="0">{escape(config)}</pre>' if config else "",
     )
 
@@ -156,20 +154,21 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
 
 
 def _published(content: dict[str, Any]) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(row['quantity'])}</td><td>{escape(row['where'])}</td><td>{escape(str(row['printed']))}</td>"
-        f'<td class="number">{row["computed"]:.10g}</td><td>{"agrees" if row["agrees"] else "differs"}</td></tr>'
+    rows = [
+        f"<td>{escape(row['quantity'])}</td><td>{escape(row['where'])}</td><td>{escape(str(row['printed']))}</td>"
+        f'<td class="number">{row["computed"]:.10g}</td><td>{"agrees" if row["agrees"] else "differs"}</td>'
         for row in content["published"]
-    )
+    ]
     head = "".join(f'<th scope="col">{word}</th>' for word in ("quantity", "where", "printed", "computed", ""))
-    return "<h3>Printed numbers beside computed ones</h3>" + _scrolling(
-        "Printed and computed numbers", f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
-    )
+    title = "Printed and computed numbers"
+    return f"<h3>Printed numbers beside computed ones</h3>{_scrolling(title, rows, f'<thead><tr>{head}</tr></thead>')}"
 
 
-def _scrolling(name: str, rows: str) -> str:
+def _scrolling(name: str, rows: list[str], head: str = "") -> str:
     """A table that scrolls by itself where the page is narrow, by keyboard as well."""
-    return f'<div class="wide" tabindex="0" role="region" aria-label="{name}"><table>{rows}</table></div>'
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    table = f"<table>{head}<tbody>{body}</tbody></table>"
+    return f'<div class="wide" tabindex="0" role="region" aria-label="{name}">{table}</div>'
 
 
 def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[str]:

@@ -140,7 +140,7 @@ def test_the_other_model_of_delays_and_other_folders_are_refused(tmp_path):
         read_controls(tmp_path)
 
 
-def test_a_run_has_recorded_its_scene(tmp_path):
+def test_a_run_has_recorded_its_scene(tmp_path, unpainted):
     file = written(tmp_path, f"{DEVICE}, stiffness: 1000")
     assert zwidth.run(file, out=tmp_path / "run").ok
     assert read_controls(tmp_path / "run") == read_controls(file)

@@ -16,6 +16,8 @@ from zwidth.pages.explorer.controls import (
     to_yaml,
 )
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 VIEWS = {
     "rigid": Controls(),
     "unstable": Controls().change({"stiffness": 1e6}),
