@@ -143,7 +143,8 @@ class Border:
     def _corner(self, inside: float, outside: float) -> float:
         """Where the curve stops to be an edge between two angles: another crossing of its row meets it there."""
         b = self.boundary
-        ends = np.array(_narrow(b.borders, inside, outside, 1))
+        inside, outside = _narrow(b.borders, inside, outside, 1)
+        ends = np.array([inside, outside])
         here = curve_at(b.loop, ends)
         rows = b.crossings(here.beta)
         gaps = rows.alpha - here.alpha[:, None]
@@ -154,7 +155,7 @@ class Border:
             w = self._meeting(np.stack([ends, rows.w[:, other]]), gaps[:, other], other)
             if list(b.borders(np.array([w - _BESIDE * w, w + _BESIDE * w]))) in ([True, False], [False, True]):
                 return w
-        return _narrow(b.borders, *ends.tolist(), _ROUNDS)[0]
+        return _narrow(b.borders, inside, outside, _ROUNDS)[0]
 
     def _meeting(self, ends: np.ndarray, gaps: np.ndarray, other: int) -> float:
         """Where the curve meets another crossing of its rows, by Newton's method.

@@ -152,7 +152,7 @@ def poles_less_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
             else:
                 out[some] = _springs(loop, a)
     # Steps leave rounding on real poles; those of a pair that meets there are 1e-8 apart.
-    out.imag[np.abs(out.imag) <= _REAL * np.abs(out)] = 0.0
+    out = np.where(np.abs(np.imag(out)) <= _REAL * np.abs(out), np.real(out) + 0j, out)
     return out.reshape(*shape, order)
 
 
