@@ -74,8 +74,8 @@ def map_by_degree(
     else:
         arrays, xp = broadcast(arguments), np
         delays = arrays[-1]
-    shape = arrays[0].shape
-    columns = [array.reshape(-1) for array in arrays]
+    shape = np.shape(arrays[0])
+    columns: list[Any] = [xp.reshape(array, -1) for array in arrays]
     # What is beyond the range of the model must not decide the length of all others.
     defined = np.broadcast_to(np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0), shape).reshape(-1)
     whole = np.floor(defined)
