@@ -144,6 +144,22 @@ def false_position(
     return fori_loop(0, steps, step, at).best
 
 
+# Steps towards a zero between two nodes at most, and how near, as a share of its place, it is told.
+_BETWEEN_STEPS, _CLOSED = 120, 4e-16
+
+
+def zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """Where a function changes its sign behind nodes ``k``, given its values at all nodes; in NumPy."""
+    if not k.size:
+        return nodes[k]
+    low, high, first, last = nodes[k], nodes[k + 1], values[k], values[k + 1]
+    with np.errstate(all="ignore"):
+        sizes = np.abs(first) + np.abs(last)
+        scale = np.where(first > 0, 1.0, -1.0) / np.where(sizes > 0, sizes, 1.0)
+        ends = low, high, first * scale, last * scale
+        return false_position(lambda at: function(at) * scale, *ends, _BETWEEN_STEPS, _CLOSED * high)
+
+
 def follow_root(function: Function, root: Array, usable: Callable[[Array, Array], Array]) -> Array:
     """A zero, in JAX with its derivatives in whatever the function depends on, to the second order.
 

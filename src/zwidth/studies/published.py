@@ -214,6 +214,6 @@ class PublishedStudy(ComputedStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         printed, sharpened = published_numbers(), sharpened_numbers()
         texts = {"md": as_markdown(printed, sharpened), "json": as_json(printed, sharpened)}
-        away = [f"{row.quantity}: printed {row.printed}, computed {row.computed:.10g}"
-                for row in printed if not row.agrees]  # fmt: skip
-        return Outcome(documents={f"{self.name}.{ending}": text for ending, text in texts.items()}, notes=tuple(away))
+        away = (row for row in printed if not row.agrees)
+        notes = tuple(f"{row.quantity}: printed {row.printed}, computed {row.computed:.10g}" for row in away)
+        return Outcome(documents={f"{self.name}.{ending}": text for ending, text in texts.items()}, notes=notes)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import ON_CIRCLE, circle, depths
-from zwidth.arrays.roots import false_position
+from zwidth.arrays.roots import zeros_between
 from zwidth.loops.linear.roots import LoopRoots
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
@@ -23,7 +23,6 @@ _ROUNDS = 60
 _LAST = 1e-4
 # Shares of a step at which a dip of the slope between two nodes is looked for.
 _INSIDE = np.arange(1, 8) / 8.0
-_MOST_STEPS = 120
 
 
 class CurvePoints(NamedTuple):
@@ -74,15 +73,7 @@ def nodes_of(loop: LoopRoots) -> np.ndarray:
 def zeros_of(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
     """Zeros of a field of the curve between nodes where its sign changes."""
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
-    low, high, sign = w[k], w[k + 1], np.sign(values[k])
-    if not k.size:
-        return low
-    with np.errstate(all="ignore"):
-        scale = sign / (np.abs(values[k]) + np.abs(values[k + 1]))
-        ends = values[k] * scale, values[k + 1] * scale
-        return false_position(
-            lambda at: getattr(curve_at(loop, at), field) * scale, low, high, *ends, _MOST_STEPS, 2e-16 * high
-        )
+    return zeros_between(lambda at: getattr(curve_at(loop, at), field), w, values, k)
 
 
 def find_dips(w: np.ndarray, values: np.ndarray) -> np.ndarray:

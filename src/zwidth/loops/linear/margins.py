@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle
-from zwidth.arrays.roots import false_position
+from zwidth.arrays.roots import false_position, zeros_between
 from zwidth.arrays.xp import within
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import AnyChain
@@ -35,7 +35,6 @@ from zwidth.words.types import Array
 
 # Halvings beside a zero of the wall, and how much of itself the wall may change from node to node.
 _HALVINGS, _SHARE = 40, 0.25
-_STEPS, _CLOSED = 100, 4e-16
 # An L so small, as a share of what it changes by over w, is a zero of it.
 _NOTHING = 1e-10
 
@@ -104,16 +103,7 @@ class OpenLoop(NamedTuple):
             w = np.sort(np.concatenate([w, dips]))
             value, slope = read(self.at(w))
         k = np.flatnonzero((value[:-1] > 0) != (value[1:] > 0))
-        return self._zeros(lambda jet: read(jet)[0], w, value, k)
-
-    def _zeros(self, read: Callable[[Jet], np.ndarray], w: np.ndarray, value: np.ndarray, k: np.ndarray) -> np.ndarray:
-        """Where what is read of L changes its sign behind nodes ``k``."""
-        if not k.size:
-            return w[k]
-        sizes = np.abs(value[k]) + np.abs(value[k + 1])
-        sign = np.where(value[k] > 0, 1.0, -1.0) / np.where(sizes > 0, sizes, 1.0)
-        ends = w[k], w[k + 1], sign * value[k], sign * value[k + 1]
-        return false_position(lambda x: sign * read(self.at(x)), *ends, _STEPS, _CLOSED * w[k])
+        return zeros_between(lambda at: read(self.at(at))[0], w, value, k)
 
     def _dips(
         self, read: Callable[[Jet], tuple[np.ndarray, np.ndarray]], w: np.ndarray, value: np.ndarray, slope: np.ndarray
@@ -125,7 +115,8 @@ class OpenLoop(NamedTuple):
         # At half the rate L may be 0: no tangent of its logarithm leads anywhere from there.
         with np.errstate(invalid="ignore"):
             lowest = np.minimum(size[:-1] - fall[:-1] * step, size[1:] - fall[1:] * step)
-        return self._zeros(lambda jet: read(jet)[1], w, slope, np.flatnonzero(toward & (lowest < 0)))
+        k = np.flatnonzero(toward & (lowest < 0))
+        return zeros_between(lambda at: read(self.at(at))[1], w, slope, k)
 
     def least_distance(self) -> tuple[float, float]:
         """The least ``|1 + L|`` and its angle."""
@@ -136,7 +127,7 @@ class OpenLoop(NamedTuple):
         distance, rising = np.abs(1.0 + self.L.value), np.nan_to_num(slope(self.L))
         k = np.flatnonzero((rising[:-1] <= 0) & (rising[1:] > 0))
         k = k[np.minimum(distance[k], distance[k + 1]) < 2.0 * np.nanmin(distance)]
-        places = np.concatenate([self.w, self._zeros(slope, self.w, rising, k)])
+        places = np.concatenate([self.w, zeros_between(lambda at: slope(self.at(at)), self.w, rising, k)])
         distances = np.concatenate([distance, np.abs(1.0 + self.at(places[self.w.size :]).value)])
         rest = self.at_rest()
         if rest is not None:

@@ -74,7 +74,8 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
     Numerics:
         Phase margin and gain crossover are in closed form, the others are found to about 1e-14, at a cost that does not
         grow with d. The fraction of the delay is sampled 64 times a period, and the last change looked for between two
-        samples. Traceable: `jit`, `vmap`, `grad`.
+        samples. Traceable: `jit`, `vmap`, `grad`. A margin that is NaN has NaN derivatives; where it is one of those of
+        which `jax.jacrev` takes all at a time, so have the wall's others, unlike in `jax.jacfwd` or one by one.
 
     References:
         Landau 1990 (modulus margin); python-control's `stability_margins`, which calls them gm, pm, sm, wpc, wgc, wms.
