@@ -283,7 +283,7 @@ def test_without_x64_float32_is_computed_in_and_the_statuses_agree(case):
     for name, value in result.items():
         assert value.dtype in (jnp.float32, jnp.complex64, jnp.bool_, jnp.int32), name
         if value.dtype.kind in "fc":
-            np.testing.assert_allclose(value, direct[name], rtol=2e-3, atol=2e-3, err_msg=name)
+            np.testing.assert_allclose(value, direct[name], rtol=case.single, atol=case.single, err_msg=name)
         else:
             np.testing.assert_array_equal(value, direct[name], err_msg=name)
 

@@ -143,11 +143,6 @@ def adaptive_integral(function, low, high):
     return total
 
 
-def test_the_passive_area_in_single_precision():
-    # Inside somebody's own jit the ambient precision holds; the triangle and the closed tip need no more.
-    assert float(jax.jit(passive_area, compiler_options=QUICKLY)(0.5, 0.0)) == pytest.approx(0.5, rel=1e-5)
-
-
 def test_the_passive_area_with_a_traced_delay(x64):
     d = np.array([0.0, 0.3, 1.0, 2.5, 0.1, 1.3])
     direct = passive_area(0.7, d)

@@ -128,12 +128,6 @@ def test_eigenvalues_inside_a_transformation(x64):
     assert companion(0.5) == pytest.approx(float(exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-8)
 
 
-def test_single_precision_keeps_its_digits():
-    got = jax.jit(lambda alpha: zwidth.spectral_radius(alpha, 0.5, 0.1, 1.0), compiler_options=QUICKLY)(0.5)
-    assert got.dtype == np.float32
-    assert got == pytest.approx(zwidth.spectral_radius(0.5, 0.5, 0.1, 1.0), rel=1e-5)
-
-
 def test_nothing_is_compiled_and_no_delay_takes_long():
     # Eigenvalues of a matrix of the longest delay would fit neither into the memory nor into an hour.
     code = (
