@@ -389,3 +389,16 @@ def test_slopes_of_boundary_points_by_mpmath(name, line):
                 there = [mpf(value) + (step if j == k else 0) for j, value in enumerate(values)]
                 expected = (exact(found["omega"][row], *there) - exact(found["omega"][row], *map(mpf, values))) / step
                 assert float(slopes[other][name][row]) == pytest.approx(float(expected), rel=1e-10)
+
+
+def test_slopes_of_areas():
+    step, d = 1e-5, np.array([0.0, 0.3, 1.0, 2.5, 0.1, 1.3])
+    low, high = zwidth.stable_area(np.array([1.0 - step, 1.0 + step]), 1.3)
+    slopes = ask("stable_area", delta=1.0, d=1.3)[1]["value"]
+    assert slopes["delta"] == pytest.approx((high - low) / (2 * step), rel=1e-8)
+    area, slopes = ask("passive_area", delta=0.7, d=d)
+    np.testing.assert_allclose(area["value"], zwidth.passive_area(0.7, d), rtol=1e-14)
+    for at, by_d in zip(d[4:], slopes["value"]["d"][4:], strict=True):
+        # A maximum over frequency is found to the square root of a rounding error only.
+        low, high = zwidth.passive_area(0.7, np.array([at - step, at + step]))
+        assert by_d == pytest.approx((high - low) / (2 * step), abs=1e-7)
