@@ -146,7 +146,7 @@ class FollowedPoles(NamedTuple):
     special: tuple[np.ndarray, ...]
 
 
-class _Output:
+class _Canvas:
     """The values of a window and of what else its cells hold, and which of its walls are special."""
 
     def __init__(self, area: Area, side: int, with_rate: bool) -> None:
@@ -181,7 +181,7 @@ def _tiles(values: np.ndarray, side: int) -> np.ndarray:
 class _Level:
     """The cells of one size of some devices."""
 
-    def __init__(self, area: Area, side: int, wanted: AllowedErrors, output: _Output) -> None:
+    def __init__(self, area: Area, side: int, wanted: AllowedErrors, output: _Canvas) -> None:
         self.area, self.side, self.wanted, self.output = area, side, wanted, output
         self.axes = _AxisPieces(area.alpha, side), _AxisPieces(area.beta, side)
         self.radius, self.rate = _tiles(output.radius, side), _tiles(output.rate, side)
@@ -367,7 +367,7 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
     longest = max(area.alpha.shape[1], area.beta.shape[1])
     sides = [side for side in _SIDES if side < 2 * longest or side == _SIDES[-1]]
     held = area.d != np.floor(area.d)
-    output = _Output(area, sides[0], with_rate)
+    output = _Canvas(area, sides[0], with_rate)
     levels = [_Level(area, side, AllowedErrors(accuracy, with_rate), output) for side in sides]
 
     corners = [np.arange(part.start // sides[0], -(-part.stop // sides[0])) for part in area.window]
