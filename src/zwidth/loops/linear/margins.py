@@ -82,7 +82,7 @@ class OpenLoop(NamedTuple):
         return self._roots(size)
 
     def phase_crossovers(self) -> np.ndarray:
-        """Angles in (0, pi) at which L is real and negative, ascending."""
+        """Angles in (0, pi] at which L is real and negative, ascending."""
 
         def turn(jet: Jet) -> tuple[np.ndarray, np.ndarray]:
             with np.errstate(all="ignore"):
@@ -90,7 +90,7 @@ class OpenLoop(NamedTuple):
                 return unit.imag, unit.real * (jet.slope / jet.value).imag
 
         # At pi L is real in any case.
-        found = self._roots(turn, until=-1)
+        found = np.append(self._roots(turn, until=-1), np.pi)
         L = self.at(found)
         # Where L passes through 0 its phase jumps, and no factor brings a pole there.
         return found[(L.value.real < 0) & (np.abs(L.value) > _NOTHING * found * np.abs(L.slope))]
@@ -149,13 +149,11 @@ def open_loop_response(loop: LoopRoots, alpha: Array, beta: Array, at: CirclePoi
 def margins_of(wall: OpenLoop, stable: bool) -> Margins:
     """The nearest crossovers, and the least distance from -1, of one wall; the delay margin is not asked for."""
     w = wall.phase_crossovers()
-    places, values = list(w), list(np.abs(wall.at(w).value))
-    for place, value in ((np.pi, float(wall.L.value[-1].real)), (0.0, wall.at_rest())):
-        if value is not None and np.isfinite(value) and value < 0:
-            places.append(place)
-            values.append(-value)
-    w = wall.gain_crossovers()
-    nearest = find_nearest(stable, np.array(places), np.array(values), w, np.angle(-wall.at(w).value))
+    sizes, rest = np.abs(wall.at(w).value), wall.at_rest()
+    if rest is not None and rest < 0:
+        w, sizes = np.append(w, 0.0), np.append(sizes, -rest)
+    crossed = wall.gain_crossovers()
+    nearest = find_nearest(stable, w, sizes, crossed, np.angle(-wall.at(crossed).value))
     gain, phase, phase_at, gain_at = nearest
     distance, closest = wall.least_distance()
     return Margins(gain, phase, np.nan, distance, phase_at, gain_at, closest)
