@@ -18,7 +18,7 @@ from zwidth.arrays.circle import circle
 from zwidth.fitting.device_rows import DeviceRows
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
-from zwidth.fitting.structure import add_lag, to_scene
+from zwidth.fitting.structure import StructuredRecordings, to_scene
 from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
 from zwidth.parts.actuator import Actuator
 from zwidth.parts.measured import MeasuredDevice
@@ -153,9 +153,11 @@ def look_for_lags(best: FittedModel) -> LagTest:
     best = _glimpse(best)
     lags = np.geomspace(_SHORTEST, max(_LONGEST, min(_LONGEST_LAG, best.theta[2])), _LAGS)
     # Of the mass alone: what resonances add turns hardly.
-    (g, delta, d), logs = best.theta[:3], best.model.logs
-    columns = [np.concatenate([add_lag(np.array([g, delta, d - lag, lag]), log, 1) for log in logs]) for lag in lags]
-    columns = best.model.weigh(g * np.concatenate(columns, -1))
+    (g, delta, d), model = best.theta[:3], StructuredRecordings(best.model.logs, None, 1)
+    rest = np.zeros(model.size - 4)
+    thetas = [np.array([g, delta, d - lag, lag, *rest]) for lag in lags]
+    columns = [[model.add_parts(theta, k)[0] for k in range(len(model.logs))] for theta in thetas]
+    columns = best.model.weigh(np.stack([np.concatenate(column) for column in columns], -1))
     absorbed = best.inverse.matrix @ columns
     left, rest = columns - best.columns[0] @ absorbed, best.model.weigh(best.residuals)
     whole = np.linalg.norm(left, axis=0)
