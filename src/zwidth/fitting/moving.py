@@ -14,7 +14,7 @@ NumPy's and LAPACK's compiled recursions, for JAX would compile for seconds for 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import exp, expm1, log1p
+from math import expm1, log1p
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -74,12 +74,10 @@ class Recording:
         push = g * force + offset
         pieces = _rub(push, length, delta, v0, friction) if friction else _glide(push, length, delta, v0)
         place, slopes = _follow(pieces, force, push, length, longer, delta, friction)
-        # Two parts a period.
-        place, slopes = place[1::2], slopes[1::2]
-        whole_slopes = np.zeros((self.position.size, 7))
-        whole_slopes[:, 3] = 1.0
-        whole_slopes[1:, [0, 1, 2, 4, 5, 6]] = slopes
-        return ModelledMotion(x0 + np.concatenate([[0.0], place]), whole_slopes)
+        whole_slopes = np.zeros((7, self.position.size))
+        whole_slopes[3] = 1.0
+        whole_slopes[[0, 1, 2, 4, 5, 6], 1:] = slopes
+        return ModelledMotion(x0 + np.concatenate([[0.0], place]), whole_slopes.T)
 
 
 def _glide(push: np.ndarray, length: np.ndarray, delta: float, v0: float) -> Pieces:
@@ -91,42 +89,62 @@ def _glide(push: np.ndarray, length: np.ndarray, delta: float, v0: float) -> Pie
 
 
 def _rub(push: np.ndarray, length: np.ndarray, delta: float, v0: float, friction: float) -> Pieces:
-    kinds = [(h, exp(-delta * h), -expm1(-delta * h) / delta if delta else h) for h in length[:2].tolist()]
-    v, way = v0, float(np.sign(v0))
-    # Where it moves on in which direction, and where it turned from which one and when.
-    ends, begun, ways, turns, times, olds = [0.0] * push.size, [0], [way], [], [], []
-    rub = way * friction
-    for k, a in enumerate(push.tolist()):
+    at, count = phi_functions(delta * length[:2]), push.size
+    slow, rates = np.tile(at.c, count // 2), np.tile(length[:2] * at.phi1, count // 2)
+    able, times = np.flatnonzero(np.abs(push) > friction), np.append(0.0, np.cumsum(length))
+    # What is gained from rest in a direction s, G. From v_m on, s v_k = G_k + (s v_m - G_m) e^(-delta (t_k - t_m)).
+    gliding, rubbing = np.append(0.0, recur(slow, rates * push)), np.append(0.0, recur(slow, rates * friction))
+    gained = {s: s * gliding - rubbing for s in (1.0, -1.0)}
+    decays = [np.exp(-delta * (times[k:] - times[k])) for k in (0, 1)]
+    # Where it moves on in which direction; where it turned from which one, how long before, and its velocity then.
+    m, v, way = 0, v0, float(np.sign(v0))
+    begun, ways, turns = [0], [way], []
+    while m < count:
         if way == 0.0:
-            if not abs(a) > friction:
-                continue
-            way = 1.0 if a > 0 else -1.0
-            rub = way * friction
-            begun.append(k)
+            after = np.searchsorted(able, m)
+            if after == able.size:
+                break
+            m, v = int(able[after]), 0.0
+            way = 1.0 if push[m] > 0 else -1.0
+            begun.append(m)
             ways.append(way)
-        h, c, rate = kinds[k % 2]
-        pull = a - rub
-        v = c * v + rate * pull
-        if v * way <= 0.0 and pull * way < 0.0 and h > 0.0:
-            before = -(ends[k - 1] if k else v0) / pull
-            before = min(log1p(delta * before) / delta if delta else before, h)
-            turns.append(k)
-            times.append(before)
-            olds.append(way)
-            if abs(a) > friction:
-                way, rest = -way, h - before
-                rub = way * friction
-                v = (-expm1(-delta * rest) / delta if delta else rest) * (a - rub)
-            else:
-                way, v = 0.0, 0.0
-            begun.append(k)
-            ways.append(way)
-        ends[k] = v
-    start, end = np.array([v0, *ends[:-1]]), np.array(ends)
-    way_after = np.repeat(ways, np.diff([*begun, push.size]))
-    turned, before, at = np.zeros(push.shape, bool), length.copy(), way_after.copy()
-    turned[turns], before[turns], at[turns] = True, times, olds
-    return Pieces(start, end, turned, before, at, way_after, at == 0, way_after == 0)
+        gain, decay = gained[way], decays[m % 2]
+        ahead = way * v - float(gain[m])
+        k = _find_stop(gain[m:], decay, ahead)
+        if m + k == count:
+            break
+        v, m, a, h = way * max(0.0, float(gain[m + k] + ahead * decay[k])), m + k + 1, float(push[m + k]), length[m + k]
+        pull = a - way * friction
+        if not (pull * way < 0.0 and h > 0.0):
+            v = float(slow[m - 1]) * v + float(rates[m - 1]) * pull
+            continue
+        before = -v / pull
+        before = min(log1p(delta * before) / delta if delta else before, float(h))
+        rest, old, way = float(h) - before, way, -way if abs(a) > friction else 0.0
+        v = (-expm1(-delta * rest) / delta if delta else rest) * (a - way * friction) if way else 0.0
+        turns.append((m - 1, before, old, v))
+        begun.append(m - 1)
+        ways.append(way)
+    way_after = np.repeat(ways, np.diff([*begun, count]))
+    turned, before, at = np.zeros(count, bool), length.copy(), way_after.copy()
+    held, added = way_after == 0, rates * (push - way_after * friction)
+    if turns:
+        k = [turn[0] for turn in turns]
+        turned[k], (before[k], at[k], added[k]) = True, np.array(turns)[:, 1:].T
+    end = recur(np.where(held | turned, 0.0, slow), np.where(held, 0.0, added), v0)
+    return Pieces(np.append(v0, end[:-1]), end, turned, before, at, way_after, at == 0, held)
+
+
+def _find_stop(gain: np.ndarray, decay: np.ndarray, ahead: float) -> int:
+    """After how many parts the next one ends at no speed in the direction of the motion; all of them where none does."""
+    first, size = 1, 32
+    while first < gain.size:
+        last = first + size
+        stopped = gain[first:last] + ahead * decay[first : min(last, gain.size)] <= 0.0
+        if stopped[k := int(stopped.argmax())]:
+            return first + k - 1
+        first, size = last, 4 * size
+    return gain.size - 1
 
 
 def _follow(
@@ -138,35 +156,33 @@ def _follow(
     delta: float,
     friction: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The way gone at the end of every part, and its derivatives in g, delta, d, v0, o and c."""
-    v, end, turned, t = pieces.start, pieces.end, pieces.turned, pieces.before
-    first, a = phi_functions(delta * t), np.where(pieces.held, 0.0, push - pieces.way * friction)
-    moved = first.phi1 * t * v + first.phi2 * t**2 * a
-    by_speed, by_place = _derive(first, delta, t, v, a, force, pieces.way, pieces.held)
+    """The way gone at the end of every period, and its derivatives in g, delta, d, v0, o and c, a row each."""
+    v, end, way, held, k = pieces.start, pieces.end, pieces.way, pieces.held, np.flatnonzero(pieces.turned)
+    a, kinds = np.where(held, 0.0, push - way * friction), phi_functions(delta * length[:2])
+    moved, by = _derive(kinds, delta, length[:2], *(each.reshape(-1, 2) for each in (v, a, force, way, held)))
+    moved, by = moved.ravel(), by.reshape(2, 6, -1)
     # What sticks forgets its speed.
-    slow = np.where(pieces.held, 0.0, first.c)
-    speed = np.where(turned, 0.0, a) - delta * end
-    again = np.where(pieces.held, 0.0, t * first.phi1)
-    if turned.any():
-        k = np.flatnonzero(turned)
-        r, a_after = (length - t)[k], np.where(pieces.held_after, 0.0, push - pieces.way_after * friction)[k]
-        second = phi_functions(delta * r)
-        moved[k] += second.phi2 * r**2 * a_after
-        after_speed, after_place = _derive(
-            second, delta, r, 0.0 * r, a_after, force[k], pieces.way_after[k], pieces.held_after[k]
-        )
-        speed[k] += a_after
+    again, slow = (np.where(held.reshape(-1, 2), 0.0, each).ravel() for each in (length[:2] * kinds.phi1, kinds.c))
+    speed = a - delta * end
+    if k.size:
+        t, r, held_after, way_after = pieces.before[k], (length - pieces.before)[k], pieces.held_after[k], pieces.way_after[k]
+        first, a_after = phi_functions(delta * t), np.where(held_after, 0.0, push[k] - way_after * friction)
+        there, by_first = _derive(first, delta, t, v[k], a[k], force[k], way[k], held[k])
+        then, by_second = _derive(phi_functions(delta * r), delta, r, 0.0 * r, a_after, force[k], way_after, held_after)
+        moved[k], speed[k] = there + then, a_after - delta * end[k]
         turn, onward = speed[k] / a[k], end[k] / a[k]
-        again[k] += onward * slow[k]
-        by_place[k] += after_place + onward[:, None] * by_speed[k]
-        by_speed[k] = turn[:, None] * by_speed[k] + after_speed
-        slow[k] *= turn
+        again[k], slow[k] = t * first.phi1 + onward * first.c, turn * first.c
+        by[0][:, k] = by_first[0] + onward * by_first[1] + by_second[0]
+        by[1][:, k] = turn * by_first[1] + by_second[1]
     # A part that lasts longer goes on as it ended.
-    by_speed[:, 2], by_place[:, 2] = longer * speed, longer * end
-    begin = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
-    speeds = recur(slow, by_speed, begin)
-    speeds = np.concatenate([begin[None], speeds[:-1]])
-    return np.cumsum(moved), np.cumsum(again[:, None] * speeds + by_place, axis=0)
+    (by_place, by_speed), by[:, 2] = by, longer * np.array([end, speed])
+    # Two parts a period.
+    by_place = by_place[:, ::2] + by_place[:, 1::2] + again[1::2] * by_speed[:, ::2]
+    by_speed = slow[1::2] * by_speed[:, ::2] + by_speed[:, 1::2]
+    again, slow = again[::2] + again[1::2] * slow[::2], slow[::2] * slow[1::2]
+    begin = np.eye(6)[3]
+    speeds = np.column_stack([begin, recur(slow, by_speed.T, begin)[:-1].T])
+    return np.cumsum(moved[::2] + moved[1::2]), np.cumsum(by_place + again * speeds, axis=1)
 
 
 def _derive(
@@ -179,28 +195,29 @@ def _derive(
     way: np.ndarray,
     held: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How the velocity and the place at the end of a piece move with g, delta, -, -, o and c, the start held."""
-    free = np.where(held, 0.0, 1.0)
-    by = np.stack([force * free, 0.0 * t, 0.0 * t, 0.0 * t, free, -way * free], -1)
-    by_speed, by_place = (t * at.phi1)[:, None] * by, (t**2 * at.phi2)[:, None] * by
-    by_speed[:, 1] = -t * (at.c * v + t * at.psi * a)
+    """The way of a piece; how place and velocity at its end move with g, delta, -, -, o and c, the start held: rows."""
+    reach, far = t * at.phi1, t**2 * at.phi2
     # -phi2'.
     bend = np.where(delta * t == 0, 1.0 / 6.0, at.gap / np.where(delta * t == 0, 1.0, delta * t))
-    by_place[:, 1] = -(t**2) * (at.psi * v + t * bend * a)
-    return by_speed, by_place
+    by = np.zeros((2, 6, *v.shape))
+    by[0, 1], by[1, 1] = -(t**2) * (at.psi * v + t * bend * a), -t * (at.c * v + t * at.psi * a)
+    by[0, 4], by[1, 4] = np.where(held, 0.0, far), np.where(held, 0.0, reach)
+    by[:, 0], by[:, 5] = force * by[:, 4], -way * by[:, 4]
+    return reach * v + far * a, by
 
 
 def recur(factor: np.ndarray | complex, added: np.ndarray, begin: float | np.ndarray = 0.0) -> np.ndarray:
     """``y_k = factor_k y_(k-1) + added_k``, of real or complex numbers."""
     from scipy.linalg.lapack import dtbtrs, ztbtrs  # pyright: ignore[reportAttributeAccessIssue]  (made at import)
 
-    factor = np.broadcast_to(factor, len(added))
-    right = np.array(added, dtype=np.result_type(factor, added, float))
-    right[0] += factor[0] * begin
-    band = np.ones((2, factor.size), right.dtype)
-    band[1, :-1] = -factor[1:]
+    right = np.array(added, dtype=np.result_type(factor, added, float), order="F")
+    first, later = (factor[0], factor[1:]) if isinstance(factor, np.ndarray) else (factor, factor)
+    right[0] += first * begin
+    # As LAPACK stores it: nothing is copied.
+    band = np.empty((len(right), 2), right.dtype).T
+    band[1, :-1] = np.negative(later)
     solve = ztbtrs if right.dtype == complex else dtbtrs
-    return solve(band, right.reshape(factor.size, -1), uplo="L", diag="U")[0].reshape(right.shape)
+    return solve(band, right, uplo="L", diag="U", overwrite_b=1)[0].reshape(right.shape)
 
 
 @dataclass(frozen=True)
