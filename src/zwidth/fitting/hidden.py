@@ -156,7 +156,7 @@ def look_for_lags(best: FittedModel) -> LagTest:
     (g, delta, d), model = best.theta[:3], StructuredRecordings(best.model.logs, None, 1)
     rest = np.zeros(model.size - 4)
     thetas = [np.array([g, delta, d - lag, lag, *rest]) for lag in lags]
-    columns = [[model.add_parts(theta, k)[0] for k in range(len(model.logs))] for theta in thetas]
+    columns = [[model.add_parts(theta, k).position for k in range(len(model.logs))] for theta in thetas]
     columns = best.model.weigh(np.stack([np.concatenate(column) for column in columns], -1))
     absorbed = best.inverse.matrix @ columns
     left, rest = columns - best.columns[0] @ absorbed, best.model.weigh(best.residuals)

@@ -13,7 +13,9 @@ NumPy's and LAPACK's compiled recursions, for JAX would compile for seconds for 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import expm1, log1p
 from typing import ClassVar, NamedTuple, Self
 
@@ -36,11 +38,17 @@ class Pieces(NamedTuple):
     held_after: np.ndarray
 
 
-class ModelledMotion(NamedTuple):
-    """Positions and their derivatives in g, delta, d, x0, v0, o and c, (n, 7)."""
+@dataclass(frozen=True)
+class ModelledMotion:
+    """Positions, and their derivatives where somebody asks: in g, delta, d, x0, v0, o and c, or in theta."""
 
     position: np.ndarray
-    slopes: np.ndarray
+    differentiate: Callable[[], np.ndarray]
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """A column for each number."""
+        return self.differentiate()
 
 
 @dataclass(frozen=True)
@@ -70,27 +78,32 @@ class Recording:
         whole, f = (float(part) for part in split_delay(np.float64(d)))
         now = self.skip + np.arange(self.position.size - 1) - int(whole)
         force = np.stack([self.force[now - 1], self.force[now]], -1).ravel()
-        length, longer = np.tile([f, 1.0 - f], now.size), np.tile([1.0, -1.0], now.size)
-        push = g * force + offset
-        pieces = _rub(push, length, delta, v0, friction) if friction else _glide(push, length, delta, v0)
-        place, slopes = _follow(pieces, force, push, length, longer, delta, friction)
-        whole_slopes = np.zeros((7, self.position.size))
-        whole_slopes[3] = 1.0
-        whole_slopes[[0, 1, 2, 4, 5, 6], 1:] = slopes
-        return ModelledMotion(x0 + np.concatenate([[0.0], place]), whole_slopes.T)
+        length, push, kinds = np.tile([f, 1.0 - f], now.size), g * force + offset, phi_functions(delta * np.array([f, 1.0 - f]))
+        pieces = (_rub if friction else _glide)(push, length, kinds, delta, v0, friction)
+        way, differentiate = _follow(pieces, force, push, length, kinds, delta, friction)
+
+        def move_with() -> np.ndarray:
+            slopes = np.zeros((7, self.position.size))
+            slopes[3], slopes[[0, 1, 2, 4, 5, 6], 1:] = 1.0, differentiate()
+            return slopes.T
+
+        return ModelledMotion(x0 + np.append(0.0, way), move_with)
 
 
-def _glide(push: np.ndarray, length: np.ndarray, delta: float, v0: float) -> Pieces:
-    at = phi_functions(delta * length)
-    end = recur(at.c, length * at.phi1 * push, v0)
-    start = np.concatenate([[v0], end[:-1]])
+def _glide(
+    push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float
+) -> Pieces:
+    slow, rates = (np.tile(each, push.size // 2) for each in (kinds.c, length[:2] * kinds.phi1))
+    end = recur(slow, rates * push, v0)
     never, still = np.zeros(push.shape, bool), np.zeros_like(push)
-    return Pieces(start, end, never, length, still, still, never, never)
+    return Pieces(np.append(v0, end[:-1]), end, never, length, still, still, never, never)
 
 
-def _rub(push: np.ndarray, length: np.ndarray, delta: float, v0: float, friction: float) -> Pieces:
-    at, count = phi_functions(delta * length[:2]), push.size
-    slow, rates = np.tile(at.c, count // 2), np.tile(length[:2] * at.phi1, count // 2)
+def _rub(
+    push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float
+) -> Pieces:
+    count = push.size
+    slow, rates = (np.tile(each, count // 2) for each in (kinds.c, length[:2] * kinds.phi1))
     able, times = np.flatnonzero(np.abs(push) > friction), np.append(0.0, np.cumsum(length))
     # What is gained from rest in a direction s, G. From v_m on, s v_k = G_k + (s v_m - G_m) e^(-delta (t_k - t_m)).
     gliding, rubbing = np.append(0.0, recur(slow, rates * push)), np.append(0.0, recur(slow, rates * friction))
@@ -152,37 +165,43 @@ def _follow(
     force: np.ndarray,
     push: np.ndarray,
     length: np.ndarray,
-    longer: np.ndarray,
+    kinds: PhiFunctions,
     delta: float,
     friction: float,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
     """The way gone at the end of every period, and its derivatives in g, delta, d, v0, o and c, a row each."""
     v, end, way, held, k = pieces.start, pieces.end, pieces.way, pieces.held, np.flatnonzero(pieces.turned)
-    a, kinds = np.where(held, 0.0, push - way * friction), phi_functions(delta * length[:2])
-    moved, by = _derive(kinds, delta, length[:2], *(each.reshape(-1, 2) for each in (v, a, force, way, held)))
-    moved, by = moved.ravel(), by.reshape(2, 6, -1)
-    # What sticks forgets its speed.
-    again, slow = (np.where(held.reshape(-1, 2), 0.0, each).ravel() for each in (length[:2] * kinds.phi1, kinds.c))
-    speed = a - delta * end
-    if k.size:
-        t, r, held_after, way_after = pieces.before[k], (length - pieces.before)[k], pieces.held_after[k], pieces.way_after[k]
-        first, a_after = phi_functions(delta * t), np.where(held_after, 0.0, push[k] - way_after * friction)
-        there, by_first = _derive(first, delta, t, v[k], a[k], force[k], way[k], held[k])
-        then, by_second = _derive(phi_functions(delta * r), delta, r, 0.0 * r, a_after, force[k], way_after, held_after)
-        moved[k], speed[k] = there + then, a_after - delta * end[k]
-        turn, onward = speed[k] / a[k], end[k] / a[k]
-        again[k], slow[k] = t * first.phi1 + onward * first.c, turn * first.c
-        by[0][:, k] = by_first[0] + onward * by_first[1] + by_second[0]
-        by[1][:, k] = turn * by_first[1] + by_second[1]
-    # A part that lasts longer goes on as it ended.
-    (by_place, by_speed), by[:, 2] = by, longer * np.array([end, speed])
-    # Two parts a period.
-    by_place = by_place[:, ::2] + by_place[:, 1::2] + again[1::2] * by_speed[:, ::2]
-    by_speed = slow[1::2] * by_speed[:, ::2] + by_speed[:, 1::2]
-    again, slow = again[::2] + again[1::2] * slow[::2], slow[::2] * slow[1::2]
-    begin = np.eye(6)[3]
-    speeds = np.column_stack([begin, recur(slow, by_speed.T, begin)[:-1].T])
-    return np.cumsum(moved[::2] + moved[1::2]), np.cumsum(by_place + again * speeds, axis=1)
+    a, held_after, way_after = np.where(held, 0.0, push - way * friction), pieces.held_after[k], pieces.way_after[k]
+    a_after = np.where(held_after, 0.0, push[k] - way_after * friction)
+    t, r = pieces.before[k], (length - pieces.before)[k]
+    first, second = zip(*(np.split(each, 2) for each in phi_functions(delta * np.append(t, r))), strict=True)
+    first, second, spans = PhiFunctions(*first), PhiFunctions(*second), length[:2]
+    moved = (kinds.phi1 * spans * v.reshape(-1, 2) + kinds.phi2 * spans**2 * a.reshape(-1, 2)).ravel()
+    moved[k] = t * first.phi1 * v[k] + t**2 * first.phi2 * a[k] + r**2 * second.phi2 * a_after
+
+    def differentiate() -> np.ndarray:
+        by = _derive(kinds, delta, spans, *(each.reshape(-1, 2) for each in (v, a, force, way, held))).reshape(2, 6, -1)
+        # What sticks forgets its speed.
+        again, slow = (np.where(held.reshape(-1, 2), 0.0, each).ravel() for each in (spans * kinds.phi1, kinds.c))
+        speed = a - delta * end
+        if k.size:
+            speed[k] = a_after - delta * end[k]
+            turn, onward = speed[k] / a[k], end[k] / a[k]
+            again[k], slow[k] = t * first.phi1 + onward * first.c, turn * first.c
+            before = _derive(first, delta, t, v[k], a[k], force[k], way[k], held[k])
+            after = _derive(second, delta, r, 0.0 * r, a_after, force[k], way_after, held_after)
+            by[0][:, k], by[1][:, k] = before[0] + onward * before[1] + after[0], turn * before[1] + after[1]
+        # A part that lasts longer goes on as it ended.
+        by[:, 2] = np.tile([1.0, -1.0], end.size // 2) * np.array([end, speed])
+        # Two parts a period.
+        (place, late_place), (moves, late_moves) = (np.moveaxis(each.reshape(6, -1, 2), -1, 0) for each in by)
+        (again, late_again), (slow, late_slow) = again.reshape(-1, 2).T, slow.reshape(-1, 2).T
+        begin = np.eye(6)[3]
+        speeds = recur(slow * late_slow, (late_slow * moves + late_moves).T, begin)[:-1].T
+        by_speed = (again + late_again * slow) * np.column_stack([begin, speeds])
+        return np.cumsum(place + late_place + late_again * moves + by_speed, axis=1)
+
+    return np.cumsum(moved[::2] + moved[1::2]), differentiate
 
 
 def _derive(
@@ -194,16 +213,15 @@ def _derive(
     force: np.ndarray,
     way: np.ndarray,
     held: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The way of a piece; how place and velocity at its end move with g, delta, -, -, o and c, the start held: rows."""
-    reach, far = t * at.phi1, t**2 * at.phi2
+) -> np.ndarray:
+    """How place and velocity at the end of a piece move with g, delta, -, -, o and c, the start held: rows."""
     # -phi2'.
     bend = np.where(delta * t == 0, 1.0 / 6.0, at.gap / np.where(delta * t == 0, 1.0, delta * t))
     by = np.zeros((2, 6, *v.shape))
     by[0, 1], by[1, 1] = -(t**2) * (at.psi * v + t * bend * a), -t * (at.c * v + t * at.psi * a)
-    by[0, 4], by[1, 4] = np.where(held, 0.0, far), np.where(held, 0.0, reach)
+    by[0, 4], by[1, 4] = np.where(held, 0.0, t**2 * at.phi2), np.where(held, 0.0, t * at.phi1)
     by[:, 0], by[:, 5] = force * by[:, 4], -way * by[:, 4]
-    return reach * v + far * a, by
+    return by
 
 
 def recur(factor: np.ndarray | complex, added: np.ndarray, begin: float | np.ndarray = 0.0) -> np.ndarray:
@@ -272,14 +290,27 @@ class Recordings:
         """The largest force commanded."""
         return max(float(np.abs(log.force).max()) for log in self.logs)
 
+    def follow(self, theta: np.ndarray) -> ModelledMotion:
+        """The motion of theta in all logs."""
+        each = [self.follow_log(theta, k) for k in range(len(self.logs))]
+        place = np.concatenate([motion.position for motion in each])
+        return ModelledMotion(place, lambda: np.concatenate([motion.slopes.T for motion in each], 1).T)
+
+    def follow_log(self, theta: np.ndarray, which: int, later: float = 0.0) -> ModelledMotion:
+        """The motion in one of them, of a rigid mass whose force comes later."""
+        log, speed = self.logs[which], self.speeds[which]
+        into = np.array([0, 1, 2, speed - 1, speed, -2, -1])
+        g, delta, d, *rest = theta[into].tolist()
+        moved = log.move(g, delta, d + later, *rest)
+
+        def differentiate() -> np.ndarray:
+            slopes = np.zeros((theta.size, log.position.size))
+            slopes[into] = moved.slopes.T
+            return slopes.T
+
+        return ModelledMotion(moved.position, differentiate)
+
     def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and their derivatives in theta."""
-        places, slopes = [], []
-        for speed, log in zip(self.speeds, self.logs, strict=True):
-            into = [0, 1, 2, speed - 1, speed, -2, -1]
-            moved = log.move(*theta[into].tolist())
-            slope = np.zeros((log.position.size, self.size))
-            slope[:, into] = moved.slopes
-            places.append(moved.position)
-            slopes.append(slope)
-        return np.concatenate(places), np.concatenate(slopes)
+        motion = self.follow(theta)
+        return motion.position, motion.slopes

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.fitting.encoder import MeasurementNoise
-from zwidth.fitting.moving import Recording, Recordings
+from zwidth.fitting.moving import ModelledMotion, Recording, Recordings
 
 # Dampings b T/m and frictions as shares of the largest force that are started from; the least friction that is looked
 # for, for at 0 its slope is not seen.
@@ -313,13 +313,14 @@ def _refine(
     low[list(held)] = high[list(held)] = start[list(held)]
     theta, measured, damping = np.clip(start, low, high), model.measured, _EASY
 
-    def look(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        place, slopes = model.predict(theta)
-        rest = model.weigh(measured - place)
-        return rest, model.weigh(slopes), float(rest @ rest)
+    def look(theta: np.ndarray) -> tuple[ModelledMotion, np.ndarray, float]:
+        motion = model.follow(theta)
+        rest = model.weigh(measured - motion.position)
+        return motion, rest, float(rest @ rest)
 
-    (rest, slopes, squares), promised = look(theta), np.inf
+    (motion, rest, squares), promised = look(theta), np.inf
     for _ in range(most):
+        slopes = model.weigh(motion.slopes)
         sizes = np.linalg.norm(slopes, axis=0)
         # Only what moves the positions moves, and nothing out of its bounds.
         fall = slopes.T @ rest
@@ -334,7 +335,7 @@ def _refine(
             trial = theta.copy()
             trial[free] += step / sizes
             trial = np.clip(trial, low, high)
-            trial_rest, trial_slopes, trial_squares = look(trial)
+            trial_motion, trial_rest, trial_squares = look(trial)
             if trial_squares < squares or damping > _STUBBORN:
                 break
             if promised <= arrived * squares:
@@ -343,7 +344,7 @@ def _refine(
         if not trial_squares < squares:
             # No step in the direction of the slopes helps any more: a corner, or rounding.
             break
-        theta, rest, slopes, squares, before = trial, trial_rest, trial_slopes, trial_squares, squares
+        theta, motion, rest, squares, before = trial, trial_motion, trial_rest, trial_squares, squares
         damping = 0.0 if damping < _LIGHT else damping / 10.0
         if before - squares <= arrived * before and promised <= arrived * before:
             return theta, squares, True

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.fitting.moving import Recording, Recordings, recur
+from zwidth.fitting.moving import ModelledMotion, Recording, Recordings, recur
 from zwidth.fitting.scenes import scene_of
 from zwidth.loops.rigid.device import phi_functions
 from zwidth.parts.velocity import Velocity
@@ -49,41 +49,51 @@ class StructuredRecordings(Recordings):
         low[self.parts], high[self.parts] = np.reshape(ends, (-1, 2)).T
         return low, high
 
-    def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        moved = []
-        for k, (speed, log) in enumerate(zip(self.speeds, self.logs, strict=True)):
-            into, (late, by_late) = np.array([0, 1, 2, speed - 1, speed, -2, -1]), _delay(theta, self.lag, log)
-            rigid, both = log.move(*(theta[into] + np.eye(7)[2] * late).tolist()), self.add_parts(theta, k)
-            both[0] += rigid.position
-            both[1 + into % theta.size] += rigid.slopes.T
-            both[4 : 4 + self.lag] += np.outer(by_late, rigid.slopes[:, 2])
-            moved.append(both)
-        both = np.concatenate(moved, 1)
-        return both[0], both[1:].T
+    def follow_log(self, theta: np.ndarray, which: int, later: float = 0.0) -> ModelledMotion:
+        late, by_late = _delay(theta, self.lag, self.logs[which])
+        rigid, beside = super().follow_log(theta, which, later + late), self.add_parts(theta, which)
 
-    def add_parts(self, theta: np.ndarray, which: int) -> np.ndarray:
-        """What amplifier and modes add, in one log, to the mass whose force comes later; then its slopes: rows."""
-        log, (g, delta, d) = self.logs[which], theta[:3].tolist()
-        own, now = np.eye(1 + theta.size), np.arange(log.position.size)
+        def differentiate() -> np.ndarray:
+            slopes = rigid.slopes + beside.slopes
+            slopes[:, 3 : 3 + self.lag] += np.outer(rigid.slopes[:, 2], by_late)
+            return slopes
+
+        return ModelledMotion(rigid.position + beside.position, differentiate)
+
+    def add_parts(self, theta: np.ndarray, which: int) -> ModelledMotion:
+        """What amplifier and modes add in one log to the mass whose force comes later."""
+        log, (g, delta, d), (late, by_late) = self.logs[which], theta[:3].tolist(), _delay(theta, self.lag, self.logs[which])
+        own, now, place = np.eye(theta.size), np.arange(log.position.size), np.zeros(log.position.size)
         poles, by_theta, weights, states = self._find_poles(theta)
-        # Rows, and how they count in the sum and in its slopes: real parts. A delay moves E by -E' = -p E - F.
-        parts = [(_prolong(log)[log.skip - 1 - int(np.floor(d)) + now], -own[3] * weights[:, 0].sum())]
-        for pole, by, weight, state in zip(poles, by_theta, weights, states, strict=True):
-            way, by_pole = _follow(log, pole, d)
-            parts += [(way, weight - pole * weight[0] * own[3]), (by_pole, weight[0] * by)]
-            if state >= 0:
+        first, ways, ringing, slides = self.parts.stop + 2 * (len(self.logs) + self.modes * which), {}, [], []
+        for pole, by, (weight, *_), k in zip(poles.tolist(), by_theta, weights, states, strict=True):
+            ways[pole] = _follow(log, pole, d)
+            place += (weight * ways[pole].position).real
+            if k >= 0:
                 # How a mode moves that did so before: by two real poles, or the real and imaginary part of one.
-                k, ringing = 1 + state + self.parts.stop + 2 * (len(self.logs) + self.modes * which), np.exp(pole * now)
-                free = own[k] - 1j * own[k + 1] if pole.imag else own[k]
-                size = free[1:] @ theta
-                parts += [(ringing, free + size * own[0]), (now * ringing, size * by)]
-        late, by_late = _delay(theta, self.lag, log)
-        for sign, later, by in ((1.0, 0.0, 0.0 * by_late), (-1.0, late, by_late)) if self.lag else ():
-            way, by_delta, speed = _slide(log, delta, d + later)
-            parts += [(way, sign * (g * own[0] + own[1])), (by_delta, sign * g * own[2])]
-            parts.append((speed[0] - speed, sign * g * (own[3] + by @ own[4 : 4 + self.lag])))
-        rows = np.array([half for row, _ in parts for half in (row.real, row.imag)])
-        return np.array([half for _, factor in parts for half in (factor.real, -factor.imag)]).T @ rows
+                free, motion = own[first + k] - 1j * pole.imag * own[first + k + 1] / (pole.imag or 1.0), np.exp(pole * now)
+                place += (motion * (free @ theta)).real
+                ringing += [(motion, free), (now * motion, (free @ theta) * by)]
+        if self.lag:
+            turn = own[2] + by_late @ own[3 : 3 + self.lag]
+            both = ((g, own[2], d, ways[-delta]), (-g, turn, d + late, _follow(log, -delta, d + late)))
+            for sign, turn, there, way in both:
+                slide = _slide(log, delta, there, way)
+                place += sign * slide.position
+                slides.append((sign, turn, way.position, slide))
+
+        def differentiate() -> np.ndarray:
+            # Rows, and how their real parts count in the slopes. A delay moves E by -E' = -p E - F.
+            parts = [(_prolong(log)[log.skip - 1 - int(np.floor(d)) + now], -own[2] * weights[:, 0].sum()), *ringing]
+            for pole, by, (weight, *slopes) in zip(poles.tolist(), by_theta, weights, strict=True):
+                way = ways[pole]
+                parts += [(way.position, slopes - pole * weight * own[2]), (way.slopes, weight * by)]
+            for sign, turn, speed, slide in slides:
+                parts += [(slide.position, sign / g * own[0]), (slide.slopes, sign * own[1]), (speed[0] - speed, sign * turn)]
+            rows = np.array([half for row, _ in parts for half in (row.real, row.imag)])
+            return rows.T @ np.array([half for _, factor in parts for half in (factor.real, -factor.imag)])
+
+        return ModelledMotion(place, differentiate)
 
     def _find_poles(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Poles on and above the real axis, their slopes, weights and theirs, and which state of modes, -1 for none."""
@@ -104,9 +114,8 @@ class StructuredRecordings(Recordings):
         for each, values in zip(both, (poles, weights), strict=True):
             each[:, 0] = values[:, 0]
             each[:, 1 + moving] = (values[:, 1 : 1 + count] - values[:, 1 + count :]) / (2.0 * steps)
-        by_theta, weights = both[:, above]
-        poles, by_theta[:, 0] = by_theta[:, 0].copy(), 0.0
-        return poles, by_theta, weights, states[above]
+        poles, weights = both[:, above]
+        return poles[:, 0], poles[:, 1:], weights, states[above]
 
 
 def to_scene(model: Recordings, theta: np.ndarray, period: float, velocity: Velocity) -> Scene:
@@ -174,16 +183,20 @@ def find_roots(w: Any, ratio: Any) -> np.ndarray:
     return np.array([w * (-ratio + root), w * (-ratio - root)])
 
 
-def _follow(log: Recording, pole: complex, d: float) -> list[np.ndarray]:
-    """``E_p`` at the positions, from rest at the log's first sample, and its derivative in p."""
+def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:
+    """``E_p`` at the positions, from rest at the log's first sample; its slope is that in p."""
     whole, force = int(np.floor(d)), np.append([0.0, 0.0], _prolong(log))
-    f, pole = d - whole, complex(pole) if pole.imag else float(pole.real)
+    f, pole, seen = d - whole, pole if pole.imag else pole.real, slice(log.skip - whole, log.skip - whole + log.position.size)
     (new, by_new), (old, by_old) = _hold(pole, 1.0 - f), _hold(pole, f)
     turn, later = np.exp(pole), np.exp(pole * (1.0 - f))
     ways = recur(turn, new * force[1:-1] + later * old * force[:-2])
-    moves = by_new * force[1:-1] + later * (by_old + (1.0 - f) * old) * force[:-2]
-    moves[1:] += turn * ways[:-1]
-    return [each[log.skip - whole :][: log.position.size] for each in (ways, recur(turn, moves))]
+
+    def differentiate() -> np.ndarray:
+        moves = by_new * force[1:-1] + later * (by_old + (1.0 - f) * old) * force[:-2]
+        moves[1:] += turn * ways[:-1]
+        return recur(turn, moves)[seen]
+
+    return ModelledMotion(ways[seen], differentiate)
 
 
 def _hold(pole: complex, time: float) -> tuple[complex, complex]:
@@ -195,20 +208,20 @@ def _hold(pole: complex, time: float) -> tuple[complex, complex]:
     return held, (time * np.exp(turn) - held) / pole
 
 
-def _slide(log: Recording, delta: float, d: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The way of a mass with g = 1 and no friction from the first position on, its derivative in delta, its speed."""
+def _slide(log: Recording, delta: float, d: float, speed: ModelledMotion) -> ModelledMotion:
+    """The way of a mass with g = 1 and no friction from the first position on; its slope is that in delta."""
     whole = int(np.floor(d))
-    f, now = d - whole, np.arange(log.skip, log.skip + log.position.size - 1) - whole
-    spans = np.array([f, 1.0 - f, 1.0])
-    both = phi_functions((delta + _STEP * np.array([[0.0], [1.0], [-1.0]])) * spans)
-    reach, way = (both.phi1 * spans).T, (both.phi2 * spans**2).T
-    factors = np.array([reach[2], way[0] + reach[0] * reach[1], way[1]])
-    speed, by_pole = np.real(_follow(log, -delta, d))
-    force = _prolong(log)
-    terms = np.array([speed[:-1], force[now - 1], force[now]])
-    steps = np.array([factors[:, 0], 0.5 / _STEP * (factors[:, 1] - factors[:, 2])]) @ terms
-    steps[1] -= factors[0, 0] * by_pole[:-1]
-    return *np.pad(np.cumsum(steps, 1), ((0, 0), (1, 0))), speed
+    spans, now = np.array([d - whole, 1.0 - d + whole, 1.0]), np.arange(log.skip, log.skip + log.position.size - 1) - whole
+    at = phi_functions((delta + _STEP * np.array([[0.0], [1.0], [-1.0]])) * spans)
+    reach, way = (at.phi1 * spans).T, (at.phi2 * spans**2).T
+    factors, force = np.array([reach[2], way[0] + reach[0] * reach[1], way[1]]), _prolong(log)
+    terms = np.array([speed.position[:-1], force[now - 1], force[now]])
+
+    def differentiate() -> np.ndarray:
+        steps = 0.5 / _STEP * (factors[:, 1] - factors[:, 2]) @ terms - factors[0, 0] * speed.slopes[:-1]
+        return np.append(0.0, np.cumsum(steps))
+
+    return ModelledMotion(np.append(0.0, np.cumsum(factors[:, 0] @ terms)), differentiate)
 
 
 def _prolong(log: Recording) -> np.ndarray:
