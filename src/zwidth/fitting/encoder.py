@@ -80,9 +80,19 @@ class MeasurementNoise:
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
         """Columns over samples in which the mean of every stretch is so small that it counts by its own variance."""
-        starts, sizes, alike = self.stretches
-        beyond = (1.0 - alike**-0.5) / sizes
-        return columns - np.repeat((np.add.reduceat(columns, starts).T * beyond).T, sizes, axis=0)
+        rows, starts, sizes, beyond = self._rests
+        weighed = columns.copy()
+        if rows.size:
+            weighed[rows] -= np.repeat((np.add.reduceat(columns[rows], starts).T * beyond).T, sizes, axis=0)
+        return weighed
+
+    @cached_property
+    def _rests(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Samples of stretches that count less; where among them each begins, its samples, what of its sum is less."""
+        _, sizes, alike = self.stretches
+        less = alike > 1.0
+        few = sizes[less]
+        return np.flatnonzero(np.repeat(less, sizes)), np.cumsum(few) - few, few, (1.0 - alike[less] ** -0.5) / few
 
     def spread(self, slopes: np.ndarray) -> np.ndarray:
         """``J^T C J`` for columns J, with C the covariance of the samples."""

@@ -310,12 +310,12 @@ def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, 
 def _filter_forces(best: FittedModel, ratio: float, rates: np.ndarray) -> np.ndarray:
     """What poles make of all forces, at the positions, a column each; imaginary parts behind the real ones."""
     ends = np.cumsum([0, *(log.position.size for log in best.model.logs)])
-    whole, late = int(best.theta[2]), np.empty((ends[-1], rates.size), np.complex128)
+    whole, late = int(best.theta[2]), np.empty((1 if ratio == 1.0 else 2, rates.size, ends[-1]))
     for k, pole in enumerate(np.exp(rates)):
         for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
-            late[start:end, k] = recur(pole, np.append(0.0, log.force[:-1]))[log.skip - whole :][: end - start]
-    parts = [late.real] if ratio == 1.0 else [late.real, late.imag]
-    return np.array([best.model.weigh(part) for part in parts])
+            moved = recur(pole, np.append(0.0, log.force[:-1]))[log.skip - whole :][: end - start]
+            late[:, k, start:end] = [moved.real, moved.imag][: len(late)]
+    return np.array([best.model.weigh(part.T) for part in late])
 
 
 def _size_modes(

@@ -78,7 +78,11 @@ class Recording:
         whole, f = (float(part) for part in split_delay(np.float64(d)))
         now = self.skip + np.arange(self.position.size - 1) - int(whole)
         force = np.stack([self.force[now - 1], self.force[now]], -1).ravel()
-        length, push, kinds = np.tile([f, 1.0 - f], now.size), g * force + offset, phi_functions(delta * np.array([f, 1.0 - f]))
+        length, push, kinds = (
+            np.tile([f, 1.0 - f], now.size),
+            g * force + offset,
+            phi_functions(delta * np.array([f, 1.0 - f])),
+        )
         pieces = (_rub if friction else _glide)(push, length, kinds, delta, v0, friction)
         way, differentiate = _follow(pieces, force, push, length, kinds, delta, friction)
 
@@ -99,9 +103,7 @@ def _glide(
     return Pieces(np.append(v0, end[:-1]), end, never, length, still, still, never, never)
 
 
-def _rub(
-    push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float
-) -> Pieces:
+def _rub(push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float) -> Pieces:
     count = push.size
     slow, rates = (np.tile(each, count // 2) for each in (kinds.c, length[:2] * kinds.phi1))
     able, times = np.flatnonzero(np.abs(push) > friction), np.append(0.0, np.cumsum(length))
@@ -121,22 +123,31 @@ def _rub(
             way = 1.0 if push[m] > 0 else -1.0
             begun.append(m)
             ways.append(way)
-        gain, decay = gained[way], decays[m % 2]
-        ahead = way * v - float(gain[m])
-        k = _find_stop(gain[m:], decay, ahead)
-        if m + k == count:
+        # The next part that ends at no speed in this direction, in ever longer windows.
+        gain, decay, first, size = gained[way], decays[m % 2], m + 1, 32
+        ahead = way * v - gain.item(m)
+        while first <= count:
+            stopped = (
+                gain[first : first + size] + ahead * decay[first - m : first - m + size][: count + 1 - first] <= 0.0
+            )
+            if stopped[k := int(stopped.argmax())]:
+                break
+            first, size = first + size, 4 * size
+        else:
             break
-        v, m, a, h = way * max(0.0, float(gain[m + k] + ahead * decay[k])), m + k + 1, float(push[m + k]), length[m + k]
+        k += first - 1
+        v, a, h = way * max(0.0, gain.item(k) + ahead * decay.item(k - m)), push.item(k), length.item(k)
+        m = k + 1
         pull = a - way * friction
         if not (pull * way < 0.0 and h > 0.0):
-            v = float(slow[m - 1]) * v + float(rates[m - 1]) * pull
+            v = slow.item(k) * v + rates.item(k) * pull
             continue
         before = -v / pull
-        before = min(log1p(delta * before) / delta if delta else before, float(h))
-        rest, old, way = float(h) - before, way, -way if abs(a) > friction else 0.0
+        before = min(log1p(delta * before) / delta if delta else before, h)
+        rest, old, way = h - before, way, -way if abs(a) > friction else 0.0
         v = (-expm1(-delta * rest) / delta if delta else rest) * (a - way * friction) if way else 0.0
-        turns.append((m - 1, before, old, v))
-        begun.append(m - 1)
+        turns.append((k, before, old, v))
+        begun.append(k)
         ways.append(way)
     way_after = np.repeat(ways, np.diff([*begun, count]))
     turned, before, at = np.zeros(count, bool), length.copy(), way_after.copy()
@@ -146,18 +157,6 @@ def _rub(
         turned[k], (before[k], at[k], added[k]) = True, np.array(turns)[:, 1:].T
     end = recur(np.where(held | turned, 0.0, slow), np.where(held, 0.0, added), v0)
     return Pieces(np.append(v0, end[:-1]), end, turned, before, at, way_after, at == 0, held)
-
-
-def _find_stop(gain: np.ndarray, decay: np.ndarray, ahead: float) -> int:
-    """After how many parts the next one ends at no speed in the direction of the motion; all of them where none does."""
-    first, size = 1, 32
-    while first < gain.size:
-        last = first + size
-        stopped = gain[first:last] + ahead * decay[first : min(last, gain.size)] <= 0.0
-        if stopped[k := int(stopped.argmax())]:
-            return first + k - 1
-        first, size = last, 4 * size
-    return gain.size - 1
 
 
 def _follow(

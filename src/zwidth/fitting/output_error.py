@@ -205,10 +205,11 @@ def _start(model: Recordings, longest: float) -> list[np.ndarray]:
 
     def search() -> list[tuple[float, float, int]]:
         """The sums of squares of dampings and delays, the least first."""
-        columns = [(delta, _answer(early, delta, 0.0, base)) for delta in _DELTAS]
-        return sorted(
-            (_combine(each[rows - d], model.measured)[1], delta, d) for delta, each in columns for d in range(most + 1)
-        )
+        found, d = [], np.arange(most + 1)
+        for delta in _DELTAS:
+            columns = _answer(early, delta, 0.0, base)[rows - d[:, None]]
+            found += [(float(rest), delta, k) for k, rest in enumerate(_combine(columns, model.measured)[1])]
+        return sorted(found)
 
     def start(delta: float, d: float) -> np.ndarray:
         values = _combine(_answer(model, delta, d, base), model.measured)[0]
@@ -236,13 +237,16 @@ def _answer(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.n
     return np.column_stack([places, slopes[:, 3:-1]])
 
 
-def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, float]:
-    """Least squares to half of the digits, which are enough to start from, and its sum of squares."""
-    sizes = np.linalg.norm(columns, axis=0)
-    scaled = columns / np.where(sizes > 0, sizes, 1.0)
-    values = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ wanted, rcond=None)[0]
-    rest = wanted - scaled @ values
-    return values / np.where(sizes > 0, sizes, 1.0), float(rest @ rest)
+def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares to half of the digits, which are enough to start from, and their sums of squares."""
+    sizes = np.linalg.norm(columns, axis=-2, keepdims=True)
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    scaled = columns / sizes
+    turned = np.swapaxes(scaled, -1, -2)
+    least = sizes.shape[-1] * np.finfo(float).eps
+    values = (np.linalg.pinv(turned @ scaled, least, hermitian=True) @ (turned @ wanted)[..., None])[..., 0]
+    rest = wanted - (scaled @ values[..., None])[..., 0]
+    return values / sizes[..., 0, :], np.sum(rest**2, -1)
 
 
 def _follow(model: Recordings, starts: list[np.ndarray], longest: float) -> np.ndarray:
