@@ -78,20 +78,11 @@ class Recording:
         whole, f = (float(part) for part in split_delay(np.float64(d)))
         now = self.skip + np.arange(self.position.size - 1) - int(whole)
         force = np.stack([self.force[now - 1], self.force[now]], -1).ravel()
-        length, push, kinds = (
-            np.tile([f, 1.0 - f], now.size),
-            g * force + offset,
-            phi_functions(delta * np.array([f, 1.0 - f])),
-        )
+        push, length = g * force + offset, np.tile([f, 1.0 - f], now.size)
+        kinds = phi_functions(delta * length[:2])
         pieces = (_rub if friction else _glide)(push, length, kinds, delta, v0, friction)
         way, differentiate = _follow(pieces, force, push, length, kinds, delta, friction)
-
-        def move_with() -> np.ndarray:
-            slopes = np.zeros((7, self.position.size))
-            slopes[3], slopes[[0, 1, 2, 4, 5, 6], 1:] = 1.0, differentiate()
-            return slopes.T
-
-        return ModelledMotion(x0 + np.append(0.0, way), move_with)
+        return ModelledMotion(x0 + np.append(0.0, way), differentiate)
 
 
 def _glide(
@@ -113,7 +104,7 @@ def _rub(push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float
     decays = [np.exp(-delta * (times[k:] - times[k])) for k in (0, 1)]
     # Where it moves on in which direction; where it turned from which one, how long before, and its velocity then.
     m, v, way = 0, v0, float(np.sign(v0))
-    begun, ways, turns = [0], [way], []
+    begun, turns = [(0, way)], []
     while m < count:
         if way == 0.0:
             after = np.searchsorted(able, m)
@@ -121,8 +112,7 @@ def _rub(push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float
                 break
             m, v = int(able[after]), 0.0
             way = 1.0 if push[m] > 0 else -1.0
-            begun.append(m)
-            ways.append(way)
+            begun.append((m, way))
         # The next part that ends at no speed in this direction, in ever longer windows.
         gain, decay, first, size = gained[way], decays[m % 2], m + 1, 32
         ahead = way * v - gain.item(m)
@@ -147,9 +137,9 @@ def _rub(push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float
         rest, old, way = h - before, way, -way if abs(a) > friction else 0.0
         v = (-expm1(-delta * rest) / delta if delta else rest) * (a - way * friction) if way else 0.0
         turns.append((k, before, old, v))
-        begun.append(k)
-        ways.append(way)
-    way_after = np.repeat(ways, np.diff([*begun, count]))
+        begun.append((k, way))
+    starts, ways = np.array(begun).T
+    way_after = np.repeat(ways, np.diff(np.append(starts, count)).astype(int))
     turned, before, at = np.zeros(count, bool), length.copy(), way_after.copy()
     held, added = way_after == 0, rates * (push - way_after * friction)
     if turns:
@@ -160,18 +150,12 @@ def _rub(push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float
 
 
 def _follow(
-    pieces: Pieces,
-    force: np.ndarray,
-    push: np.ndarray,
-    length: np.ndarray,
-    kinds: PhiFunctions,
-    delta: float,
-    friction: float,
+    pieces: Pieces, force: np.ndarray, push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, c: float
 ) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
-    """The way gone at the end of every period, and its derivatives in g, delta, d, v0, o and c, a row each."""
+    """The way gone at the end of every period, and the derivatives of places in g, delta, d, x0, v0, o and c."""
     v, end, way, held, k = pieces.start, pieces.end, pieces.way, pieces.held, np.flatnonzero(pieces.turned)
-    a, held_after, way_after = np.where(held, 0.0, push - way * friction), pieces.held_after[k], pieces.way_after[k]
-    a_after = np.where(held_after, 0.0, push[k] - way_after * friction)
+    a, held_after, way_after = np.where(held, 0.0, push - way * c), pieces.held_after[k], pieces.way_after[k]
+    a_after = np.where(held_after, 0.0, push[k] - way_after * c)
     t, r = pieces.before[k], (length - pieces.before)[k]
     first, second = zip(*(np.split(each, 2) for each in phi_functions(delta * np.append(t, r))), strict=True)
     first, second, spans = PhiFunctions(*first), PhiFunctions(*second), length[:2]
@@ -179,7 +163,7 @@ def _follow(
     moved[k] = t * first.phi1 * v[k] + t**2 * first.phi2 * a[k] + r**2 * second.phi2 * a_after
 
     def differentiate() -> np.ndarray:
-        by = _derive(kinds, delta, spans, *(each.reshape(-1, 2) for each in (v, a, force, way, held))).reshape(2, 6, -1)
+        by = _derive(kinds, delta, spans, *(each.reshape(-1, 2) for each in (v, a, force, way, held))).reshape(2, 7, -1)
         # What sticks forgets its speed.
         again, slow = (np.where(held.reshape(-1, 2), 0.0, each).ravel() for each in (spans * kinds.phi1, kinds.c))
         speed = a - delta * end
@@ -193,33 +177,26 @@ def _follow(
         # A part that lasts longer goes on as it ended.
         by[:, 2] = np.tile([1.0, -1.0], end.size // 2) * np.array([end, speed])
         # Two parts a period.
-        (place, late_place), (moves, late_moves) = (np.moveaxis(each.reshape(6, -1, 2), -1, 0) for each in by)
+        (place, late_place), (moves, late_moves) = (np.moveaxis(each.reshape(7, -1, 2), -1, 0) for each in by)
         (again, late_again), (slow, late_slow) = again.reshape(-1, 2).T, slow.reshape(-1, 2).T
-        begin = np.eye(6)[3]
-        speeds = recur(slow * late_slow, (late_slow * moves + late_moves).T, begin)[:-1].T
-        by_speed = (again + late_again * slow) * np.column_stack([begin, speeds])
-        return np.cumsum(place + late_place + late_again * moves + by_speed, axis=1)
+        speeds = np.column_stack(
+            [np.eye(7)[4], recur(slow * late_slow, (late_slow * moves + late_moves).T, np.eye(7)[4])[:-1].T]
+        )
+        place = place + late_place + late_again * moves + (again + late_again * slow) * speeds
+        return np.cumsum(np.column_stack([np.eye(7)[3], place]), axis=1).T
 
     return np.cumsum(moved[::2] + moved[1::2]), differentiate
 
 
-def _derive(
-    at: PhiFunctions,
-    delta: float,
-    t: np.ndarray,
-    v: np.ndarray,
-    a: np.ndarray,
-    force: np.ndarray,
-    way: np.ndarray,
-    held: np.ndarray,
-) -> np.ndarray:
-    """How place and velocity at the end of a piece move with g, delta, -, -, o and c, the start held: rows."""
+def _derive(at: PhiFunctions, delta: float, t: np.ndarray, *piece: np.ndarray) -> np.ndarray:
+    """How place and velocity at the end of a piece move with g, delta, -, -, -, o and c, the start held: rows."""
+    v, a, force, way, held = piece
     # -phi2'.
     bend = np.where(delta * t == 0, 1.0 / 6.0, at.gap / np.where(delta * t == 0, 1.0, delta * t))
-    by = np.zeros((2, 6, *v.shape))
+    by = np.zeros((2, 7, *v.shape))
     by[0, 1], by[1, 1] = -(t**2) * (at.psi * v + t * bend * a), -t * (at.c * v + t * at.psi * a)
-    by[0, 4], by[1, 4] = np.where(held, 0.0, t**2 * at.phi2), np.where(held, 0.0, t * at.phi1)
-    by[:, 0], by[:, 5] = force * by[:, 4], -way * by[:, 4]
+    by[0, 5], by[1, 5] = np.where(held, 0.0, t**2 * at.phi2), np.where(held, 0.0, t * at.phi1)
+    by[:, 0], by[:, 6] = force * by[:, 5], -way * by[:, 5]
     return by
 
 
@@ -293,21 +270,14 @@ class Recordings:
         """The motion of theta in all logs."""
         each = [self.follow_log(theta, k) for k in range(len(self.logs))]
         place = np.concatenate([motion.position for motion in each])
-        return ModelledMotion(place, lambda: np.concatenate([motion.slopes.T for motion in each], 1).T)
+        return ModelledMotion(place, lambda: np.concatenate([motion.slopes for motion in each]))
 
     def follow_log(self, theta: np.ndarray, which: int, later: float = 0.0) -> ModelledMotion:
         """The motion in one of them, of a rigid mass whose force comes later."""
-        log, speed = self.logs[which], self.speeds[which]
+        speed = self.speeds[which]
         into = np.array([0, 1, 2, speed - 1, speed, -2, -1])
-        g, delta, d, *rest = theta[into].tolist()
-        moved = log.move(g, delta, d + later, *rest)
-
-        def differentiate() -> np.ndarray:
-            slopes = np.zeros((theta.size, log.position.size))
-            slopes[into] = moved.slopes.T
-            return slopes.T
-
-        return ModelledMotion(moved.position, differentiate)
+        moved = self.logs[which].move(*(theta[into] + later * np.eye(7)[2]).tolist())
+        return ModelledMotion(moved.position, lambda: moved.slopes @ np.eye(theta.size)[into])
 
     def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and their derivatives in theta."""

@@ -62,11 +62,7 @@ class StructuredRecordings(Recordings):
 
     def add_parts(self, theta: np.ndarray, which: int) -> ModelledMotion:
         """What amplifier and modes add in one log to the mass whose force comes later."""
-        log, (g, delta, d), (late, by_late) = (
-            self.logs[which],
-            theta[:3].tolist(),
-            _delay(theta, self.lag, self.logs[which]),
-        )
+        log, (g, delta, d) = self.logs[which], theta[:3].tolist()
         own, now, place = np.eye(theta.size), np.arange(log.position.size), np.zeros(log.position.size)
         poles, by_theta, weights, states = self._find_poles(theta)
         first, ways, ringing, slides = self.parts.stop + 2 * (len(self.logs) + self.modes * which), {}, [], []
@@ -75,19 +71,18 @@ class StructuredRecordings(Recordings):
             place += (weight * ways[pole].position).real
             if k >= 0:
                 # How a mode moves that did so before: by two real poles, or the real and imaginary part of one.
-                free, motion = (
-                    own[first + k] - 1j * pole.imag * own[first + k + 1] / (pole.imag or 1.0),
-                    np.exp(pole * now),
-                )
-                place += (motion * (free @ theta)).real
-                ringing += [(motion, free), (now * motion, (free @ theta) * by)]
+                free = own[first + k] - 1j * own[first + k + 1] if pole.imag else own[first + k]
+                motion, size = np.exp(pole * now), free @ theta
+                place += (motion * size).real
+                ringing += [(motion, free), (now * motion, size * by)]
         if self.lag:
+            late, by_late = _delay(theta, self.lag, log)
             turn = own[2] + by_late @ own[3 : 3 + self.lag]
-            both = ((g, own[2], d, ways[-delta]), (-g, turn, d + late, _follow(log, -delta, d + late)))
-            for sign, turn, there, way in both:
-                slide = _slide(log, delta, there, way)
+            for sign, by, there in ((g, own[2], d), (-g, turn, d + late)):
+                speed = _follow(log, -delta, there)
+                slide = _slide(log, delta, there, speed)
                 place += sign * slide.position
-                slides.append((sign, turn, way.position, slide))
+                slides.append((sign, by, speed.position, slide))
 
         def differentiate() -> np.ndarray:
             # Rows, and how their real parts count in the slopes. A delay moves E by -E' = -p E - F.
@@ -95,12 +90,9 @@ class StructuredRecordings(Recordings):
             for pole, by, (weight, *slopes) in zip(poles.tolist(), by_theta, weights, strict=True):
                 way = ways[pole]
                 parts += [(way.position, slopes - pole * weight * own[2]), (way.slopes, weight * by)]
-            for sign, turn, speed, slide in slides:
-                parts += [
-                    (slide.position, sign / g * own[0]),
-                    (slide.slopes, sign * own[1]),
-                    (speed[0] - speed, sign * turn),
-                ]
+            for sign, by, speed, slide in slides:
+                parts += [(slide.position, sign / g * own[0]), (slide.slopes, sign * own[1])]
+                parts += [(speed[0] - speed, sign * by)]
             rows = np.array([half for row, _ in parts for half in (row.real, row.imag)])
             return rows.T @ np.array([half for _, factor in parts for half in (factor.real, -factor.imag)])
 
@@ -197,11 +189,8 @@ def find_roots(w: Any, ratio: Any) -> np.ndarray:
 def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:
     """``E_p`` at the positions, from rest at the log's first sample; its slope is that in p."""
     whole, force = int(np.floor(d)), np.append([0.0, 0.0], _prolong(log))
-    f, pole, seen = (
-        d - whole,
-        pole if pole.imag else pole.real,
-        slice(log.skip - whole, log.skip - whole + log.position.size),
-    )
+    f, pole, first = d - whole, pole if pole.imag else pole.real, log.skip - whole
+    seen = slice(first, first + log.position.size)
     (new, by_new), (old, by_old) = _hold(pole, 1.0 - f), _hold(pole, f)
     turn, later = np.exp(pole), np.exp(pole * (1.0 - f))
     ways = recur(turn, new * force[1:-1] + later * old * force[:-2])
@@ -226,10 +215,7 @@ def _hold(pole: complex, time: float) -> tuple[complex, complex]:
 def _slide(log: Recording, delta: float, d: float, speed: ModelledMotion) -> ModelledMotion:
     """The way of a mass with g = 1 and no friction from the first position on; its slope is that in delta."""
     whole = int(np.floor(d))
-    spans, now = (
-        np.array([d - whole, 1.0 - d + whole, 1.0]),
-        np.arange(log.skip, log.skip + log.position.size - 1) - whole,
-    )
+    spans, now = np.array([d - whole, 1.0 - d + whole, 1.0]), log.skip - whole + np.arange(log.position.size - 1)
     at = phi_functions((delta + _STEP * np.array([[0.0], [1.0], [-1.0]])) * spans)
     reach, way = (at.phi1 * spans).T, (at.phi2 * spans**2).T
     factors, force = np.array([reach[2], way[0] + reach[0] * reach[1], way[1]]), _prolong(log)
