@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +22,8 @@ _DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)
 _FRICTIONS, LEAST = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35]), 1e-12
 # Without friction so many starts are followed whose delays lie so far apart, in periods.
 _STARTS, _APART = 3, 2
-# So many first positions of each log tell the starts, and their mean over so many the first speed.
-_GLIMPSE, _FIRST = 600, 4
+# So many first positions of each log tell the starts, their mean over so many the first speed, so many delays at once.
+_GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
 # So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
 # Where in theta the numbers of a rigid device are, alike to such a share.
@@ -207,10 +208,11 @@ def _start(model: Recordings, longest: float) -> list[np.ndarray]:
 
     def search() -> list[tuple[float, float, int]]:
         """The sums of squares of dampings and delays, the least first."""
-        found, d = [], np.arange(most + 1)
-        for delta in _DELTAS:
-            columns = _answer(early, delta, 0.0, base)[rows - d[:, None]]
-            found += [(float(rest), delta, k) for k, rest in enumerate(_combine(columns, model.measured)[1])]
+        found = []
+        for delta, some in product(_DELTAS, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
+            columns = _answer(early, delta, 0.0, base)[rows - some[:, None]]
+            rests = _combine(columns, model.measured)[1]
+            found += [(float(rest), delta, d) for rest, d in zip(rests, some.tolist(), strict=True)]
         return sorted(found)
 
     def start(delta: float, d: float) -> np.ndarray:

@@ -27,8 +27,8 @@ from zwidth.scenes.scene import Scene
 _STEP = 1e-6
 # Time constants of amplifiers in periods, frequencies in radians a period, damping ratios.
 LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (5e-4, 4.0)
-# A double pole has no partial fractions; e^x - 1 - x loses its digits at so small ones.
-_DOUBLE, _SMALL = 1e-5, 1e-5
+# A double pole has no partial fractions.
+_DOUBLE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -191,25 +191,19 @@ def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:
     whole, force = int(np.floor(d)), np.append([0.0, 0.0], _prolong(log))
     f, pole, first = d - whole, pole if pole.imag else pole.real, log.skip - whole
     seen = slice(first, first + log.position.size)
-    (new, by_new), (old, by_old) = _hold(pole, 1.0 - f), _hold(pole, f)
-    turn, later = np.exp(pole), np.exp(pole * (1.0 - f))
-    ways = recur(turn, new * force[1:-1] + later * old * force[:-2])
+    # What a new force and the older one move until a sample, and a little beside the pole.
+    at = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
+    at = np.where(at == 0, 1e-300, at)
+    held = np.expm1(np.array([1.0 - f, f]) * at) / at * np.exp([0.0, 1.0 - f] * at)
+    turn, forces = np.exp(pole), np.array([force[1:-1], force[:-2]])
+    ways = recur(turn, held[0] @ forces)
 
     def differentiate() -> np.ndarray:
-        moves = by_new * force[1:-1] + later * (by_old + (1.0 - f) * old) * force[:-2]
+        moves = (held[1] - held[2]) * 0.5 / _STEP @ forces
         moves[1:] += turn * ways[:-1]
         return recur(turn, moves)[seen]
 
     return ModelledMotion(ways[seen], differentiate)
-
-
-def _hold(pole: complex, time: float) -> tuple[complex, complex]:
-    """``(e^(p t) - 1)/p`` and its derivative in p."""
-    turn = pole * time
-    if abs(turn) < _SMALL:
-        return time * (1.0 + turn / 2.0 + turn**2 / 6.0), time**2 * (0.5 + turn / 3.0 + turn**2 / 8.0)
-    held = np.expm1(turn) / pole
-    return held, (time * np.exp(turn) - held) / pole
 
 
 def _slide(log: Recording, delta: float, d: float, speed: ModelledMotion) -> ModelledMotion:
