@@ -314,7 +314,7 @@ def _filter_forces(best: FittedModel, ratio: float, rates: np.ndarray) -> np.nda
     for k, pole in enumerate(np.exp(rates)):
         for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
             moved = recur(pole, np.append(0.0, log.force[:-1]))[log.skip - whole :][: end - start]
-            late[:, k, start:end] = [moved.real, moved.imag][: len(late)]
+            late[:, k, start:end] = [np.real(moved), np.imag(moved)][: len(late)]
     return np.array([best.model.weigh(part.T) for part in late])
 
 

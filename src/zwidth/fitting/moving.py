@@ -7,8 +7,8 @@ In units of the period, with g = T^2/m, the velocity of a mass that moves in the
 A period has two parts in which a is constant: until the delayed force changes, and afterwards. In a part the velocity
 tends to a/delta and so passes 0 once at most, where the mass turns, or sticks if ``|g F + o| <= c``. Hence a part is a
 piece before and a piece after that instant, each in closed form. So are the derivatives: the instant moves by minus
-the change of the velocity there over a. Only with friction are velocities found one after the other; all else are
-NumPy's and LAPACK's compiled recursions, for JAX would compile for seconds for a log's length.
+the change of the velocity there over a. Only turns are found one after the other; all else are NumPy's and LAPACK's
+compiled recursions, for JAX would compile for seconds for a log's length.
 """
 
 from __future__ import annotations

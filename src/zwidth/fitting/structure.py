@@ -23,7 +23,7 @@ from zwidth.loops.rigid.device import phi_functions
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
 
-# Of theta's differences: of delta and d absolute, of all else relative.
+# Of differences to both sides: of delta and of a followed pole absolute, of all else relative.
 _STEP = 1e-6
 # Time constants of amplifiers in periods, frequencies in radians a period, damping ratios.
 LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (5e-4, 4.0)
@@ -110,15 +110,15 @@ class StructuredRecordings(Recordings):
         modes = modes.reshape(self.modes, 3, 1 + 2 * count)
         modes[:, 2] /= at[0]
         poles, weights = (np.array(each) for each in list_poles(at[1], lag, modes))
-        states, above = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), poles[:, 0].imag >= 0
+        states, heights = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), np.imag(poles[:, :1])
         # Of a pair half is followed, which counts twice.
-        weights *= at[0] * (1.0 + (poles[:, :1].imag > 0))
+        weights *= at[0] * (1.0 + (heights > 0))
         both = np.zeros((2, len(poles), 1 + theta.size), complex)
         for each, values in zip(both, (poles, weights), strict=True):
             each[:, 0] = values[:, 0]
             each[:, 1 + moving] = (values[:, 1 : 1 + count] - values[:, 1 + count :]) / (2.0 * steps)
-        poles, weights = both[:, above]
-        return poles[:, 0], poles[:, 1:], weights, states[above]
+        poles, weights = both[:, heights[:, 0] >= 0]
+        return poles[:, 0], poles[:, 1:], weights, states[heights[:, 0] >= 0]
 
 
 def to_scene(model: Recordings, theta: np.ndarray, period: float, velocity: Velocity) -> Scene:
@@ -151,7 +151,7 @@ def _delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.nda
     return (float(late), by) if late < most else (float(most), 0.0 * by)
 
 
-def list_poles(delta: Any, lag: Sequence[Any], modes: Sequence[Sequence[Any]]) -> tuple[list[Any], list[Any]]:
+def list_poles(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
     """Poles and residues of ``A(s) (1/(s (s + delta)) + sum of modes)`` but for ``1/(s (s + delta))``.
 
     Those of the amplifier, -delta behind one, and two of each mode: frequency, damping ratio and ``m/m_i``.
