@@ -5,6 +5,8 @@ over their poles p of ``r E_p``, ``E_p' = p E_p + F(t - d)``, the force held. Fo
 
     A(s)/(s (s + delta)) = 1/(s (s + delta)) + sum_j (r_j/p_j)/(p_j + delta) (1/(s - p_j) - 1/(s + delta)).
 
+So are the derivatives: in the pole E_p is filtered once more, and a force that comes later moves it by ``-E_p'``.
+
 Friction alone is not linear: its turns are those of the mass whose force comes later by the amplifier's delay at low
 frequencies, -A'(0), which is the same but for the bends of the force within a turn.
 """
