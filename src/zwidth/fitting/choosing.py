@@ -14,9 +14,8 @@ from zwidth.fitting.structure import StructuredRecordings
 
 # So many parts, lags and resonances, are added at most; so many positions of each log tell which one.
 _MOST, _TOLD = 4, 2500
-# Steps from every start, at first and in all, and then from the best one of each kind of device; with so many times the
-# least squares of any it is not followed on.
-_GLANCED, _BEGUN, _COMPARED, _HOPELESS = 8, 20, 40, 2.0
+# Steps from every start, and then from the best one of each kind of device.
+_BEGUN, _COMPARED = 20, 40
 # Sums of what the fit leaves may spread so many times more than noise's, before it is doubted.
 ALIKE = 1.5
 # Smaller residuals, as a share of the way moved, are rounding.
@@ -77,24 +76,15 @@ def _grow(
     doubted where the further numbers of a resonance explain more than chance does.
     """
     begun: dict[tuple[int, int], tuple[float, StructuredRecordings, np.ndarray]] = {}
-
-    def begin(lag: int, modes: int, start: np.ndarray) -> None:
+    for lag, modes, start in _start(best, banks):
         model = StructuredRecordings(best.model.logs, None, lag, modes).begin(_TOLD)
-        theta, squares = follow_start(model, start, longest, _GLANCED)
-        if squares <= _HOPELESS * min((each[0] for each in begun.values()), default=np.inf):
-            theta, squares = follow_start(model, theta, longest, _BEGUN - _GLANCED)
+        theta, squares = follow_start(model, start, longest, _BEGUN)
         if squares < begun.get((lag, modes), (np.inf,))[0]:
             begun[lag, modes] = squares, model, theta
-
-    for one in _start(best, banks):
-        begin(*one)
-    if (1, best.model.modes) in begun:
-        begin(2, best.model.modes, _add_order(begun[1, best.model.modes][2]))
-    tried, least = [], min(squares for squares, *_ in begun.values())
-    for squares, model, start in begun.values():
-        if squares <= _HOPELESS * least:
-            theta, squares = follow_start(model, start, longest, _COMPARED)
-            tried.append(_Trial(model.measured.size * np.log(squares), np.log(model.measured.size), model, theta))
+    tried = []
+    for _, model, start in begun.values():
+        theta, squares = follow_start(model, start, longest, _COMPARED)
+        tried.append(_Trial(model.measured.size * np.log(squares), np.log(model.measured.size), model, theta))
     likeliest = min(tried, key=lambda trial: trial.cost)
     model = replace(likeliest.model, logs=best.model.logs)
     found = settle(model, likeliest.theta, longest, resolution)
@@ -120,17 +110,13 @@ def _start(best: FittedModel, banks: list[PoleBank]) -> Iterator[tuple[int, int,
             if late <= head[2] + 0.5:
                 start = [head[0], head[1], max(head[2] - late, 0.0)]
                 yield 1, modes, np.r_[start, late, ringing, speeds, states, theta[-2:]]
+                yield 2, modes, np.r_[start, late / (2.0 * _RATIO), _RATIO, ringing, speeds, states, theta[-2:]]
     elif lag == 1:
-        yield 2, modes, _add_order(theta)
+        yield 2, modes, np.r_[head, theta[3] / (2.0 * _RATIO), _RATIO, ringing, speeds, states, theta[-2:]]
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
     for ratio, frequency in _likeliest(banks):
         mode = [2.0 * np.pi * frequency, ratio, 0.0]
         yield lag, modes + 1, np.r_[head, theta[3 : 3 + lag], ringing, mode, speeds, states, theta[-2:]]
-
-
-def _add_order(theta: np.ndarray) -> np.ndarray:
-    """A lag of second order that begins as one of first order."""
-    return np.r_[theta[:3], theta[3] / (2.0 * _RATIO), _RATIO, theta[4:]]
 
 
 def _likeliest(banks: list[PoleBank]) -> Iterator[tuple[float, float]]:
