@@ -26,8 +26,6 @@ _STARTS, _APART = 3, 2
 _GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
 # So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
-# Where in theta the numbers of a rigid device are, alike to such a share.
-_DEVICE, _ALIKE = [0, 1, 2, -1], 0.01
 # Devices with other parts are compared at this promised reduction.
 _CLOSELY = 2e-5
 # Promised reductions of the squares that end the search, and excuse a corner; steps; how they are damped.
@@ -258,13 +256,7 @@ def _follow(model: Recordings, starts: list[np.ndarray], longest: float) -> np.n
     for count, kept in _ROUNDS:
         part = model.begin(count)
         found = [_refine(part, start, longest, (), _FOLLOWED, _NEAR) for start in starts]
-        starts = []
-        for theta, *_ in sorted(found, key=lambda found: found[1]):
-            # What came to the same device goes on once.
-            if len(starts) < kept and not any(
-                np.allclose(theta[_DEVICE], each[_DEVICE], _ALIKE, 0.0) for each in starts
-            ):
-                starts.append(theta)
+        starts = [theta for theta, *_ in sorted(found, key=lambda found: found[1])[:kept]]
     return starts[0]
 
 
