@@ -6,13 +6,16 @@ import sys
 
 import jax
 import jax.numpy as jnp
+import mpmath as mp
 import numpy as np
 import pytest
 from compiling import QUICKLY
+from mpmath import mpf
 
+import oracles
 import zwidth
 from contract.cases import CASES, OTHERS
-from contract.traced import ROWS, batch, compiled, fixed_of, has_gradient, in_float64
+from contract.traced import ROWS, ask, batch, compiled, fixed_of, has_gradient, in_float64
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import Status
 
@@ -249,7 +252,7 @@ def test_inside_a_transformation_bad_points_leave_their_neighbors_alone(case):
     clean = [np.where(good, column, column[0]) for column in columns]
     with jax.enable_x64(True):
         result = compiled(case.name)([jnp.asarray(column) for column in clean])
-    leaves = (result[0] if has_gradient(case) else result)[1]
+    leaves = result[1] if has_gradient(case) else result
     traced = in_float64(case.name)[0]
     for name, value in leaves.items():
         np.testing.assert_array_equal(np.asarray(value)[good], traced[name][good], err_msg=name)
@@ -258,9 +261,9 @@ def test_inside_a_transformation_bad_points_leave_their_neighbors_alone(case):
 
 @SMOOTH
 def test_derivatives_are_finite_at_good_points_and_nan_at_bad_ones(case):
-    parts = in_float64(case.name)[1]
-    assert parts is not None
-    gradient = np.stack([np.asarray(part) for part in parts], axis=-1)
+    slopes = in_float64(case.name)[1]
+    assert slopes
+    gradient = np.stack([np.asarray(part) for parts in slopes.values() for part in parts], axis=-1)
     good = batch(case)[1]
     assert np.isfinite(gradient[good]).all()
     assert np.isnan(gradient[~good]).any(axis=-1).all()
@@ -280,7 +283,7 @@ def test_without_x64_float32_is_computed_in_and_the_statuses_agree(case):
     for name, value in result.items():
         assert value.dtype in (jnp.float32, jnp.complex64, jnp.bool_, jnp.int32), name
         if value.dtype.kind in "fc":
-            np.testing.assert_allclose(value, direct[name], rtol=2e-3, atol=2e-3, err_msg=name)
+            np.testing.assert_allclose(value, direct[name], rtol=case.single, atol=case.single, err_msg=name)
         else:
             np.testing.assert_array_equal(value, direct[name], err_msg=name)
 
@@ -315,3 +318,87 @@ def test_a_traced_delay_is_refused_where_it_decides_a_shape(case):
 def test_a_transformation_is_refused_by_name(case):
     with pytest.raises(InputError, match=rf"^{case.function}: got traced values; .*use"):
         jax.jit(lambda values: case.call(**values))(case.arguments)
+
+
+# --- what single functions say there, asked of the programs that are compiled above -------------------------------
+
+
+def exact_radius(alpha, beta, delta, d):
+    """The size of the outermost pole, and d rho/d alpha by a central difference, in 60 digits."""
+    with mp.workdps(60):
+        h = mpf(10) ** -20
+        down, rho, up = (
+            max(abs(z) for z in oracles.roots(oracles.polynomial(mpf(alpha) + step * h, beta, delta, d)))
+            for step in (-1, 0, 1)
+        )
+        return float(rho), float((up - down) / (2 * h))
+
+
+def test_the_outermost_pole_and_its_slope_at_traced_delays():
+    delays = [0.0, 4.0, 1.5]
+    found, slopes = ask(
+        "spectral_radius", alpha=[0.2, 0.2, 0.2, 0.5], beta=[0.4, 0.4, 0.4, 0.5], delta=0.1, d=[*delays, 1.5]
+    )
+    assert found["value"][3] == pytest.approx(exact_radius(0.5, 0.5, 0.1, 1.5)[0], rel=1e-8)
+    for d, slope in zip(delays, slopes["value"]["alpha"], strict=False):
+        assert slope == pytest.approx(exact_radius(0.2, 0.4, 0.1, d)[1], rel=1e-9)
+    np.testing.assert_allclose(slopes["value"]["alpha"][:2], [0.92824, 0.53533], atol=1e-5)
+    found = ask("spectral_radius", alpha=0.5, beta=0.5, delta=0.1, d=[0.0, 1.5, 30.0])[0]["value"]
+    assert found[1] == pytest.approx(exact_radius(0.5, 0.5, 0.1, 1.5)[0], rel=1e-8)
+    np.testing.assert_allclose(found, zwidth.spectral_radius(0.5, 0.5, 0.1, [0.0, 1.5, 30.0]), rtol=1e-11)
+
+
+def test_at_a_double_pole_the_spectral_radius_has_no_derivative():
+    top = zwidth.alpha_max(5.0, 0.0)
+    slopes = ask("spectral_radius", alpha=top.alpha, beta=top.beta, delta=5.0, d=0.0)[1]["value"]
+    assert all(np.isnan(slope) for slope in slopes.values())
+
+
+def test_a_rate_of_decay_and_its_slope():
+    found, slopes = ask("decay_rate", alpha=0.1, beta=0.3, delta=0.2, d=1.0)
+    assert found["value"] == pytest.approx(zwidth.decay_rate(0.1, 0.3, 0.2, 1.0), rel=1e-12)
+    h = 1e-5
+    difference = (zwidth.decay_rate(0.1 + h, 0.3, 0.2, 1.0) - zwidth.decay_rate(0.1 - h, 0.3, 0.2, 1.0)) / (2 * h)
+    assert slopes["value"]["alpha"] == pytest.approx(difference, rel=1e-7)
+
+
+@pytest.mark.parametrize(("name", "line"), [("row", "beta"), ("column", "alpha")])
+def test_slopes_of_boundary_points_by_mpmath(name, line):
+    """Of the wall's other number in the given one, in delta and in d; at whole d those from the right."""
+    other, axis, step = "alpha" if line == "beta" else "beta", ("alpha", "beta").index(line), mpf(10) ** -25
+    points = [(0.1, 0.4, 0.4), (0.1, 0.4, 2.0), (0.05, 0.9, 2.3), (0.02, 0.1, 7.0)]
+    if line == "beta":
+        points += [(0.3, 0.1, 1.0), (0.1, 0.7, 2.4), (0.5, 0.0, 0.0), (50.0, 0.1, 1.0)]
+    names = (line, "delta", "d")
+    found, slopes = ask(f"boundary_point of a {name}", **dict(zip(names, np.transpose(points), strict=True)))
+
+    def exact(omega, number, delta, d):
+        def offset(w):
+            return oracles.boundary(w, delta, d)[axis] - number
+
+        start = (mpf(float(omega)), mpf(float(omega)) * (1 - mpf(10) ** -9))
+        return oracles.boundary(mp.findroot(offset, start, solver="secant", tol=mpf(10) ** -75), delta, d)[1 - axis]
+
+    with mp.workdps(160):
+        for row, values in enumerate(points):
+            if values[0] == 50.0:
+                # No wall of this row is stable.
+                assert np.isnan([found[other][row], *(slopes[other][name][row] for name in names)]).all()
+                continue
+            for k, name in enumerate(names):
+                there = [mpf(value) + (step if j == k else 0) for j, value in enumerate(values)]
+                expected = (exact(found["omega"][row], *there) - exact(found["omega"][row], *map(mpf, values))) / step
+                assert float(slopes[other][name][row]) == pytest.approx(float(expected), rel=1e-10)
+
+
+def test_slopes_of_areas():
+    step, d = 1e-5, np.array([0.0, 0.3, 1.0, 2.5, 0.1, 1.3])
+    low, high = zwidth.stable_area(np.array([1.0 - step, 1.0 + step]), 1.3)
+    slopes = ask("stable_area", delta=1.0, d=1.3)[1]["value"]
+    assert slopes["delta"] == pytest.approx((high - low) / (2 * step), rel=1e-8)
+    area, slopes = ask("passive_area", delta=0.7, d=d)
+    np.testing.assert_allclose(area["value"], zwidth.passive_area(0.7, d), rtol=1e-14)
+    for at, by_d in zip(d[4:], slopes["value"]["d"][4:], strict=True):
+        # A maximum over frequency is found to the square root of a rounding error only.
+        low, high = zwidth.passive_area(0.7, np.array([at - step, at + step]))
+        assert by_d == pytest.approx((high - low) / (2 * step), abs=1e-7)

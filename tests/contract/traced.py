@@ -44,35 +44,40 @@ def compiled(case_name):
     """The case inside jit, vmap and grad at once, where it has a gradient, in float64: what comes out for its batch."""
     case = next(case for case in CASES if case.name == case_name)
 
-    def total(point):
+    def values(point):
         leaves = case.leaves(case.call(**dict(zip(case.free, point, strict=True)), **fixed_of(case)))
-        # Infinite margins have no derivative to speak of.
-        parts = [jnp.sum(jnp.abs(v)) for v in leaves.values() if v.dtype.kind in "fc"]
-        return sum(parts, start=jnp.zeros(())), leaves
+        # Of one point: complex numbers and lists of numbers are added up, and so are many results, for a sweep back
+        # from each of them compiles for long.
+        real = {name: v for name, v in leaves.items() if v.dtype.kind in "fc"}
+        sums = {name: jnp.sum(jnp.abs(v)) if v.ndim or v.dtype.kind == "c" else v for name, v in real.items()}
+        return (sums if len(sums) <= 3 else {"all": sum(map(jnp.abs, sums.values()))}), leaves
 
-    function = jax.value_and_grad(total, has_aux=True) if has_gradient(case) else total
+    function = jax.jacrev(values, has_aux=True) if has_gradient(case) else lambda point: values(point)[1]
     return jax.jit(jax.vmap(function), compiler_options=QUICKLY)
 
 
 @cache
 def in_float64(case_name):
-    """(leaves, gradients) of `batch`."""
+    """(leaves, for each of them its derivatives in every argument) of `batch`."""
     case = next(case for case in CASES if case.name == case_name)
     with jax.enable_x64(True):
         result = compiled(case_name)([jnp.asarray(column) for column in batch(case)[0]])
-    (_, leaves), gradient = result if has_gradient(case) else (result, None)
-    return {name: np.asarray(value) for name, value in leaves.items()}, gradient
+    slopes, leaves = result if has_gradient(case) else (None, result)
+    return {name: np.asarray(value) for name, value in leaves.items()}, slopes
 
 
-def ask(name: str, **columns: Any) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The leaves of a case in float64 at up to `ROWS` points, and the derivatives of their sum in every argument."""
+def ask(name: str, **columns: Any) -> tuple[dict[str, np.ndarray], dict[str, dict[str, np.ndarray]]]:
+    """The leaves of a case in float64 at up to `ROWS` points, and the derivatives of each in every argument."""
     case = next(case for case in CASES if case.name == name)
     spread = np.broadcast_arrays(*(np.asarray(columns[argument], np.float64) for argument in case.free))
     count = spread[0].size
     assert count <= ROWS
     with jax.enable_x64(True):
-        (_, leaves), slopes = compiled(name)([jnp.asarray(np.resize(column, ROWS)) for column in spread])
+        slopes, leaves = compiled(name)([jnp.asarray(np.resize(column, ROWS)) for column in spread])
     return (
         {leaf: np.asarray(value)[:count] for leaf, value in leaves.items()},
-        {argument: np.asarray(slope)[:count] for argument, slope in zip(case.free, slopes, strict=True)},
+        {
+            leaf: {argument: np.asarray(slope)[:count] for argument, slope in zip(case.free, parts, strict=True)}
+            for leaf, parts in slopes.items()
+        },
     )

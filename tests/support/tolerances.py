@@ -170,5 +170,6 @@ FIT_EXACT = Tolerance(
     "rounding of its records; measured below 4e-13 over 500 devices for walls, 2e-11 for logs.",
 )
 FIT_AGAIN = Tolerance(
-    1e-6, "Relative: another least-squares program stops where a difference quotient of its derivatives is zero."
+    1e-6,
+    "Relative, an offset to the friction too: another least-squares program stops where difference quotients are zero.",
 )

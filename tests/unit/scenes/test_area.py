@@ -1,10 +1,8 @@
 """Areas against the outlined region, a Monte Carlo count of poles, and Colgate's triangle."""
 
-import jax
 import mpmath as mp
 import numpy as np
 import pytest
-from compiling import QUICKLY
 from mpmath import mpf
 
 import oracles
@@ -46,7 +44,9 @@ def test_the_area_by_quadrature_in_mpmath(delta, d):
             before, after = (oracles.boundary(omega * (1 + sign * h), delta, d)[1] for sign in (-1, 1))
             return oracles.boundary(omega, delta, d)[0] * (after - before) / (2 * h * omega)
 
-        exact = mp.quad(height, mp.linspace(end * mpf(10) ** -12, end * (1 - mpf(10) ** -15), 4), maxdegree=5) + corner
+        # Smooth: these 24 nodes a piece are right to 28 digits, which tanh-sinh takes seven times as many for.
+        ends = mp.linspace(end * mpf(10) ** -12, end * (1 - mpf(10) ** -15), 4)
+        exact = mp.quad(height, ends, maxdegree=4, method="gauss-legendre") + corner
         assert oracles.relative_error(stable_area(delta, d), exact) < 1e-12
 
 
@@ -60,14 +60,6 @@ def test_the_area_is_the_share_of_stable_walls(delta, d):
     box = outline.alpha.max() * (high - low)
     # Four standard deviations of the count.
     assert abs(share - stable_area(np.array([delta]), d)[0] / box) < 4 * np.sqrt(share * (1 - share) / 20_000)
-
-
-def test_the_slope_of_the_area(x64):
-    step = 1e-5
-    delta = np.array([1.0 - step, 1.0 + step])
-    area = stable_area(delta, 1.3)
-    slope = jax.jit(jax.grad(stable_area), compiler_options=QUICKLY)
-    assert float(slope(1.0, 1.3)) == pytest.approx((area[1] - area[0]) / (2 * step), rel=1e-8)
 
 
 def test_the_passive_set_without_delay_is_a_triangle():
@@ -143,22 +135,9 @@ def adaptive_integral(function, low, high):
     return total
 
 
-def test_the_passive_area_in_single_precision():
-    # Inside somebody's own jit the ambient precision holds; the triangle and the closed tip need no more.
-    assert float(jax.jit(passive_area, compiler_options=QUICKLY)(0.5, 0.0)) == pytest.approx(0.5, rel=1e-5)
-
-
-def test_the_passive_area_with_a_traced_delay(x64):
+def test_a_bad_entry_leaves_other_passive_areas_alone():
+    # To the last bit.
     d = np.array([0.0, 0.3, 1.0, 2.5, 0.1, 1.3])
-    direct = passive_area(0.7, d)
-    area, slope = jax.jit(jax.vmap(jax.value_and_grad(lambda d: passive_area(0.7, d))), compiler_options=QUICKLY)(d)
-    np.testing.assert_allclose(area, direct, rtol=1e-14)
-    # One bad entry leaves the others alone, to the last bit.
     spoiled = passive_area(0.7, np.where(np.arange(6) == 1, np.nan, d))
     assert np.isnan(spoiled[1])
-    assert np.array_equal(np.delete(spoiled, 1), np.delete(direct, 1))
-    step = 1e-5
-    for at, by_d in zip(d[4:], slope[4:], strict=True):
-        # A maximum over frequency is found to the square root of a rounding error only.
-        low, high = passive_area(0.7, np.array([at - step, at + step]))
-        assert float(by_d) == pytest.approx((high - low) / (2 * step), abs=1e-7)
+    assert np.array_equal(np.delete(spoiled, 1), np.delete(passive_area(0.7, d), 1))

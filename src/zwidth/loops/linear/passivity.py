@@ -171,6 +171,9 @@ def needed_damping(condition: PassivityCondition, alpha: float, beta: float) -> 
     stiff = max(alpha + beta * condition.spring, 0.0)
     w = np.concatenate([[0.0], np.geomspace(1e-6, 1e-2, 24), np.linspace(1e-2, np.pi, _NODES)[1:]])
     values = condition.needed(stiff, beta, w)
+    # Left to be inferred, round by round, they would cost the type checker eight seconds.
+    low: Array
+    high: Array
     low, high, first, last = w[:-1], w[1:], values[:-1], values[1:]
     best, most = float(values.max()), values
     for _ in range(_ROUNDS):

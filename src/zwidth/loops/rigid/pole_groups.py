@@ -22,6 +22,8 @@ from zwidth.loops.rigid.pole_step import join
 
 # Orders of the polynomials in xi and eta; each group takes the least that will do.
 ORDERS = (2, 4, 8, 12, 20)
+# Radii are exponentials of them, interpolated between so many nodes more, along xi and along eta, than the order says.
+SPARE = 6
 # Terms of A by u, and points of a mean for each pole; what is asked for less than that need not tell all poles apart.
 _TERMS, _POINTS, _COARSE = 36, 48, 1e-5
 # So near to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is: of the
@@ -31,6 +33,8 @@ DOUBTFUL = 1e-7
 _FINER = 1e-3
 # Of a rate: one that is known less well is looked at wall by wall.
 _RATE_SHARE = 1e-6
+# Walls of a cell whose logarithms are smaller may have to be computed by themselves; few are so near to the circle.
+_SLOW = 1e-5
 # Poles so near to the real axis are on it.
 REAL = 1e-7
 # Steps to the middles of groups.
@@ -215,6 +219,10 @@ def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional
     inverse, power = 1.0 / ratio[own], np.array(ORDERS)[:, None] + 1
     share = rest[own] / (low[own] * (1.0 - inverse))
     error = inverse**power / (power * (1.0 - inverse)) + share / (1.0 - share)
+    if poles == 1:
+        # And of radii between nodes, by Lebesgue's constant of those.
+        nodes = power + (SPARE - 1)
+        error = error + (1.0 + (1.0 + np.log(nodes) / 1.57) ** 2) * inverse**nodes / (1.0 - inverse) ** 2
     error = np.where(good & (share < 0.5), error + alias, np.inf)
     # Two stay in the smallest disk that will do; one moves from the center by less.
     if poles == 1:
@@ -223,8 +231,7 @@ def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional
     else:
         farthest = np.where(ratio > 1.02, np.log1p(-disk), -np.inf)
     group = Group(poles, re, im, a, f, w, disk[own], re + farthest.max(0), error, best)
-    # Some of a cell's walls may have to be computed by themselves.
-    most = wanted.allowed(np.maximum(group.least, DOUBTFUL)) * (1.0 if poles == 1 else _FINER)
+    most = wanted.allowed(np.maximum(group.least, _SLOW)) * (1.0 if poles == 1 else _FINER)
     return group._replace(order=(~(group.doubt <= most)).sum(0))
 
 

@@ -7,9 +7,13 @@ is left of the smallest is for single walls.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebpts1, chebvander
+from numpy.polynomial.polynomial import polyvander
 
 from zwidth.loops.rigid.circle import Loop, count_in_cell, factor_loop
 from zwidth.loops.rigid.pole_groups import (
@@ -17,6 +21,7 @@ from zwidth.loops.rigid.pole_groups import (
     ORDERS,
     REAL,
     ROUNDING,
+    SPARE,
     AllowedErrors,
     Cells,
     Group,
@@ -33,7 +38,7 @@ from zwidth.loops.rigid.pole_step import halley_step
 # Sides of cells, in walls.
 _SIDES = (128, 64, 32, 16, 8)
 # Cells of one list, and of those how many have their sums made at one time, and walls: what they need stays in caches.
-_LIST, _BATCH, _WALLS = 1 << 9, 1 << 7, 1 << 14
+_LIST, _BATCH, _WALLS = 1 << 9, 1 << 7, 1 << 16
 # Of Halley's method on every start; where the last one was shorter than this share of the distance between the poles of
 # a long delay it has arrived, and starts that end nearer to each other than that have found one pole.
 _STEPS, _NEARBY = 5, 1e-2
@@ -63,26 +68,43 @@ class Area(NamedTuple):
         return [self.alpha[alpha, column], self.beta[beta, row], self.delta[device], self.d[device]]
 
 
-class _AxisPieces(NamedTuple):
-    """An axis in pieces: their middles and half lengths (devices, pieces), and powers of places in them."""
-
-    middle: np.ndarray
-    half: np.ndarray
-    powers: np.ndarray  # (devices, pieces, walls, powers)
+def _powers(places: np.ndarray, order: int) -> np.ndarray:
+    """(..., powers)."""
+    return polyvander(places, order)
 
 
-def _cut(values: np.ndarray, side: int) -> _AxisPieces:
-    with np.errstate(all="ignore"):
-        pieces = np.pad(values, ((0, 0), (0, -values.shape[1] % side)), mode="edge")
-        pieces = pieces.reshape(values.shape[0], -1, side)
-        low, high = pieces.min(-1), pieces.max(-1)
-        middle = 0.5 * (low + high)
-        half = np.maximum(0.5 * (high - low), 1e-12 * np.abs(middle) + 1e-200)
-        place = (pieces - middle[..., None]) / half[..., None]
-        powers = np.ones((*place.shape, ORDERS[-1] + 1))
-        for k in range(ORDERS[-1]):
-            np.multiply(powers[..., k], place, out=powers[..., k + 1])
-        return _AxisPieces(middle, half, powers)
+@cache
+def _nodes(order: int) -> np.ndarray:
+    """Where polynomials of an order are put into another function: zeros of a Chebyshev polynomial."""
+    return chebpts1(order + SPARE)
+
+
+def _shares(places: np.ndarray, order: int) -> np.ndarray:
+    """What values at the nodes add to those at places: (..., nodes)."""
+    nodes = _nodes(order)
+    waves = chebvander(nodes, nodes.size - 1).T * (2.0 / nodes.size)
+    waves[0] *= 0.5
+    return chebvander(places, nodes.size - 1) @ waves
+
+
+class _AxisPieces:
+    """An axis in pieces: their middles and half lengths (devices, pieces), and what polynomials on them need."""
+
+    def __init__(self, values: np.ndarray, side: int) -> None:
+        with np.errstate(all="ignore"):
+            pieces = np.pad(values, ((0, 0), (0, -values.shape[1] % side)), mode="edge")
+            pieces = pieces.reshape(values.shape[0], -1, side)
+            low, high = pieces.min(-1), pieces.max(-1)
+            self.middle = 0.5 * (low + high)
+            self.half = np.maximum(0.5 * (high - low), 1e-12 * np.abs(self.middle) + 1e-200)
+            self._places = (pieces - self.middle[..., None]) / self.half[..., None]
+        self._known: dict[Any, np.ndarray] = {}
+
+    def table(self, kind: Callable[[np.ndarray, int], np.ndarray], order: int) -> np.ndarray:
+        """`_powers` or `_shares` of all places: (devices, pieces, walls, ...)."""
+        if (kind, order) not in self._known:
+            self._known[kind, order] = kind(self._places, order)
+        return self._known[kind, order]
 
 
 def fill_up(index: np.ndarray) -> np.ndarray:
@@ -124,14 +146,46 @@ class FollowedPoles(NamedTuple):
     special: tuple[np.ndarray, ...]
 
 
+class _Output:
+    """The values of a window and of what else its cells hold, and which of its walls are special."""
+
+    def __init__(self, area: Area, side: int, with_rate: bool) -> None:
+        # All cells end where the largest ones do.
+        first = [part.start // side * side for part in area.window]
+        sizes = [-(-part.stop // side) * side - start for part, start in zip(area.window, first, strict=True)]
+        shape, self.first = (area.d.size, *sizes), np.array([[0], *([start] for start in first)])
+        self.radius, self.rate = np.empty(shape), np.empty(shape if with_rate else (0, 0, 0))
+        # Devices, rows and columns of walls whose radius is next to 1 or NaN.
+        self.special: list[np.ndarray] = []
+
+    def cut_out(self, window: tuple[slice, slice]) -> FollowedPoles:
+        """What lies in the window."""
+        rows, columns = (
+            slice(part.start - start, part.stop - start)
+            for part, start in zip(window, self.first[1:, 0].tolist(), strict=True)
+        )
+        radius, rate = (values[:, rows, columns] for values in (self.radius, self.rate))
+        places = np.concatenate([np.empty((3, 0), int), *self.special], axis=1) - [[0], [rows.start], [columns.start]]
+        inside = (places[1:] >= 0).all(0) & (places[1] < radius.shape[1]) & (places[2] < radius.shape[2])
+        # Walls at which two groups were compared may be there twice.
+        flat = np.unique(np.ravel_multi_index(tuple(places[:, inside]), radius.shape))
+        return FollowedPoles(radius, rate, np.unravel_index(flat, radius.shape))
+
+
+def _tiles(values: np.ndarray, side: int) -> np.ndarray:
+    """The same values by device, row and column of cells, and those in them."""
+    devices, rows, columns = values.shape
+    return values.reshape(devices, rows // side, side, columns // side, side).swapaxes(2, 3)
+
+
 class _Level:
     """The cells of one size of some devices."""
 
-    def __init__(self, area: Area, side: int, wanted: AllowedErrors, radius: np.ndarray, rate: np.ndarray) -> None:
-        self.area, self.side, self.wanted, self.radius, self.rate = area, side, wanted, radius, rate
-        self.axes = _cut(area.alpha, side), _cut(area.beta, side)
-        # Devices, rows and columns of walls whose radius is next to 1 or NaN.
-        self.special: list[np.ndarray] = []
+    def __init__(self, area: Area, side: int, wanted: AllowedErrors, output: _Output) -> None:
+        self.area, self.side, self.wanted, self.output = area, side, wanted, output
+        self.axes = _AxisPieces(area.alpha, side), _AxisPieces(area.beta, side)
+        self.radius, self.rate = _tiles(output.radius, side), _tiles(output.rate, side)
+        self.first = output.first // side
 
     def split(self, places: np.ndarray) -> np.ndarray:
         """Each cell in four, without what is beyond the window."""
@@ -219,12 +273,9 @@ class _Level:
         circles = np.concatenate(_on_one_side(re, self.wanted.accuracy))
         outside, sure = (part.reshape(2, -1) for part in count_in_cell(circles, loop, (a, b), fractional))
         flat = sure.all(0) & (outside[0] > 0) & (outside[1] == 0)
-        self._fill(np.where(re > 0, *_on_one_side(re, 0.0))[flat], places[:, flat])
+        values = np.exp(np.where(re > 0, *_on_one_side(re, 0.0)))
+        self.radius[tuple((places - self.first)[:, flat])] = values[flat, None, None]
         return flat
-
-    def _fill(self, re: np.ndarray, places: np.ndarray) -> None:
-        for value, cell in zip(np.exp(re).tolist(), places.T.tolist(), strict=True):
-            self.radius[self._place(cell)[0]] = value
 
     def _follow(self, group: Group, where: np.ndarray, places: np.ndarray, cells: Cells, merge: bool) -> None:
         """Write a group in some cells, in batches of one order."""
@@ -239,66 +290,73 @@ class _Level:
 
     def _write(self, places: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
         """The poles of all walls of some cells, or the larger ones of these and of what is there."""
-        size, order = max(1, _WALLS // self.side**2), ORDERS[k] + 1
-        memories = np.empty((len(sums), min(size, places.shape[1]), self.side, self.side))
+        size, doubt = max(1, _WALLS // self.side**2), group.doubt[k]
+        # Rounding between nodes is in units of the largest value: radii are taken from the middle's.
+        middle = np.exp(group.re)[:, None, None]
         if len(sums) == 1:
-            sums[0][:, 0, 0] += group.re
+            (logarithms,) = sums
+            logarithms[:, 0, 0] += group.re
+            if self.wanted.with_rate:
+                polynomials = [(logarithms, _powers)]
+            else:
+                powers = _powers(_nodes(ORDERS[k]), ORDERS[k])
+                polynomials = [(np.exp(powers @ logarithms @ powers.T) - middle, _shares)]
+            # The size of all logarithms of a cell is at least that of its middle's less all that the others add.
+            sizes = np.abs(logarithms)
+            least = np.maximum(2.0 * sizes[:, 0, 0] - sizes.sum((1, 2)), 0.0)
+            # No wall of the other cells is in doubt or unknown.
+            close = (least < 2.0 * self.wanted.doubt) | (doubt > self.wanted.allowed(least))
+        else:
+            polynomials, close = [(x, _powers) for x in sums], np.ones(doubt.size, bool)
+        # Into the same memory: new memory takes as long to get as all of this.
+        memories = np.empty((len(polynomials), min(size, places.shape[1]), self.side, self.side))
         for start in range(0, places.shape[1], size):
             part = slice(start, min(start + size, places.shape[1]))
-            some = places[:, part]
-            xi, eta = (
-                axis.powers[place][..., :order] for axis, place in zip(self.axes, self._along(some), strict=True)
-            )
-            # Into the same memory: new memory takes as long to get as all of this.
-            values, *others = (
-                np.matmul(eta, x[part] @ xi.transpose(0, 2, 1), out=memory[: some.shape[1]])
-                for x, memory in zip(sums, memories, strict=True)
-            )
-            if others or self.wanted.with_rate:
-                re, disk, error = (x[part, None, None] for x in (group.re, group.disk, group.error[k] + ROUNDING))
-                if others:
-                    values, inside = larger_of_two(values, others[0], disk)
-                    values += re
-                    known = knows_larger(inside, disk, error, self.wanted.allowed(np.abs(values)))
-                else:
-                    known = disk / (1.0 - disk) * error + ROUNDING * np.abs(re) <= self.wanted.allowed(np.abs(values))
-                values[~known] = np.nan
-            self._note(some, values)
-            for cell, value in zip(some.T.tolist(), values, strict=True):
-                tile, inside = self._place(cell)
-                # Of whole cells, then to their places: how numbers are rounded may depend on how many there are, and
-                # NumPy 2.4 negates strided ones wrongly.
-                if self.rate.size:
-                    rate = (-value)[inside]
-                    self.rate[tile] = np.minimum(self.rate[tile], rate) if merge else rate
-                radius = np.exp(value, out=value)[inside]
-                self.radius[tile] = np.maximum(self.radius[tile], radius) if merge else radius
+            some, noted = places[:, part], np.flatnonzero(close[part])
+            found = [
+                self._spread(x[part], by, k, some, memory)
+                for (x, by), memory in zip(polynomials, memories, strict=True)
+            ]
+            if len(sums) == 2:
+                found = self._larger(found, pick(group, part), k)
+            elif self.wanted.with_rate:
+                unknown = doubt[part][noted, None, None] > self.wanted.allowed(np.abs(found[0][noted]))
+                found[0][noted] = np.where(unknown, np.nan, found[0][noted])
+                found = [np.exp(found[0]), -found[0]]
+            else:
+                found[0] += middle[part]
+            if noted.size:
+                self._note(some[:, noted], found[0][noted])
+            here = tuple(some - self.first)
+            for whole, new, larger in zip((self.radius, self.rate), found, (np.maximum, np.minimum), strict=False):
+                whole[here] = larger(whole[here], new) if merge else new
 
-    def _place(self, cell: list[int]) -> tuple[Any, Any]:
-        """Where a cell, by device, row and column, lies in the window; and what of it does."""
-        tile: list[Any] = cell[:1]
-        inside = []
-        for index, axis in zip(cell[1:], self.area.window, strict=True):
-            start = self.side * index - axis.start
-            first, stop = max(0, start), min(start + self.side, axis.stop - axis.start)
-            tile.append(slice(first, stop))
-            inside.append(slice(first - start, stop - start))
-        return tuple(tile), tuple(inside)
+    def _larger(self, sums: list[np.ndarray], group: Group, k: int) -> list[np.ndarray]:
+        """The radius and the rate of the larger of two poles, NaN where it is not known."""
+        re, disk, error = (x[:, None, None] for x in (group.re, group.disk, group.error[k] + ROUNDING))
+        values, inside = larger_of_two(sums[0], sums[1], disk)
+        values += re
+        known = knows_larger(inside, disk, error, self.wanted.allowed(np.abs(values)))
+        values[~known] = np.nan
+        return [np.exp(values), -values][: 1 + self.wanted.with_rate]
+
+    def _spread(self, values: np.ndarray, by: Any, k: int, places: np.ndarray, memory: np.ndarray) -> np.ndarray:
+        """Polynomials of eta and xi, by their coefficients or their values at nodes, at all walls of cells."""
+        along = zip(self.axes, self._along(places), strict=True)
+        xi, eta = (axis.table(by, ORDERS[k])[place] for axis, place in along)
+        return np.matmul(eta, values @ xi.transpose(0, 2, 1), out=memory[: places.shape[1]])
 
     def forget(self, places: np.ndarray) -> None:
         """NaN for all walls of some cells."""
         self._note(places, np.full((places.shape[1], self.side, self.side), np.nan))
-        for cell in places.T.tolist():
-            tile, _ = self._place(cell)
-            self.radius[tile] = np.nan
+        self.radius[tuple(places - self.first)] = np.nan
 
-    def _note(self, places: np.ndarray, logarithms: np.ndarray) -> None:
+    def _note(self, places: np.ndarray, radius: np.ndarray) -> None:
         """Note the walls whose side of the circle is in doubt, or that are NaN."""
-        flat, doubt = logarithms.reshape(-1, self.side**2), self.wanted.doubt
-        for index in np.flatnonzero(~((flat.min(1) > doubt) | (flat.max(1) < -doubt))):
-            (device, rows, columns), inside = self._place(places[:, index].tolist())
-            row, column = np.nonzero(~(np.abs(logarithms[index][inside]) > doubt))
-            self.special.append(np.stack([np.full(row.size, device), row + rows.start, column + columns.start]))
+        flat = np.flatnonzero(~(np.abs(radius - 1.0) > 1.01 * self.wanted.doubt))
+        cell, *inside = np.unravel_index(flat, radius.shape)
+        corner = self.side * (places - self.first)[1:, cell]
+        self.output.special.append(np.concatenate([places[:1, cell], corner + inside]))
 
 
 def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> FollowedPoles:
@@ -308,10 +366,9 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
     """
     longest = max(area.alpha.shape[1], area.beta.shape[1])
     sides = [side for side in _SIDES if side < 2 * longest or side == _SIDES[-1]]
-    shape = area.d.size, *(part.stop - part.start for part in area.window)
-    radius, rate = np.empty(shape), np.empty(shape if with_rate else 0)
     held = area.d != np.floor(area.d)
-    levels = [_Level(area, side, AllowedErrors(accuracy, with_rate), radius, rate) for side in sides]
+    output = _Output(area, sides[0], with_rate)
+    levels = [_Level(area, side, AllowedErrors(accuracy, with_rate), output) for side in sides]
 
     corners = [np.arange(part.start // sides[0], -(-part.stop // sides[0])) for part in area.window]
     for kind in (False, True):
@@ -321,7 +378,4 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
             for level in levels:
                 cells = level.solve_all(cells if level is levels[0] else level.split(cells), kind)
             levels[-1].forget(cells)
-    special = np.concatenate([np.empty((3, 0), int), *(part for level in levels for part in level.special)], axis=1)
-    # Walls at which two groups were compared may be there twice.
-    flat = np.unique(np.ravel_multi_index(tuple(special), shape))
-    return FollowedPoles(radius, rate, np.unravel_index(flat, shape))
+    return output.cut_out(area.window)

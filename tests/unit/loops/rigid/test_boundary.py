@@ -344,29 +344,3 @@ def test_bad_points_are_marked_and_leave_the_others_alone(ridge):
 def test_what_is_refused(line, message):
     with pytest.raises(InputError, match=message):
         zwidth.boundary_point(0.1, 1, **line)
-
-
-def test_derivatives_of_a_point(x64):
-    def stiffest(point):
-        delta, d, beta = point
-        found = zwidth.boundary_point(delta, d, beta=beta)
-        return found.alpha, found.omega
-
-    points = np.array([(0.1, 1.0, 0.3), (0.7, 2.4, 0.1), (0.0, 0.0, 0.5), (np.nan, 1.0, 0.1), (0.1, 1.0, 50.0)])
-    gradient = jax.jit(jax.vmap(jax.value_and_grad(stiffest, has_aux=True)), compiler_options=QUICKLY)
-    (value, omega), slope = gradient(jnp.asarray(points))
-    np.testing.assert_array_equal(np.isnan(value), [False, False, False, True, True])
-    assert np.isnan(slope[3:]).all()
-    h = mpf(10) ** -25
-    with mp.workdps(160):
-        for row, point in enumerate(points[:3]):
-            near = mpf(float(omega[row]))
-
-            def alpha(steps, point=point, near=near):
-                delta, d, beta = (mpf(x) + h * step for x, step in zip(point, steps, strict=True))
-                omega = mp.findroot(lambda w: oracles.boundary(w, delta, d)[1] - beta, (near, near * mpf("0.9999")))
-                return oracles.boundary(omega, delta, d)[0]
-
-            for axis, unit in enumerate(np.eye(3)):
-                difference = (alpha(unit) - alpha((0, 0, 0))) / h
-                assert oracles.relative_error(slope[row, axis], difference, 0.1) <= tol.BOUNDARY_POINT_SLOPE.float64

@@ -149,34 +149,6 @@ def test_points_by_mpmath(fixed):
                 assert abs(mpf(float(points.beta[row])) - exact[1]) < 1e-14 * (abs(exact[1]) + here[0])
 
 
-@pytest.mark.parametrize("line", ["alpha", "beta"])
-def test_derivatives_by_mpmath(line, x64):
-    """Of the wall's other number in the given one, in delta and in d; at whole d both sides agree."""
-    axis, step = ("alpha", "beta").index(line), mpf(10) ** -25
-
-    def point(number, delta, d):
-        found = zwidth.boundary_point(delta, d, **{line: number})
-        return found.alpha if axis else found.beta
-
-    devices = np.array([(0.1, 0.4, 0.4), (0.1, 0.4, 2.0), (0.05, 0.9, 2.3), (0.02, 0.1, 7.0)])
-    slopes = jax.jit(jax.vmap(jax.grad(point, (0, 1, 2))), compiler_options=QUICKLY)(*devices.T)
-    omegas = [zwidth.boundary_point(delta, d, **{line: number}).omega for number, delta, d in devices]
-
-    def exact(omega, number, delta, d):
-        def offset(w):
-            return oracles.boundary(w, delta, d)[axis] - number
-
-        start = (mpf(float(omega)), mpf(float(omega)) * (1 - mpf(10) ** -9))
-        return oracles.boundary(mp.findroot(offset, start, solver="secant", tol=mpf(10) ** -75), delta, d)[1 - axis]
-
-    with mp.workdps(80):
-        for row, (omega, values) in enumerate(zip(omegas, devices.tolist(), strict=True)):
-            for k, slope in enumerate(slopes):
-                there = [mpf(value) + (step if j == k else 0) for j, value in enumerate(values)]
-                expected = (exact(omega, *there) - exact(omega, *map(mpf, values))) / step
-                assert float(slope[row]) == pytest.approx(float(expected), rel=1e-10)
-
-
 def test_rows_without_a_stable_wall_are_empty_by_every_route():
     for delay in DELAY_MODELS:
 

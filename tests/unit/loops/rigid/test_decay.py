@@ -3,11 +3,9 @@
 from pathlib import Path
 
 import flint
-import jax
 import mpmath as mp
 import numpy as np
 import pytest
-from compiling import QUICKLY
 
 import oracles
 import zwidth
@@ -204,15 +202,6 @@ def test_rates_are_right_or_missing_where_poles_nearly_meet(draw, count, rtol, a
 
 def test_without_stiffness_nothing_decays():
     assert zwidth.decay_rate(0.0, 0.3, 0.1, 1) == 0.0
-
-
-def test_inside_a_transformation(x64):
-    both = jax.value_and_grad(lambda alpha: zwidth.decay_rate(alpha, 0.3, 0.2, 1.0))
-    rate, slope = jax.jit(both, compiler_options=QUICKLY)(0.1)
-    assert rate == pytest.approx(zwidth.decay_rate(0.1, 0.3, 0.2, 1.0), rel=1e-12)
-    h = 1e-5
-    difference = (zwidth.decay_rate(0.1 + h, 0.3, 0.2, 1.0) - zwidth.decay_rate(0.1 - h, 0.3, 0.2, 1.0)) / (2 * h)
-    assert slope == pytest.approx(difference, rel=1e-7)
 
 
 def test_bad_points_are_nan_and_scalars_refused():
