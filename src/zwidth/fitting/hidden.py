@@ -112,8 +112,7 @@ def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
     Schwarz's criterion with the numbers that the pole adds, two rates and two sizes; one of each of a real pole.
     """
     best = _glimpse(best)
-    basis, _ = np.linalg.qr(best.columns[0][:, best.columns[0].any(0)])
-    rest = best.model.weigh(best.residuals)
+    basis, rest = best.inverse.basis, best.model.weigh(best.residuals)
     rest = rest - basis @ (basis.T @ rest)
     noise = best.variance * best.excess
     banks = [_test(best, basis, rest, ratio, noise) for ratio in _APART]

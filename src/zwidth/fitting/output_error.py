@@ -44,11 +44,16 @@ _CHANCE = 1e-3
 
 
 class ColumnsInverse(NamedTuple):
-    """Their pseudo-inverse, which numbers the positions leave open, and how many they tell."""
+    """Their pseudo-inverse, which numbers the positions leave open, and an orthonormal basis of what the others move."""
 
     matrix: np.ndarray
     open: np.ndarray
-    rank: int
+    basis: np.ndarray  # without what columns differ by in rounding alone
+
+    @property
+    def rank(self) -> int:
+        """How many numbers the positions tell."""
+        return self.basis.shape[1]
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ class FittedModel:
         left, values, right = np.linalg.svd(self.columns[0], full_matrices=False)
         blind = values * _BLIND < values[0]
         inverse = right[~blind].T / values[~blind] @ left[:, ~blind].T
-        return ColumnsInverse(inverse, np.any(np.abs(right[blind]) > _BLIND**-0.5, axis=0), int(np.sum(~blind)))
+        return ColumnsInverse(inverse, np.any(np.abs(right[blind]) > _BLIND**-0.5, axis=0), left[:, ~blind])
 
     def step_beyond(self, k: int) -> float:
         """Where the least squares of what is held at its bound would lie, in standard errors from there."""
