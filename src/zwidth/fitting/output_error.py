@@ -44,7 +44,7 @@ _CHANCE = 1e-3
 
 
 class ColumnsInverse(NamedTuple):
-    """Their pseudo-inverse, which numbers the positions leave open, and an orthonormal basis of what the others move."""
+    """Their pseudo-inverse, which numbers the positions leave open, and orthonormal directions of the others."""
 
     matrix: np.ndarray
     open: np.ndarray
