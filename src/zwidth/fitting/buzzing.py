@@ -17,7 +17,7 @@ late by d = n + f moves of ``E' = p E + F``, with zeta = z - 1:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -27,7 +27,7 @@ import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle, lag_jet
 from zwidth.fitting.scenes import with_cutoff
-from zwidth.fitting.structure import LAGS, RATIOS, TURNS, amplify, find_roots
+from zwidth.fitting.structure import LAGS, RATIOS, TURNS, list_poles
 from zwidth.loops.rigid.device import held_plant, split_delay
 from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.velocity import Estimate, Velocity
@@ -59,13 +59,11 @@ class NeededAnswer:
         self.whole, fraction = split_delay(np.asarray(d, float))
         self.delta, self.fraction = delta, fraction
         self.plant = held_plant(delta, fraction)
-        pairs = list(_find_poles(delta, lag, modes))
-        self.beside = len(pairs) > 0
-        if pairs:
-            both = np.array(
-                np.broadcast_arrays(fraction + np.zeros(1), *(each for pair in pairs for each in pair))[1:], complex
-            )
-            poles, self.residues = np.where(both[::2] == 0, 1e-300, both[::2]), both[1::2]
+        poles, residues = list_poles(delta, lag, modes)
+        self.beside = len(poles) > 0
+        if poles:
+            both = np.array(np.broadcast_arrays(fraction + np.zeros(1), *poles, *residues)[1:], complex)
+            poles, self.residues = np.where(both[: len(poles)] == 0, 1e-300, both[: len(poles)]), both[len(poles) :]
             self.turns, self.full = np.expm1(poles), np.expm1(poles) / poles
             self.late = np.expm1((1.0 - fraction) * poles) / poles
 
@@ -101,22 +99,6 @@ class NeededAnswer:
             q * (by_delta.em / (at.before + self.plant.em) - _answer(by_delta, at) / total),
             -q * _answer(by_fraction, at) / total,
         )
-
-
-def _find_poles(delta: Any, lag: Sequence[Any], modes: Sequence[Sequence[Any]]) -> Iterator[tuple[Any, Any]]:
-    """Poles and residues of ``A(s) (1/(s (s + delta)) + sum of modes)`` but for ``1/(s (s + delta))``."""
-    lags = list(zip(*amplify(lag), strict=True))
-    weights = [residue / pole / (pole + delta) for pole, residue in lags]
-    yield from [(pole, weight) for (pole, _), weight in zip(lags, weights, strict=True)]
-    if lags:
-        yield -delta + 0j, -sum(weights)
-    for turns, ratio, share in modes:
-        own = find_roots(turns, ratio)
-        for pole, other in (own, own[::-1]):
-            gain = sum(residue / (pole - late) for late, residue in lags) if lags else 1.0
-            yield pole, share * gain / (pole - other)
-        for pole, residue in lags:
-            yield pole, share * residue / (pole - own[0]) / (pole - own[1])
 
 
 def _answer(plant: Any, at: CirclePoints) -> Any:

@@ -59,8 +59,11 @@ class MeasurementNoise:
     resolution: float
 
     @cached_property
-    def stretches(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where stretches within a step begin, their samples, how many times white noise's variance the means have."""
+    def _rests(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Samples of stretches within a step that err alike; where among them each begins, and how many it has.
+
+        Last, how many times white noise's variance their means have.
+        """
         starts, first = [], np.inf
         for k, place in enumerate(self.position.tolist()):
             if not abs(place - first) < self.resolution:
@@ -70,19 +73,21 @@ class MeasurementNoise:
         alike = np.ones(sizes.size)
         for wave, weight in self._waves():
             alike += weight / self.variance * (np.abs(np.add.reduceat(wave, starts)) ** 2 / sizes - 1.0)
-        return np.array(starts), sizes, np.maximum(alike, 1.0)
+        few = sizes[alike > 1.0]
+        return np.flatnonzero(np.repeat(alike > 1.0, sizes)), np.cumsum(few) - few, few, alike[alike > 1.0]
 
     @property
     def count(self) -> int:
         """How many samples of white noise have squares as large as these, weighed."""
-        _, sizes, alike = self.stretches
-        return int(np.sum(sizes + 1.0 - alike))
+        return int(self.position.size + np.sum(1.0 - self._rests[-1]))
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
         """Columns over samples in which the mean of every stretch is so small that it counts by its own variance."""
-        starts, sizes, alike = self.stretches
-        beyond = (1.0 - alike**-0.5) / sizes
-        return columns - np.repeat((np.add.reduceat(columns, starts).T * beyond).T, sizes, axis=0)
+        rows, starts, sizes, alike = self._rests
+        weighed, beyond = columns.copy(), (1.0 - alike**-0.5) / sizes
+        if rows.size:
+            weighed[rows] -= np.repeat((np.add.reduceat(columns[rows], starts).T * beyond).T, sizes, axis=0)
+        return weighed
 
     def spread(self, slopes: np.ndarray) -> np.ndarray:
         """``J^T C J`` for columns J, with C the covariance of the samples."""

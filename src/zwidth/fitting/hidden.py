@@ -18,7 +18,7 @@ from zwidth.arrays.circle import circle
 from zwidth.fitting.device_rows import DeviceRows
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
-from zwidth.fitting.structure import add_lag, to_scene
+from zwidth.fitting.structure import StructuredRecordings, to_scene
 from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
 from zwidth.parts.actuator import Actuator
 from zwidth.parts.measured import MeasuredDevice
@@ -112,8 +112,7 @@ def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
     Schwarz's criterion with the numbers that the pole adds, two rates and two sizes; one of each of a real pole.
     """
     best = _glimpse(best)
-    basis, _ = np.linalg.qr(best.columns[0][:, best.columns[0].any(0)])
-    rest = best.model.weigh(best.residuals)
+    basis, rest = best.inverse.basis, best.model.weigh(best.residuals)
     rest = rest - basis @ (basis.T @ rest)
     noise = best.variance * best.excess
     banks = [_test(best, basis, rest, ratio, noise) for ratio in _APART]
@@ -153,9 +152,11 @@ def look_for_lags(best: FittedModel) -> LagTest:
     best = _glimpse(best)
     lags = np.geomspace(_SHORTEST, max(_LONGEST, min(_LONGEST_LAG, best.theta[2])), _LAGS)
     # Of the mass alone: what resonances add turns hardly.
-    (g, delta, d), logs = best.theta[:3], best.model.logs
-    columns = [np.concatenate([add_lag(np.array([g, delta, d - lag, lag]), log, 1) for log in logs]) for lag in lags]
-    columns = best.model.weigh(g * np.concatenate(columns, -1))
+    (g, delta, d), model = best.theta[:3], StructuredRecordings(best.model.logs, None, 1)
+    rest = np.zeros(model.size - 4)
+    thetas = [np.array([g, delta, d - lag, lag, *rest]) for lag in lags]
+    columns = [[model.add_parts(theta, k).position for k in range(len(model.logs))] for theta in thetas]
+    columns = best.model.weigh(np.stack([np.concatenate(column) for column in columns], -1))
     absorbed = best.inverse.matrix @ columns
     left, rest = columns - best.columns[0] @ absorbed, best.model.weigh(best.residuals)
     whole = np.linalg.norm(left, axis=0)
@@ -308,12 +309,12 @@ def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, 
 def _filter_forces(best: FittedModel, ratio: float, rates: np.ndarray) -> np.ndarray:
     """What poles make of all forces, at the positions, a column each; imaginary parts behind the real ones."""
     ends = np.cumsum([0, *(log.position.size for log in best.model.logs)])
-    whole, late = int(best.theta[2]), np.empty((ends[-1], rates.size), np.complex128)
+    whole, late = int(best.theta[2]), np.empty((1 if ratio == 1.0 else 2, rates.size, ends[-1]))
     for k, pole in enumerate(np.exp(rates)):
         for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
-            late[start:end, k] = recur(pole, np.append(0.0, log.force[:-1]))[log.skip - whole :][: end - start]
-    parts = [late.real] if ratio == 1.0 else [late.real, late.imag]
-    return np.array([best.model.weigh(part) for part in parts])
+            moved = recur(pole, np.append(0.0, log.force[:-1]))[log.skip - whole :][: end - start]
+            late[:, k, start:end] = [np.real(moved), np.imag(moved)][: len(late)]
+    return np.array([best.model.weigh(part.T) for part in late])
 
 
 def _size_modes(

@@ -7,14 +7,16 @@ In units of the period, with g = T^2/m, the velocity of a mass that moves in the
 A period has two parts in which a is constant: until the delayed force changes, and afterwards. In a part the velocity
 tends to a/delta and so passes 0 once at most, where the mass turns, or sticks if ``|g F + o| <= c``. Hence a part is a
 piece before and a piece after that instant, each in closed form. So are the derivatives: the instant moves by minus
-the change of the velocity there over a. Only with friction are velocities found one after the other; all else are
-NumPy's and LAPACK's compiled recursions, for JAX would compile for seconds for a log's length.
+the change of the velocity there over a. Only turns are found one after the other; all else are NumPy's and LAPACK's
+compiled recursions, for JAX would compile for seconds for a log's length.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import exp, expm1, log1p
+from functools import cached_property
+from math import expm1, log1p
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -36,11 +38,17 @@ class Pieces(NamedTuple):
     held_after: np.ndarray
 
 
-class ModelledMotion(NamedTuple):
-    """Positions and their derivatives in g, delta, d, x0, v0, o and c, (n, 7)."""
+@dataclass(frozen=True)
+class ModelledMotion:
+    """Positions, and their derivatives where somebody asks: in g, delta, d, x0, v0, o and c, or in theta."""
 
     position: np.ndarray
-    slopes: np.ndarray
+    differentiate: Callable[[], np.ndarray]
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """A column for each number."""
+        return self.differentiate()
 
 
 @dataclass(frozen=True)
@@ -70,137 +78,140 @@ class Recording:
         whole, f = (float(part) for part in split_delay(np.float64(d)))
         now = self.skip + np.arange(self.position.size - 1) - int(whole)
         force = np.stack([self.force[now - 1], self.force[now]], -1).ravel()
-        length, longer = np.tile([f, 1.0 - f], now.size), np.tile([1.0, -1.0], now.size)
-        push = g * force + offset
-        pieces = _rub(push, length, delta, v0, friction) if friction else _glide(push, length, delta, v0)
-        place, slopes = _follow(pieces, force, push, length, longer, delta, friction)
-        # Two parts a period.
-        place, slopes = place[1::2], slopes[1::2]
-        whole_slopes = np.zeros((self.position.size, 7))
-        whole_slopes[:, 3] = 1.0
-        whole_slopes[1:, [0, 1, 2, 4, 5, 6]] = slopes
-        return ModelledMotion(x0 + np.concatenate([[0.0], place]), whole_slopes)
+        push, length = g * force + offset, np.tile([f, 1.0 - f], now.size)
+        kinds = phi_functions(delta * length[:2])
+        pieces = (_rub if friction else _glide)(push, length, kinds, delta, v0, friction)
+        way, differentiate = _follow(pieces, force, push, length, kinds, delta, friction)
+        return ModelledMotion(x0 + np.append(0.0, way), differentiate)
 
 
-def _glide(push: np.ndarray, length: np.ndarray, delta: float, v0: float) -> Pieces:
-    at = phi_functions(delta * length)
-    end = recur(at.c, length * at.phi1 * push, v0)
-    start = np.concatenate([[v0], end[:-1]])
+def _glide(
+    push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float
+) -> Pieces:
+    slow, rates = (np.tile(each, push.size // 2) for each in (kinds.c, length[:2] * kinds.phi1))
+    end = recur(slow, rates * push, v0)
     never, still = np.zeros(push.shape, bool), np.zeros_like(push)
-    return Pieces(start, end, never, length, still, still, never, never)
+    return Pieces(np.append(v0, end[:-1]), end, never, length, still, still, never, never)
 
 
-def _rub(push: np.ndarray, length: np.ndarray, delta: float, v0: float, friction: float) -> Pieces:
-    kinds = [(h, exp(-delta * h), -expm1(-delta * h) / delta if delta else h) for h in length[:2].tolist()]
-    v, way = v0, float(np.sign(v0))
-    # Where it moves on in which direction, and where it turned from which one and when.
-    ends, begun, ways, turns, times, olds = [0.0] * push.size, [0], [way], [], [], []
-    rub = way * friction
-    for k, a in enumerate(push.tolist()):
+def _rub(push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float) -> Pieces:
+    count = push.size
+    slow, rates = (np.tile(each, count // 2) for each in (kinds.c, length[:2] * kinds.phi1))
+    able, times = np.flatnonzero(np.abs(push) > friction), np.append(0.0, np.cumsum(length))
+    # What is gained from rest in a direction s, G. From v_m on, s v_k = G_k + (s v_m - G_m) e^(-delta (t_k - t_m)).
+    gliding, rubbing = np.append(0.0, recur(slow, rates * push)), np.append(0.0, recur(slow, rates * friction))
+    gained = {s: s * gliding - rubbing for s in (1.0, -1.0)}
+    decays = [np.exp(-delta * (times[k:] - times[k])) for k in (0, 1)]
+    # Where it moves on in which direction; where it turned from which one, how long before, and its velocity then.
+    m, v, way = 0, v0, float(np.sign(v0))
+    begun, turns = [(0, way)], []
+    while m < count:
         if way == 0.0:
-            if not abs(a) > friction:
-                continue
-            way = 1.0 if a > 0 else -1.0
-            rub = way * friction
-            begun.append(k)
-            ways.append(way)
-        h, c, rate = kinds[k % 2]
-        pull = a - rub
-        v = c * v + rate * pull
-        if v * way <= 0.0 and pull * way < 0.0 and h > 0.0:
-            before = -(ends[k - 1] if k else v0) / pull
-            before = min(log1p(delta * before) / delta if delta else before, h)
-            turns.append(k)
-            times.append(before)
-            olds.append(way)
-            if abs(a) > friction:
-                way, rest = -way, h - before
-                rub = way * friction
-                v = (-expm1(-delta * rest) / delta if delta else rest) * (a - rub)
-            else:
-                way, v = 0.0, 0.0
-            begun.append(k)
-            ways.append(way)
-        ends[k] = v
-    start, end = np.array([v0, *ends[:-1]]), np.array(ends)
-    way_after = np.repeat(ways, np.diff([*begun, push.size]))
-    turned, before, at = np.zeros(push.shape, bool), length.copy(), way_after.copy()
-    turned[turns], before[turns], at[turns] = True, times, olds
-    return Pieces(start, end, turned, before, at, way_after, at == 0, way_after == 0)
+            after = np.searchsorted(able, m)
+            if after == able.size:
+                break
+            m, v = int(able[after]), 0.0
+            way = 1.0 if push[m] > 0 else -1.0
+            begun.append((m, way))
+        # The next part that ends at no speed in this direction, in ever longer windows.
+        gain, decay, first, size = gained[way], decays[m % 2], m + 1, 32
+        ahead = way * v - gain.item(m)
+        while first <= count:
+            stopped = (
+                gain[first : first + size] + ahead * decay[first - m : first - m + size][: count + 1 - first] <= 0.0
+            )
+            if stopped[k := int(stopped.argmax())]:
+                break
+            first, size = first + size, 4 * size
+        else:
+            break
+        k += first - 1
+        v, a, h = way * max(0.0, gain.item(k) + ahead * decay.item(k - m)), push.item(k), length.item(k)
+        m = k + 1
+        pull = a - way * friction
+        if not (pull * way < 0.0 and h > 0.0):
+            v = slow.item(k) * v + rates.item(k) * pull
+            continue
+        before = -v / pull
+        before = min(log1p(delta * before) / delta if delta else before, h)
+        rest, old, way = h - before, way, -way if abs(a) > friction else 0.0
+        v = (-expm1(-delta * rest) / delta if delta else rest) * (a - way * friction) if way else 0.0
+        turns.append((k, before, old, v))
+        begun.append((k, way))
+    starts, ways = np.array(begun).T
+    way_after = np.repeat(ways, np.diff(np.append(starts, count)).astype(int))
+    turned, before, at = np.zeros(count, bool), length.copy(), way_after.copy()
+    held, added = way_after == 0, rates * (push - way_after * friction)
+    if turns:
+        k = [turn[0] for turn in turns]
+        turned[k], (before[k], at[k], added[k]) = True, np.array(turns)[:, 1:].T
+    end = recur(np.where(held | turned, 0.0, slow), np.where(held, 0.0, added), v0)
+    return Pieces(np.append(v0, end[:-1]), end, turned, before, at, way_after, at == 0, held)
 
 
 def _follow(
-    pieces: Pieces,
-    force: np.ndarray,
-    push: np.ndarray,
-    length: np.ndarray,
-    longer: np.ndarray,
-    delta: float,
-    friction: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The way gone at the end of every part, and its derivatives in g, delta, d, v0, o and c."""
-    v, end, turned, t = pieces.start, pieces.end, pieces.turned, pieces.before
-    first, a = phi_functions(delta * t), np.where(pieces.held, 0.0, push - pieces.way * friction)
-    moved = first.phi1 * t * v + first.phi2 * t**2 * a
-    by_speed, by_place = _derive(first, delta, t, v, a, force, pieces.way, pieces.held)
-    # What sticks forgets its speed.
-    slow = np.where(pieces.held, 0.0, first.c)
-    speed = np.where(turned, 0.0, a) - delta * end
-    again = np.where(pieces.held, 0.0, t * first.phi1)
-    if turned.any():
-        k = np.flatnonzero(turned)
-        r, a_after = (length - t)[k], np.where(pieces.held_after, 0.0, push - pieces.way_after * friction)[k]
-        second = phi_functions(delta * r)
-        moved[k] += second.phi2 * r**2 * a_after
-        after_speed, after_place = _derive(
-            second, delta, r, 0.0 * r, a_after, force[k], pieces.way_after[k], pieces.held_after[k]
+    pieces: Pieces, force: np.ndarray, push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, c: float
+) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
+    """The way gone at the end of every period, and the derivatives of places in g, delta, d, x0, v0, o and c."""
+    v, end, way, held, k = pieces.start, pieces.end, pieces.way, pieces.held, np.flatnonzero(pieces.turned)
+    a, held_after, way_after = np.where(held, 0.0, push - way * c), pieces.held_after[k], pieces.way_after[k]
+    a_after = np.where(held_after, 0.0, push[k] - way_after * c)
+    t, r = pieces.before[k], (length - pieces.before)[k]
+    first, second = zip(*(np.split(each, 2) for each in phi_functions(delta * np.append(t, r))), strict=True)
+    first, second, spans = PhiFunctions(*first), PhiFunctions(*second), length[:2]
+    moved = (kinds.phi1 * spans * v.reshape(-1, 2) + kinds.phi2 * spans**2 * a.reshape(-1, 2)).ravel()
+    moved[k] = t * first.phi1 * v[k] + t**2 * first.phi2 * a[k] + r**2 * second.phi2 * a_after
+
+    def differentiate() -> np.ndarray:
+        by = _derive(kinds, delta, spans, *(each.reshape(-1, 2) for each in (v, a, force, way, held))).reshape(2, 7, -1)
+        # What sticks forgets its speed.
+        again, slow = (np.where(held.reshape(-1, 2), 0.0, each).ravel() for each in (spans * kinds.phi1, kinds.c))
+        speed = a - delta * end
+        if k.size:
+            speed[k] = a_after - delta * end[k]
+            turn, onward = speed[k] / a[k], end[k] / a[k]
+            again[k], slow[k] = t * first.phi1 + onward * first.c, turn * first.c
+            before = _derive(first, delta, t, v[k], a[k], force[k], way[k], held[k])
+            after = _derive(second, delta, r, 0.0 * r, a_after, force[k], way_after, held_after)
+            by[0][:, k], by[1][:, k] = before[0] + onward * before[1] + after[0], turn * before[1] + after[1]
+        # A part that lasts longer goes on as it ended.
+        by[:, 2] = np.tile([1.0, -1.0], end.size // 2) * np.array([end, speed])
+        # Two parts a period.
+        (place, late_place), (moves, late_moves) = (np.moveaxis(each.reshape(7, -1, 2), -1, 0) for each in by)
+        (again, late_again), (slow, late_slow) = again.reshape(-1, 2).T, slow.reshape(-1, 2).T
+        speeds = np.column_stack(
+            [np.eye(7)[4], recur(slow * late_slow, (late_slow * moves + late_moves).T, np.eye(7)[4])[:-1].T]
         )
-        speed[k] += a_after
-        turn, onward = speed[k] / a[k], end[k] / a[k]
-        again[k] += onward * slow[k]
-        by_place[k] += after_place + onward[:, None] * by_speed[k]
-        by_speed[k] = turn[:, None] * by_speed[k] + after_speed
-        slow[k] *= turn
-    # A part that lasts longer goes on as it ended.
-    by_speed[:, 2], by_place[:, 2] = longer * speed, longer * end
-    begin = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
-    speeds = recur(slow, by_speed, begin)
-    speeds = np.concatenate([begin[None], speeds[:-1]])
-    return np.cumsum(moved), np.cumsum(again[:, None] * speeds + by_place, axis=0)
+        place = place + late_place + late_again * moves + (again + late_again * slow) * speeds
+        return np.cumsum(np.column_stack([np.eye(7)[3], place]), axis=1).T
+
+    return np.cumsum(moved[::2] + moved[1::2]), differentiate
 
 
-def _derive(
-    at: PhiFunctions,
-    delta: float,
-    t: np.ndarray,
-    v: np.ndarray,
-    a: np.ndarray,
-    force: np.ndarray,
-    way: np.ndarray,
-    held: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """How the velocity and the place at the end of a piece move with g, delta, -, -, o and c, the start held."""
-    free = np.where(held, 0.0, 1.0)
-    by = np.stack([force * free, 0.0 * t, 0.0 * t, 0.0 * t, free, -way * free], -1)
-    by_speed, by_place = (t * at.phi1)[:, None] * by, (t**2 * at.phi2)[:, None] * by
-    by_speed[:, 1] = -t * (at.c * v + t * at.psi * a)
+def _derive(at: PhiFunctions, delta: float, t: np.ndarray, *piece: np.ndarray) -> np.ndarray:
+    """How place and velocity at the end of a piece move with g, delta, -, -, -, o and c, the start held: rows."""
+    v, a, force, way, held = piece
     # -phi2'.
     bend = np.where(delta * t == 0, 1.0 / 6.0, at.gap / np.where(delta * t == 0, 1.0, delta * t))
-    by_place[:, 1] = -(t**2) * (at.psi * v + t * bend * a)
-    return by_speed, by_place
+    by = np.zeros((2, 7, *v.shape))
+    by[0, 1], by[1, 1] = -(t**2) * (at.psi * v + t * bend * a), -t * (at.c * v + t * at.psi * a)
+    by[0, 5], by[1, 5] = np.where(held, 0.0, t**2 * at.phi2), np.where(held, 0.0, t * at.phi1)
+    by[:, 0], by[:, 6] = force * by[:, 5], -way * by[:, 5]
+    return by
 
 
 def recur(factor: np.ndarray | complex, added: np.ndarray, begin: float | np.ndarray = 0.0) -> np.ndarray:
     """``y_k = factor_k y_(k-1) + added_k``, of real or complex numbers."""
     from scipy.linalg.lapack import dtbtrs, ztbtrs  # pyright: ignore[reportAttributeAccessIssue]  (made at import)
 
-    factor = np.broadcast_to(factor, len(added))
-    right = np.array(added, dtype=np.result_type(factor, added, float))
-    right[0] += factor[0] * begin
-    band = np.ones((2, factor.size), right.dtype)
-    band[1, :-1] = -factor[1:]
+    right = np.array(added, dtype=np.result_type(factor, added, float), order="F")
+    first, later = (factor[0], factor[1:]) if isinstance(factor, np.ndarray) else (factor, factor)
+    right[0] += first * begin
+    # As LAPACK stores it: nothing is copied.
+    band = np.empty((len(right), 2), right.dtype).T
+    band[1, :-1] = np.negative(later)
     solve = ztbtrs if right.dtype == complex else dtbtrs
-    return solve(band, right.reshape(factor.size, -1), uplo="L", diag="U")[0].reshape(right.shape)
+    return solve(band, right, uplo="L", diag="U", overwrite_b=1)[0].reshape(right.shape)
 
 
 @dataclass(frozen=True)
@@ -255,14 +266,20 @@ class Recordings:
         """The largest force commanded."""
         return max(float(np.abs(log.force).max()) for log in self.logs)
 
+    def follow(self, theta: np.ndarray) -> ModelledMotion:
+        """The motion of theta in all logs."""
+        each = [self.follow_log(theta, k) for k in range(len(self.logs))]
+        place = np.concatenate([motion.position for motion in each])
+        return ModelledMotion(place, lambda: np.concatenate([motion.slopes for motion in each]))
+
+    def follow_log(self, theta: np.ndarray, which: int, later: float = 0.0) -> ModelledMotion:
+        """The motion in one of them, of a rigid mass whose force comes later."""
+        speed = self.speeds[which]
+        into = np.array([0, 1, 2, speed - 1, speed, -2, -1])
+        moved = self.logs[which].move(*(theta[into] + later * np.eye(7)[2]).tolist())
+        return ModelledMotion(moved.position, lambda: moved.slopes @ np.eye(theta.size)[into])
+
     def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and their derivatives in theta."""
-        places, slopes = [], []
-        for speed, log in zip(self.speeds, self.logs, strict=True):
-            into = [0, 1, 2, speed - 1, speed, -2, -1]
-            moved = log.move(*theta[into].tolist())
-            slope = np.zeros((log.position.size, self.size))
-            slope[:, into] = moved.slopes
-            places.append(moved.position)
-            slopes.append(slope)
-        return np.concatenate(places), np.concatenate(slopes)
+        motion = self.follow(theta)
+        return motion.position, motion.slopes

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from zwidth.fitting.encoder import MeasurementNoise
-from zwidth.fitting.moving import Recording, Recordings
+from zwidth.fitting.moving import ModelledMotion, Recording, Recordings
 
 # Dampings b T/m and frictions as shares of the largest force that are started from; the least friction that is looked
 # for, for at 0 its slope is not seen.
@@ -21,8 +22,8 @@ _DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)
 _FRICTIONS, LEAST = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35]), 1e-12
 # Without friction so many starts are followed whose delays lie so far apart, in periods.
 _STARTS, _APART = 3, 2
-# So many first positions of each log tell the starts, and their mean over so many the first speed.
-_GLIMPSE, _FIRST = 600, 4
+# So many first positions of each log tell the starts, their mean over so many the first speed, so many delays at once.
+_GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
 # So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
 # Devices with other parts are compared at this promised reduction.
@@ -43,11 +44,16 @@ _CHANCE = 1e-3
 
 
 class ColumnsInverse(NamedTuple):
-    """Their pseudo-inverse, which numbers the positions leave open, and how many they tell."""
+    """Their pseudo-inverse, which numbers the positions leave open, and orthonormal directions of the others."""
 
     matrix: np.ndarray
     open: np.ndarray
-    rank: int
+    basis: np.ndarray  # without what columns differ by in rounding alone
+
+    @property
+    def rank(self) -> int:
+        """How many numbers the positions tell."""
+        return self.basis.shape[1]
 
 
 @dataclass(frozen=True)
@@ -100,7 +106,7 @@ class FittedModel:
         left, values, right = np.linalg.svd(self.columns[0], full_matrices=False)
         blind = values * _BLIND < values[0]
         inverse = right[~blind].T / values[~blind] @ left[:, ~blind].T
-        return ColumnsInverse(inverse, np.any(np.abs(right[blind]) > _BLIND**-0.5, axis=0), int(np.sum(~blind)))
+        return ColumnsInverse(inverse, np.any(np.abs(right[blind]) > _BLIND**-0.5, axis=0), left[:, ~blind])
 
     def step_beyond(self, k: int) -> float:
         """Where the least squares of what is held at its bound would lie, in standard errors from there."""
@@ -205,10 +211,12 @@ def _start(model: Recordings, longest: float) -> list[np.ndarray]:
 
     def search() -> list[tuple[float, float, int]]:
         """The sums of squares of dampings and delays, the least first."""
-        columns = [(delta, _answer(early, delta, 0.0, base)) for delta in _DELTAS]
-        return sorted(
-            (_combine(each[rows - d], model.measured)[1], delta, d) for delta, each in columns for d in range(most + 1)
-        )
+        found = []
+        for delta, some in product(_DELTAS, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
+            columns = _answer(early, delta, 0.0, base)[rows - some[:, None]]
+            rests = _combine(columns, model.measured)[1]
+            found += [(float(rest), delta, d) for rest, d in zip(rests, some.tolist(), strict=True)]
+        return sorted(found)
 
     def start(delta: float, d: float) -> np.ndarray:
         values = _combine(_answer(model, delta, d, base), model.measured)[0]
@@ -236,13 +244,16 @@ def _answer(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.n
     return np.column_stack([places, slopes[:, 3:-1]])
 
 
-def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, float]:
-    """Least squares to half of the digits, which are enough to start from, and its sum of squares."""
-    sizes = np.linalg.norm(columns, axis=0)
-    scaled = columns / np.where(sizes > 0, sizes, 1.0)
-    values = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ wanted, rcond=None)[0]
-    rest = wanted - scaled @ values
-    return values / np.where(sizes > 0, sizes, 1.0), float(rest @ rest)
+def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares to half of the digits, which are enough to start from, and their sums of squares."""
+    sizes = np.linalg.norm(columns, axis=-2, keepdims=True)
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    scaled = columns / sizes
+    turned = np.swapaxes(scaled, -1, -2)
+    least = sizes.shape[-1] * np.finfo(float).eps
+    values = (np.linalg.pinv(turned @ scaled, least, hermitian=True) @ (turned @ wanted)[..., None])[..., 0]
+    rest = wanted - (scaled @ values[..., None])[..., 0]
+    return values / sizes[..., 0, :], np.sum(rest**2, -1)
 
 
 def _follow(model: Recordings, starts: list[np.ndarray], longest: float) -> np.ndarray:
@@ -313,13 +324,14 @@ def _refine(
     low[list(held)] = high[list(held)] = start[list(held)]
     theta, measured, damping = np.clip(start, low, high), model.measured, _EASY
 
-    def look(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        place, slopes = model.predict(theta)
-        rest = model.weigh(measured - place)
-        return rest, model.weigh(slopes), float(rest @ rest)
+    def look(theta: np.ndarray) -> tuple[ModelledMotion, np.ndarray, float]:
+        motion = model.follow(theta)
+        rest = model.weigh(measured - motion.position)
+        return motion, rest, float(rest @ rest)
 
-    (rest, slopes, squares), promised = look(theta), np.inf
+    (motion, rest, squares), promised = look(theta), np.inf
     for _ in range(most):
+        slopes = model.weigh(motion.slopes)
         sizes = np.linalg.norm(slopes, axis=0)
         # Only what moves the positions moves, and nothing out of its bounds.
         fall = slopes.T @ rest
@@ -334,7 +346,7 @@ def _refine(
             trial = theta.copy()
             trial[free] += step / sizes
             trial = np.clip(trial, low, high)
-            trial_rest, trial_slopes, trial_squares = look(trial)
+            trial_motion, trial_rest, trial_squares = look(trial)
             if trial_squares < squares or damping > _STUBBORN:
                 break
             if promised <= arrived * squares:
@@ -343,7 +355,7 @@ def _refine(
         if not trial_squares < squares:
             # No step in the direction of the slopes helps any more: a corner, or rounding.
             break
-        theta, rest, slopes, squares, before = trial, trial_rest, trial_slopes, trial_squares, squares
+        theta, motion, rest, squares, before = trial, trial_motion, trial_rest, trial_squares, squares
         damping = 0.0 if damping < _LIGHT else damping / 10.0
         if before - squares <= arrived * before and promised <= arrived * before:
             return theta, squares, True

@@ -5,26 +5,27 @@ over their poles p of ``r E_p``, ``E_p' = p E_p + F(t - d)``, the force held. Fo
 
     A(s)/(s (s + delta)) = 1/(s (s + delta)) + sum_j (r_j/p_j)/(p_j + delta) (1/(s - p_j) - 1/(s + delta)).
 
+So are the derivatives: in the pole E_p is filtered once more, and a force that comes later moves it by ``-E_p'``.
+
 Friction alone is not linear: its turns are those of the mass whose force comes later by the amplifier's delay at low
 frequencies, -A'(0), which is the same but for the bends of the force within a turn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from zwidth.fitting.moving import Recording, Recordings, recur
+from zwidth.fitting.moving import ModelledMotion, Recording, Recordings, recur
 from zwidth.fitting.scenes import scene_of
 from zwidth.loops.rigid.device import phi_functions
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
 
-# Of theta's differences: of delta and d absolute, of all else relative.
+# Of differences to both sides: of delta and of a followed pole absolute, of all else relative.
 _STEP = 1e-6
 # Time constants of amplifiers in periods, frequencies in radians a period, damping ratios.
 LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (5e-4, 4.0)
@@ -50,33 +51,76 @@ class StructuredRecordings(Recordings):
         low[self.parts], high[self.parts] = np.reshape(ends, (-1, 2)).T
         return low, high
 
-    def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        places, slopes, states = [], [], self.parts.stop + 2 * len(self.logs)
-        lag, modes = range(3, 3 + self.lag), range(3 + self.lag, self.parts.stop, 3)
-        for speed, log in zip(self.speeds, self.logs, strict=True):
-            into = [0, 1, 2, speed - 1, speed, -2, -1]
-            late, by_late = _delay(theta, self.lag, log)
-            moved = log.move(*(theta[into] + np.eye(7)[2] * late).tolist())
-            place, slope = moved.position, np.zeros((log.position.size, self.size))
-            slope[:, into] = moved.slopes
-            slope[:, lag] = moved.slopes[:, 2:3] * by_late
+    def follow_log(self, theta: np.ndarray, which: int, later: float = 0.0) -> ModelledMotion:
+        late, by_late = _delay(theta, self.lag, self.logs[which])
+        rigid, beside = super().follow_log(theta, which, later + late), self.add_parts(theta, which)
 
-            # Columns times numbers of theta: where these are, and which others move the columns.
-            parts = [(partial(add_lag, log=log, order=self.lag), [0], [1, 2, *lag])] if self.lag else []
-            for mode in modes:
-                own = [mode, mode + 1]
-                parts.append((partial(_ring, log=log, order=self.lag, mode=mode), [mode + 2], [2, *lag, *own]))
-                parts.append((partial(_ring_on, log=log, mode=mode), [states, states + 1], own))
-                states += 2
-            for function, sizes, moving in parts:
-                columns = function(theta)
-                place = place + columns @ theta[sizes]
-                slope[:, sizes] += columns
-                for k in moving:
-                    slope[:, k] += _differ(function, theta, k, columns) @ theta[sizes]
-            places.append(place)
-            slopes.append(slope)
-        return np.concatenate(places), np.concatenate(slopes)
+        def differentiate() -> np.ndarray:
+            slopes = rigid.slopes + beside.slopes
+            slopes[:, 3 : 3 + self.lag] += np.outer(rigid.slopes[:, 2], by_late)
+            return slopes
+
+        return ModelledMotion(rigid.position + beside.position, differentiate)
+
+    def add_parts(self, theta: np.ndarray, which: int) -> ModelledMotion:
+        """What amplifier and modes add in one log to the mass whose force comes later."""
+        log, (g, delta, d) = self.logs[which], theta[:3].tolist()
+        own, now, place = np.eye(theta.size), np.arange(log.position.size), np.zeros(log.position.size)
+        poles, by_theta, weights, states = self._find_poles(theta)
+        first, ways, ringing, slides = self.parts.stop + 2 * (len(self.logs) + self.modes * which), {}, [], []
+        for pole, by, (weight, *_), k in zip(poles.tolist(), by_theta, weights, states, strict=True):
+            ways[pole] = _follow(log, pole, d)
+            place += (weight * ways[pole].position).real
+            if k >= 0:
+                # How a mode moves that did so before: by two real poles, or the real and imaginary part of one.
+                free = own[first + k] - 1j * own[first + k + 1] if pole.imag else own[first + k]
+                motion, size = np.exp(pole * now), free @ theta
+                place += (motion * size).real
+                ringing += [(motion, free), (now * motion, size * by)]
+        if self.lag:
+            late, by_late = _delay(theta, self.lag, log)
+            turn = own[2] + by_late @ own[3 : 3 + self.lag]
+            for sign, by, there in ((g, own[2], d), (-g, turn, d + late)):
+                speed = _follow(log, -delta, there)
+                slide = _slide(log, delta, there, speed)
+                place += sign * slide.position
+                slides.append((sign, by, speed.position, slide))
+
+        def differentiate() -> np.ndarray:
+            # Rows, and how their real parts count in the slopes. A delay moves E by -E' = -p E - F.
+            parts = [(_prolong(log)[log.skip - 1 - int(np.floor(d)) + now], -own[2] * weights[:, 0].sum()), *ringing]
+            for pole, by, (weight, *slopes) in zip(poles.tolist(), by_theta, weights, strict=True):
+                way = ways[pole]
+                parts += [(way.position, slopes - pole * weight * own[2]), (way.slopes, weight * by)]
+            for sign, by, speed, slide in slides:
+                parts += [(slide.position, sign / g * own[0]), (slide.slopes, sign * own[1])]
+                parts += [(speed[0] - speed, sign * by)]
+            rows = np.array([half for row, _ in parts for half in (row.real, row.imag)])
+            return rows.T @ np.array([half for _, factor in parts for half in (factor.real, -factor.imag)])
+
+        return ModelledMotion(place, differentiate)
+
+    def _find_poles(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Poles on and above the real axis, their slopes, weights and theirs, and which state of modes, -1 for none."""
+        moving = np.r_[0, 1, self.parts]
+        steps, count = _STEP * np.abs(theta[moving]), moving.size
+        steps[1], steps[4 + self.lag :: 3] = max(_STEP, steps[1]), steps[0]
+        at = np.tile(theta[:, None], 1 + 2 * count)
+        at[moving, 1 + np.arange(count)] += steps
+        at[moving, 1 + count + np.arange(count)] -= steps
+        lag, modes = np.split(at[self.parts], [self.lag])
+        modes = modes.reshape(self.modes, 3, 1 + 2 * count)
+        modes[:, 2] /= at[0]
+        poles, weights = (np.array(each) for each in list_poles(at[1], lag, modes))
+        states, heights = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), np.imag(poles[:, :1])
+        # Of a pair half is followed, which counts twice.
+        weights *= at[0] * (1.0 + (heights > 0))
+        both = np.zeros((2, len(poles), 1 + theta.size), complex)
+        for each, values in zip(both, (poles, weights), strict=True):
+            each[:, 0] = values[:, 0]
+            each[:, 1 + moving] = (values[:, 1 : 1 + count] - values[:, 1 + count :]) / (2.0 * steps)
+        poles, weights = both[:, heights[:, 0] >= 0]
+        return poles[:, 0], poles[:, 1:], weights, states[heights[:, 0] >= 0]
 
 
 def to_scene(model: Recordings, theta: np.ndarray, period: float, velocity: Velocity) -> Scene:
@@ -99,16 +143,6 @@ def derive_numbers(model: Recordings, theta: np.ndarray, period: float) -> tuple
     return by_theta, np.array([2.0, 1.0, 1.0, *[1.0, 0.0][: model.lag], *model.modes * [-1.0, 0.0, 2.0]])
 
 
-def add_lag(theta: np.ndarray, log: Recording, order: int) -> np.ndarray:
-    """What an amplifier adds to the motion of the mass with g = 1 whose force comes later, a column."""
-    delta, d = theta[1:3]
-    poles, residues = amplify(theta[3 : 3 + order])
-    weights = residues / poles / (poles + delta)
-    ways = [np.real(weight * _follow(log, pole, d)) for pole, weight in zip(poles, weights, strict=True)]
-    later = _slide(log, delta, d) - _slide(log, delta, d + _delay(theta, order, log)[0])
-    return (later + sum(ways) - np.real(weights.sum() * _follow(log, -delta, d)))[:, None]
-
-
 def _delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.ndarray]:
     """By how much an amplifier delays slow forces, and its derivatives; no more than forces are known."""
     if order == 2:
@@ -119,23 +153,24 @@ def _delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.nda
     return (float(late), by) if late < most else (float(most), 0.0 * by)
 
 
-def _ring(theta: np.ndarray, log: Recording, order: int, mode: int) -> np.ndarray:
-    """What a mode with ``T^2/m = 1`` adds, behind the amplifier, a column."""
-    own = find_roots(*theta[mode : mode + 2])
-    poles, residues = amplify(theta[3 : 3 + order])
-    place = np.zeros(log.position.size)
-    for pole, residue in zip(poles, residues, strict=True):
-        place += (residue / np.prod(pole - own) * _follow(log, pole, theta[2])).real
-    for pole, other in (own, own[::-1]):
-        gain = np.sum(residues / (pole - poles)) if order else 1.0
-        place += (gain / (pole - other) * _follow(log, pole, theta[2])).real
-    return place[:, None]
+def list_poles(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
+    """Poles and residues of ``A(s) (1/(s (s + delta)) + sum of modes)`` but for ``1/(s (s + delta))``.
 
-
-def _ring_on(theta: np.ndarray, log: Recording, mode: int) -> np.ndarray:
-    """How a mode moves that did so before, two columns."""
-    own, other = np.exp(np.arange(log.position.size)[:, None] * find_roots(*theta[mode : mode + 2])).T
-    return np.stack([own.real, own.imag if own.imag.any() else other.real], -1)
+    Those of the amplifier, -delta behind one, and two of each mode: frequency, damping ratio and ``m/m_i``.
+    """
+    late, gains = (list(each) for each in amplify(lag))
+    poles, weights = list(late), [gain / pole / (pole + delta) for pole, gain in zip(late, gains, strict=True)]
+    if late:
+        poles, weights = [*poles, -delta + 0j], [*weights, -sum(weights)]
+    for turns, ratio, share in modes:
+        own = find_roots(turns, ratio)
+        for k, (pole, gain) in enumerate(zip(late, gains, strict=True)):
+            weights[k] = weights[k] + share * gain / (pole - own[0]) / (pole - own[1])
+        for pole, other in (own, own[::-1]):
+            poles.append(pole)
+            behind = sum(gain / (pole - each) for each, gain in zip(late, gains, strict=True)) if late else 1.0
+            weights.append(share * behind / (pole - other))
+    return poles, weights
 
 
 def amplify(lag: Sequence[Any] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -153,37 +188,40 @@ def find_roots(w: Any, ratio: Any) -> np.ndarray:
     return np.array([w * (-ratio + root), w * (-ratio - root)])
 
 
-def _differ(function: Callable[[np.ndarray], np.ndarray], theta: np.ndarray, k: int, columns: np.ndarray) -> np.ndarray:
-    """The derivative in one number of theta, of which the columns are known."""
-    step = np.zeros(theta.size)
-    step[k] = _STEP * max(abs(float(theta[k])), 1.0 if k < 3 else 0.0)
-    return (function(theta + step) - columns) / step[k]
+def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:
+    """``E_p`` at the positions, from rest at the log's first sample; its slope is that in p."""
+    whole, force = int(np.floor(d)), np.append([0.0, 0.0], _prolong(log))
+    f, pole, first = d - whole, pole if pole.imag else pole.real, log.skip - whole
+    seen = slice(first, first + log.position.size)
+    # What a new force and the older one move until a sample, and a little beside the pole.
+    at = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
+    at = np.where(at == 0, 1e-300, at)
+    held = np.expm1(np.array([1.0 - f, f]) * at) / at * np.exp([0.0, 1.0 - f] * at)
+    turn, forces = np.exp(pole), np.array([force[1:-1], force[:-2]])
+    ways = recur(turn, held[0] @ forces)
+
+    def differentiate() -> np.ndarray:
+        moves = (held[1] - held[2]) * 0.5 / _STEP @ forces
+        moves[1:] += turn * ways[:-1]
+        return recur(turn, moves)[seen]
+
+    return ModelledMotion(ways[seen], differentiate)
 
 
-def _follow(log: Recording, pole: complex, d: float) -> np.ndarray:
-    """``E_p`` at the positions, from rest at the log's first sample."""
+def _slide(log: Recording, delta: float, d: float, speed: ModelledMotion) -> ModelledMotion:
+    """The way of a mass with g = 1 and no friction from the first position on; its slope is that in delta."""
     whole = int(np.floor(d))
-    f, pole, force = d - whole, complex(pole), np.append([0.0, 0.0], _prolong(log))
-    late, first = _held(pole, f) * np.exp(pole * (1.0 - f)), _held(pole, 1.0 - f)
-    moved = recur(np.exp(pole), first * force[1:-1] + late * force[:-2])
-    return moved[log.skip - whole :][: log.position.size]
+    spans, now = np.array([d - whole, 1.0 - d + whole, 1.0]), log.skip - whole + np.arange(log.position.size - 1)
+    at = phi_functions((delta + _STEP * np.array([[0.0], [1.0], [-1.0]])) * spans)
+    reach, way = (at.phi1 * spans).T, (at.phi2 * spans**2).T
+    factors, force = np.array([reach[2], way[0] + reach[0] * reach[1], way[1]]), _prolong(log)
+    terms = np.array([speed.position[:-1], force[now - 1], force[now]])
 
+    def differentiate() -> np.ndarray:
+        steps = 0.5 / _STEP * (factors[:, 1] - factors[:, 2]) @ terms - factors[0, 0] * speed.slopes[:-1]
+        return np.append(0.0, np.cumsum(steps))
 
-def _held(pole: complex, time: float) -> complex:
-    """``(e^(p t) - 1)/p``."""
-    return np.expm1(pole * time) / pole if pole else time + 0j
-
-
-def _slide(log: Recording, delta: float, d: float) -> np.ndarray:
-    """The way of a mass with g = 1 and no friction from the first position on."""
-    whole = int(np.floor(d))
-    f, now = d - whole, np.arange(log.skip, log.skip + log.position.size - 1) - whole
-    spans = np.array([f, 1.0 - f, 1.0])
-    both = phi_functions(delta * spans)
-    reach, way = both.phi1 * spans, both.phi2 * spans**2
-    speed, force = np.real(_follow(log, -delta, d))[:-1], _prolong(log)
-    steps = reach[2] * speed + (way[0] + reach[0] * reach[1]) * force[now - 1] + way[1] * force[now]
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return ModelledMotion(np.append(0.0, np.cumsum(factors[:, 0] @ terms)), differentiate)
 
 
 def _prolong(log: Recording) -> np.ndarray:

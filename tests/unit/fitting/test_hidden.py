@@ -9,6 +9,7 @@ from measured_devices import DAMPING, DELAY, MASS, OTHERS, PERIOD, RIGID, OtherD
 from scipy.signal import lfilter
 
 import zwidth
+from zwidth.fitting.moving import Recording
 from zwidth.fitting.words import choose_wall, describe_fit, write_scene
 from zwidth.words.status import Status
 
@@ -150,6 +151,23 @@ def test_no_safe_wall_is_unstable_on_a_device_with_resonances(seed):
     fit = zwidth.fit_log(true.period, replace(true, encoder=10 * true.encoder).play(force), force)
     safe = fit.safe_wall()
     assert safe.status != Status.OK or true.is_stable(safe.stiffness, safe.virtual_damping)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rounding_decides_nothing_where_a_log_has_one_push(seed):
+    """There friction and offset move alike, and what is left between them is no direction."""
+    force, ahead = np.zeros(1030), 30
+    force[50:150] = 1.0
+    g = PERIOD**2 / 0.1
+    moved = Recording(force, np.zeros(1000), ahead).move(g, 0.01, 1.3, 0.0, 0.0, 0.0, 0.05 * g).position
+    step, noise = np.ptp(moved) / 5000.0, np.random.default_rng(seed).standard_normal(force.size)
+    position = step * np.round(np.append(np.zeros(ahead), moved) / step + 0.2 * noise)
+    first, *others = (
+        np.array(zwidth.fit_log(PERIOD, position * by, force, resolution=step).intervals["stiffness_max"])
+        for by in (1.0, 1.0 + 3e-15, 1.0 - 7e-15)
+    )
+    for other in others:
+        np.testing.assert_allclose(other, first, rtol=0, atol=1e-3 * np.ptp(first))
 
 
 def test_long_logs_are_looked_at_in_part():
