@@ -364,8 +364,9 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
 
     A wall's value does not depend on the window: cells lie on the whole map, and each is computed by itself.
     """
-    longest = max(area.alpha.shape[1], area.beta.shape[1])
-    sides = [side for side in _SIDES if side < 2 * longest or side == _SIDES[-1]]
+    # Larger ones would mostly lie beyond the map.
+    shortest = min(area.alpha.shape[1], area.beta.shape[1])
+    sides = [side for side in _SIDES if side < 2 * shortest or side == _SIDES[-1]]
     held = area.d != np.floor(area.d)
     output = _Canvas(area, sides[0], with_rate)
     levels = [_Level(area, side, AllowedErrors(accuracy, with_rate), output) for side in sides]
