@@ -171,5 +171,6 @@ FIT_EXACT = Tolerance(
 )
 FIT_AGAIN = Tolerance(
     1e-6,
-    "Relative, an offset to the friction too: another least-squares program stops where difference quotients are zero.",
+    "Relative, of an offset to its standard error where that is larger: the fit stops where it promises 1e-12 of the "
+    "squares, another least-squares program where a difference quotient of its derivatives is zero.",
 )
