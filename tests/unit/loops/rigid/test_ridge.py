@@ -15,7 +15,7 @@ from compiling import QUICKLY
 
 import zwidth
 from zwidth.loops.rigid.poles import radius_by_companion
-from zwidth.loops.rigid.ridge import slopes_kernel
+from zwidth.loops.rigid.ridge import ridge_kernel
 from zwidth.words.errors import InputError
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import DELAY_MODELS as MODELS
@@ -39,10 +39,10 @@ def reference(model):
 @cache
 def compiled_derivatives(model):
     def three(point):
-        return jnp.stack(zwidth.alpha_max(*point, delay=model)[:3])
+        return jnp.stack(ridge_kernel(point[0], point[1], model)[:3])
 
     def alpha(point):
-        return zwidth.alpha_max(*point, delay=model).alpha
+        return ridge_kernel(point[0], point[1], model).alpha
 
     def everything(point):
         # One reverse sweep, and its change in both directions.
@@ -153,56 +153,6 @@ def precise_curve(omega, delta, d, model):
     # wall = alpha z + beta (z - 1), a real 2 x 2 system
     beta = (mp.re(wall) * mp.im(z) - mp.im(wall) * mp.re(z)) / (-mp.im(z))
     return (mp.im(wall) - beta * mp.im(z)) / mp.im(z), beta
-
-
-def precise_alpha(delta, d, guess, model):
-    """alpha_max by 60-digit Newton steps on the curve of the definitions."""
-
-    def height(omega):
-        return precise_curve(omega, delta, d, model)[0]
-
-    return height(mp.findroot(lambda w: mp.diff(height, w), guess, tol=1e-30))
-
-
-POINTS = [(0.0, 0.5), (0.1, 1.3), (0.1, 1.0), (3.0, 0.25), (20.0, 0.6), (0.7, 6.5), (50.0, 3.5)]
-
-
-def precise_derivatives(delta, d, omega, model):
-    """Gradient and Hessian from the right, as documented: four points each way leave an error of step^3 and less."""
-    step = mp.mpf(10) ** -9
-    with mp.workdps(60):
-        first, second = (mp.mpf(-11) / 6, 3, mp.mpf(-3) / 2, mp.mpf(1) / 3), (2, -5, 4, -1)
-        at = [[precise_alpha(delta + i * step, d + j * step, omega, model) for j in range(4)] for i in range(4)]
-        down, across = [at[i][0] for i in range(4)], at[0]
-        mixed = sum(first[i] * first[j] * at[i][j] for i in range(4) for j in range(4)) / step**2
-        gradient = [mp.fdot(first, line) / step for line in (down, across)]
-        bends = [mp.fdot(second, line) / step**2 for line in (down, across)]
-    return np.array(gradient, float), np.array([[bends[0], mixed], [mixed, bends[1]]], float)
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_gradient_and_hessian_against_60_digits(model, x64):
-    def alpha(p):
-        return zwidth.alpha_max(p[0], p[1], delay=model).alpha
-
-    _, _, hessians = derivatives(model, *np.transpose(POINTS))
-    for k, (delta, d) in enumerate(POINTS):
-        point = zwidth.alpha_max(delta, d, delay=model)
-        gradient, hessian = precise_derivatives(delta, d, point.omega, model)
-        size = 1 + abs(float(point.alpha))
-        by_hand = slopes_kernel(np.float64(delta), np.float64(d), model)
-        np.testing.assert_allclose((by_hand.by_delta, by_hand.by_d), gradient, rtol=1e-13, atol=1e-14 * size)
-        p = jnp.array([delta, d])
-        np.testing.assert_allclose(jax.grad(alpha)(p), gradient, rtol=1e-13, atol=1e-14 * size)
-        np.testing.assert_allclose(hessians[k], hessian, rtol=1e-10, atol=1e-11 * size)
-        if k != 1:
-            continue
-        # Outside of jit every call is traced anew, and compiles a program for each pair of arguments: one pair of each
-        # model, at one point.
-        nth = 1 if model == "held" else 0
-        slope = jax.grad(lambda delta, d: zwidth.alpha_max(delta, d, delay=model).alpha)
-        bend = jax.grad(slope, nth)(delta, d)
-        np.testing.assert_allclose(bend, hessian[0, nth], rtol=1e-10, atol=1e-11 * size)
 
 
 def test_values_against_60_digits_at_random():

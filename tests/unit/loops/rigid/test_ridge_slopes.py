@@ -1,10 +1,11 @@
-"""Closed-form derivatives of the plant against 90 digits, those of the ridge through JAX's transformations."""
+"""Closed-form derivatives of the plant and the ridge against 60 digits, and through JAX's transformations."""
 
 import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from compiling import QUICKLY
 
 import zwidth
 from zwidth.arrays import evaluate
@@ -45,6 +46,61 @@ def test_plant_slopes(delta, f):
             exact = [float((a - b) / (2 * step)) for a, b in zip(up, down, strict=True)]
         np.testing.assert_allclose((slopes.a2, slopes.a1, slopes.a0, slopes.gap), exact, rtol=2e-14, atol=4e-16 * size)
     assert by_delta.c == pytest.approx(-held_plant(np.float64(delta), np.float64(f)).c, rel=1e-15)
+
+
+def precise_alpha(delta, d, guess, model):
+    """alpha_max by 60-digit Newton steps on the curve of the definitions."""
+    n = mp.floor(d) if model == "held" else d
+    a2, a1, a0, _ = precise_plant(delta, d - n)
+    c = mp.exp(-delta)
+
+    def height(omega):
+        z = mp.expj(omega)
+        wall = -(z - 1) * (z - c) * mp.expj(omega * n) / (a2 * z + a1 + a0 / z)
+        return mp.re(wall) - mp.tan(omega / 2) * mp.im(wall)
+
+    return height(mp.findroot(lambda w: mp.diff(height, w), guess, tol=1e-30))
+
+
+POINTS = [(0.0, 0.5), (0.1, 1.3), (0.1, 1.0), (3.0, 0.25), (20.0, 0.6), (0.7, 6.5), (50.0, 3.5)]
+
+
+def precise_derivatives(delta, d, omega, model):
+    """Gradient and Hessian from the right, as documented: four points each way leave an error of step^3 and less."""
+    step = mp.mpf(10) ** -9
+    with mp.workdps(60):
+        first, second = (mp.mpf(-11) / 6, 3, mp.mpf(-3) / 2, mp.mpf(1) / 3), (2, -5, 4, -1)
+        at = [[precise_alpha(delta + i * step, d + j * step, omega, model) for j in range(4)] for i in range(4)]
+        down, across = [at[i][0] for i in range(4)], at[0]
+        mixed = sum(first[i] * first[j] * at[i][j] for i in range(4) for j in range(4)) / step**2
+        gradient = [mp.fdot(first, line) / step for line in (down, across)]
+        bends = [mp.fdot(second, line) / step**2 for line in (down, across)]
+    return np.array(gradient, float), np.array([[bends[0], mixed], [mixed, bends[1]]], float)
+
+
+@pytest.mark.parametrize("model", ["held", "fractional_power"])
+def test_gradient_and_hessian_against_60_digits(model, x64):
+    def alpha(p):
+        return zwidth.alpha_max(p[0], p[1], delay=model).alpha
+
+    hessians = jax.jit(jax.vmap(jax.hessian(alpha)), compiler_options=QUICKLY)(jnp.array(POINTS))
+    for k, (delta, d) in enumerate(POINTS):
+        point = zwidth.alpha_max(delta, d, delay=model)
+        gradient, hessian = precise_derivatives(delta, d, point.omega, model)
+        size = 1 + abs(float(point.alpha))
+        by_hand = slopes_kernel(np.float64(delta), np.float64(d), model)
+        np.testing.assert_allclose((by_hand.by_delta, by_hand.by_d), gradient, rtol=1e-13, atol=1e-14 * size)
+        p = jnp.array([delta, d])
+        np.testing.assert_allclose(jax.grad(alpha)(p), gradient, rtol=1e-13, atol=1e-14 * size)
+        np.testing.assert_allclose(hessians[k], hessian, rtol=1e-10, atol=1e-11 * size)
+        if k != 1:
+            continue
+        # Outside of jit every call is traced anew, and compiles a program for each pair of arguments: one pair of each
+        # model, at one point.
+        nth = 1 if model == "held" else 0
+        slope = jax.grad(lambda delta, d: zwidth.alpha_max(delta, d, delay=model).alpha)
+        bend = jax.grad(slope, nth)(delta, d)
+        np.testing.assert_allclose(bend, hessian[0, nth], rtol=1e-10, atol=1e-11 * size)
 
 
 def test_grad_vmap_and_jit_agree(x64):
