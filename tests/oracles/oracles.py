@@ -143,6 +143,12 @@ def roots(coefficients) -> list[mpc]:
     return found
 
 
+def exact_radius(alpha, beta, delta, d) -> mpf:
+    """The size of the outermost pole, of simple ones."""
+    with mp.workdps(max(mp.dps, digits_for(delta))):
+        return max(abs(root) for root in roots(polynomial(alpha, beta, delta, d)))
+
+
 def relative_error(got, exact, floor: float = 0) -> float:
     """|got - exact| over |exact| (or over ``floor``, where that is larger)."""
     scale = max(abs(exact), mpf(floor))

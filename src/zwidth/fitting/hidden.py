@@ -152,9 +152,8 @@ def look_for_lags(best: FittedModel) -> LagTest:
     best = _glimpse(best)
     lags = np.geomspace(_SHORTEST, max(_LONGEST, min(_LONGEST_LAG, best.theta[2])), _LAGS)
     # Of the mass alone: what resonances add turns hardly.
-    (g, delta, d), model = best.theta[:3], StructuredRecordings(best.model.logs, None, 1)
-    rest = np.zeros(model.size - 4)
-    thetas = [np.array([g, delta, d - lag, lag, *rest]) for lag in lags]
+    (g, delta, d), model = best.theta[:3], StructuredRecordings(best.model.logs, lag=1)
+    thetas = [np.pad([g, delta, d - lag, lag], (0, model.size - 4)) for lag in lags]
     columns = [[model.add_parts(theta, k).position for k in range(len(model.logs))] for theta in thetas]
     columns = best.model.weigh(np.stack([np.concatenate(column) for column in columns], -1))
     absorbed = best.inverse.matrix @ columns

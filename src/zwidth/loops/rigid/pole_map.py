@@ -68,11 +68,6 @@ class Area(NamedTuple):
         return [self.alpha[alpha, column], self.beta[beta, row], self.delta[device], self.d[device]]
 
 
-def _powers(places: np.ndarray, order: int) -> np.ndarray:
-    """(..., powers)."""
-    return polyvander(places, order)
-
-
 @cache
 def _nodes(order: int) -> np.ndarray:
     """Where polynomials of an order are put into another function: zeros of a Chebyshev polynomial."""
@@ -101,7 +96,7 @@ class _AxisPieces:
         self._known: dict[Any, np.ndarray] = {}
 
     def table(self, kind: Callable[[np.ndarray, int], np.ndarray], order: int) -> np.ndarray:
-        """`_powers` or `_shares` of all places: (devices, pieces, walls, ...)."""
+        """`polyvander` or `_shares` of all places: (devices, pieces, walls, ...)."""
         if (kind, order) not in self._known:
             self._known[kind, order] = kind(self._places, order)
         return self._known[kind, order]
@@ -181,11 +176,11 @@ def _tiles(values: np.ndarray, side: int) -> np.ndarray:
 class _Level:
     """The cells of one size of some devices."""
 
-    def __init__(self, area: Area, side: int, wanted: AllowedErrors, output: _Canvas) -> None:
-        self.area, self.side, self.wanted, self.output = area, side, wanted, output
+    def __init__(self, area: Area, side: int, wanted: AllowedErrors, canvas: _Canvas) -> None:
+        self.area, self.side, self.wanted, self.canvas = area, side, wanted, canvas
         self.axes = _AxisPieces(area.alpha, side), _AxisPieces(area.beta, side)
-        self.radius, self.rate = _tiles(output.radius, side), _tiles(output.rate, side)
-        self.first = output.first // side
+        self.radius, self.rate = _tiles(canvas.radius, side), _tiles(canvas.rate, side)
+        self.first = canvas.first // side
 
     def split(self, places: np.ndarray) -> np.ndarray:
         """Each cell in four, without what is beyond the window."""
@@ -297,9 +292,9 @@ class _Level:
             (logarithms,) = sums
             logarithms[:, 0, 0] += group.re
             if self.wanted.with_rate:
-                polynomials = [(logarithms, _powers)]
+                polynomials = [(logarithms, polyvander)]
             else:
-                powers = _powers(_nodes(ORDERS[k]), ORDERS[k])
+                powers = polyvander(_nodes(ORDERS[k]), ORDERS[k])
                 polynomials = [(np.exp(powers @ logarithms @ powers.T) - middle, _shares)]
             # The size of all logarithms of a cell is at least that of its middle's less all that the others add.
             sizes = np.abs(logarithms)
@@ -307,7 +302,7 @@ class _Level:
             # No wall of the other cells is in doubt or unknown.
             close = (least < 2.0 * self.wanted.doubt) | (doubt > self.wanted.allowed(least))
         else:
-            polynomials, close = [(x, _powers) for x in sums], np.ones(doubt.size, bool)
+            polynomials, close = [(x, polyvander) for x in sums], np.ones(doubt.size, bool)
         # Into the same memory: new memory takes as long to get as all of this.
         memories = np.empty((len(polynomials), min(size, places.shape[1]), self.side, self.side))
         for start in range(0, places.shape[1], size):
@@ -356,7 +351,7 @@ class _Level:
         flat = np.flatnonzero(~(np.abs(radius - 1.0) > 1.01 * self.wanted.doubt))
         cell, *inside = np.unravel_index(flat, radius.shape)
         corner = self.side * (places - self.first)[1:, cell]
-        self.output.special.append(np.concatenate([places[:1, cell], corner + inside]))
+        self.canvas.special.append(np.concatenate([places[:1, cell], corner + inside]))
 
 
 def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> FollowedPoles:
@@ -368,8 +363,8 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
     shortest = min(area.alpha.shape[1], area.beta.shape[1])
     sides = [side for side in _SIDES if side < 2 * shortest or side == _SIDES[-1]]
     held = area.d != np.floor(area.d)
-    output = _Canvas(area, sides[0], with_rate)
-    levels = [_Level(area, side, AllowedErrors(accuracy, with_rate), output) for side in sides]
+    canvas = _Canvas(area, sides[0], with_rate)
+    levels = [_Level(area, side, AllowedErrors(accuracy, with_rate), canvas) for side in sides]
 
     corners = [np.arange(part.start // sides[0], -(-part.stop // sides[0])) for part in area.window]
     for kind in (False, True):
@@ -379,4 +374,4 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
             for level in levels:
                 cells = level.solve_all(cells if level is levels[0] else level.split(cells), kind)
             levels[-1].forget(cells)
-    return output.cut_out(area.window)
+    return canvas.cut_out(area.window)

@@ -43,11 +43,6 @@ def test_scattered_points_keep_their_bounds(labels, accuracy):
     assert (found.error <= 1.1 * accuracy * labels["rho"])[ok].all()
 
 
-def exact_radius(alpha, beta, delta, d):
-    with mp.workdps(oracles.digits_for(delta)):
-        return max(abs(root) for root in oracles.roots(oracles.polynomial(alpha, beta, delta, d)))
-
-
 @pytest.mark.parametrize("transposed", [False, True])
 @pytest.mark.parametrize("d", [0.0, 1.5])
 def test_maps_keep_their_bounds(d, transposed):
@@ -64,7 +59,7 @@ def test_maps_keep_their_bounds(d, transposed):
     for index in np.ndindex(found.radius[::37, ::29].shape):
         place = (37 * index[0], 29 * index[1])
         alpha, beta = (float(axis[place]) for axis in np.broadcast_arrays(*axes))
-        assert abs(found.radius[place] - exact_radius(alpha, beta, 0.1, d)) <= found.error[place]
+        assert abs(found.radius[place] - oracles.exact_radius(alpha, beta, 0.1, d)) <= found.error[place]
 
 
 def test_several_devices_in_one_call_are_several_maps():
@@ -75,10 +70,11 @@ def test_several_devices_in_one_call_are_several_maps():
 
 
 def test_mixed_delays_single_points_and_none():
-    assert bound_radius(0.5, 0.5, 0.1, 1.5).radius == pytest.approx(float(exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-9)
+    exact = float(oracles.exact_radius(0.5, 0.5, 0.1, 1.5))
+    assert bound_radius(0.5, 0.5, 0.1, 1.5).radius == pytest.approx(exact, rel=1e-9)
     assert bound_radius([], 0.5, 0.1, 1.5).radius.shape == (0,)
     mixed = bound_radius(0.5, 0.5, 0.1, [0.0, 1.5, 4.0])
-    expected = [float(exact_radius(0.5, 0.5, 0.1, d)) for d in (0.0, 1.5, 4.0)]
+    expected = [float(oracles.exact_radius(0.5, 0.5, 0.1, d)) for d in (0.0, 1.5, 4.0)]
     np.testing.assert_allclose(mixed.radius, expected, rtol=1e-9)
 
 
@@ -101,7 +97,7 @@ def test_double_poles_are_not_certified():
     assert not found.certified
     assert found.status == Status.NOT_CONVERGED
     assert 1e-9 < found.error < 1e-3
-    assert abs(found.radius - exact_radius(float(top.alpha), float(top.beta), 5.0, 0.0)) <= found.error
+    assert abs(found.radius - oracles.exact_radius(float(top.alpha), float(top.beta), 5.0, 0.0)) <= found.error
 
 
 @pytest.mark.parametrize(
@@ -125,7 +121,7 @@ def test_eigenvalues_inside_a_transformation(x64):
     companion = jax.jit(
         lambda alpha: zwidth.spectral_radius(alpha, 0.5, 0.1, 1.5, method="companion"), compiler_options=QUICKLY
     )
-    assert companion(0.5) == pytest.approx(float(exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-8)
+    assert companion(0.5) == pytest.approx(float(oracles.exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-8)
 
 
 def test_nothing_is_compiled_and_no_delay_takes_long():
@@ -149,7 +145,7 @@ def test_triple_poles_keep_their_bounds():
     found = bound_radius(alpha, beta, 0.0, 0.0)
     assert found.error[0] > 1e-7 * found.radius[0]
     for k in range(61):
-        assert abs(found.radius[k] - exact_radius(alpha[k], beta, 0.0, 0.0)) <= found.error[k]
+        assert abs(found.radius[k] - oracles.exact_radius(alpha[k], beta, 0.0, 0.0)) <= found.error[k]
 
 
 def test_radii_of_the_adversarial_walls_keep_their_bounds():
