@@ -170,7 +170,5 @@ FIT_EXACT = Tolerance(
     "rounding of its records; measured below 4e-13 over 500 devices for walls, 2e-11 for logs.",
 )
 FIT_AGAIN = Tolerance(
-    1e-6,
-    "Relative, of an offset to its standard error where that is larger: the fit stops where it promises 1e-12 of the "
-    "squares, another least-squares program where a difference quotient of its derivatives is zero.",
+    1e-6, "Relative: another least-squares program stops where a difference quotient of its derivatives is zero."
 )

@@ -29,7 +29,7 @@ _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
 # Devices with other parts are compared at this promised reduction.
 _CLOSELY = 2e-5
 # Promised reductions of the squares that end the search, and excuse a corner; steps; how they are damped.
-_ARRIVED, _NEARLY, _STEPS = 1e-12, 1e-6, 100
+_ARRIVED, _NEARLY, _STEPS = 1e-14, 1e-6, 100
 _EASY, _LIGHT, _STUBBORN = 1e-4, 1e-6, 1e12
 # A mass that slides back by less than this share of its way may do so for the noise alone.
 _BACK = 0.1
@@ -347,12 +347,14 @@ def _refine(
             trial[free] += step / sizes
             trial = np.clip(trial, low, high)
             trial_motion, trial_rest, trial_squares = look(trial)
-            if trial_squares < squares or damping > _STUBBORN:
+            # The last steps move the squares by less than these are rounded by.
+            better = trial_squares < squares or max(promised, trial_squares - squares) <= _ROUNDING * squares
+            if better or damping > _STUBBORN:
                 break
             if promised <= arrived * squares:
                 return theta, squares, True
             damping = max(10.0 * damping, _EASY)
-        if not trial_squares < squares:
+        if not better:
             # No step in the direction of the slopes helps any more: a corner, or rounding.
             break
         theta, motion, rest, squares, before = trial, trial_motion, trial_rest, trial_squares, squares
