@@ -169,8 +169,8 @@ Route: TypeAlias = Literal["auto", "numpy", "jax"]
 # The values of a kernel at concrete points, and for each argument how every result moves with it.
 Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
 
-# Up to so many points NumPy is done before a compiler has begun.
-FEW = 1 << 12
+# Up to so many points NumPy is done long before a compiler, which takes seconds: in a tenth of one, or a few.
+FEW = 1 << 15
 # A compiled call gets so many points at most: one compilation, bounded memory, work for every processor.
 BLOCK = 1 << 16
 # The compiler treats shorter arrays differently, to the last place.

@@ -38,7 +38,7 @@ _BELOW_ONE, _ROUNDED = 1.0 - 2.0**-53, 1e-13
 _LARGEST_SHARE = 1e-3
 # Poles so near to the real axis are taken for single ones.
 _REAL = 1e-6
-# Smaller maps are not worth their cells.
+# Maps of fewer walls a device are not worth their cells.
 SMALLEST_MAP = 1 << 11
 # Listed walls whose poles are found at one time without a compiler: in smaller lists they take longer.
 _AT_ONCE = 1 << 13
@@ -105,7 +105,7 @@ def _finish_poles(columns: list[np.ndarray], poles: OutermostPoles, accuracy: fl
     attempts: list[Any] = [certify_again, certify_starts, 1.0, search, *_LADDER[accuracy * _LADDER <= _LARGEST_ERROR]]
     with np.errstate(all="ignore"):
         for attempt in attempts:
-            pieces = [left[start : start + FEW] for start in range(0, left.size, FEW)]
+            pieces = [left[start : start + _AT_ONCE] for start in range(0, left.size, _AT_ONCE)]
             tried = [_attempt(attempt, columns, poles, piece, accuracy, kind) for piece in pieces]
             left = np.concatenate([left[:0], *tried])
     return poles
@@ -132,16 +132,17 @@ def _attempt(
 
 
 def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
-    """The points as a map of one or several devices, where they are one that is large enough.
+    """The points as a map of one or several devices, where they are one that is large enough; a line is a map, too.
 
-    With it the caller's axes in the map's order, those of the devices, then beta's, then alpha's; and its shape.
+    With it the caller's axes in the map's order, those of the devices, then beta's, then alpha's, of which a line lacks
+    one: it gets the first axis, which has to be of length 1; and its shape.
     """
     shape, alone = points.shape, []
     for name in ("beta", "alpha"):
-        varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1]
+        varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1] or [0]
         # By name: one and the same array may be given twice.
         others = [array for other, array in points._asdict().items() if other != name]
-        if len(varying) != 1 or any(other.shape[varying[0]] > 1 for other in others):
+        if len(varying) > 1 or any(other.shape[varying[0]] > 1 for other in others):
             return None
         alone.append(varying[0])
     if points.alpha.size * points.beta.size < SMALLEST_MAP:
@@ -211,14 +212,15 @@ def _find_listed(
 def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = False) -> WallPoles:
     """The outermost poles of arrays of one shape, as a map where they are one."""
     shape = arrays[0].shape
-    laid = as_area(Points(*map(fold, arrays))) if arrays[0].size >= SMALLEST_MAP else None
+    # A line lacks an axis. Few walls one by one take less than cells.
+    laid = as_area(Points(*(fold(array[None]) for array in arrays))) if arrays[0].size > FEW else None
     if laid is None:
         columns = [array.reshape(-1) for array in arrays]
         return list_poles(columns, accuracy, with_rate).map(lambda leaf: leaf.reshape(shape))
     area, order, sizes = laid
 
     def lay(leaf: np.ndarray) -> np.ndarray:
-        leaf = leaf.reshape(sizes).transpose(np.argsort(order))
+        leaf = leaf.reshape(sizes).transpose(np.argsort(order))[0]
         return leaf if leaf.shape == shape else np.broadcast_to(leaf, shape).copy()
 
     return area_poles(area, accuracy, with_rate).map(lay)

@@ -35,13 +35,15 @@ from zwidth.loops.rigid.pole_groups import (
 from zwidth.loops.rigid.pole_search import all_starts
 from zwidth.loops.rigid.pole_step import halley_step
 
-# Sides of cells, in walls.
+# Sides of cells on a map as long as wide, in walls; on others as many walls in the map's own proportions.
 _SIDES = (128, 64, 32, 16, 8)
 # Cells of one list, and of those how many have their sums made at one time, and walls: what they need stays in caches.
 _LIST, _BATCH, _WALLS = 1 << 9, 1 << 7, 1 << 16
 # Of Halley's method on every start; where the last one was shorter than this share of the distance between the poles of
 # a long delay it has arrived, and starts that end nearer to each other than that have found one pole.
 _STEPS, _NEARBY = 5, 1e-2
+# Values of an axis whose powers and shares are kept.
+_REMEMBERED = 1 << 14
 # How far inside of the groups the circles of a count are, in units of how far the groups move in the cell.
 _INSIDE = (0.3, 1.5, 6.0)
 
@@ -95,11 +97,13 @@ class _AxisPieces:
             self._places = (pieces - self.middle[..., None]) / self.half[..., None]
         self._known: dict[Any, np.ndarray] = {}
 
-    def table(self, kind: Callable[[np.ndarray, int], np.ndarray], order: int) -> np.ndarray:
-        """`polyvander` or `_shares` of all places: (devices, pieces, walls, ...)."""
+    def table(self, kind: Callable[[np.ndarray, int], np.ndarray], order: int, pieces: Any) -> np.ndarray:
+        """`polyvander` or `_shares` of the walls of some pieces: (pieces, walls, ...)."""
+        if self._places.size > _REMEMBERED:
+            return kind(self._places[pieces], order)
         if (kind, order) not in self._known:
             self._known[kind, order] = kind(self._places, order)
-        return self._known[kind, order]
+        return self._known[kind, order][pieces]
 
 
 def fill_up(index: np.ndarray) -> np.ndarray:
@@ -144,10 +148,11 @@ class FollowedPoles(NamedTuple):
 class _Canvas:
     """The values of a window and of what else its cells hold, and which of its walls are special."""
 
-    def __init__(self, area: Area, side: int, with_rate: bool) -> None:
+    def __init__(self, area: Area, sides: tuple[int, int], with_rate: bool) -> None:
         # All cells end where the largest ones do.
-        first = [part.start // side * side for part in area.window]
-        sizes = [-(-part.stop // side) * side - start for part, start in zip(area.window, first, strict=True)]
+        cells = list(zip(area.window, sides, strict=True))
+        first = [part.start // side * side for part, side in cells]
+        sizes = [-(-part.stop // side) * side - start for (part, side), start in zip(cells, first, strict=True)]
         shape, self.first = (area.d.size, *sizes), np.array([[0], *([start] for start in first)])
         self.radius, self.rate = np.empty(shape), np.empty(shape if with_rate else (0, 0, 0))
         # Devices, rows and columns of walls whose radius is next to 1 or NaN.
@@ -167,31 +172,46 @@ class _Canvas:
         return FollowedPoles(radius, rate, np.unravel_index(flat, radius.shape))
 
 
-def _tiles(values: np.ndarray, side: int) -> np.ndarray:
+def _sides(rows: int, columns: int) -> list[tuple[int, int]]:
+    """Rows and columns of the cells of a map, from the largest on, each a power of 2."""
+    longer, all_sides = 0.5 * np.log2(columns / rows), []
+    # Larger ones would mostly lie beyond the map.
+    for side in (side for side in _SIDES if side < 2.0 * np.sqrt(rows * columns) or side == _SIDES[-1]):
+        high = int(2.0 ** np.clip(np.round(np.log2(side) - longer), 0.0, 2.0 * np.log2(side)))
+        all_sides.append((high, side**2 // high))
+    return all_sides
+
+
+def _tiles(values: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
     """The same values by device, row and column of cells, and those in them."""
-    devices, rows, columns = values.shape
-    return values.reshape(devices, rows // side, side, columns // side, side).swapaxes(2, 3)
+    (devices, rows, columns), (high, wide) = values.shape, sides
+    return values.reshape(devices, rows // high, high, columns // wide, wide).swapaxes(2, 3)
 
 
 class _Level:
     """The cells of one size of some devices."""
 
-    def __init__(self, area: Area, side: int, wanted: AllowedErrors, canvas: _Canvas) -> None:
-        self.area, self.side, self.wanted, self.canvas = area, side, wanted, canvas
-        self.axes = _AxisPieces(area.alpha, side), _AxisPieces(area.beta, side)
-        self.radius, self.rate = _tiles(canvas.radius, side), _tiles(canvas.rate, side)
-        self.first = canvas.first // side
+    def __init__(self, area: Area, sides: tuple[int, int], wanted: AllowedErrors, canvas: _Canvas) -> None:
+        self.area, self.sides, self.wanted, self.canvas = area, sides, wanted, canvas
+        self.axes = _AxisPieces(area.alpha, sides[1]), _AxisPieces(area.beta, sides[0])
+        self.radius, self.rate = _tiles(canvas.radius, sides), _tiles(canvas.rate, sides)
+        self.first = canvas.first // self._steps
 
-    def split(self, places: np.ndarray) -> np.ndarray:
-        """Each cell in four, without what is beyond the window."""
-        device, row, column = np.repeat(places, 4, axis=1)
-        row, column = (
-            2 * part + np.tile(place, places.shape[1]) for part, place in ((row, [0, 0, 1, 1]), (column, [0, 1, 0, 1]))
-        )
-        rows, columns = self.area.window
-        inside = (self.side * row < rows.stop) & (self.side * (row + 1) > rows.start)
-        inside &= (self.side * column < columns.stop) & (self.side * (column + 1) > columns.start)
-        return np.stack([device, row, column])[:, inside]
+    @property
+    def _steps(self) -> np.ndarray:
+        """Walls between neighbors, of devices, rows and columns of cells."""
+        return np.array([[1], *([side] for side in self.sides)])
+
+    def split(self, places: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
+        """Cells of such sides in those of this size, without what is beyond the window."""
+        parts = [large // small for large, small in zip(sides, self.sides, strict=True)]
+        within = np.stack(np.unravel_index(np.arange(parts[0] * parts[1]), (1, *parts)))
+        places = (places * [[1], *([part] for part in parts)])[:, :, None] + within[:, None]
+        places = places.reshape(3, -1)
+        low = (places * self._steps)[1:]
+        ends = [[[part.start], [part.stop]] for part in self.area.window]
+        start, stop = np.swapaxes(ends, 0, 1)
+        return places[:, ((low < stop) & (low + self._steps[1:] > start)).all(0)]
 
     def solve_all(self, places: np.ndarray, fractional: bool) -> np.ndarray:
         """`solve` list by list."""
@@ -228,6 +248,10 @@ class _Level:
                 followed = [enclose(2, *middle, some, fractional, self.wanted)]
             done[index] = self._prove(followed, places[:, index], some, fractional)
         return places[:, :count][:, ~done[:count]]
+
+    def _takes_logarithms(self, k: int) -> bool:
+        """Whether exponentials of all walls are taken: for rates, and where nodes would be as many."""
+        return self.wanted.with_rate or min(self.sides) <= _nodes(ORDERS[k]).size
 
     def _along(self, places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """The pieces of alpha's axis and of beta's in which cells are."""
@@ -285,13 +309,13 @@ class _Level:
 
     def _write(self, places: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
         """The poles of all walls of some cells, or the larger ones of these and of what is there."""
-        size, doubt = max(1, _WALLS // self.side**2), group.doubt[k]
+        size, doubt = max(1, _WALLS // (self.sides[0] * self.sides[1])), group.doubt[k]
         # Rounding between nodes is in units of the largest value: radii are taken from the middle's.
         middle = np.exp(group.re)[:, None, None]
         if len(sums) == 1:
             (logarithms,) = sums
             logarithms[:, 0, 0] += group.re
-            if self.wanted.with_rate:
+            if self._takes_logarithms(k):
                 polynomials = [(logarithms, polyvander)]
             else:
                 powers = polyvander(_nodes(ORDERS[k]), ORDERS[k])
@@ -304,7 +328,7 @@ class _Level:
         else:
             polynomials, close = [(x, polyvander) for x in sums], np.ones(doubt.size, bool)
         # Into the same memory: new memory takes as long to get as all of this.
-        memories = np.empty((len(polynomials), min(size, places.shape[1]), self.side, self.side))
+        memories = np.empty((len(polynomials), min(size, places.shape[1]), *self.sides))
         for start in range(0, places.shape[1], size):
             part = slice(start, min(start + size, places.shape[1]))
             some, noted = places[:, part], np.flatnonzero(close[part])
@@ -314,10 +338,10 @@ class _Level:
             ]
             if len(sums) == 2:
                 found = self._larger(found, pick(group, part), k)
-            elif self.wanted.with_rate:
+            elif self._takes_logarithms(k):
                 unknown = doubt[part][noted, None, None] > self.wanted.allowed(np.abs(found[0][noted]))
                 found[0][noted] = np.where(unknown, np.nan, found[0][noted])
-                found = [np.exp(found[0]), -found[0]]
+                found = [np.exp(found[0]), -found[0]][: 1 + self.wanted.with_rate]
             else:
                 found[0] += middle[part]
             if noted.size:
@@ -338,19 +362,22 @@ class _Level:
     def _spread(self, values: np.ndarray, by: Any, k: int, places: np.ndarray, memory: np.ndarray) -> np.ndarray:
         """Polynomials of eta and xi, by their coefficients or their values at nodes, at all walls of cells."""
         along = zip(self.axes, self._along(places), strict=True)
-        xi, eta = (axis.table(by, ORDERS[k])[place] for axis, place in along)
-        return np.matmul(eta, values @ xi.transpose(0, 2, 1), out=memory[: places.shape[1]])
+        xi, eta = (axis.table(by, ORDERS[k], place) for axis, place in along)
+        xi = xi.transpose(0, 2, 1)
+        # The longer side last: it costs the more.
+        first, second = (eta @ values, xi) if self.sides[0] < self.sides[1] else (eta, values @ xi)
+        return np.matmul(first, second, out=memory[: places.shape[1]])
 
     def forget(self, places: np.ndarray) -> None:
         """NaN for all walls of some cells."""
-        self._note(places, np.full((places.shape[1], self.side, self.side), np.nan))
+        self._note(places, np.full((places.shape[1], *self.sides), np.nan))
         self.radius[tuple(places - self.first)] = np.nan
 
     def _note(self, places: np.ndarray, radius: np.ndarray) -> None:
         """Note the walls whose side of the circle is in doubt, or that are NaN."""
         flat = np.flatnonzero(~(np.abs(radius - 1.0) > 1.01 * self.wanted.doubt))
         cell, *inside = np.unravel_index(flat, radius.shape)
-        corner = self.side * (places - self.first)[1:, cell]
+        corner = (self._steps * (places - self.first))[1:, cell]
         self.canvas.special.append(np.concatenate([places[:1, cell], corner + inside]))
 
 
@@ -359,19 +386,21 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
 
     A wall's value does not depend on the window: cells lie on the whole map, and each is computed by itself.
     """
-    # Larger ones would mostly lie beyond the map.
-    shortest = min(area.alpha.shape[1], area.beta.shape[1])
-    sides = [side for side in _SIDES if side < 2 * shortest or side == _SIDES[-1]]
+    sizes, wanted = _sides(area.beta.shape[1], area.alpha.shape[1]), AllowedErrors(accuracy, with_rate)
     held = area.d != np.floor(area.d)
-    canvas = _Canvas(area, sides[0], with_rate)
-    levels = [_Level(area, side, AllowedErrors(accuracy, with_rate), canvas) for side in sides]
-
-    corners = [np.arange(part.start // sides[0], -(-part.stop // sides[0])) for part in area.window]
-    for kind in (False, True):
-        devices = np.flatnonzero(held == kind)
-        cells = np.stack([part.reshape(-1) for part in np.meshgrid(devices, *corners, indexing="ij")])
-        with np.errstate(all="ignore"):
-            for level in levels:
-                cells = level.solve_all(cells if level is levels[0] else level.split(cells), kind)
-            levels[-1].forget(cells)
+    canvas = _Canvas(area, sizes[0], with_rate)
+    corners = [
+        np.arange(part.start // side, -(-part.stop // side)) for part, side in zip(area.window, sizes[0], strict=True)
+    ]
+    left = [
+        np.stack([part.reshape(-1) for part in np.meshgrid(np.flatnonzero(held == kind), *corners, indexing="ij")])
+        for kind in (False, True)
+    ]
+    with np.errstate(all="ignore"):
+        for sides, larger in zip(sizes, (sizes[0], *sizes), strict=False):
+            level = _Level(area, sides, wanted, canvas)
+            left = [level.solve_all(level.split(cells, larger), kind == 1) for kind, cells in enumerate(left)]
+            if not any(cells.size for cells in left):
+                break
+        level.forget(np.concatenate(left, axis=1))
     return canvas.cut_out(area.window)

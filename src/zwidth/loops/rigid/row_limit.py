@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import evaluate_columns
+from zwidth.arrays.evaluate import FEW, evaluate_columns
 from zwidth.arrays.xp import COSINE, SINE, horner, namespace, repeat, within
 from zwidth.loops.rigid.device import DeviceTerms, device, long_curve, short_curve
 from zwidth.loops.rigid.folding import Points, group_by
@@ -256,8 +256,6 @@ def _newton_step(goal: Array, at: Angles) -> Array:
 
 # Smaller maps are compared as they are.
 _LARGE = 1 << 16
-# So few rows are solved by NumPy.
-_FEW_ROWS = 1 << 12
 # A place in the order that no count reaches: alpha <= 0 and NaN are never stable.
 _NEVER = np.iinfo(np.int16).max
 # A pattern is as long as two rows: with fewer rows it would be a cost of its own.
@@ -270,7 +268,7 @@ def boundary_map(points: Points) -> np.ndarray:
     The limit is right to about 1e-15 relative, and to 1e-15 of the largest limit near the lobe's end.
     """
     alpha, beta = (np.where(within(part, WALL_RANGE), part, np.nan) for part in (points.alpha, points.beta))
-    return _compare(alpha, row_limits(beta, points.delta, points.d, _FEW_ROWS))
+    return _compare(alpha, row_limits(beta, points.delta, points.d, FEW))
 
 
 def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, few: int = 0) -> np.ndarray:

@@ -46,9 +46,9 @@ def spectral_radius(
         d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast.
         method: "newton" (and "auto") finds the outermost pole and proves each value by counts of the poles inside
             a circle, at a cost that does not grow with d; "companion" computes all poles.
-        accuracy: relative error to prove, 1e-9 by default, at least 1e-12. On a map (alpha along one axis, beta along
-            another) a larger one is quicker, at long delays above all, and errors are nearly as large in places; single
-            walls keep most digits. "companion" takes any.
+        accuracy: relative error to prove, 1e-9 by default, at least 1e-12. On a large map (alpha along one axis,
+            beta along another) or line a larger one is quicker, at long delays above all, and errors are nearly as
+            large in places; single walls keep most digits. "companion" takes any.
         delay: only "held" has poles.
 
     Returns:
@@ -61,8 +61,8 @@ def spectral_radius(
         TracedDelayError: d is traced with method "companion".
 
     Numerics:
-        Float64 when called directly, few points and maps without JAX; the ambient precision inside `jit`, where d may
-        be traced. On a map a Taylor series serves a cell of walls (`loops.rigid.pole_map`); its terms fall faster than
+        Float64 when called directly, maps and up to 32,768 other walls without JAX; the ambient precision inside
+        `jit`, where d may be traced. On a map a Taylor series serves a cell of walls (`loops.rigid.pole_map`); its terms fall faster than
         the bound that is proved of them. Derivatives are those of the outermost pole, of every order up to the second;
         NaN where it is a multiple one. Next to a k-fold pole the radius is known to about 1e-16^(1/k). How slowly a
         loop decays that is stable by less than 1e-16, `decay_rate` tells.

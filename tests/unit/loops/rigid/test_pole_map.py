@@ -5,12 +5,13 @@ import pytest
 from bounds import bound_radius
 
 import zwidth
+from zwidth.arrays.evaluate import FEW
 from zwidth.loops.rigid.folding import Points, fold
 from zwidth.loops.rigid.outermost_poles import SMALLEST_MAP, area_poles, as_area, outermost_poles
 from zwidth.loops.rigid.pole_map import Area, follow_poles
 from zwidth.words.status import Status
 
-ALPHA, BETA = np.linspace(-0.1, 1.5, 203), np.linspace(-0.3, 1.5, 157)
+ALPHA, BETA = np.linspace(-0.1, 1.5, 223), np.linspace(-0.3, 1.5, 157)
 
 
 def laid_out(*values):
@@ -68,15 +69,15 @@ def test_every_accuracy_is_kept(d, accuracy):
 
 def test_an_axis_in_any_order_has_the_same_walls():
     rng = np.random.default_rng(4)
-    alpha, beta = np.geomspace(1e-12, 1.0, 64), np.linspace(-0.05, 1.0, 64)
-    mixed = rng.permutation(64)
+    alpha, beta = np.geomspace(1e-12, 1.0, 200), np.linspace(-0.05, 1.0, 200)
+    mixed = rng.permutation(200)
     found = zwidth.spectral_radius(alpha, beta[:, None], 0.1, 1.0)
     np.testing.assert_allclose(
         zwidth.spectral_radius(alpha[mixed], beta[:, None], 0.1, 1.0), found[:, mixed], rtol=2e-9
     )
     rate = zwidth.decay_rate(alpha, beta[:, None], 0.1, 1.0)
-    alone = zwidth.decay_rate(np.tile(alpha, 2), np.repeat(beta[[9, 50]], 64), 0.1, 1.0).reshape(2, 64)
-    np.testing.assert_allclose(rate[[9, 50]], alone, rtol=1e-6)
+    alone = zwidth.decay_rate(np.tile(alpha, 2), np.repeat(beta[[9, 150]], 200), 0.1, 1.0).reshape(2, 200)
+    np.testing.assert_allclose(rate[[9, 150]], alone, rtol=1e-6)
     assert np.isfinite(alone).mean() > 0.95
 
 
@@ -92,6 +93,21 @@ def test_bad_values_on_an_axis_leave_the_others_alone():
     assert np.median(np.abs(found.radius[:, good] - plain[:, good])) < 1e-15
 
 
+@pytest.mark.parametrize(("rows", "columns"), [(1, 40000), (40000, 1), (3, 12000), (3000, 12)])
+@pytest.mark.parametrize("d", [1.0, 0.37, 60.0])
+def test_lines_and_long_thin_maps_are_as_well_known(rows, columns, d):
+    """Cells have the proportions of the map; with others nearly all walls would be left to be computed alone."""
+    alpha, beta = np.linspace(1e-4, 1.2 / (1.0 + d), columns), np.linspace(0.3, 0.9, rows)
+    walls = (alpha, beta[:, None], 0.1, d)
+    area = Area.whole(alpha[None], beta[None], np.array([0.1]), np.array([d]))
+    assert np.isfinite(follow_poles(area, 1e-9).radius).mean() > 0.99
+    check_against_points(bound_radius(*walls), walls, 5)
+    rate, radius = zwidth.decay_rate(*walls), zwidth.spectral_radius(*walls)
+    np.testing.assert_allclose(np.exp(-rate), radius, rtol=2e-9)
+    line = zwidth.spectral_radius(alpha, beta[0], 0.1, d) if rows == 1 else radius[0]
+    np.testing.assert_array_equal(line, radius[0])
+
+
 def test_what_is_no_map_is_left_to_the_points():
     assert laid_out(ALPHA, ALPHA, 0.1, 0.0) is None
     assert laid_out(ALPHA, BETA[:3, None], 0.1, 0.0) is None
@@ -99,7 +115,8 @@ def test_what_is_no_map_is_left_to_the_points():
     found = laid_out(ALPHA, BETA[:, None], np.array([0.1, 0.2])[:, None, None], 1.0)
     assert found is not None
     assert found[2] == (2, BETA.size, ALPHA.size)
-    assert ALPHA.size * BETA.size >= SMALLEST_MAP
+    # Of so many walls maps are looked for; fewer are taken one by one.
+    assert ALPHA.size * BETA.size > FEW >= SMALLEST_MAP
 
 
 def double_pole(z, delta, d):
@@ -133,9 +150,10 @@ def test_two_poles_that_meet_are_followed_together(z, d, width):
 
 @pytest.mark.parametrize("accuracy", [1e-2, 1e-9])
 @pytest.mark.parametrize("d", [0.37, 50.0])
-def test_a_window_has_the_bits_of_the_whole_map(d, accuracy):
+@pytest.mark.parametrize("longer", [1, 40])
+def test_a_window_has_the_bits_of_the_whole_map(d, accuracy, longer):
     """Windows that end inside of cells, one wall from their edge too; a rate is that of its radius."""
-    alpha, beta = np.linspace(0.0, 0.8 / (1.0 + d), 209)[None], np.linspace(-0.2, 1.0, 150)[None]
+    alpha, beta = np.linspace(0.0, 0.8 / (1.0 + d), 209 * longer)[None], np.linspace(-0.2, 1.0, 150)[None]
     devices = np.array([0.1, 0.7]), np.full(2, d)
     whole = area_poles(Area.whole(alpha, beta, *devices), accuracy, with_rate=True)
     known = np.isfinite(whole.rate)
