@@ -86,6 +86,16 @@ def fitted_once():
 
 
 @pytest.fixture
+def early_compiler(monkeypatch):
+    """Of some thousand points a compiler is asked, as a user's are who has many more."""
+    from zwidth.arrays import evaluate
+    from zwidth.loops.rigid import folding, outermost_poles, passivity, row_limit
+
+    for module in (evaluate, folding, outermost_poles, passivity, row_limit):
+        monkeypatch.setattr(module, "FEW", 1 << 11)
+
+
+@pytest.fixture
 def unpainted():
     """Pictures are not painted: what a test looks at is something else."""
     from unpainted import painting_nothing

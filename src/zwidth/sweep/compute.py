@@ -2,7 +2,7 @@
 
 A point's value must not depend on which other points its chunk holds, nor on who computes it. Every kernel therefore
 runs on pieces of one fixed size, of points that share what decides its shape: two compilations of one kernel, for
-batches of two sizes, may round differently.
+batches of two sizes, may round differently, and so may NumPy at the end of a list.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.evaluate import map_blocks
+from zwidth.arrays.evaluate import Route, map_blocks
 from zwidth.loops.rigid.margins import margins_kernel
 from zwidth.loops.rigid.outermost_poles import area_poles, list_poles
 from zwidth.loops.rigid.passivity import margin_at_one_delay
@@ -36,6 +36,8 @@ _ROW_PIECE = 1 << 12
 _WALL_PIECE = 1 << 12
 # Points whose columns are laid out at one time; more of them run one after the other.
 _LAID_OUT = 1 << 20
+# Walls or rows of a whole grid with which NumPy is done before a compiler, and all that it needs, is ready.
+_FEW = 1 << 20
 # Walls of one device that are worth a map.
 _SMALLEST_PLANE = 1 << 8
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
@@ -75,8 +77,7 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
             poles = area_poles(Area(alpha, beta, block.delta, block.d, (betas, alphas)), accuracy, with_rate=True)
             radius, proved, rate = (leaf.transpose(0, 2, 1) for leaf in poles)
         else:
-            # Always compiled, however few they are: a value must not depend on the size of its chunk.
-            listed = partial(list_poles, accuracy=accuracy, with_rate=True, few=0)
+            listed = partial(list_poles, accuracy=accuracy, with_rate=True, route=_route(block.walls))
             radius, proved, rate = _by_device(listed, block, shape, leaves=3)
         found["spectral_radius"], unproved = radius, proved == 0
         # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
@@ -127,6 +128,11 @@ def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
     return stable
 
 
+def _route(count: int) -> Route:
+    """NumPy, or a compiler: one of them for the whole grid, for they may differ in the last place."""
+    return "numpy" if count <= _FEW else "jax"
+
+
 def _limits(block: Block) -> np.ndarray:
     """The stiffest stable alpha of every device and beta, shape (D, B)."""
     columns = [part.ravel() for part in np.broadcast_arrays(block.beta, block.delta[:, None], block.d[:, None])]
@@ -136,7 +142,8 @@ def _limits(block: Block) -> np.ndarray:
         # As `row_limits` itself tells them apart: a delay that is NaN is not long.
         index = np.flatnonzero((columns[2] >= 1) == long)
         if index.size:
-            limit[index] = _map_pieces(row_limits, [column[index] for column in columns], _ROW_PIECE)
+            by_rows = partial(row_limits, route=_route(block.rows))
+            limit[index] = _map_pieces(by_rows, [column[index] for column in columns], _ROW_PIECE)
     return limit.reshape(block.beta.shape)
 
 

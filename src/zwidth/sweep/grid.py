@@ -34,6 +34,17 @@ class Block(NamedTuple):
     mass: np.ndarray  # in SI units, shape (D,); empty in a normalized sweep, likewise the period
     period: np.ndarray
     plane: Plane  # the whole grid's walls, of which the block may hold a part only
+    devices: int  # of the whole grid
+
+    @property
+    def rows(self) -> int:
+        """How many rows of one beta the whole grid has."""
+        return self.devices * self.plane.beta.shape[1]
+
+    @property
+    def walls(self) -> int:
+        """How many walls the whole grid has."""
+        return self.rows * self.plane.alpha.shape[1]
 
 
 class SceneBlock(NamedTuple):
@@ -105,7 +116,16 @@ class Grid:
             mass, period = np.empty(0), np.empty(0)
         alpha, beta = self._broadcast_walls(alpha, beta, delta.size)
         plane = Plane(alpha, beta, *cut)
-        return Block(delta, d, alpha[:, plane.alphas], beta[:, plane.betas], mass, period, plane)
+        return Block(
+            delta,
+            d,
+            alpha[:, plane.alphas],
+            beta[:, plane.betas],
+            mass,
+            period,
+            plane,
+            math.prod(self.shape_of("device")),
+        )
 
     def scene_block(self, place: tuple[slice, ...]) -> SceneBlock:
         """The same in SI units, of a sweep whose devices have parts."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks
+from zwidth.arrays.evaluate import BLOCK, FEW, Route, map_blocks
 from zwidth.arrays.xp import WIDE
 from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
@@ -58,26 +58,29 @@ def _compile_quick(fractional: bool) -> Any:
     return jax.jit(lambda a, b, c, d, accuracy: quick_kernel(a, b, c, d, accuracy, fractional), compiler_options=WIDE)
 
 
-def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW) -> OutermostPoles:
-    """The outermost poles of equally long columns of alpha, beta, delta and d; up to ``few`` without a compiler."""
+def outermost_poles(columns: list[np.ndarray], accuracy: float, route: Route = "auto") -> OutermostPoles:
+    """The outermost poles of equally long columns of alpha, beta, delta and d.
+
+    By the routes "numpy" and "jax" a wall's pole does not depend on the others.
+    """
     fractional = columns[3] != np.floor(columns[3])
     if not fractional.any() or fractional.all():
-        return _of_one_kind(columns, accuracy, bool(fractional.any()), few)
+        return _of_one_kind(columns, accuracy, bool(fractional.any()), route)
     # A mixed batch pays for the cubic only where it must.
     whole = OutermostPoles(*(np.empty(fractional.size) for _ in OutermostPoles._fields))
     for part in (np.flatnonzero(fractional), np.flatnonzero(~fractional)):
-        for leaf, found in zip(whole, outermost_poles([c[part] for c in columns], accuracy, few), strict=True):
+        for leaf, found in zip(whole, outermost_poles([c[part] for c in columns], accuracy, route), strict=True):
             leaf[part] = found
     return whole
 
 
-def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: int) -> OutermostPoles:
+def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, route: Route) -> OutermostPoles:
     size = columns[0].size
     with np.errstate(all="ignore"):
-        if size == 1 <= few:
+        if size == 1 and route == "auto":
             # Plain numbers are several times faster than arrays of one.
             found = [np.reshape(leaf, 1) for leaf in _quick([column[0] for column in columns], accuracy, kind)]
-        elif size <= few:
+        elif route == "numpy" or (route == "auto" and size <= FEW):
             full = [column[fill_up(np.arange(size))] for column in columns]
             blocks = [
                 _quick([column[start : start + _AT_ONCE] for column in full], accuracy, kind)
@@ -179,29 +182,31 @@ def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPole
     near, left = (tuple(place[part] for place in places) for part in (~missing, missing))
     radius[near] = _on_its_side(radius[near], [column[~missing] for column in columns])
     if left[0].size:
-        full = fill_up(np.flatnonzero(missing))
-        alone = list_poles([column[full] for column in columns], accuracy, with_rate, few=full.size)
+        alone = list_poles([column[missing] for column in columns], accuracy, with_rate, "numpy")
         for whole, leaf in zip((radius, proved, rate), alone, strict=True):
             if whole.size:
-                whole[left] = leaf[: left[0].size]
+                whole[left] = leaf
     return WallPoles(radius, proved, rate if with_rate else _NONE)
 
 
-def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = False, few: int = FEW) -> WallPoles:
+def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = False, route: Route = "auto") -> WallPoles:
     """The outermost poles of equally long columns; as for `outermost_poles`, bad walls among them."""
-    return _find_listed(columns, accuracy, with_rate, few)[0]
+    size = columns[0].size
+    if route != "auto":
+        columns = [column[fill_up(np.arange(size))] for column in columns]
+    return _find_listed(columns, accuracy, with_rate, route)[0].map(lambda leaf: leaf[:size])
 
 
 def slowest_pole(wall: tuple[float, float, float, float]) -> tuple[float, float, float]:
     """The spectral radius of one wall, its rate of decay and the angle of that pole."""
-    poles, found = _find_listed([np.array([value]) for value in wall], SLOWEST_ACCURACY, True, FEW)
+    poles, found = _find_listed([np.array([value]) for value in wall], SLOWEST_ACCURACY, True, "auto")
     return float(poles.radius[0]), float(poles.rate[0]), abs(float(found.im[0]))
 
 
 def _find_listed(
-    columns: list[np.ndarray], accuracy: float, with_rate: bool, few: int
+    columns: list[np.ndarray], accuracy: float, with_rate: bool, route: Route
 ) -> tuple[WallPoles, OutermostPoles]:
-    found = outermost_poles(columns, accuracy, few)
+    found = outermost_poles(columns, accuracy, route)
     rate = rates(found, columns, accuracy) if with_rate else _NONE
     radius = np.exp(np.where(np.isinf(found.error), np.nan, found.re))
     near = np.flatnonzero(np.abs(found.re) <= np.maximum(DOUBTFUL, np.where(np.isinf(found.error), 0.0, found.error)))

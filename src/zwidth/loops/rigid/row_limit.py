@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import FEW, evaluate_columns
+from zwidth.arrays.evaluate import FEW, Route, evaluate_columns
 from zwidth.arrays.xp import COSINE, SINE, horner, namespace, repeat, within
 from zwidth.loops.rigid.device import DeviceTerms, device, long_curve, short_curve
 from zwidth.loops.rigid.folding import Points, group_by
@@ -268,20 +268,16 @@ def boundary_map(points: Points) -> np.ndarray:
     The limit is right to about 1e-15 relative, and to 1e-15 of the largest limit near the lobe's end.
     """
     alpha, beta = (np.where(within(part, WALL_RANGE), part, np.nan) for part in (points.alpha, points.beta))
-    return _compare(alpha, row_limits(beta, points.delta, points.d, FEW))
+    return _compare(alpha, row_limits(beta, points.delta, points.d))
 
 
-def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, few: int = 0) -> np.ndarray:
-    """The stiffest stable wall of every (beta, delta, d), of their broadcast shape; NaN where out of range.
-
-    Compiled, unless there are at most ``few``: the two routes may differ in the last place, and what is stored must not
-    depend on how it was cut into pieces.
-    """
+def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route = "auto") -> np.ndarray:
+    """The stiffest stable wall of every (beta, delta, d), of their broadcast shape; NaN where out of range."""
     shape = np.broadcast_shapes(beta.shape, delta.shape, d.shape)
     out = np.empty(shape)
     for long, points, place in group_by((beta, delta, d), d >= 1):
         kernel = _long_limit if long else _short_limit
-        if out.size <= few:
+        if route == "numpy" or (route == "auto" and out.size <= FEW):
             # Each device is computed once.
             with np.errstate(all="ignore"):
                 out[place] = kernel(points[0], *np.broadcast_arrays(*points[1:]))

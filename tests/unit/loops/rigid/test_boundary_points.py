@@ -36,22 +36,6 @@ def devices(count=COUNT, seed=5):
     return delta, np.minimum(n + f, 1e5)
 
 
-def in_parts(function, *columns, **lines):
-    """Calls of few points, which NumPy answers."""
-    size = 4096
-    parts = []
-    for start in range(0, columns[0].size, size):
-        cut = slice(start, start + size)
-        named = {
-            name: tuple(part[cut] for part in line) if isinstance(line, tuple) else line[cut]
-            for name, line in lines.items()
-            if not isinstance(line, str)
-        }
-        words = {name: line for name, line in lines.items() if isinstance(line, str)}
-        parts.append(function(*(column[cut] for column in columns), **named, **words))
-    return type(parts[0])(*map(np.concatenate, zip(*parts, strict=True)))
-
-
 def judged(stable, alpha, beta, use):
     """How many walls of ``use`` have not this verdict."""
     delta, d = devices()
@@ -65,7 +49,7 @@ def test_columns_end_where_stability_does(side):
     random = np.random.default_rng(1)
     soft = 10 ** random.uniform(-45, 0, COUNT)
     alpha = np.where(random.random(COUNT) < 0.5, soft, 10 ** random.uniform(-1, 1, COUNT)) / (d + 1) ** 2
-    points = in_parts(zwidth.boundary_point, delta, d, alpha=alpha, side=side)
+    points = zwidth.boundary_point(delta, d, alpha=alpha, side=side)
     found = points.status == Status.OK
     assert np.isin(points.status, [Status.OK, Status.NO_BOUNDARY]).all()
     assert 0.6 < found.mean() < 1
@@ -73,7 +57,7 @@ def test_columns_end_where_stability_does(side):
     step = np.maximum(1e-9 * np.abs(points.beta + delta), 16 * tol.EPS64 * np.maximum(delta, np.abs(points.beta)))
     step = step if side == "lower" else -step
     # Beside the ridge float64 knows alpha better than beta: a stiffer column by 1e-6 has no end there.
-    clear = in_parts(zwidth.boundary_point, delta, d, alpha=alpha * (1 + 1e-6)).status == Status.OK
+    clear = zwidth.boundary_point(delta, d, alpha=alpha * (1 + 1e-6)).status == Status.OK
     assert not judged(True, alpha, points.beta + step, found & clear).size
     assert not judged(False, alpha, points.beta - step, found).size
     # Where there is no end, the row of the ridge is unstable at this stiffness.
@@ -87,7 +71,7 @@ def test_rows_end_where_stability_does():
     # The verdict itself loses digits closer to -delta: there the next test judges.
     b = np.maximum(share * (delta + 1 / (d + 1)), 1e-5 * delta)
     beta = np.where(b < 1e-60, 0.0, b - delta)
-    points = in_parts(zwidth.boundary_point, delta, d, beta=beta)
+    points = zwidth.boundary_point(delta, d, beta=beta)
     found = points.status == Status.OK
     assert 0.5 < found.mean() < 1
     assert not judged(True, points.alpha * (1 - 1e-9), beta, found).size

@@ -71,9 +71,9 @@ def test_every_adversarial_label_is_found():
 def test_compiled_and_plain_filters_agree_with_the_labels():
     # More points than NumPy is given, by repetition; the compiled filter's labels must be right as well.
     points = adversarial()
-    alpha, beta, delta, d = (np.tile(points[name], 2) for name in NAMES)
-    assert alpha.size > FEW
-    code, label = filter_walls(fold_arguments((alpha, beta, delta, d)).points), np.tile(points["label"], 2)
+    times = FEW // points["label"].size + 1
+    alpha, beta, delta, d = (np.tile(points[name], times) for name in NAMES)
+    code, label = filter_walls(fold_arguments((alpha, beta, delta, d)).points), np.tile(points["label"], times)
     decided = code < OPEN
     assert decided.mean() > 0.7
     np.testing.assert_array_equal(code[decided] == 1, label[decided] == STABLE)

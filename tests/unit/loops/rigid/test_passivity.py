@@ -307,6 +307,7 @@ def test_maps_are_the_scattered_walls(d):
     np.testing.assert_array_equal(zwidth.is_passive(alpha, beta, 1.0, d), grid > 0)
 
 
+@pytest.mark.usefixtures("early_compiler")
 def test_several_delays_in_one_map():
     delays = np.array([0.0, np.nan, 2.0, 0.3])[:, None, None]
     alpha, beta = np.linspace(0, 1, 100)[:, None], np.linspace(-1, 1, 90)

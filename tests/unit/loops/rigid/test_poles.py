@@ -208,6 +208,7 @@ def test_the_iteration_is_right_to_the_last_digits_wherever_eigenvalues_are():
     assert wrong == []
 
 
+@pytest.mark.usefixtures("early_compiler")
 @pytest.mark.parametrize(("d", "beta"), [(0.0, None), (2.5, None), (2.0, 0.0), (2.5, 0.0)])
 def test_compiled_and_not_compiled_walls_have_the_same_poles(d, beta):
     rng = np.random.default_rng(4)
