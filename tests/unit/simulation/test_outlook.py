@@ -199,7 +199,7 @@ def test_a_damper_without_a_spring_comes_to_rest_where_it_is(name):
     """No place is asked for: the device coasts by ``m v/(b + B)``, and readings shift with it."""
     scene = SCENE.replace(velocity=VELOCITIES[name])
     damping = np.linspace(5.0, 8.0, MANY)
-    given = {"start_position": 2e-3, "start_velocity": 0.05}
+    given: dict[str, Any] = {"start_position": 2e-3, "start_velocity": 0.05}
     now, later = (scene.simulate(0.0, damping, **given, periods=periods) for periods in (60, 6000))
     assert now.outcome.tolist() == [CODES.DECAYING] * MANY
     assert later.outcome.tolist() == [CODES.REST] * MANY
