@@ -54,8 +54,7 @@ def choose_structure(
     rigid, rival = (best, pole, banks), None
     for _ in range(_MOST):
         # A lag has no size of its own, and so is seen where a pole of any size is not.
-        lags = not best.model.lag and look_for_lags(best).toward.max() ** 2 > 2.0 * np.log(best.count)
-        if rival is not None or (pole is None and not lags):
+        if rival is not None or (pole is None and not _shows_lags(best)):
             break
         richer, rival = _grow(best, banks, longest, resolution)
         if richer is None:
@@ -65,6 +64,10 @@ def choose_structure(
     known = best.arrived and not best.inverse.open[: best.model.parts.stop].any()
     explained = rival is not None or (pole is None and best.excess <= ALIKE)
     return (best, rival or pole, banks) if explained and known else rigid
+
+
+def _shows_lags(best: FittedModel) -> bool:
+    return not best.model.lag and look_for_lags(best).toward.max() ** 2 > 2.0 * np.log(best.count)
 
 
 def _grow(

@@ -81,7 +81,7 @@ class StructuredRecordings(Recordings):
             late, by_late = _delay(theta, self.lag, log)
             turn = own[2] + by_late @ own[3 : 3 + self.lag]
             for sign, by, there in ((g, own[2], d), (-g, turn, d + late)):
-                speed = _follow(log, -delta, there)
+                speed = ways[-delta] if there == d else _follow(log, -delta, there)
                 slide = _slide(log, delta, there, speed)
                 place += sign * slide.position
                 slides.append((sign, by, speed.position, slide))
