@@ -54,7 +54,8 @@ def choose_structure(
     rigid, rival = (best, pole, banks), None
     for _ in range(_MOST):
         # A lag has no size of its own, and so is seen where a pole of any size is not.
-        if rival is not None or (pole is None and not _shows_lags(best)):
+        lags = pole is None and not best.model.lag and look_for_lags(best).toward.max() ** 2 > 2.0 * np.log(best.count)
+        if rival is not None or (pole is None and not lags):
             break
         richer, rival = _grow(best, banks, longest, resolution)
         if richer is None:
@@ -64,10 +65,6 @@ def choose_structure(
     known = best.arrived and not best.inverse.open[: best.model.parts.stop].any()
     explained = rival is not None or (pole is None and best.excess <= ALIKE)
     return (best, rival or pole, banks) if explained and known else rigid
-
-
-def _shows_lags(best: FittedModel) -> bool:
-    return not best.model.lag and look_for_lags(best).toward.max() ** 2 > 2.0 * np.log(best.count)
 
 
 def _grow(
