@@ -91,10 +91,10 @@ class NeededAnswer:
         slopes = 1j * (at.z * (self.late / above - 1.0 / below) - self.whole - 1.0)
         return Jet(each.sum(0), (each * slopes).sum(0))
 
-    def moves(self, at: CirclePoints) -> tuple[np.ndarray, np.ndarray]:
-        """The derivatives in delta and d of q, of the rigid device alone."""
+    def moves(self, at: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The derivatives in delta and d of q, that of the rigid device alone."""
         by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
-        total, q = _answer(self.plant, at), self.rigid_jet(at).value
+        total = _answer(self.plant, at)
         return (
             q * (by_delta.em / (at.before + self.plant.em) - _answer(by_delta, at) / total),
             -q * _answer(by_fraction, at) / total,
@@ -185,16 +185,18 @@ class Onsets:
             rest, slope = (self.rub * f.value - mass * q.value).imag, (self.rub * f.slope - mass * q.slope).imag
             step = np.clip(-rest / slope, -_LONGEST * w, _LONGEST * w)
             w = np.minimum(w + step, 0.5 * (w + np.pi))
-            if np.all(np.abs(step) <= _ARRIVED * w):
+            # Nothing comes of a wall that is NaN.
+            if not np.any(np.abs(step) > _ARRIVED * w):
                 break
         at = circle(w)
         f, q = estimate.jet(at), answer.jet(at)
         kappa = (mass * q.value - self.rub * f.value).real
         # kappa and w as theta moves: d kappa + e_w dw = m dq - rub dF with e_w = rub F' - m q'.
-        change = np.stack([q.value, *answer.moves(at)], -1)
+        rigid = answer.rigid_jet(at).value if answer.beside else q.value
+        change = np.stack([q.value, *answer.moves(at, rigid)], -1)
         if answer.beside:
             # q = -1/G: what moves the mass alone counts by the square of its share.
-            change[:, 1:] *= (q.value / answer.rigid_jet(at).value)[:, None] ** 2
+            change[:, 1:] *= (q.value / rigid)[:, None] ** 2
             k = np.r_[1, 2, self._rigid : self.unknowns]
             sides = theta[:, None, None, None] + _STEP * np.eye(theta.size)[:, k, None, None] * _SIDES[:, None]
             more = np.einsum("kjn,j->nk", self.answer(sides).add(at).value, _WEIGHTS) / _STEP

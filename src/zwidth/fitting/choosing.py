@@ -54,7 +54,7 @@ def choose_structure(
     rigid, rival = (best, pole, banks), None
     for _ in range(_MOST):
         # A lag has no size of its own, and so is seen where a pole of any size is not.
-        lags = not best.model.lag and look_for_lags(best).toward.max() ** 2 > 2.0 * np.log(best.count)
+        lags = pole is None and not best.model.lag and look_for_lags(best).toward.max() ** 2 > 2.0 * np.log(best.count)
         if rival is not None or (pole is None and not lags):
             break
         richer, rival = _grow(best, banks, longest, resolution)

@@ -84,9 +84,10 @@ class MeasurementNoise:
     def weigh(self, columns: np.ndarray) -> np.ndarray:
         """Columns over samples in which the mean of every stretch is so small that it counts by its own variance."""
         rows, starts, sizes, alike = self._rests
+        if not rows.size:
+            return columns
         weighed, beyond = columns.copy(), (1.0 - alike**-0.5) / sizes
-        if rows.size:
-            weighed[rows] -= np.repeat((np.add.reduceat(columns[rows], starts).T * beyond).T, sizes, axis=0)
+        weighed[rows] -= np.repeat((np.add.reduceat(columns[rows], starts).T * beyond).T, sizes, axis=0)
         return weighed
 
     def spread(self, slopes: np.ndarray) -> np.ndarray:
@@ -103,7 +104,8 @@ class MeasurementNoise:
         plain = np.sum(columns**2, 0)
         total = self.variance * plain
         for wave, weight in self._waves():
-            total = total + weight * (np.abs(columns.T @ wave) ** 2 - plain)
+            # Real and imaginary parts, for a product with complex numbers would copy the columns as such.
+            total = total + weight * (np.sum((columns.T @ wave.view(float).reshape(-1, 2)) ** 2, 1) - plain)
         return total
 
     def spread_of_sums(self, count: int, weights: MeasurementNoise) -> float:

@@ -284,24 +284,26 @@ def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, 
     )
     sizes, late = _size_modes(best, bank.rates)
     last = _filter_forces(best, 1.0, np.array([-np.inf]))[0]
+    last_shares = basis.T @ last
+    last_cleared, numbers = last - basis @ last_shares, best.inverse.matrix @ basis / best.columns[1][:, None]
     modes = np.stack([sizes.imag, sizes.real], -1)[:, -parts:]
     count = max(1, _AT_ONCE // (2 * rest.size))
     for first in range(0, frequency.size, count):
         part = slice(first, first + count)
         columns, mode = _filter_forces(best, ratio, bank.rates[part]), modes[part].T
-        cleared = columns - basis @ (basis.T @ columns)
+        shares = basis.T @ columns
+        cleared = columns - basis @ shares
         own = np.linalg.norm(cleared, axis=1).min(0) <= _OWN * np.linalg.norm(columns, axis=1).max(0)
         square = np.array([[np.sum(one * other, 0) for other in cleared] for one in cleared]).T
         along, by = (rest @ cleared).T, np.linalg.pinv(square, rcond=_OWN**2, hermitian=True)
         bank.explained[part] = np.where(own, 0.0, np.einsum("ki,kij,kj->k", along, by, along)) / noise
-        moved = np.sum(columns * mode[:, None], 0) - last * late[part]
-        left = moved - basis @ (basis.T @ moved)
+        left = np.sum(cleared * mode[:, None], 0) - last_cleared * late[part]
         size = np.linalg.norm(left, axis=0)
         bank.whole[part], size = size / np.sqrt(noise), np.where(own | (size == 0), np.inf, size)
         bank.toward[part] = rest @ left / size / np.sqrt(noise)
         errors = best.noise.spread_each(best.model.weigh(left)) * best.excess
         bank.kindred[part] = np.sqrt(np.maximum(errors / size**2 / noise, 1.0))
-        bank.absorbed[:, part] = best.inverse.matrix @ moved / best.columns[1][:, None]
+        bank.absorbed[:, part] = numbers @ (np.sum(shares * mode[:, None], 0) - last_shares * late[part])
     return bank
 
 
@@ -309,9 +311,10 @@ def _filter_forces(best: FittedModel, ratio: float, rates: np.ndarray) -> np.nda
     """What poles make of all forces, at the positions, a column each; imaginary parts behind the real ones."""
     ends = np.cumsum([0, *(log.position.size for log in best.model.logs)])
     whole, late = int(best.theta[2]), np.empty((1 if ratio == 1.0 else 2, rates.size, ends[-1]))
-    for k, pole in enumerate(np.exp(rates)):
-        for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
-            moved = recur(pole, np.append(0.0, log.force[:-1]))[log.skip - whole :][: end - start]
+    for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
+        force = np.append(0.0, log.force[:-1])
+        for k, pole in enumerate(np.exp(rates)):
+            moved = recur(pole, force)[log.skip - whole :][: end - start]
             late[:, k, start:end] = [np.real(moved), np.imag(moved)][: len(late)]
     return np.array([best.model.weigh(part.T) for part in late])
 

@@ -59,6 +59,12 @@ class Recording:
     position: np.ndarray
     skip: int
 
+    @cached_property
+    def pushes(self) -> np.ndarray:
+        """The force of each sample and that of the one before; two more, for a search may pass delays less than 0."""
+        force = np.concatenate([[0.0, 0.0], self.force, self.force[-1:], self.force[-1:]])
+        return np.array([force[1:-1], force[:-2]])
+
     def begin(self, count: int) -> Recording:
         """So many first positions alone, counted from where the force first changes, for before that little is seen."""
         count += max(0, int(np.argmax(self.force != self.force[0])) - self.skip)
@@ -157,8 +163,8 @@ def _follow(
     a, held_after, way_after = np.where(held, 0.0, push - way * c), pieces.held_after[k], pieces.way_after[k]
     a_after = np.where(held_after, 0.0, push[k] - way_after * c)
     t, r = pieces.before[k], (length - pieces.before)[k]
-    first, second = zip(*(np.split(each, 2) for each in phi_functions(delta * np.append(t, r))), strict=True)
-    first, second, spans = PhiFunctions(*first), PhiFunctions(*second), length[:2]
+    both, spans = phi_functions(delta * np.append(t, r)), length[:2]
+    first, second = (PhiFunctions(*(each[part] for each in both)) for part in np.s_[: t.size, t.size :])
     moved = (kinds.phi1 * spans * v.reshape(-1, 2) + kinds.phi2 * spans**2 * a.reshape(-1, 2)).ravel()
     moved[k] = t * first.phi1 * v[k] + t**2 * first.phi2 * a[k] + r**2 * second.phi2 * a_after
 

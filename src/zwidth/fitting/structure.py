@@ -81,14 +81,14 @@ class StructuredRecordings(Recordings):
             late, by_late = _delay(theta, self.lag, log)
             turn = own[2] + by_late @ own[3 : 3 + self.lag]
             for sign, by, there in ((g, own[2], d), (-g, turn, d + late)):
-                speed = _follow(log, -delta, there)
+                speed = ways[-delta] if there == d else _follow(log, -delta, there)
                 slide = _slide(log, delta, there, speed)
                 place += sign * slide.position
                 slides.append((sign, by, speed.position, slide))
 
         def differentiate() -> np.ndarray:
             # Rows, and how their real parts count in the slopes. A delay moves E by -E' = -p E - F.
-            parts = [(_prolong(log)[log.skip - 1 - int(np.floor(d)) + now], -own[2] * weights[:, 0].sum()), *ringing]
+            parts = [(log.pushes[0, log.skip - int(np.floor(d)) + now], -own[2] * weights[:, 0].sum()), *ringing]
             for pole, by, (weight, *slopes) in zip(poles.tolist(), by_theta, weights, strict=True):
                 way = ways[pole]
                 parts += [(way.position, slopes - pole * weight * own[2]), (way.slopes, weight * by)]
@@ -190,18 +190,18 @@ def find_roots(w: Any, ratio: Any) -> np.ndarray:
 
 def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:
     """``E_p`` at the positions, from rest at the log's first sample; its slope is that in p."""
-    whole, force = int(np.floor(d)), np.append([0.0, 0.0], _prolong(log))
+    whole = int(np.floor(d))
     f, pole, first = d - whole, pole if pole.imag else pole.real, log.skip - whole
     seen = slice(first, first + log.position.size)
     # What a new force and the older one move until a sample, and a little beside the pole.
     at = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
     at = np.where(at == 0, 1e-300, at)
     held = np.expm1(np.array([1.0 - f, f]) * at) / at * np.exp([0.0, 1.0 - f] * at)
-    turn, forces = np.exp(pole), np.array([force[1:-1], force[:-2]])
-    ways = recur(turn, held[0] @ forces)
+    turn = np.exp(pole)
+    ways = recur(turn, held[0] @ log.pushes)
 
     def differentiate() -> np.ndarray:
-        moves = (held[1] - held[2]) * 0.5 / _STEP @ forces
+        moves = (held[1] - held[2]) * 0.5 / _STEP @ log.pushes
         moves[1:] += turn * ways[:-1]
         return recur(turn, moves)[seen]
 
@@ -211,19 +211,14 @@ def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:
 def _slide(log: Recording, delta: float, d: float, speed: ModelledMotion) -> ModelledMotion:
     """The way of a mass with g = 1 and no friction from the first position on; its slope is that in delta."""
     whole = int(np.floor(d))
-    spans, now = np.array([d - whole, 1.0 - d + whole, 1.0]), log.skip - whole + np.arange(log.position.size - 1)
+    spans, now = np.array([d - whole, 1.0 - d + whole, 1.0]), log.skip - whole
     at = phi_functions((delta + _STEP * np.array([[0.0], [1.0], [-1.0]])) * spans)
     reach, way = (at.phi1 * spans).T, (at.phi2 * spans**2).T
-    factors, force = np.array([reach[2], way[0] + reach[0] * reach[1], way[1]]), _prolong(log)
-    terms = np.array([speed.position[:-1], force[now - 1], force[now]])
+    factors = np.array([reach[2], way[0] + reach[0] * reach[1], way[1]])
+    terms = np.vstack([speed.position[:-1], log.pushes[::-1, now + 1 : now + log.position.size]])
 
     def differentiate() -> np.ndarray:
         steps = 0.5 / _STEP * (factors[:, 1] - factors[:, 2]) @ terms - factors[0, 0] * speed.slopes[:-1]
         return np.append(0.0, np.cumsum(steps))
 
     return ModelledMotion(np.append(0.0, np.cumsum(factors[:, 0] @ terms)), differentiate)
-
-
-def _prolong(log: Recording) -> np.ndarray:
-    """The forces, and two more: a search may pass delays of a period less than none."""
-    return np.append(log.force, 2 * [log.force[-1]])
