@@ -402,5 +402,6 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
             left = [level.solve_all(level.split(cells, larger), kind == 1) for kind, cells in enumerate(left)]
             if not any(cells.size for cells in left):
                 break
-        level.forget(np.concatenate(left, axis=1))
+            if sides == sizes[-1]:
+                level.forget(np.concatenate(left, axis=1))
     return canvas.cut_out(area.window)
