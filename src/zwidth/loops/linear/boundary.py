@@ -231,26 +231,26 @@ def _solve_rows(
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
     found = below + np.where(np.isfinite(first) & np.isfinite(last), share, 0.5) * (above - below)
-    at_ends = [(first == 0, below.copy()), (last == 0, above.copy())]
-    here = np.arange(beta.size)
-    x = found.copy()
-    for step in range(_MOST_STEPS):
+    # A row through an end of its arc meets the line there in one point, with nothing between them.
+    found = np.where(last == 0, above, np.where(first == 0, below, found))
+    here = np.flatnonzero((first != 0) & (last != 0))
+    x = found[here]
+    for step in range(_MOST_STEPS if here.size else 0):
         value, slope, _ = _residual(loop, fixed, beta[here], x)
         ahead = (value < 0) == rising[here]
         below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
         with np.errstate(all="ignore"):
             new = x - value / slope
         good = (new >= below[here]) & (new <= above[here]) & (step % 6 != 5)
-        new = np.where(good, new, 0.5 * (below[here] + above[here]))
+        # Who has arrived at an end of the bracket may leave it by rounding.
+        good |= np.abs(new - x) <= _ARRIVED * x
+        new = np.where(good, np.clip(new, below[here], above[here]), 0.5 * (below[here] + above[here]))
         found[here] = new
         # A step so short leaves rounding: each next one would be its square.
         on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
         if not on.any():
             break
         here, x = here[on], new[on]
-    # A row through an end of its arc meets the line there in one point, with nothing between them.
-    for exact, end in at_ends:
-        found = np.where(exact, end, found)
     return found, _residual(loop, fixed, beta, found)[2]
 
 
