@@ -195,23 +195,17 @@ class _Level:
         self.area, self.sides, self.wanted, self.canvas = area, sides, wanted, canvas
         self.axes = _AxisPieces(area.alpha, sides[1]), _AxisPieces(area.beta, sides[0])
         self.radius, self.rate = _tiles(canvas.radius, sides), _tiles(canvas.rate, sides)
-        self.first = canvas.first // self._steps
-
-    @property
-    def _steps(self) -> np.ndarray:
-        """Walls between neighbors, of devices, rows and columns of cells."""
-        return np.array([[1], *([side] for side in self.sides)])
+        # Walls between neighbors, of devices, rows and columns of cells.
+        self.steps = np.array([[1], *([side] for side in sides)])
+        self.first = canvas.first // self.steps
 
     def split(self, places: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
         """Cells of such sides in those of this size, without what is beyond the window."""
-        parts = [large // small for large, small in zip(sides, self.sides, strict=True)]
-        within = np.stack(np.unravel_index(np.arange(parts[0] * parts[1]), (1, *parts)))
-        places = (places * [[1], *([part] for part in parts)])[:, :, None] + within[:, None]
-        places = places.reshape(3, -1)
-        low = (places * self._steps)[1:]
-        ends = [[[part.start], [part.stop]] for part in self.area.window]
-        start, stop = np.swapaxes(ends, 0, 1)
-        return places[:, ((low < stop) & (low + self._steps[1:] > start)).all(0)]
+        parts = np.array([1, *sides]) // self.steps[:, 0]
+        within = np.indices(parts.tolist()).reshape(3, 1, -1)
+        places = ((places * parts[:, None])[:, :, None] + within).reshape(3, -1)
+        low, (start, stop) = (places * self.steps)[1:], np.array([(w.start, w.stop) for w in self.area.window]).T
+        return places[:, ((low < stop[:, None]) & (low + self.steps[1:] > start[:, None])).all(0)]
 
     def solve_all(self, places: np.ndarray, fractional: bool) -> np.ndarray:
         """`solve` list by list."""
@@ -377,7 +371,7 @@ class _Level:
         """Note the walls whose side of the circle is in doubt, or that are NaN."""
         flat = np.flatnonzero(~(np.abs(radius - 1.0) > 1.01 * self.wanted.doubt))
         cell, *inside = np.unravel_index(flat, radius.shape)
-        corner = (self._steps * (places - self.first))[1:, cell]
+        corner = (self.steps * (places - self.first))[1:, cell]
         self.canvas.special.append(np.concatenate([places[:1, cell], corner + inside]))
 
 
@@ -389,9 +383,7 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
     sizes, wanted = _sides(area.beta.shape[1], area.alpha.shape[1]), AllowedErrors(accuracy, with_rate)
     held = area.d != np.floor(area.d)
     canvas = _Canvas(area, sizes[0], with_rate)
-    corners = [
-        np.arange(part.start // side, -(-part.stop // side)) for part, side in zip(area.window, sizes[0], strict=True)
-    ]
+    corners = [np.arange(w.start // side, -(-w.stop // side)) for w, side in zip(area.window, sizes[0], strict=True)]
     left = [
         np.stack([part.reshape(-1) for part in np.meshgrid(np.flatnonzero(held == kind), *corners, indexing="ij")])
         for kind in (False, True)
