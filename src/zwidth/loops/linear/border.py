@@ -113,10 +113,9 @@ class Border:
         # Most ends are those of two edges.
         ends = ends[np.diff(ends, prepend=-np.inf) > 0.1 * beside]
         rows = (ends[:, None] + beside * np.array([-1.0, 1.0])).ravel()
-        intervals, crossed = bound_intervals(b, rows), b.crossings(rows).w
-        for column in np.concatenate([intervals.below, intervals.above], 1).T:
-            on = np.flatnonzero((column >= 0) & (column < len(b.arcs)))
-            w = crossed[on, column[on]]
+        found = bound_intervals(b, rows)
+        for column, angles in ((found.below, found.w_below), (found.above, found.w_above)):
+            w = angles[(column >= 0) & (column < len(b.arcs))]
             within.append(w[[not any(e.w[0] - _BESIDE <= at <= e.w[-1] + _BESIDE for e in edges) for at in w]])
         return np.unique(np.concatenate(within))
 

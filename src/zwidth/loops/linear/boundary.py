@@ -79,26 +79,76 @@ class Boundary:
     def crossings(self, beta: np.ndarray) -> Crossings:
         """Where the rows of these dampings, shape (rows,), cross the boundary."""
         beta, sound = self._settle(beta)
-        cells = [_cells(arc, beta) for arc in self.arcs]
-        row = np.concatenate([rows for rows, _ in cells])
-        place = np.repeat(np.arange(len(cells)), [rows.size for rows, _ in cells])
-        low = np.concatenate([arc.w[k - 1] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
-        high = np.concatenate([arc.w[k] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
-        leaving = np.array([arc.leaving for arc in self.arcs])[place]
-        w, alpha = _solve_rows(self.loop, self._fixed, beta[row], low, high, leaving)
+        steps = self._steps
+        place, row, k = steps.meet(beta)
+        w, alpha = self._solve(beta[row], place, k)
         shape = beta.size, len(self.arcs) + len(self.lines)
         out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape), sound)
         out.alpha[row, place], out.w[row, place] = alpha, w
-        out.leaving[row, place] = leaving
+        out.leaving[row, place] = steps.leaving[place]
         for place, line in enumerate(self.lines, len(self.arcs)):
             out.alpha[:, place] = line.q - beta * line.f
             out.w[:, place] = line.w
             out.leaving[:, place] = line.leaving(beta)
         return out
 
+    def _solve(self, beta: np.ndarray, place: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The angle before node ``k`` of all arcs' at which each row crosses, and its alpha.
+
+        ``Im(q - beta F)``, which rises with w where a pair leaves, over what vanishes on every row, by Newton's method
+        kept inside its bracket; who has arrived takes no part any more.
+        """
+        steps, nodes = self._steps, self._at_nodes
+        lower = np.where(steps.w[k - 1] < steps.w[k], k - 1, k)
+        upper = 2 * k - 1 - lower
+        below, above = steps.w[lower], steps.w[upper]
+        middle = np.cos(0.5 * (below + above))
+        signs = [np.sign(middle - np.cos(w)) for w in self._fixed]
+        rising = steps.leaving[place] * np.prod(signs, axis=0) > 0
+        first, last = nodes.pick(lower).of_rows(beta), nodes.pick(upper).of_rows(beta)
+        # A row through an end of its arc meets the line there in one point, with nothing between them.
+        found = np.where(last.ratio == 0, above, np.where(first.ratio == 0, below, _between(below, above, first, last)))
+        alpha = np.where(last.ratio == 0, last.alpha, first.alpha)
+        here = np.flatnonzero((first.ratio != 0) & (last.ratio != 0))
+        x = found[here]
+        for step in range(_MOST_STEPS if here.size else 0):
+            row = self._look(x).of_rows(beta[here])
+            ahead = (row.ratio < 0) == rising[here]
+            below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
+            with np.errstate(all="ignore"):
+                new = x - row.ratio / row.ratio_slope
+            good = (new >= below[here]) & (new <= above[here]) & (step % 6 != 5)
+            # Who has arrived at an end of the bracket may leave it by rounding.
+            good |= np.abs(new - x) <= _ARRIVED * x
+            new = np.where(good, np.clip(new, below[here], above[here]), 0.5 * (below[here] + above[here]))
+            # A step so short leaves rounding: each next one would be its square.
+            found[here], alpha[here] = new, row.alpha + (new - x) * row.alpha_slope
+            on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
+            if not on.any():
+                break
+            here, x = here[on], new[on]
+        return found, alpha
+
+    def _look(self, w: np.ndarray) -> _Angles:
+        """The loop at angles, for any rows."""
+        at, whole, turn = circle(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
+        for angle in self._fixed:
+            factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
+            whole, turn = whole * factor, turn * factor - whole * np.sin(w)
+        with np.errstate(all="ignore"):
+            return _Angles(*self.loop.required_wall(at), *self.loop.estimate.jet(at), whole, turn)
+
+    @cached_property
+    def _at_nodes(self) -> _Angles:
+        return self._look(self._steps.w)
+
+    @cached_property
+    def _steps(self) -> _Steps:
+        return _Steps.join(self.arcs)
+
     def arc_at(self, w: np.ndarray) -> np.ndarray:
         """The arc that an angle lies on."""
-        return np.searchsorted([arc.first for arc in self.arcs], w, side="right") - 1
+        return np.searchsorted(self._steps.slowest, w, side="right") - 1
 
     @property
     def _fixed(self) -> list[float]:
@@ -126,9 +176,7 @@ class Boundary:
 
     def _missed(self, beta: np.ndarray) -> np.ndarray:
         """By how many poles the crossings of each row fail to lead to the count far above."""
-        total = np.full(beta.shape, float(self.base - self.top))
-        for arc in self.arcs:
-            total += np.where((beta >= arc.beta[0]) & (beta < arc.beta[-1]), arc.leaving, 0.0)
+        total = float(self.base - self.top) + self._steps.leaving @ self._steps.are_met(beta)
         for line in self.lines:
             total += line.leaving(beta)
         return total
@@ -148,23 +196,19 @@ class Boundary:
         """
         but = np.broadcast_to(but, beta.shape)
         beta, sound = self._settle(beta)
+        steps = self._steps
+        place, row, k = steps.meet(beta)
+        counted = but[row] != place
+        place, row, k = place[counted], row[counted], k[counted]
+        with np.errstate(all="ignore"):
+            share = (beta[row] - steps.beta[k - 1]) / (steps.beta[k] - steps.beta[k - 1])
+            share = np.where(steps.straight[k], share, 0.5)
+            away = alpha[row] - (steps.alpha[k - 1] + share * (steps.alpha[k] - steps.alpha[k - 1]))
+            passed, near = away > steps.room[k], ~(np.abs(away) > steps.room[k])
+        if near.any():
+            passed[near] = self._solve(beta[row[near]], place[near], k[near])[1] < alpha[row[near]]
         total = np.zeros(beta.shape)
-        near: list[tuple[np.ndarray, ...]] = []
-        for place, arc in enumerate(self.arcs):
-            row, k = _cells(arc, beta)
-            with np.errstate(all="ignore"):
-                share = (beta[row] - arc.beta[k - 1]) / (arc.beta[k] - arc.beta[k - 1])
-                share = np.where(arc.straight[k - 1], share, 0.5)
-                away = alpha[row] - (arc.alpha[k - 1] + share * (arc.alpha[k] - arc.alpha[k - 1]))
-                above, below = away > arc.room[k - 1], away < -arc.room[k - 1]
-            counted = but[row] != place
-            total[row[above & counted]] += arc.leaving
-            left = ~(above | below) & counted
-            near.append((row[left], np.full(left.sum(), arc.leaving), arc.w[k[left] - 1], arc.w[k[left]]))
-        row, leaving, low, high = (np.concatenate(column) for column in zip(*near, strict=True))
-        if row.size:
-            passed = _solve_rows(self.loop, self._fixed, beta[row], low, high, leaving)[1] < alpha[row]
-            np.add.at(total, row[passed], leaving[passed])
+        np.add.at(total, row[passed], steps.leaving[place[passed]])
         for place, line in enumerate(self.lines, len(self.arcs)):
             passed = (line.q - beta * line.f < alpha) & (but != place)
             total += np.where(passed, line.leaving(beta), 0.0)
@@ -208,64 +252,90 @@ class Boundary:
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
 
 
-def _cells(arc: Arc, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows that meet an arc, and before which of its nodes."""
-    # A row through an end of arcs is counted as the row just above it.
-    row = np.flatnonzero((beta >= arc.beta[0]) & (beta < arc.beta[-1]))
-    return row, np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
+class _Steps(NamedTuple):
+    """All arcs one after another: of each node, and of the step that leads to it from the one before."""
+
+    w: np.ndarray
+    beta: np.ndarray
+    alpha: np.ndarray
+    straight: np.ndarray
+    room: np.ndarray
+    keys: np.ndarray  # of each node: its arc, then its place among the dampings of all
+    dampings: np.ndarray
+    first: np.ndarray  # of each arc: its first node in these
+    ends: np.ndarray  # (2, arcs): between which dampings it is
+    leaving: np.ndarray
+    slowest: np.ndarray  # its lowest angle
+
+    @classmethod
+    def join(cls, arcs: tuple[Arc, ...]) -> _Steps:
+        """Lay the arcs of a boundary one after another."""
+        w, beta, alpha = (
+            np.concatenate([np.empty(0), *parts]) for parts in zip(*(arc[:3] for arc in arcs), strict=True)
+        )
+        straight, room = (
+            np.concatenate([np.append(parts[0][:1], part) for part in parts])
+            for parts in zip(*(arc[3:5] for arc in arcs), strict=True)
+        )
+        sizes = [arc.w.size for arc in arcs]
+        dampings, keys = np.unique(beta, return_inverse=True)
+        keys = keys + np.repeat(np.arange(len(arcs)), sizes) * dampings.size
+        ends = np.array([arc.beta[[0, -1]] for arc in arcs]).T
+        own = np.array([(arc.leaving, arc.first) for arc in arcs]).T
+        return cls(w, beta, alpha, straight, room, keys, dampings, np.cumsum([0, *sizes[:-1]]), ends, *own)
+
+    def are_met(self, beta: np.ndarray) -> np.ndarray:
+        """Which arcs rows meet: (arcs, rows)."""
+        # A row through an end of arcs is counted as the row just above it.
+        return (beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None])
+
+    def meet(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The arcs that rows meet, the rows, and before which of the nodes."""
+        place, row = np.nonzero(self.are_met(beta))
+        k = np.searchsorted(self.keys, place * self.dampings.size + np.searchsorted(self.dampings, beta)[row])
+        return place, row, np.maximum(k, self.first[place] + 1)
 
 
-def _solve_rows(
-    loop: LoopRoots, fixed: list[float], beta: np.ndarray, low: np.ndarray, high: np.ndarray, leaving: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The angle between two nodes at which each row crosses, and its alpha.
+class _Row(NamedTuple):
+    """Of rows at angles: what vanishes at a crossing, ``Re(q - beta F)``, and their slopes in w."""
 
-    ``Im(q - beta F)``, which rises with w where a pair leaves, over what vanishes on every row, by Newton's method kept
-    inside its bracket; who has arrived takes no part any more.
-    """
-    cosine = np.cos(0.5 * (low + high))
-    rising = leaving * np.prod([np.sign(cosine - np.cos(w)) for w in fixed], axis=0) > 0
-    below, above = np.minimum(low, high), np.maximum(low, high)
-    first, last = _residual(loop, fixed, beta, below)[0], _residual(loop, fixed, beta, above)[0]
-    with np.errstate(all="ignore"):
-        share = first / (first - last)
-    share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
-    found = below + np.where(np.isfinite(first) & np.isfinite(last), share, 0.5) * (above - below)
-    # A row through an end of its arc meets the line there in one point, with nothing between them.
-    found = np.where(last == 0, above, np.where(first == 0, below, found))
-    here = np.flatnonzero((first != 0) & (last != 0))
-    x = found[here]
-    for step in range(_MOST_STEPS if here.size else 0):
-        value, slope, _ = _residual(loop, fixed, beta[here], x)
-        ahead = (value < 0) == rising[here]
-        below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
+    ratio: np.ndarray
+    ratio_slope: np.ndarray
+    alpha: np.ndarray
+    alpha_slope: np.ndarray
+
+
+class _Angles(NamedTuple):
+    """q and F at angles with their slopes, and ``sin w prod(cos w - cos fixed)`` with its own."""
+
+    q: np.ndarray
+    q_slope: np.ndarray
+    f: np.ndarray
+    f_slope: np.ndarray
+    whole: np.ndarray
+    turn: np.ndarray
+
+    def pick(self, index: np.ndarray) -> _Angles:
+        """Some of them."""
+        return _Angles(*(part[index] for part in self))
+
+    def of_rows(self, beta: np.ndarray) -> _Row:
+        """``Im(q - beta F)`` over what vanishes on every row, and the alpha of rows that cross there."""
         with np.errstate(all="ignore"):
-            new = x - value / slope
-        good = (new >= below[here]) & (new <= above[here]) & (step % 6 != 5)
-        # Who has arrived at an end of the bracket may leave it by rounding.
-        good |= np.abs(new - x) <= _ARRIVED * x
-        new = np.where(good, np.clip(new, below[here], above[here]), 0.5 * (below[here] + above[here]))
-        found[here] = new
-        # A step so short leaves rounding: each next one would be its square.
-        on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
-        if not on.any():
-            break
-        here, x = here[on], new[on]
-    return found, _residual(loop, fixed, beta, found)[2]
+            value, slope = self.q - beta * self.f, self.q_slope - beta * self.f_slope
+            end = self.whole == 0
+            safe = np.where(end, 1.0, self.whole)
+            ratio = np.where(end, slope.imag / self.turn, value.imag / safe)
+            return _Row(ratio, (slope.imag - ratio * self.turn) / safe, value.real, slope.real)
 
 
-def _residual(loop: LoopRoots, fixed: list[float], beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
-    """``Im(q - beta F)`` over ``sin w prod(cos w - cos fixed)``, its derivative; and ``Re(q - beta F)``."""
-    at = circle(w)
-    with np.errstate(all="ignore"):
-        q, f = loop.required_wall(at), loop.estimate.jet(at)
-        value, slope = q.value - beta * f.value, q.slope - beta * f.slope
-        whole = np.where(w >= np.pi, 0.0, np.sin(w))
-        turn = np.cos(w)
-        for angle in fixed:
-            factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
-            whole, turn = whole * factor, turn * factor - whole * np.sin(w)
-        end = whole == 0
-        safe = np.where(end, 1.0, whole)
-        ratio = np.where(end, slope.imag / turn, value.imag / safe)
-        return ratio, (slope.imag - ratio * turn) / safe, value.real
+@np.errstate(all="ignore")
+def _between(below: np.ndarray, above: np.ndarray, first: _Row, last: _Row) -> np.ndarray:
+    """Where a crossing between two angles is sought first: by the cubic of the inverse, or by the secant."""
+    rise, far = last.ratio - first.ratio, above - below
+    share = -first.ratio / rise
+    known = np.isfinite(first.ratio) & np.isfinite(last.ratio)
+    secant = np.where(known, np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9)), 0.5)
+    bends = rise * (1.0 - share) / first.ratio_slope, rise * share / last.ratio_slope
+    cubic = below + share * (share * (3.0 - 2.0 * share) * far + (1.0 - share) * (bends[0] - bends[1]))
+    return np.where((share > 0) & (share < 1) & (cubic > below) & (cubic < above), cubic, below + secant * far)

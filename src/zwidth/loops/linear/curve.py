@@ -60,14 +60,17 @@ def nodes_of(loop: LoopRoots) -> np.ndarray:
     # this its slope is rounding.
     last = _LAST * min([turn, *far[far > 1e-13]]) ** (2.0 / 3.0)
     w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - last, 32)[1:]])
+    nodes, low, high = [w], w[:-1], w[1:]
     for _ in range(_ROUNDS):
-        half = 0.5 * np.diff(w)
-        wide = 2.0 * half * loop.turning(w[:-1] + half, half) > _STEP * 16.0
-        wide |= 2.0 * half * loop.turning(w[:-1] + half, 0.0 * half) > _STEP
+        half = 0.5 * (high - low)
+        wide = 2.0 * half * loop.turning(low + half, half) > _STEP * 16.0
+        wide |= 2.0 * half * loop.turning(low + half, 0.0 * half) > _STEP
         if not wide.any():
             break
-        w = np.sort(np.concatenate([w, w[:-1][wide] + half[wide]]))
-    return w
+        middle = (low + half)[wide]
+        nodes.append(middle)
+        low, high = np.concatenate([low[wide], middle]), np.concatenate([middle, high[wide]])
+    return np.sort(np.concatenate(nodes))
 
 
 def zeros_of(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
@@ -187,7 +190,9 @@ def cut_arcs(
 ) -> list[Arc]:
     """Cut the curve where beta turns or runs to infinity, and where Im F changes its sign."""
     ends = np.unique(np.concatenate([list(limits), poles, turns]))
-    at_pole = {float(p) for p in poles}
+    # Its dampings there; NaN where it runs to infinity.
+    betas = dict(zip(turns.tolist(), curve_at(loop, turns).beta.tolist(), strict=True)) | limits
+    betas |= dict.fromkeys(poles.tolist(), np.nan)
     arcs = []
     for a, b in pairwise(ends.tolist()):
         inner = (w > a) & (w < b)
@@ -198,8 +203,10 @@ def cut_arcs(
         rising = np.sum(np.sign(curve.turn)) > 0
         # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w: told once, by the nodes.
         leaving = 2.0 if rising == (np.sum(np.sign(curve.fall)) > 0) else -2.0
-        first = _end_value(loop, float(a), at_pole, -1 if rising else 1, limits)
-        last = _end_value(loop, float(b), at_pole, 1 if rising else -1, limits)
+        first, last = (
+            betas[end] if np.isfinite(betas[end]) else side * np.inf
+            for end, side in ((a, -1.0 if rising else 1.0), (b, 1.0 if rising else -1.0))
+        )
         # The ends have no alpha: next to them every wall is compared with the crossing itself.
         with np.errstate(all="ignore"):
             slope = curve.turn / curve.fall**2
@@ -239,11 +246,3 @@ def _bands(
         rise, largest = np.abs(np.diff(alpha)), np.maximum(size[1:], size[:-1])
         close = 0.5 * np.abs(np.diff(w) * np.diff(alpha_slope)) + np.abs(bend - 1.0) * rise + _ROUNDING * largest
         return straight, np.where(straight, close, 1.5 * rise + _ROOM * largest)
-
-
-def _end_value(loop: LoopRoots, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:
-    if w in at_pole:
-        return side * np.inf
-    if w in limits:
-        return limits[w] if np.isfinite(limits[w]) else side * np.inf
-    return float(curve_at(loop, np.array([w])).beta[0])

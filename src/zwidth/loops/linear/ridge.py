@@ -140,10 +140,9 @@ def _condition(w: float) -> Condition:
 
 def _ends_of_row(boundary: Boundary, beta: float) -> list[_Top]:
     """The upper ends with alpha > 0 of a row's stable intervals."""
-    row = np.array([beta])
-    found, w = bound_intervals(boundary, row), boundary.crossings(row).w[0]
-    ends = zip(found.high[0].tolist(), found.above[0].tolist(), strict=True)
-    return [_Top(high, beta, float(w[place]), place, False) for high, place in ends if 0 < high < np.inf]
+    found = bound_intervals(boundary, np.array([beta]))
+    ends = zip(found.high[0].tolist(), found.w_above[0].tolist(), found.above[0].tolist(), strict=True)
+    return [_Top(high, beta, w, place, False) for high, w, place in ends if 0 < high < np.inf]
 
 
 def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:

@@ -26,11 +26,13 @@ _FEW_WALLS = 4
 class BoundIntervals(NamedTuple):
     """Stable intervals of alpha: shape (rows, most intervals of a row), NaN where a row has fewer.
 
-    With each stands the column of the crossings that ends it, -1 where there is none.
+    With each stands the column of the crossings that ends it, -1 where there is none, and the angle there.
     """
 
     low: np.ndarray
     high: np.ndarray
+    w_below: np.ndarray
+    w_above: np.ndarray
     below: np.ndarray
     above: np.ndarray
 
@@ -42,12 +44,14 @@ def bound_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
 
 def join_rows(parts: Sequence[BoundIntervals], order: np.ndarray | slice = slice(None)) -> BoundIntervals:
     """The rows of several parts in one, in an order of their own."""
+    if len(parts) == 1:
+        return parts[0]
     most = max(part.low.shape[1] for part in parts)
 
     def widen(column: np.ndarray, none: float) -> np.ndarray:
         return np.pad(column, ((0, 0), (0, most - column.shape[1])), constant_values=none)
 
-    columns = zip(zip(*parts, strict=True), (np.nan, np.nan, -1, -1), strict=True)
+    columns = zip(zip(*parts, strict=True), (*[np.nan] * 4, -1, -1), strict=True)
     return BoundIntervals(*(np.concatenate([widen(c, none) for c in own])[order] for own, none in columns))
 
 
@@ -57,9 +61,10 @@ def _some_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
     order = np.argsort(found.alpha, axis=1)
     alpha = np.take_along_axis(found.alpha, order, 1)
     leaving = np.take_along_axis(found.leaving, order, 1)
-    least, most = np.full((beta.size, 1), -np.inf), np.full((beta.size, 1), np.inf)
-    ends = np.concatenate([least, np.where(np.isnan(alpha), np.inf, alpha), most], 1)
-    met = np.concatenate([np.full((beta.size, 1), -1), order, np.full((beta.size, 1), -1)], 1)
+    sides = (0, 0), (1, 1)
+    ends = np.pad(np.where(np.isnan(alpha), np.inf, alpha), sides, constant_values=(-np.inf, np.inf))
+    met = np.pad(order, sides, constant_values=-1)
+    w = np.pad(np.take_along_axis(found.w, order, 1), sides, constant_values=np.nan)
     outside = boundary.base + np.concatenate([np.zeros((beta.size, 1)), np.cumsum(leaving, 1)], 1)
     # Closer than any alpha in range two crossings are one: the rounding of 0 on an undamped device's own row.
     wide = ends[:, 1:] > ends[:, :-1] + WALL_RANGE[0]
@@ -67,9 +72,11 @@ def _some_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
     # Neighbors that touch, where one pole leaves as another enters, stay apart: their common end is on the boundary.
     place = np.cumsum(stable, 1) - 1
     shape = beta.size, int(stable.sum(1).max(initial=0))
-    out = BoundIntervals(*(np.full(shape, np.nan) for _ in range(2)), *(np.full(shape, -1) for _ in range(2)))
+    out = BoundIntervals(*(np.full(shape, np.nan) for _ in range(4)), *(np.full(shape, -1) for _ in range(2)))
     row, gap = np.nonzero(stable)
-    for whole, values in zip(out, (ends[:, :-1], ends[:, 1:], met[:, :-1], met[:, 1:]), strict=True):
+    for whole, values in zip(
+        out, (part for both in (ends, w, met) for part in (both[:, :-1], both[:, 1:])), strict=True
+    ):
         whole[row, place[row, gap]] = values[row, gap]
     return out
 
