@@ -24,10 +24,15 @@ _ROOM = 1.02
 # Decided intervals that are shorter than this share of where they are say nothing.
 _LEAST = 1e-9
 _TINY = 1e-300
+# Rows or columns, times points of the curve, that are looked at together.
+_BLOCK = 1 << 15
 
 
 class Decided(NamedTuple):
-    """Decided intervals of alpha or beta, ascending: ends, and whether the walls inside are stable."""
+    """Decided intervals of alpha or beta, ascending: (lines, intervals), NaN where a line of the plane has fewer.
+
+    Their ends, and whether the walls inside are stable.
+    """
 
     low: np.ndarray
     high: np.ndarray
@@ -50,65 +55,85 @@ class DecidedWalls:
         steps = np.pad(step, ((0, 0), (0, 0), (1, 0))) + np.pad(step, ((0, 0), (0, 0), (0, 1)))
         return _gram(X) - _ROOM * c.radius**2 * _gram(H) - 0.25 * steps
 
-    def row(self, beta: float) -> Decided:
-        """Decided intervals of alpha at a damping."""
-        low, high = self.ends(beta)
-        return self._intervals(1, beta, low, high)
+    def rows(self, beta: np.ndarray) -> Decided:
+        """Decided intervals of alpha at dampings."""
+        return self._intervals(1, beta, *self.ends(beta))
 
-    def column(self, alpha: float) -> Decided:
-        """Decided intervals of beta at a stiffness."""
+    def columns(self, alpha: np.ndarray) -> Decided:
+        """Decided intervals of beta at stiffnesses."""
         c = self.curve
-        most = min((alpha - 1.0 / max(c.weakest, _TINY)) / c.slow, (1.0 / c.strongest - alpha) / c.fast)
+        most = np.minimum((alpha - 1.0 / max(c.weakest, _TINY)) / c.slow, (1.0 / c.strongest - alpha) / c.fast)
         return self._intervals(2, alpha, -most, most)
 
-    def ends(self, beta: float) -> tuple[float, float]:
-        """Between which alpha the walls of a row are decided below the first line, and beyond the last one."""
+    def ends(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Between which alpha the walls of rows are decided below the first line, and beyond the last one."""
         c = self.curve
-        return abs(beta) * c.slow + 1.0 / max(c.weakest, _TINY), 1.0 / c.strongest - abs(beta) * c.fast
+        return np.abs(beta) * c.slow + 1.0 / max(c.weakest, _TINY), 1.0 / c.strongest - np.abs(beta) * c.fast
 
     @cached_property
     def most_damping(self) -> float:
         """The largest ``|beta|`` of a row with decided walls; negative where there is none."""
-        low, high = self.ends(0.0)
-        return (high - low) / (self.curve.slow + self.curve.fast)
+        low, high = self.ends(np.zeros(()))
+        return float(high - low) / (self.curve.slow + self.curve.fast)
 
-    def _intervals(self, free: int, fixed: float, least: float, most: float) -> Decided:
-        none = Decided(np.zeros(0), np.zeros(0), np.zeros(0, bool))
-        if self.curve.odd or not least < most:
-            return none
-        M, other = self._forms, 3 - free
+    def _intervals(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> Decided:
+        """Of rows or columns, so many at a time."""
+        size = max(1, _BLOCK // self.curve.w.size)
+        parts = [
+            self._some(free, fixed[part], least[part], most[part])
+            for part in (slice(start, start + size) for start in range(0, max(fixed.size, 1), size))
+        ]
+        line, *found = (np.concatenate(column) for column in zip(*parts, strict=True))
+        line += np.repeat(size * np.arange(len(parts)), [part[0].size for part in parts])
+        low, high, stable = np.moveaxis(side_by_side(fixed.size, line, np.stack(found, -1)), -1, 0)
+        return Decided(low, high, stable == 1)
+
+    def _some(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, ...]:
+        """One after another: the row or column that each interval is of, its ends, and whether its walls are stable."""
+        M, other, across = self._forms, 3 - free, fixed[:, None]
         a = M[free, free]
-        half = M[0, free] + fixed * M[free, other]
-        c = M[0, 0] + 2.0 * fixed * M[0, other] + fixed * fixed * M[other, other]
+        half = M[0, free] + across * M[free, other]
+        c = M[0, 0] + 2.0 * across * M[0, other] + across * across * M[other, other]
         spread = half * half - a * c
-        if np.any((a <= 0) & (spread <= 0)):
-            return none
-        met = spread >= 0
-        a, half, c, spread = a[met], half[met], c[met], spread[met]
+        # Between its ends a point decides nothing, or, where its form opens downwards, outside of them.
+        met, outer = spread >= 0, a <= 0
+        known = (least < most) & ~np.any(outer & (spread <= 0), 1) & (not self.curve.odd)
+        line, point = np.nonzero(met & known[:, None])
+        half, c, a = half[line, point], c[line, point], a[point]
         with np.errstate(all="ignore"):
-            larger = -(half + np.where(half < 0, -1.0, 1.0) * np.sqrt(spread))
-            ends = np.sort(np.stack([larger / np.where(a == 0, _TINY, a), c / larger]), axis=0)
-        ends = np.where(np.isnan(ends), np.array([[-np.inf], [np.inf]]), ends)
-        inner = a > 0
-        low = np.concatenate([[-np.inf, most], ends[0, inner], np.full((~inner).sum(), -np.inf), ends[1, ~inner]])
-        high = np.concatenate([[least, np.inf], ends[1, inner], ends[0, ~inner], np.full((~inner).sum(), np.inf)])
-        order = np.argsort(low)
-        low, reached = low[order], np.maximum.accumulate(high[order])
-        gap = np.flatnonzero(low[1:] > reached[:-1] + _LEAST * np.abs(low[1:]))
-        low, high = reached[gap], low[gap + 1]
-        middle, same = 0.5 * (low + high), np.full(low.size, fixed)
-        walls = (middle, same) if free == 1 else (same, middle)
-        stable = np.array([self._turns(*wall) == 0 for wall in zip(*walls, strict=True)], bool)
-        return Decided(low, high, stable)
+            larger = -(half + np.where(half < 0, -1.0, 1.0) * np.sqrt(spread[line, point]))
+            ends = larger / np.where(a == 0, _TINY, a), c / larger
+        unknown = np.isnan(ends[0] + ends[1])
+        low, high = np.where(unknown, -np.inf, np.minimum(*ends)), np.where(unknown, np.inf, np.maximum(*ends))
+        outer = outer[point]
+        np.maximum.at(least := least.copy(), line[outer], low[outer])
+        np.minimum.at(most := most.copy(), line[outer], high[outer])
+        order = np.lexsort((low[~outer], line[~outer]))
+        both = side_by_side(fixed.size, line[~outer][order], np.stack([low, high], -1)[~outer][order])
+        low, high = np.moveaxis(both, -1, 0)
+        reached = np.fmax.accumulate(np.column_stack([least, high]), 1)
+        low = np.minimum(np.where(np.isnan(low), -np.inf, low), most[:, None])
+        after = np.column_stack([low, most])
+        line, gap = np.nonzero((after > reached + _LEAST * np.abs(after)) & known[:, None])
+        low, high = reached[line, gap], after[line, gap]
+        walls = (0.5 * (low + high), fixed[line])[:: 1 if free == 1 else -1]
+        return line, low, high, self._turn(*walls) == 0
 
-    def _turns(self, alpha: float, beta: float) -> int:
-        """How often the curve of a decided wall winds around 0, from z = 1 to z = -1 and back."""
+    def _turn(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """How often the curves of decided walls wind around 0, from z = 1 to z = -1 and back."""
         c = self.curve
-        L = (alpha + beta * c.F) * c.S / c.u
-        X = c.u * (1.0 + L)
+        X = c.u + (alpha[:, None] + beta[:, None] * c.F) * c.S
         # Below the first line |L| > 1: 1 + L turns as L does, which is there the phase of a mass, a damper or a spring.
-        first = np.angle(1j * L[0]) - 0.5 * np.pi + np.angle(1.0 + 1.0 / L[0])
-        return int(np.round((first + np.angle(X[1:] / X[:-1]).sum()) / (2.0 * np.pi)))
+        L = X[:, 0] / c.u[0] - 1.0
+        first = np.angle(1j * L) - 0.5 * np.pi + np.angle(1.0 + 1.0 / L)
+        # Whole turns are where X, which never turns by half a turn from a point to the next, passes the negative axis.
+        upper = X.imag >= 0
+        wall, k = np.nonzero(upper[:, 1:] != upper[:, :-1])
+        one, other = X[wall, k], X[wall, k + 1]
+        up = np.where(upper[wall, k], 1.0, -1.0)
+        passed = up * (one.real * other.imag - one.imag * other.real) > 0
+        turns = np.bincount(wall[passed], up[passed], alpha.size)
+        return np.round((first + np.angle(X[:, -1]) - np.angle(X[:, 0])) / (2.0 * np.pi) + turns)
 
     def doubts(self, alpha: float, beta: float) -> np.ndarray:
         """At which points a wall is not decided."""
@@ -120,6 +145,14 @@ class DecidedWalls:
         wall, c = np.array([1.0, alpha, beta]), self.curve
         size = np.abs(c.u) ** 2 + np.abs((alpha + beta * c.F) * c.S) ** 2
         return int(np.argmin(np.einsum("i,ijk,j->k", wall, self._forms, wall) / size))
+
+
+def side_by_side(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values that belong to ascending lines by line: (lines, most of one, ...), NaN where one has fewer."""
+    place = np.arange(line.size) - np.searchsorted(line, line)
+    out = np.full((lines, int(place.max(initial=-1)) + 1, *values.shape[1:]), np.nan)
+    out[line, place] = values
+    return out
 
 
 def _gram(parts: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from zwidth.loops.linear.margins import find_nearest
 from zwidth.loops.linear.rows import Island
 from zwidth.loops.loop import LinearLoop, SlowestMotion
 from zwidth.loops.measured.curve import ResponseCurve
-from zwidth.loops.measured.intervals import DecidedWalls
+from zwidth.loops.measured.intervals import Decided, DecidedWalls, side_by_side
 from zwidth.loops.rigid.margins import Margins
 from zwidth.loops.rigid.ridge import RidgePoint
 from zwidth.loops.rigid.verdict import Stability, StabilityMethod
@@ -78,17 +78,16 @@ class MeasuredLoop(LinearLoop):
         known = np.isfinite(a) & np.isfinite(b)
         stable, status = np.zeros(a.size, bool), np.full(a.size, np.int32(Status.INVALID_INPUT))
         status[known] = Status.UNDECIDED
-        rows, columns = np.unique(b[known]), np.unique(a[known])
+        a, b = a[known], b[known]
+        (rows, of_row), (columns, of_column) = (np.unique(values, return_inverse=True) for values in (b, a))
         by_row = rows.size <= columns.size
-        for fixed in rows if by_row else columns:
-            place = np.flatnonzero(known & ((b if by_row else a) == fixed))
-            decided = self.walls.row(float(fixed)) if by_row else self.walls.column(float(fixed))
-            value = (a if by_row else b)[place]
-            k = np.searchsorted(decided.low, value, side="left") - 1
-            inside = k >= 0
-            inside[inside] = value[inside] < decided.high[k[inside]]
-            status[place[inside]] = Status.OK
-            stable[place[inside]] = decided.stable[k[inside]]
+        decided, line = (self.walls.rows(rows), of_row) if by_row else (self.walls.columns(columns), of_column)
+        value, held = a if by_row else b, np.zeros((2, a.size), bool)
+        for low, high, sure in zip(*(part.T for part in decided), strict=True):
+            inside = (value > low[line]) & (value < high[line])
+            held |= inside & np.stack([sure[line], inside])
+        stable[known] = held[0]
+        status[np.flatnonzero(known)[held[1]]] = Status.OK
         shape, used = alpha.shape, np.full(alpha.shape, Method.CROSSOVER, np.int32)
         return Stability(stable.reshape(shape)[()], status.reshape(shape)[()], used[()])
 
@@ -98,28 +97,21 @@ class MeasuredLoop(LinearLoop):
 
     def row(self, beta: np.ndarray) -> np.ndarray:
         """The intervals of alpha that are surely stable: shape (rows, intervals, 2), NaN where a row has fewer."""
-        rows = [self.walls.row(float(value)) for value in beta]
-        ends = [np.stack([one.low[one.stable], one.high[one.stable]], -1) for one in rows]
-        out = np.full((beta.size, max((part.shape[0] for part in ends), default=0), 2), np.nan)
-        for place, part in zip(out, ends, strict=True):
-            place[: part.shape[0]] = part
-        return out
+        return _only(self.walls.rows(beta), True)
 
     def column(self, alpha: float) -> np.ndarray:
         """The intervals of beta that are surely stable: shape (intervals, 2)."""
-        found = self.walls.column(alpha)
-        return np.stack([found.low[found.stable], found.high[found.stable]], -1)
+        return _only(self.walls.columns(np.array([alpha])), True)[0]
 
-    def soft_row(self, beta: float) -> np.ndarray:
-        """The surely stable intervals of alpha below all walls of the row that are surely unstable."""
-        found = self.walls.row(beta)
-        first = found.low[~found.stable].min(initial=np.inf)
-        held = found.stable & (found.low < first)
-        return np.stack([found.low[held], found.high[held]], -1)
+    def soft_rows(self, beta: np.ndarray) -> np.ndarray:
+        """The surely stable intervals of alpha below all walls of rows that are surely unstable; as `row` has them."""
+        found = self.walls.rows(beta)
+        first = np.min(found.low, 1, where=~(found.stable | np.isnan(found.low)), initial=np.inf)
+        return _only(found, found.low < first[:, None])
 
     def holds_softly(self, alpha: float, beta: float) -> bool:
         """Whether a wall is surely stable, and no softer one of its damping surely unstable."""
-        ends = self.soft_row(beta)
+        ends = self.soft_rows(np.array([beta]))[0]
         return bool(np.any((ends[:, 0] < alpha) & (alpha < ends[:, 1])))
 
     def islands(self, least: float) -> list[Island]:
@@ -132,18 +124,18 @@ class MeasuredLoop(LinearLoop):
         most = max(self.walls.most_damping, 1e-300)
         side = most * np.sinh(_DENSER * np.arange(1, _ROWS + 1) / _ROWS) / np.sinh(_DENSER)
         beta = np.concatenate([-side[::-1], [0.0], side])
-        top = np.array([self._top(value) for value in beta.tolist()])
+        top = self._find_tops(beta)
         held = np.flatnonzero(top > 0)
         if held.size:
             ends = beta[[max(held[0] - 1, 0), min(held[-1] + 1, beta.size - 1)]]
             new = np.setdiff1d(np.linspace(ends[0], ends[1], _AGAIN), beta)
-            top = np.append(top, [self._top(value) for value in new.tolist()])
+            top = np.append(top, self._find_tops(new))
             order = np.argsort(np.append(beta, new))
             beta, top = np.append(beta, new)[order], top[order]
         return beta, top
 
-    def _top(self, beta: float) -> float:
-        return float(self.soft_row(beta)[:, 1].max(initial=0.0))
+    def _find_tops(self, beta: np.ndarray) -> np.ndarray:
+        return np.nanmax(self.soft_rows(beta)[:, :, 1], 1, initial=0.0)
 
     def outline(self) -> tuple[np.ndarray, np.ndarray] | None:
         """The stiffest surely stable wall of each damping and the softest, a closed curve for pictures; else None."""
@@ -151,7 +143,7 @@ class MeasuredLoop(LinearLoop):
         beta, top = beta[top > 0], top[top > 0]
         if not beta.size:
             return None
-        low = np.array([self.soft_row(value)[0, 0] for value in beta.tolist()])
+        low = self.soft_rows(beta)[:, 0, 0]
         return np.concatenate([low, top[::-1], low[:1]]), np.concatenate([beta, beta[::-1], beta[:1]])
 
     def stiffest(self, negative: bool) -> RidgePoint:
@@ -164,8 +156,9 @@ class MeasuredLoop(LinearLoop):
             return RidgePoint(nan, nan, nan, kind, np.int32(Status.UNDECIDED))
         low, middle, high = (float(beta[k]) for k in (max(best - 1, 0), best, min(best + 1, beta.size - 1)))
         low, held = low if negative else max(low, 0.0), float(top[best])
-        found = narrow_dips(lambda beta: np.array(-self._top(float(beta))), low, middle, high, np.array(-held), _STEPS)
-        middle, value = float(found[0]), -float(found[1])
+        ends = (np.array([end]) for end in (low, middle, high, -held))
+        found = narrow_dips(lambda beta: -self._find_tops(beta), *ends, _STEPS)
+        middle, value = float(found[0][0]), -float(found[1][0])
         # Just inside: the end itself is not decided.
         value *= 1.0 - _INSIDE
         omega = self.walls.curve.w[self.walls.binding(value, middle)]
@@ -226,6 +219,12 @@ class MeasuredLoop(LinearLoop):
             delay = float(np.min(np.mod(turns, 2.0 * np.pi) / at, initial=np.inf)) if stable else 0.0
         closest = int(np.argmin(np.abs(1.0 + L)))
         return Margins(gain, phase, delay, float(abs(1.0 + L[closest])), phase_at, gain_at, float(c.w[closest]))
+
+
+def _only(found: Decided, held: np.ndarray | bool) -> np.ndarray:
+    """Stable intervals of each line of the plane, of those some: (lines, intervals, 2), NaN where one has fewer."""
+    line, k = np.nonzero(found.stable & held)
+    return side_by_side(len(found.low), line, np.stack([found.low[line, k], found.high[line, k]], -1))
 
 
 def _zeros(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
