@@ -20,10 +20,9 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import NeededAnswer
 from zwidth.fitting.device_rows import DeviceRows, find_highest
-from zwidth.loops.linear.roots import affine_polynomial
+from zwidth.loops.linear.state_space import delayed_device, open_loop
 from zwidth.loops.loop import RigidVariants
 from zwidth.loops.rigid.device import device_status
-from zwidth.loops.rigid.poles import companion
 from zwidth.parts.checks import check_whole
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.scenes.scene import Scene
@@ -284,7 +283,10 @@ def _read_parts(drawn: np.ndarray, fit: DeviceFit) -> tuple[list[np.ndarray], li
 
 
 def _bears(scene: Scene, stiffness: float, virtual_damping: float) -> bool:
-    D, N1, N2 = affine_polynomial(scene.loop.roots)
     alpha, beta = scene.normalize_walls(stiffness * np.array(_SOFTER), virtual_damping)
-    monic = (D + alpha[:, None] * N1 + beta * N2) / D[0]
-    return bool(np.all(np.abs(np.linalg.eigvals(companion(monic))) < 1.0))
+    chain = scene.loop.chain
+    loop, device = open_loop(chain, 0.0, float(beta)), delayed_device(chain)
+    closed = np.repeat((loop.A - loop.B @ loop.C)[None], alpha.size, 0)
+    size = device.A.shape[0]
+    closed[:, -size:, -size:] -= alpha[:, None, None] * device.B @ device.C
+    return bool(np.all(np.abs(np.linalg.eigvals(closed)) < 1.0))
