@@ -17,8 +17,8 @@ from zwidth.loops.linear.poles import log_size, poles_less_one
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.showing import shown
 
-# Rows whose crossings are laid out at one time.
-_ROWS = 1 << 12
+# Rows whose crossings are laid out at one time, or more of few arcs: so many pairs of both.
+_ROWS, _PAIRS = 1 << 12, 1 << 16
 # With fewer walls a row than this, each wall is compared with its own crossings.
 _FEW_WALLS = 4
 
@@ -103,8 +103,9 @@ def _count_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
     shape = alpha.shape
     columns, good = (alpha.reshape(-1), beta.reshape(-1)), np.isfinite(alpha + beta).reshape(-1)
     stable = np.zeros(good.shape, bool)
-    for start in range(0, good.size, _ROWS):
-        part = slice(start, start + _ROWS)
+    size = max(_ROWS, _PAIRS // max(len(boundary.arcs), 1))
+    for start in range(0, good.size, size):
+        part = slice(start, start + size)
         alpha, beta = (np.where(good[part], column[part], 0.0) for column in columns)
         outside = boundary.outside(alpha, beta)
         # A row whose crossings contradict each other says nothing: all poles of its walls do.
