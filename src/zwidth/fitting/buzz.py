@@ -256,8 +256,10 @@ def _further(
     for kind, other in rivals[:1]:
         if kind is not chosen:
             there = replace(kind.onsets, kappa=walls.kappa, rub=walls.rub, w=walls.w).follow(other)
-            away = np.log([there.kappa / walls.kappa, there.w / walls.w]) ** 2
-            best = int(np.nanargmax(np.where(there.found, precision @ away, 0.0)))
+            # Where the other one has no stiffness there is nothing to compare with.
+            seen = there.found & (there.kappa > 0)
+            away = np.log(np.where(seen, [there.kappa / walls.kappa, there.w / walls.w], 1.0)) ** 2
+            best = int(np.argmax(precision @ away))
     return FurtherExperiment(
         float(damping[edge][best]),
         float(stiffness[edge][best]),

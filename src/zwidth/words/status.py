@@ -51,8 +51,8 @@ _MESSAGES = {
     Status.NOT_CONVERGED: "The solver stopped before its tolerance; ask for a nearby point or another method.",
     Status.NO_BOUNDARY: "No stable wall lies on the given line; choose another alpha or beta.",
     Status.UNDECIDED: (
-        "The chosen precision cannot tell stable from unstable; use method='certified' "
-        "with the extra 'certified' installed."
+        "What is given does not decide it; of a model method='certified' decides walls, with the extra 'certified' "
+        "installed, of a fit or a measured response its doubts say what to measure."
     ),
     Status.ON_BOUNDARY: "A pole lies exactly on the unit circle, or too close to it for the largest precision allowed.",
     Status.OUT_OF_RANGE: (
