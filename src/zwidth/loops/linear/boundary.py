@@ -129,17 +129,17 @@ class Boundary:
             here, x = here[on], new[on]
         return found, alpha
 
-    def _look(self, w: np.ndarray) -> _Angles:
+    def _look(self, w: np.ndarray) -> _LoopAngles:
         """The loop at angles, for any rows."""
         at, whole, turn = circle(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
         for angle in self._fixed:
             factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
             whole, turn = whole * factor, turn * factor - whole * np.sin(w)
         with np.errstate(all="ignore"):
-            return _Angles(*self.loop.required_wall(at), *self.loop.estimate.jet(at), whole, turn)
+            return _LoopAngles(*self.loop.required_wall(at), *self.loop.estimate.jet(at), whole, turn)
 
     @cached_property
-    def _at_nodes(self) -> _Angles:
+    def _at_nodes(self) -> _LoopAngles:
         return self._look(self._steps.w)
 
     @cached_property
@@ -305,7 +305,7 @@ class _Row(NamedTuple):
     alpha_slope: np.ndarray
 
 
-class _Angles(NamedTuple):
+class _LoopAngles(NamedTuple):
     """q and F at angles with their slopes, and ``sin w prod(cos w - cos fixed)`` with its own."""
 
     q: np.ndarray
@@ -315,9 +315,9 @@ class _Angles(NamedTuple):
     whole: np.ndarray
     turn: np.ndarray
 
-    def pick(self, index: np.ndarray) -> _Angles:
+    def pick(self, index: np.ndarray) -> _LoopAngles:
         """Some of them."""
-        return _Angles(*(part[index] for part in self))
+        return _LoopAngles(*(part[index] for part in self))
 
     def of_rows(self, beta: np.ndarray) -> _Row:
         """``Im(q - beta F)`` over what vanishes on every row, and the alpha of rows that cross there."""
