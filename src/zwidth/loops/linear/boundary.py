@@ -325,8 +325,8 @@ class _LoopAngles(NamedTuple):
             value, slope = self.q - beta * self.f, self.q_slope - beta * self.f_slope
             end = self.whole == 0
             safe = np.where(end, 1.0, self.whole)
-            ratio = np.where(end, slope.imag / self.turn, value.imag / safe)
-            return _Row(ratio, (slope.imag - ratio * self.turn) / safe, value.real, slope.real)
+            ratio = np.where(end, np.imag(slope) / self.turn, np.imag(value) / safe)
+            return _Row(ratio, (np.imag(slope) - ratio * self.turn) / safe, np.real(value), np.real(slope))
 
 
 @np.errstate(all="ignore")

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -65,7 +65,7 @@ class DecidedWalls:
         most = np.minimum((alpha - 1.0 / max(c.weakest, _TINY)) / c.slow, (1.0 / c.strongest - alpha) / c.fast)
         return self._intervals(2, alpha, -most, most)
 
-    def ends(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def ends(self, beta: Any) -> tuple[Any, Any]:
         """Between which alpha the walls of rows are decided below the first line, and beyond the last one."""
         c = self.curve
         return np.abs(beta) * c.slow + 1.0 / max(c.weakest, _TINY), 1.0 / c.strongest - np.abs(beta) * c.fast
@@ -73,8 +73,8 @@ class DecidedWalls:
     @cached_property
     def most_damping(self) -> float:
         """The largest ``|beta|`` of a row with decided walls; negative where there is none."""
-        low, high = self.ends(np.zeros(()))
-        return float(high - low) / (self.curve.slow + self.curve.fast)
+        low, high = self.ends(0.0)
+        return (high - low) / (self.curve.slow + self.curve.fast)
 
     def _intervals(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> Decided:
         """Of rows or columns, so many at a time."""
@@ -127,11 +127,10 @@ class DecidedWalls:
         L = X[:, 0] / c.u[0] - 1.0
         first = np.angle(1j * L) - 0.5 * np.pi + np.angle(1.0 + 1.0 / L)
         # Whole turns are where X, which never turns by half a turn from a point to the next, passes the negative axis.
-        upper = X.imag >= 0
+        upper = np.imag(X) >= 0
         wall, k = np.nonzero(upper[:, 1:] != upper[:, :-1])
-        one, other = X[wall, k], X[wall, k + 1]
         up = np.where(upper[wall, k], 1.0, -1.0)
-        passed = up * (one.real * other.imag - one.imag * other.real) > 0
+        passed = up * np.imag(X[wall, k].conj() * X[wall, k + 1]) > 0
         turns = np.bincount(wall[passed], up[passed], alpha.size)
         return np.round((first + np.angle(X[:, -1]) - np.angle(X[:, 0])) / (2.0 * np.pi) + turns)
 

@@ -155,9 +155,10 @@ class MeasuredLoop(LinearLoop):
         if not top[best] > 0:
             return RidgePoint(nan, nan, nan, kind, np.int32(Status.UNDECIDED))
         low, middle, high = (float(beta[k]) for k in (max(best - 1, 0), best, min(best + 1, beta.size - 1)))
-        low, held = low if negative else max(low, 0.0), float(top[best])
-        ends = (np.array([end]) for end in (low, middle, high, -held))
-        found = narrow_dips(lambda beta: -self._find_tops(beta), *ends, _STEPS)
+        low, middle, high, cost = (
+            np.array([end]) for end in (low if negative else max(low, 0.0), middle, high, -top[best])
+        )
+        found = narrow_dips(lambda beta: -self._find_tops(beta), low, middle, high, cost, _STEPS)
         middle, value = float(found[0][0]), -float(found[1][0])
         # Just inside: the end itself is not decided.
         value *= 1.0 - _INSIDE
