@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -201,8 +200,8 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     if listing:
         width = max(map(len, known))
         for each, path in known.items():
-            words = textwrap.wrap(describe_example(path.read_text(encoding="utf-8")), 96 - width)
-            click.echo(f"{each:<{width}}  " + f"\n{'':<{width}}  ".join(words))
+            sentence = describe_example(path.read_text(encoding="utf-8"))
+            words.print_folded([f"{each:<{width}}  {sentence}"], width + 2)
         return
     example = example or (name if name in known else "quickstart")
     check_choice("--example", example, tuple(known))

@@ -147,9 +147,7 @@ def fit(
         evidence: dict[str, Any] = gather_evidence(found, source, points, units)
         wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
     if as_yaml:
-        lines = write_scene(found, source, units)
-    elif as_json:
-        lines = wrote
-    else:
-        lines = [*(row(*each) for each in describe_fit(found, source, units)), *wrote]
-    tell({**found.as_dict(), "units": units._asdict()}, lines, as_json)
+        click.echo("\n".join(write_scene(found, source, units)))
+        return
+    lines = () if as_json else describe_fit(found, source, units)
+    tell({**found.as_dict(), "units": units._asdict()}, [*(row(*each) for each in lines), *wrote], as_json)
