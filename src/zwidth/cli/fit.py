@@ -15,9 +15,9 @@ from zwidth.cli.options import (
     json_option,
     log_options,
     number_or_text,
+    period_options,
     quantity_type,
     read_logs,
-    read_period,
     read_share,
     save_figure,
     velocity_options,
@@ -72,8 +72,7 @@ _SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 @cli.command()
 @click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--buzz", "walls", type=_WALL, multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
-@click.option("--period", type=quantity_type("s", POSITIVE), help="T, in s; of logs in place of --time.")
-@click.option("--rate", type=quantity_type("Hz", POSITIVE), help="1/T, in Hz; in place of the period.")
+@period_options
 @click.option("--noise", type=_SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
 @log_options
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
@@ -87,7 +86,6 @@ def fit(
     logs: tuple[Path, ...],
     walls: tuple[Any, ...],
     period: float | None,
-    rate: float | None,
     noise: float | None,
     unknown_cutoff: bool,
     velocity: Any,
@@ -104,7 +102,6 @@ def fit(
     """
     from zwidth.fitting.words import LINEAR, ROTARY, describe_fit, write_scene
 
-    period = read_period(period, rate)
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if as_json and as_yaml:
