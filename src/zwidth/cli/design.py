@@ -63,11 +63,8 @@ def design(scene: Any, find: str | None, tolerances: tuple[Any, ...], as_json: b
         "every_device": _prove(scene, shares) if provable else None,
     }
     told = {name: part for name, part in parts.items() if part is not None}
-    tell(
-        {name: found for name, (found, _) in told.items()},
-        [line for _, said in told.values() for line in said],
-        as_json,
-    )
+    lines = [line for _, said in told.values() for line in said]
+    tell({name: found for name, (found, _) in told.items()}, lines, as_json)
 
 
 def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
@@ -99,9 +96,8 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         text = f"K_max = {with_unit(wanted, 'N/m')} is {reached} from {low} to {high}"
     else:
         others = len(needed.crossings) - 1
-        text += f" or {'more' if needed.enough == 'above' else 'less'}" + (
-            f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
-        )
+        text += f" or {'more' if needed.enough == 'above' else 'less'}"
+        text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
     return result, [row(f"{path} needed", text)]
 
 

@@ -10,6 +10,7 @@ import click
 
 from zwidth.cli.commands import cli
 from zwidth.cli.options import (
+    SHARE,
     Parsed,
     figure_option,
     json_option,
@@ -18,7 +19,6 @@ from zwidth.cli.options import (
     period_options,
     quantity_type,
     read_logs,
-    read_share,
     save_figure,
     velocity_options,
 )
@@ -66,14 +66,13 @@ def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
 
 
 _WALL = Parsed("WALL", _read_wall)
-_SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 
 
 @cli.command()
 @click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--buzz", "walls", type=_WALL, multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
 @period_options
-@click.option("--noise", type=_SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
+@click.option("--noise", type=SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
 @log_options
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")

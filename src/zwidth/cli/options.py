@@ -135,6 +135,9 @@ def read_share(text: str) -> float:
     return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
 
 
+SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
+
+
 def read_factor(text: str) -> float:
     """A factor: ``2`` or ``6 dB``."""
     number = float(text.strip().removesuffix("dB"))

@@ -61,13 +61,8 @@ def tell(result: Any, lines: list[str], as_json: bool) -> None:
 @in_own_units
 def scene_lines(scene: Scene) -> list[str]:
     device, timing = scene.device, scene.timing
-    lines = [
-        row("device", device.spell()),
-        row(
-            "timing",
-            f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(scene.d)})",
-        ),
-    ]
+    times = f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(scene.d)})"
+    lines = [row("device", device.spell()), row("timing", times)]
     velocity = type(scene.velocity).__name__
     parts, values = find_parts(scene), scene.parameters()
     # From the motor outwards.

@@ -159,13 +159,9 @@ class Recommendation:
         lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
         # A unit that both have stands once.
         lower = lower.removesuffix(f" {upper.partition(' ')[2]}")
-        delay = verdict.delay_margin
-        apart = (
-            f"gain {plain(verdict.gain_margin)}",
-            f"phase {plain(verdict.phase_margin)} degrees",
-            f"delay {'not known' if math.isnan(delay) else with_unit(delay, 's')}",
-        )
-        rest = f"margins: {', '.join(apart)}; passive: {self.spell_passive()}"
+        delay = "not known" if math.isnan(verdict.delay_margin) else with_unit(verdict.delay_margin, "s")
+        apart = f"gain {plain(verdict.gain_margin)}, phase {plain(verdict.phase_margin)} degrees, delay {delay}"
+        rest = f"margins: {apart}; passive: {self.spell_passive()}"
         return first, f"stable for B from {lower} to {upper}; {rest}"
 
     def spell_passive(self) -> str:
