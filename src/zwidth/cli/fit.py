@@ -15,7 +15,6 @@ from zwidth.cli.options import (
     figure_option,
     json_option,
     log_options,
-    number_or_text,
     period_options,
     quantity_type,
     read_logs,
@@ -25,7 +24,7 @@ from zwidth.cli.options import (
 from zwidth.pages.words import row, tell
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.quantities import POSITIVE
-from zwidth.words.rotation import use_kind
+from zwidth.words.units import tell_kind
 
 # A letter, "=", and all up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
@@ -46,23 +45,13 @@ def _read_wall(text: str) -> HeardWall:
     numbers, kinds = {"B": 0.0}, set()
     for letter, amount in found.items():
         try:
-            numbers[letter], rotary = _read_letter(letter, amount)
+            numbers[letter] = quantity_type({"K": "N/m", "B": "N s/m", "f": "Hz"}[letter]).read(amount)
         except UnusableValueError as error:
             raise ValueError(f"{letter}: {error}") from None
-        kinds |= set() if rotary is None else {rotary}
+        kinds |= {tell_kind(amount)} - {None}
     if len(kinds) > 1:
         raise ValueError(f"got {text!r}; N/m goes with N s/m, N m/rad with N m s/rad")
     return HeardWall((numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None)
-
-
-def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
-    """A number in its SI unit, and whether the unit is of a rotary axis."""
-    from zwidth.words.units import find_dimension, read_quantity, tell_kind
-
-    number = number_or_text(text)
-    rotary = tell_kind(number)
-    with use_kind(bool(rotary)):
-        return read_quantity(number, find_dimension({"K": "N/m", "B": "N s/m", "f": "Hz"}[letter]))[0], rotary
 
 
 _WALL = Parsed("WALL", _read_wall)

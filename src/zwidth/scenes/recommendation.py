@@ -33,14 +33,8 @@ _DOWN, _TRIALS, _CLOSE = 0.25, 15, 1e-4
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
 _OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
-_UNITS = {
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "virtual_damping": "N s/m",
-    "mass": "kg",
-    "time": "s",
-    "frequency": "Hz",
-}
+_UNITS = {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m"}
+_UNITS |= {"mass": "kg", "time": "s", "frequency": "Hz"}
 _EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
 _WALL = ("stiffness", "virtual_damping")
 _JUDGED = (
