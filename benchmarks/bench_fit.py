@@ -338,7 +338,8 @@ def report(count: int, parts: int, processes: int) -> str:
     for row in (*noisy, *silent):
         if "refused" in row or row["safe"] is False or (not row["doubts"] and max(row["away"].values()) > 5):
             print(row)
-    took = np.array([row["took"] for row in fitted])
+    # Of this machine and this day: not for the page.
+    print(f"a fit took {np.median([row['took'] for row in fitted]):.2f} s of the processor (median)")
     lines = [
         "# How good fits of logs are",
         "",
@@ -360,7 +361,6 @@ def report(count: int, parts: int, processes: int) -> str:
         *tabulate_kinds(fitted),
         "",
         tell_rest(noisy, fitted),
-        f"A fit took {np.median(took):.2f} s of the processor (median).",
         "",
         f"{len(silent):,} logs of an encoder without any noise, whose errors are alike from sample to sample:",
         "",

@@ -14,6 +14,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # Set before anything imports matplotlib, and inherited by the programs that tests start.
 os.environ["MPLBACKEND"] = "Agg"
+# Commands print their lines whole.
+os.environ.pop("COLUMNS", None)
 # Processes test side by side: threads of one's small matrices would wait for a core that another has. Here a plugin of
 # pytest has loaded NumPy already; the processes that pytest-xdist starts inherit this in time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -29,7 +29,9 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
     use_compilation_cache()
     try:
-        cli.main(args=arguments, prog_name="zwidth", standalone_mode=False)
+        # Click knows nothing of NO_COLOR; without a wish colors stand on a terminal.
+        color = False if os.environ.get("NO_COLOR") else None
+        cli.main(args=arguments, prog_name="zwidth", standalone_mode=False, color=color)
     except SystemExit as end:
         if arguments is None and end.code in _STOPPED:
             # A compiler may be at work in a thread of JAX's, which the usual end of Python would crash.

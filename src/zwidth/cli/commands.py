@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from zwidth.pages import words
 from zwidth.pages.words import row
 from zwidth.words.errors import InputError, ZwidthError, check_choice
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
-from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
+from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
 
 _COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -61,8 +60,8 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
 
 
 @cli.command()
-@click.option("--delta", type=click.FloatRange(min=0.0), help="Normalized physical damping b T/m.")
-@click.option("--d", type=click.FloatRange(min=0.0), help="Delay in periods.")
+@click.option("--delta", type=quantity_type("1", Range(*SIZES["delta"])), help="Normalized physical damping b T/m.")
+@click.option("--d", type=quantity_type("1", Range(*SIZES["d"])), help="Delay in periods.")
 @scene_options(wall=False, required=False)
 @click.option(
     "--delay-model",
@@ -201,8 +200,8 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     if listing:
         width = max(map(len, known))
         for each, path in known.items():
-            words = textwrap.wrap(describe_example(path.read_text(encoding="utf-8")), 96 - width)
-            click.echo(f"{each:<{width}}  " + f"\n{'':<{width}}  ".join(words))
+            sentence = describe_example(path.read_text(encoding="utf-8"))
+            words.print_folded([f"{each:<{width}}  {sentence}"], width + 2)
         return
     example = example or (name if name in known else "quickstart")
     check_choice("--example", example, tuple(known))

@@ -13,9 +13,10 @@ from zwidth.pages.words import row, tell
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
+from zwidth.words.status import Status
 
 _FINDS = {"damping": "damping", "mass": "mass", "period": "period", "rate": "period", "delay": "delay"}
-_FINDS["cutoff"] = "velocity.cutoff"
+_FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
 _BOX = ("mass", "damping", "period", "delay")
 
 
@@ -32,7 +33,7 @@ _TOLERANCE = Parsed(
 
 @cli.command()
 @scene_options(wall=True, required=True)
-@click.option("--find", type=click.Choice(tuple(_FINDS)), help="What to choose such that K_max reaches the stiffness.")
+@click.option("--find", type=click.Choice(tuple(_FINDS)), help="What to choose for the stiffness.")
 @click.option("--tolerance", "tolerances", type=_TOLERANCE, multiple=True, help="As mass=10%; may be repeated.")
 @click.option(
     "--distribution",
@@ -44,14 +45,13 @@ _TOLERANCE = Parsed(
 @click.option("--samples", type=int, help="Devices drawn; 10,000, or 200 of a scene with parts.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the draws.")
 @json_option
-def design(
-    scene: Any, find: str | None, tolerances: tuple[tuple[str, float], ...], as_json: bool, **drawn: Any
-) -> None:
+def design(scene: Any, find: str | None, tolerances: tuple[Any, ...], as_json: bool, **drawn: Any) -> None:
     """Say what a wanted stiffness needs, or what tolerances cost.
 
-    With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given.
-    With --tolerance: the share of devices on which the wall (--stiffness, --virtual-damping) is stable, the stiffness
-    that 99 % of them bear, and, for uniform tolerances of a rigid device, what is proved for every one of them.
+    With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given;
+    or the virtual damping with which a wall of --stiffness settles fastest. With --tolerance: the share of devices on
+    which the wall (--stiffness, --virtual-damping) is stable, the stiffness that 99 % of them bear, and, for uniform
+    tolerances of a rigid device, what is proved for every one of them.
     """
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")
@@ -63,16 +63,15 @@ def design(
         "every_device": _prove(scene, shares) if provable else None,
     }
     told = {name: part for name, part in parts.items() if part is not None}
-    tell(
-        {name: found for name, (found, _) in told.items()},
-        [line for _, said in told.values() for line in said],
-        as_json,
-    )
+    lines = [line for _, said in told.values() for line in said]
+    tell({name: found for name, (found, _) in told.items()}, lines, as_json)
 
 
 def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     """The value of one property that is enough, and on which side of it there is enough."""
     path = _FINDS[find]
+    if path == "virtual_damping":
+        return _choose_damping(scene)
     unit = PARAMETERS[path].unit
     values = scene.parameters()
     if path not in values:
@@ -97,10 +96,21 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         text = f"K_max = {with_unit(wanted, 'N/m')} is {reached} from {low} to {high}"
     else:
         others = len(needed.crossings) - 1
-        text += f" or {'more' if needed.enough == 'above' else 'less'}" + (
-            f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
-        )
+        text += f" or {'more' if needed.enough == 'above' else 'less'}"
+        text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
     return result, [row(f"{path} needed", text)]
+
+
+def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
+    """The virtual damping with which a wall of a wanted stiffness settles fastest."""
+    wanted, best = float(scene.wall.stiffness), scene.best_damping()
+    result = {"parameter": "virtual_damping", "value": best.virtual_damping, "unit": own_unit("N s/m")}
+    result |= {"spectral_radius": best.spectral_radius, "modulus_margin": best.modulus_margin}
+    text = f"no B is stable at K = {with_unit(wanted, 'N/m')}"
+    if best.status == Status.OK:
+        B, radius = with_unit(best.virtual_damping, "N s/m"), plain(best.spectral_radius)
+        text = f"{B} settles fastest: spectral radius {radius}, modulus margin {plain(best.modulus_margin)}"
+    return result, [row("virtual damping", text)]
 
 
 def _tolerate(

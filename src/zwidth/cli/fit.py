@@ -10,22 +10,21 @@ import click
 
 from zwidth.cli.commands import cli
 from zwidth.cli.options import (
+    SHARE,
     Parsed,
     figure_option,
     json_option,
     log_options,
-    number_or_text,
+    period_options,
     quantity_type,
     read_logs,
-    read_period,
-    read_share,
     save_figure,
     velocity_options,
 )
 from zwidth.pages.words import row, tell
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.quantities import POSITIVE
-from zwidth.words.rotation import use_kind
+from zwidth.words.units import tell_kind
 
 # A letter, "=", and all up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
@@ -46,35 +45,23 @@ def _read_wall(text: str) -> HeardWall:
     numbers, kinds = {"B": 0.0}, set()
     for letter, amount in found.items():
         try:
-            numbers[letter], rotary = _read_letter(letter, amount)
+            numbers[letter] = quantity_type({"K": "N/m", "B": "N s/m", "f": "Hz"}[letter]).read(amount)
         except UnusableValueError as error:
             raise ValueError(f"{letter}: {error}") from None
-        kinds |= set() if rotary is None else {rotary}
+        kinds |= {tell_kind(amount)} - {None}
     if len(kinds) > 1:
         raise ValueError(f"got {text!r}; N/m goes with N s/m, N m/rad with N m s/rad")
     return HeardWall((numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None)
 
 
-def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
-    """A number in its SI unit, and whether the unit is of a rotary axis."""
-    from zwidth.words.units import find_dimension, read_quantity, tell_kind
-
-    number = number_or_text(text)
-    rotary = tell_kind(number)
-    with use_kind(bool(rotary)):
-        return read_quantity(number, find_dimension({"K": "N/m", "B": "N s/m", "f": "Hz"}[letter]))[0], rotary
-
-
 _WALL = Parsed("WALL", _read_wall)
-_SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 
 
 @cli.command()
 @click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--buzz", "walls", type=_WALL, multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
-@click.option("--period", type=quantity_type("s", POSITIVE), help="T, in s; of logs in place of --time.")
-@click.option("--rate", type=quantity_type("Hz", POSITIVE), help="1/T, in Hz; in place of the period.")
-@click.option("--noise", type=_SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
+@period_options
+@click.option("--noise", type=SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
 @log_options
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
@@ -87,7 +74,6 @@ def fit(
     logs: tuple[Path, ...],
     walls: tuple[Any, ...],
     period: float | None,
-    rate: float | None,
     noise: float | None,
     unknown_cutoff: bool,
     velocity: Any,
@@ -104,7 +90,6 @@ def fit(
     """
     from zwidth.fitting.words import LINEAR, ROTARY, describe_fit, write_scene
 
-    period = read_period(period, rate)
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if as_json and as_yaml:
@@ -147,9 +132,7 @@ def fit(
         evidence: dict[str, Any] = gather_evidence(found, source, points, units)
         wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
     if as_yaml:
-        lines = write_scene(found, source, units)
-    elif as_json:
-        lines = wrote
-    else:
-        lines = [*(row(*each) for each in describe_fit(found, source, units)), *wrote]
-    tell({**found.as_dict(), "units": units._asdict()}, lines, as_json)
+        click.echo("\n".join(write_scene(found, source, units)))
+        return
+    lines = () if as_json else describe_fit(found, source, units)
+    tell({**found.as_dict(), "units": units._asdict()}, [*(row(*each) for each in lines), *wrote], as_json)

@@ -12,6 +12,7 @@ from zwidth.cli.options import (
     figure_option,
     json_option,
     log_options,
+    period_options,
     quantity_type,
     read_logs,
     save_figure,
@@ -21,21 +22,22 @@ from zwidth.pages.words import row, tell
 from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import POSITIVE
 
-_FILE = click.Path(path_type=Path)
-_PERIOD = quantity_type("s", POSITIVE)
+_FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
 
 
 @cli.command()
-@click.option("--period", type=_PERIOD, required=True, help="T of the controller, in s.")
+@period_options
 @click.option("--force", type=quantity_type("N", POSITIVE), required=True, help="The largest to command, in N.")
 @click.option("--resolution", type=quantity_type("m", POSITIVE), required=True, help="One count of the encoder, in m.")
-@click.option("--duration", type=quantity_type("s", POSITIVE), default="60", show_default="60 s", help="In s.")
+@click.option("--duration", type=_TIME, default="60 s", show_default=True, help="In s.")
 @click.option("--response", type=_FILE, help="The response of a first record, to design the second.")
 @click.option("--out", type=_FILE, default=Path("play.csv"), show_default=True, help="The file to play.")
 @velocity_options
 @json_option
 def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> None:
     """Design the force to play before `zwidth respond`."""
+    if options["period"] is None:
+        raise click.UsageError("give --period or --rate")
     from zwidth.fitting.excite import excite as design
     from zwidth.parts.measured import MeasuredDevice
 
@@ -57,8 +59,8 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
 
 @cli.command()
 @click.argument("logs", metavar="LOG.csv...", nargs=-1, required=True, type=_FILE)
-@click.option("--period", type=_PERIOD, help="T, in s; in place of --time.")
-@click.option("--cycle", type=_PERIOD, help="Period of the force, in s; found from a force that repeats exactly.")
+@period_options
+@click.option("--cycle", type=_TIME, help="Period of the force, in s; found from a force that repeats exactly.")
 @log_options
 @click.option("--save", type=_FILE, metavar="FILE.csv", help="Keep the response.")
 @velocity_options
@@ -86,7 +88,7 @@ def respond(
     from zwidth.scenes.scene import Scene
 
     if of_logs["time"] is not None and period is not None:
-        raise click.UsageError("give one of --time and --period")
+        raise click.UsageError("give one of --time, --period and --rate")
     found = respond_to_logs(read_logs(logs, period, **of_logs), period=period, cycle=cycle)
     device, period, doubts = found.device, found.period, found.doubts
     kind = "stretches of a force that repeats" if found.cycle else "pieces"

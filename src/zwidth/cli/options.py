@@ -135,6 +135,9 @@ def read_share(text: str) -> float:
     return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
 
 
+SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
+
+
 def read_factor(text: str) -> float:
     """A factor: ``2`` or ``6 dB``."""
     number = float(text.strip().removesuffix("dB"))
@@ -206,9 +209,10 @@ def _take_options(
                     return function(**{name: make(known)}, **given)
             except InputError as error:
                 field, _, text = str(error).partition(": ")
-                if field.replace(".", "__") not in {option.name for option in context.command.params}:
+                flags = {option.name: option.opts[0] for option in context.command.params}
+                if field.replace(".", "__") not in flags:
                     raise
-                raise click.BadParameter(text, param_hint=f"'{flag_of(field)}'") from None
+                raise click.BadParameter(text, param_hint=f"'{flags[field.replace('.', '__')]}'") from None
 
         command = with_made
         for path in reversed(paths):
@@ -218,11 +222,14 @@ def _take_options(
     return decorate
 
 
-def read_period(period: float | None, rate: float | None) -> float | None:
+def _read_period(given: dict[str, Any]) -> float | None:
     """The period in s, of the one that is given."""
-    if period is not None and rate is not None:
+    if len(given) > 1:
         raise click.UsageError(_BOTH)
-    return period if rate is None else 1.0 / rate
+    return 1.0 / given["rate"] if "rate" in given else given.get("period")
+
+
+period_options = _take_options("period", ("period", "rate"), (), _read_period)
 
 
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:

@@ -8,28 +8,19 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
-from zwidth.cli.options import Parsed, figure_option, json_option, read_factor, read_share, save_figure, scene_options
+from zwidth.cli.options import SHARE, Parsed, figure_option, json_option, read_factor, save_figure, scene_options
 from zwidth.pages import words
 from zwidth.pages.words import row
+
+_FACTOR = Parsed("FACTOR", read_factor, "write a factor, as 2, or 6 dB")
+_DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")), "write degrees, as 30")
 
 
 @cli.command()
 @scene_options(wall=False, required=True)
-@click.option(
-    "--stiffness-fraction",
-    type=Parsed("SHARE", read_share, "write a share, as 60% or 0.6"),
-    help="At most this share of K_max.  [default: 75% where nothing else is asked for]",
-)
-@click.option(
-    "--gain-margin",
-    type=Parsed("FACTOR", read_factor, "write a factor, as 2, or 6 dB"),
-    help="At least this factor on K and B together.",
-)
-@click.option(
-    "--phase-margin",
-    type=Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")), "write degrees, as 30"),
-    help="At least so many degrees.",
-)
+@click.option("--stiffness-fraction", type=SHARE, help="At most this share of K_max; 75% if nothing is asked for.")
+@click.option("--gain-margin", type=_FACTOR, help="At least this factor on K and B together.")
+@click.option("--phase-margin", type=_DEGREES, help="At least so many degrees.")
 @click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
 @figure_option
 @click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")

@@ -16,7 +16,7 @@ import click
 
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, json_option
-from zwidth.pages.words import print_json
+from zwidth.pages.words import print_folded, print_json, row
 from zwidth.words.formatting import plain
 
 if TYPE_CHECKING:
@@ -141,17 +141,12 @@ def _print_plan(path: Path, *, out: Path | None, memory: int, workers: int | Non
     check_resources([step for step in steps if isinstance(step, Plan)], folder, workers or 1)
 
 
-def _spell_resume_command(
-    path: Path, *, out: Path | None, workers: int | None, scheduler: str | None, shard: tuple[int, int] | None, **_: Any
-) -> str:
+def _spell_resume_command(path: Path, *, out: Path | None, shard: tuple[int, int] | None, **given: Any) -> str:
     """The command that goes on with a run, as a shell takes it."""
-    words = ["zwidth", "run", str(path)]
-    words += ["--out", str(out)] if out else []
-    words += ["--resume"]
-    words += ["--shard", f"{shard[0]}/{shard[1]}"] if shard else []
-    words += ["--workers", str(workers)] if workers else []
-    words += ["--scheduler", scheduler] if scheduler else []
-    return shlex.join(words)
+    words = ["zwidth", "run", path, *(["--out", out] if out else []), "--resume"]
+    for name, value in {**given, "shard": shard and f"{shard[0]}/{shard[1]}"}.items():
+        words += [f"--{name}", value] if value and name in ("shard", "workers", "scheduler") else []
+    return shlex.join(map(str, words))
 
 
 def _report_end(result: RunResult, command: str) -> None:
@@ -165,8 +160,7 @@ def _report_end(result: RunResult, command: str) -> None:
     parts += [f"{chunks[0] + chunks[1]} of {chunks[2]} chunks done ({chunks[0]} now)"] if sweeps else []
     click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
     for study in result.studies:
-        for number, line in enumerate(study.answer):
-            click.echo(f"{'' if number else study.name:<20}  {line}")
+        print_folded(row("" if number else study.name, line) for number, line in enumerate(study.answer))
     if any(study.sweep and study.state in ("done", "kept") for study in result.studies):
         click.echo(f"figures of the sweeps: {shlex.join(['zwidth', 'figures', str(result.folder)])}")
     if result.hopeless:
@@ -194,9 +188,8 @@ def verify(folder: Path, as_json: bool) -> None:
     """
     from zwidth.sweep.dataset import verify as verify_stores
 
-    found = verify_stores(folder)
+    found, keys = verify_stores(folder), ("chunks", "done", "damaged", "error", "ok")
     if as_json:
-        keys = ("chunks", "done", "damaged", "error", "ok")
         print_json({store.path.name: {key: getattr(store, key) for key in keys} for store in found})
     for store in () if as_json else found:
         state = store.error or f"{store.done} of {store.chunks} chunks done, {len(store.damaged) or 'none'} damaged"

@@ -39,8 +39,8 @@ from zwidth.words.units import tell_kind
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
-# Free text.
-_TEXTS = ("name", "description", "label")
+# Free text, and an angle of any device, which has no unit.
+_TEXTS = ("name", "description", "label", "phase_margin")
 MAX_FILE_BYTES = 2**20
 MAX_NODES = 50_000
 MAX_DEPTH = 20

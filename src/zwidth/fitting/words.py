@@ -125,9 +125,8 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
         rows.append(("or as well", f"an amplifier's lag of up to {lag}, with t_d = {delay} and K_max = {K}"))
     safe, wall = fit.safe_wall(), choose_wall(fit)
     if safe.status == Status.OK and safe.stiffness > 0:
-        rows.append(
-            ("safe wall", f"{_spell_wall(safe, units)}: stable on 99 % of the devices that these records allow")
-        )
+        borne = "stable on 99 % of the devices that these records allow"
+        rows.append(("safe wall", f"{_spell_wall(safe, units)}: {borne}"))
     if fit.is_doubted:
         rows.append(("no wall", NO_WALL))
     if wall is not None:
@@ -145,10 +144,9 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
         B, K = units.spell("damping", step.virtual_damping, 3), units.spell("stiffness", step.stiffness, 3)
         errors = [units.spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards)]
         text = f"K at B = {B}, near {K} and {with_unit(step.frequency, 'Hz', 3)}"
-        falls = math.isfinite(fit.stiffness_error + step.error_afterwards)
-        rows.append(
-            ("measure next", text + (f": K_max's standard error falls from {' to '.join(errors)}" if falls else ""))
-        )
+        if math.isfinite(fit.stiffness_error + step.error_afterwards):
+            text += f": K_max's standard error falls from {' to '.join(errors)}"
+        rows.append(("measure next", text))
     return rows
 
 
@@ -269,7 +267,6 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
         friction = f"{_write(fit, 'friction')} {units.force}, {_between(fit, 'friction', units)}"
         lines.append(f"# For studies of kind simulate: coulomb: {friction}.")
     if fit.resolution:
-        lines.append(
-            f"# For studies of kind simulate: resolution: {float(f'{fit.resolution:.12g}')!r} {units.position}."
-        )
+        resolution = float(f"{fit.resolution:.12g}")
+        lines.append(f"# For studies of kind simulate: resolution: {resolution!r} {units.position}.")
     return lines

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import shutil
+import textwrap
 from math import isfinite, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,11 +21,15 @@ from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from zwidth.scenes.assessment import Assessment, FrictionRule, Intervals, Limit
     from zwidth.scenes.scene import Scene
 
 # A margin is a difference of dampings; a smaller share of them is their rounding.
 _ROUNDED = 1e-12
+# A space within a quantity, as in "B = 3 N s/m"; after some words as well, where it does no harm.
+_BESIDE = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
 
 def row(label: str, text: str) -> str:
@@ -34,24 +41,28 @@ def print_json(result: Any) -> None:
     click.echo(json.dumps(to_json(result), indent=2, allow_nan=False))
 
 
+def print_folded(lines: Iterable[str], indent: int = 24) -> None:
+    """Print lines for people as wide as their terminal is, the rest of one below it; whole where there is none."""
+    width, rest = shutil.get_terminal_size((10**4, 24)).columns, indent * " "
+    fold = textwrap.TextWrapper(max(width, 40), subsequent_indent=rest, break_long_words=False, break_on_hyphens=False)
+    for line in lines:
+        # A number keeps its unit beside it.
+        click.echo(fold.fill(_BESIDE.sub("\xa0", line)).replace("\xa0", " "))
+
+
 def tell(result: Any, lines: list[str], as_json: bool) -> None:
     """Print an answer for machines, or its lines for people."""
     if as_json:
         print_json(result)
-    for line in () if as_json else lines:
-        click.echo(line)
+    else:
+        print_folded(lines)
 
 
 @in_own_units
 def scene_lines(scene: Scene) -> list[str]:
     device, timing = scene.device, scene.timing
-    lines = [
-        row("device", device.spell()),
-        row(
-            "timing",
-            f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(scene.d)})",
-        ),
-    ]
+    times = f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(scene.d)})"
+    lines = [row("device", device.spell()), row("timing", times)]
     velocity = type(scene.velocity).__name__
     parts, values = find_parts(scene), scene.parameters()
     # From the motor outwards.

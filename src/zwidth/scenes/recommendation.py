@@ -33,14 +33,8 @@ _DOWN, _TRIALS, _CLOSE = 0.25, 15, 1e-4
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
 _OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
-_UNITS = {
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "virtual_damping": "N s/m",
-    "mass": "kg",
-    "time": "s",
-    "frequency": "Hz",
-}
+_UNITS = {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m"}
+_UNITS |= {"mass": "kg", "time": "s", "frequency": "Hz"}
 _EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
 _WALL = ("stiffness", "virtual_damping")
 _JUDGED = (
@@ -159,13 +153,9 @@ class Recommendation:
         lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
         # A unit that both have stands once.
         lower = lower.removesuffix(f" {upper.partition(' ')[2]}")
-        delay = verdict.delay_margin
-        apart = (
-            f"gain {plain(verdict.gain_margin)}",
-            f"phase {plain(verdict.phase_margin)} degrees",
-            f"delay {'not known' if math.isnan(delay) else with_unit(delay, 's')}",
-        )
-        rest = f"margins: {', '.join(apart)}; passive: {self.spell_passive()}"
+        delay = "not known" if math.isnan(verdict.delay_margin) else with_unit(verdict.delay_margin, "s")
+        apart = f"gain {plain(verdict.gain_margin)}, phase {plain(verdict.phase_margin)} degrees, delay {delay}"
+        rest = f"margins: {apart}; passive: {self.spell_passive()}"
         return first, f"stable for B from {lower} to {upper}; {rest}"
 
     def spell_passive(self) -> str:

@@ -26,7 +26,7 @@ from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, summarize_stiffest, track
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, header, short, suggestion
+from zwidth.words.formatting import describe, header, plain, short, suggestion, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -156,12 +156,15 @@ class DesignStudy(ComputedStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         nominal = self.device.to_scene()
-        rows, notes, ranges = [], [], []
+        rows, answer, notes, ranges, unit = [], [], [], [], PARAMETERS[self.find].unit
         for stiffness in self.stiffness.values().tolist():
             needed = nominal.required(self.find, self.reserve * stiffness, within=self.within)
             ranges.append(needed.range)
             rows.append(self._describe(nominal, stiffness, needed))
             notes += self._note(stiffness, needed)
+            if side := {"above": "more", "below": "less"}.get(needed.enough):
+                value = plain(needed.value) if unit == "1" else with_unit(needed.value, unit)
+                answer.append(f"K_max = {with_unit(self.reserve * stiffness, 'N/m')}: {self.find} of {value} or {side}")
         low, high = min(ends[0] for ends in ranges), max(ends[1] for ends in ranges)
         curve = self._trace(nominal, low, high)
         table = stack(rows)
@@ -169,6 +172,7 @@ class DesignStudy(ComputedStudy):
             table=table,
             figures={"": partial(figures.draw_requirement, curve, table)},
             documents={f"{self.name}_curve.csv": csv_text(curve)},
+            answer=tuple(answer),
             notes=tuple(notes),
         )
 
@@ -315,7 +319,16 @@ class FiltersStudy(ComputedStudy):
             limit = np.nan if self.noise_limit is None else self.noise_limit
             table = {**table, "best": _mark_best(table, limit)}
             drawn["_noise"] = partial(figures.draw_filter_noise, table, limit)
-        return Outcome(table=table, figures=drawn)
+        best = [row for row, marked in zip(rows, table.get("best", ()), strict=False) if marked]
+        return Outcome(table=table, figures=drawn, answer=tuple(map(_spell_best, best)))
+
+
+def _spell_best(row: dict[str, Any]) -> str:
+    """The best filter of a damping, in a line."""
+    (stiffness, damping), size = (row[name] for name in SI_COLUMNS), f"{row['samples']:g} samples"
+    size = size if row["samples"] == row["samples"] else with_unit(row["cutoff_Hz"], "Hz")
+    wall = f"K_max = {with_unit(stiffness, 'N/m')} at B = {with_unit(damping, 'N s/m')}"
+    return f"b = {with_unit(row['damping_N_s_per_m'], 'N s/m')}: {row['estimate'].replace('_', ' ')}, {size}: {wall}"
 
 
 def _mark_best(table: Table, limit: float) -> np.ndarray:

@@ -77,11 +77,20 @@ def test_tolerances_are_drawn_and_proved():
     assert "proved" not in normal
 
 
+def test_the_damping_for_a_stiffness_is_that_of_the_library():
+    best = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 5e-4)).best_damping(5e3)
+    found = needed("--find", "virtual_damping", "--stiffness", "5 kN/m", *DEVICE)
+    assert (found["value"], found["spectral_radius"]) == (best.virtual_damping, best.spectral_radius)
+    assert "settles fastest" in design("--find", "virtual_damping", "--stiffness", "5 kN/m", *DEVICE)
+    assert "no B is stable at K = 500.0 kN/m" in design("--find", "virtual_damping", "--stiffness", "5e5", *DEVICE)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ([], "give --find or --tolerance, or both"),
         (["--find", "cutoff"], "--find cutoff: this scene has none; give --velocity-cutoff to start from"),
+        (["--tolerance", "weight=10%"], "Invalid value for '--tolerance': got 'weight'"),
         (["--tolerance", "mass=ten"], "write the parameter and its share, as mass=10%"),
     ],
 )

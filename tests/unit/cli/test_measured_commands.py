@@ -82,7 +82,8 @@ def test_the_table_that_was_kept_gives_the_same_wall(first):
     [
         (["respond", "no.csv"], "no such file"),
         (["excite", *LOOP[:-1], "1 s"], "too short"),
-        (["excite", *LOOP[2:]], "--period"),
+        (["excite", *LOOP[2:]], "give --period or --rate"),
+        (["excite", "--rate", "1 kHz", *LOOP], "--period and --rate are both given"),
         (["respond", "table.csv", "--period", "1 ms"], "zwidth ridge --device table.csv"),
     ],
 )

@@ -28,6 +28,18 @@ def test_a_person_reads_what_to_set_and_what_to_buy():
     assert lines[5].startswith("what buys stiffness   half the delay: K_max 34.23 kN/m, 1.72 times")
 
 
+@pytest.mark.parametrize("columns", [60, 80])
+def test_lines_fit_a_terminal(columns, monkeypatch):
+    whole = recommend("--phase-margin", "30").stdout
+    monkeypatch.setenv("COLUMNS", str(columns))
+    folded = recommend("--phase-margin", "30").stdout
+    assert max(map(len, folded.splitlines())) <= columns < max(map(len, whole.splitlines()))
+    assert folded.split() == whole.split()
+    # No number stands without its unit.
+    assert "33.45 N s/m" in folded
+    assert "30.00 degrees" in folded
+
+
 def test_machines_get_the_same():
     printed = json.loads(recommend("--stiffness-fraction", "60%", "--json").stdout)
     assert printed == json.loads(json.dumps(SCENE.recommend(stiffness_fraction=0.6).as_dict()))

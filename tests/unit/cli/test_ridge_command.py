@@ -55,6 +55,11 @@ def test_a_normalized_device_has_no_si_sensitivities():
     assert "sensitivities" not in json.loads(ridge("--delta", "0.1", "--d", "1", "--json"))
 
 
+def test_a_normalized_number_is_named_as_it_was_given():
+    refused = CliRunner().invoke(cli, ["ridge", "--delta", "inf", "--d", "1"])
+    assert "Invalid value for '--delta': got 'inf'" in refused.output
+
+
 @pytest.mark.parametrize("arguments", [[], ["--delta", "1"], ["--mass", "1"], ["--delta", "1", "--d", "-1"]])
 def test_wrong_use_exits_with_2(arguments):
     assert CliRunner().invoke(cli, ["ridge", *arguments]).exit_code == 2

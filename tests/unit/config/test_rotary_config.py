@@ -43,6 +43,12 @@ def test_units_of_rotation_make_the_devices_of_a_file_rotary():
     assert read({"mass": 1e-6, "rate": 1000, "rotary": True}).rotary
 
 
+def test_a_margin_in_degrees_is_of_any_device():
+    said = refuse({"mass": "100 g", "rate": "1 kHz"}, RECOMMEND | {"phase_margin": "30 deg"})
+    assert "phase_margin: got '30 deg'" in said
+    assert "rotary" not in said
+
+
 def test_a_published_device_stands_by_its_name():
     config = read({"device": "haptic_wheel", "rate": "1 kHz", "stiffness": 1.0})
     assert config.rotary

@@ -10,6 +10,7 @@ from zwidth.figures.table import SI_COLUMNS
 from zwidth.studies.design import DesignStudy
 from zwidth.studies.document import load_config
 from zwidth.words.errors import ConfigError
+from zwidth.words.formatting import with_unit
 
 DEVICE = {"mass": 0.1, "damping": 10.0, "rate": 1000, "delay": 1e-3}
 FILTERED = {**DEVICE, "velocity": {"kind": "low_pass", "cutoff": 100}}
@@ -31,7 +32,9 @@ def test_damping_rate_and_delay_are_those_of_the_closed_search():
         "delay": find_required("delay", 30e3, 0.0, 5e-3, mass=0.1, damping=10.0, period=1e-3),
     }
     for find, value in expected.items():
-        table = design(find, "30 kN/m", num=3).compute(None, True).table
+        found = design(find, "30 kN/m", num=3).compute(None, True)
+        table, unit = found.table, UNITS[find].replace("_per_", "/").replace("_", " ")
+        assert found.answer[0].startswith(f"K_max = 30.00 kN/m: {find} of {with_unit(value, unit)} or ")
         assert table[f"value_{UNITS[find]}"][0] == pytest.approx(value, rel=1e-9)
         assert table["enough"][0] == ("below" if find == "delay" else "above")
         assert table["stiffness_max_N_per_m"][0] >= 30e3

@@ -12,6 +12,7 @@ from zwidth.figures.table import SI_COLUMNS, select
 from zwidth.studies.boundary import BoundaryStudy, CompareStudy
 from zwidth.studies.design import FiltersStudy
 from zwidth.studies.recommend import RecommendStudy
+from zwidth.words.formatting import with_unit
 
 DEVICE = {"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": "1 periods"}
 ISLANDS = {**DEVICE, "velocity": {"kind": "windowed_difference", "samples": 24}}
@@ -149,6 +150,7 @@ def test_the_best_filter_is_the_stiffest_of_those_that_are_quiet(filters):
         quiet = rows["velocity_noise_m_per_s"] <= 1e-3
         assert 0 < quiet.sum() < quiet.size
         assert rows[SI_COLUMNS[0]][rows["best"]].tolist() == [rows[SI_COLUMNS[0]][quiet].max()]
+        assert any(line.startswith(f"b = {with_unit(damping, 'N s/m')}: ") for line in filters.answer)
 
 
 def test_figures_of_filters(filters):
