@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import cached_property
 from types import SimpleNamespace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BeforeValidator, WithJsonSchema, WrapValidator
@@ -49,10 +49,8 @@ def _check_numbers(raw: Any) -> Any:
 _Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type": ["array", "number"]})]
 
 
-class SystemSection(PartSection):
+class SystemSection(PartSection, what="a linear system"):
     """A device as a linear system, from commanded force in N to sensed position in m."""
-
-    what: ClassVar[str] = "a linear system"
 
     numerator: _Numbers | None = None
     """Coefficients in s, or in z of a sampled system, highest power first."""
@@ -107,10 +105,8 @@ def _is_whole(given: Iterable[str]) -> bool:
     return any(set(form) - {"zeros"} <= set(given) <= {*form, "sampled"} for form in _OF_SYSTEM)
 
 
-class ResponseSection(PartSection):
+class ResponseSection(PartSection, what="a response"):
     """A device by its measured frequency response, the columns of a table."""
-
-    what: ClassVar[str] = "a response"
 
     frequency: _Numbers
     """Of its lines, in Hz."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, PlainValidator, ValidationInfo, WrapValidator
 
@@ -27,11 +27,9 @@ NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
 class OneKind(Strict):
     """Base of what is either physical or normalized: the other kind's keys get a message of their own."""
 
-    foreign: ClassVar[frozenset[str]]
-
     @classmethod
     def unknown(cls, name: str) -> tuple[str, str, str]:
-        if name not in cls.foreign:
+        if name not in (PHYSICAL_KEYS if NORMALIZED_KEYS & cls.model_fields.keys() else NORMALIZED_KEYS):
             return super().unknown(name)
         if name in PART_NAMES:
             allowed = f"{cls.what} that is normalized has no parts: their keys are in SI units"
@@ -104,8 +102,6 @@ class SampledMass(OneKind):
 
     # The name of a published device is replaced by its numbers.
     model_config = ConfigDict(json_schema_extra=_add_device)
-
-    foreign: ClassVar[frozenset[str]] = NORMALIZED_KEYS
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, fields
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
@@ -66,7 +66,7 @@ _Axes: Any = create_model("_Axes", __base__=Strict, **_FIELDS)
 class Axes(_Axes):
     """The parameters of a sweep and the values that each of them takes."""
 
-    what: ClassVar[str] = "the axes of a sweep"
+    what = "the axes of a sweep"
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
