@@ -331,7 +331,7 @@ def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wante
     found = scene.recommend(**wanted)
     wrote = []
     if figure is not None:
-        from zwidth.studies.recommend import draw
+        from zwidth.studies.responses import draw
 
         wrote.append(save_figure(draw(found), figure))
     if code:

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import ConfigDict, WrapValidator
 
 from zwidth.arrays.xp import within
+from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.mass import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
 from zwidth.config.parts import (
     SimulatedVelocityField,
     build_parts,

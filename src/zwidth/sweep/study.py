@@ -10,10 +10,16 @@ from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, Wr
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.device_table import DeviceTable, TableField, read_table
-from zwidth.config.devices import DeviceForm, ResponseSection
+from zwidth.config.devices import (
+    DeviceForm,
+    ResponseSection,
+    Rotary,
+    find_second_device,
+    find_second_period,
+    tell_rotary,
+)
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
-from zwidth.config.mass import Rotary, find_second_device, find_second_period, tell_rotary
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import HeldOnly, Study, register
