@@ -1,26 +1,30 @@
-"""Devices of a configuration that are no mass with damping: a linear system, or a measured frequency response."""
+"""Devices of a configuration: a sampled mass and the keys that cannot stand beside it, a linear system, a response."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from types import SimpleNamespace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.config.device_table import find_file
-from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.parts import PartSection, split_refusal
-from zwidth.config.values import Quantity
+from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
+from zwidth.config.fields import Strict
+from zwidth.config.parts import PART_NAMES, PartSection, split_refusal
+from zwidth.config.values import Delay, Quantity, quantity_of
+from zwidth.parts.checks import Span
 from zwidth.parts.devices import DEVICES
 from zwidth.parts.linear_device import LinearDevice, split_fraction
 from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.paths import PARTS
 from zwidth.parts.response_table import SUFFIXES
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, suggestion
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.rotation import is_rotary
 
 FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
 _OF_SYSTEM = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"))
@@ -49,10 +53,8 @@ def _check_numbers(raw: Any) -> Any:
 _Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type": ["array", "number"]})]
 
 
-class SystemSection(PartSection):
+class SystemSection(PartSection, what="a linear system"):
     """A device as a linear system, from commanded force in N to sensed position in m."""
-
-    what: ClassVar[str] = "a linear system"
 
     numerator: _Numbers | None = None
     """Coefficients in s, or in z of a sampled system, highest power first."""
@@ -107,10 +109,8 @@ def _is_whole(given: Iterable[str]) -> bool:
     return any(set(form) - {"zeros"} <= set(given) <= {*form, "sampled"} for form in _OF_SYSTEM)
 
 
-class ResponseSection(PartSection):
+class ResponseSection(PartSection, what="a response"):
     """A device by its measured frequency response, the columns of a table."""
-
-    what: ClassVar[str] = "a response"
 
     frequency: _Numbers
     """Of its lines, in Hz."""
@@ -160,3 +160,133 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
 
 
 DeviceForm = Annotated[SystemSection | ResponseSection, WrapValidator(lambda raw, _: _read_form(raw))]
+
+
+PHYSICAL_KEYS = frozenset(
+    {"device", "rotary", "mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES}
+)
+NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
+
+
+class OneKind(Strict):
+    """Base of what is either physical or normalized: the other kind's keys get a message of their own."""
+
+    @classmethod
+    def unknown(cls, name: str) -> tuple[str, str, str]:
+        if name not in (PHYSICAL_KEYS if NORMALIZED_KEYS & cls.model_fields.keys() else NORMALIZED_KEYS):
+            return super().unknown(name)
+        if name in PART_NAMES:
+            allowed = f"{cls.what} that is normalized has no parts: their keys are in SI units"
+            remedy = "write mass, damping and period in place of delta and d"
+            return f"got {name!r} after normalized keys", allowed, remedy
+        kind, other = ("physical", "normalized") if name in NORMALIZED_KEYS else ("normalized", "physical")
+        return (
+            f"{other} key, after {kind} ones",
+            f"{cls.what} is described in SI units or normalized, never both",
+            f"remove it, or write all keys {'normalized' if other == 'normalized' else 'in SI units'}",
+        )
+
+
+def _period(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float:
+    """The period itself, or one over the rate."""
+    if value is not None:
+        return read(value)
+    # A rate that failed its own check is absent from the data; that fault is enough.
+    rate = info.data.get("rate", 1.0)
+    if rate is None:
+        raise problem("missing", "the sampling period or its rate is needed", "add 'period: 1 ms' or 'rate: 1 kHz'")
+    return 1.0 / rate
+
+
+def _mass(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float | None:
+    """The mass itself; none of a device that is given as a whole."""
+    if value is not None:
+        return read(value)
+    if info.data.get("device", ...) is None:
+        allowed = "a device has mass and period or rate, or, normalized, delta"
+        raise problem("missing", allowed, "add 'mass: 0.1 kg'")
+    return None
+
+
+def find_second_period(keys: Iterable[str]) -> Iterable[LocatedProblem]:
+    """A problem where the sampling period is given twice."""
+    for second in [key for key in keys if key in ("period", "rate")][1:]:
+        allowed = "the sampling period and its rate say the same"
+        yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
+
+
+def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
+    """Problems of what a device that is given as a whole holds already."""
+    for key in keys:
+        if key.partition(".")[0] in ("mass", "damping", *PARTS, "modes") and keys[key]:
+            allowed = "the linear system or response of the device holds it"
+            yield (key,), problem(f"got {key!r} beside a device given as a whole", allowed, "remove one", on_key=True)
+
+
+def tell_rotary(value: Any = None) -> bool | None:
+    """What a section keeps: true of a file of rotary devices; nothing of linear ones."""
+    if value is not None and not isinstance(value, bool):
+        raise problem(f"got {describe(value)}", "it must be true or false", "remove it: units tell the kind")
+    if value is False and is_rotary():
+        raise problem("got false", "other devices of the file are rotary, or have units of rotation", "write two files")
+    return value or is_rotary() or None
+
+
+Rotary = Annotated[bool | None, PlainValidator(tell_rotary, json_schema_input_type=bool)]
+
+
+def _add_device(schema: dict[str, Any]) -> None:
+    """What editors are told of the texts that name a device, in the place of mass and damping."""
+    forms = schema["properties"]["device"]["anyOf"]
+    forms[:0] = [{"enum": [device.name for device in DEVICES]}, {"type": "string"}]
+
+
+class SampledMass(OneKind):
+    """A mass with damping, sampled, in SI units."""
+
+    # The name of a published device is replaced by its numbers.
+    model_config = ConfigDict(json_schema_extra=_add_device)
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        """Put the numbers of a published device in the place of its name; those that are written count."""
+        name = raw.get("device")
+        known = {device.name: device for device in DEVICES}.get(name) if isinstance(name, str) else None
+        if known is None:
+            return super().prepare(raw)
+        if known.rotary != is_rotary():
+            allowed = "this device is linear, and others of the file are rotary"
+            what = problem(f"got {describe(name)}", allowed, "write two files")
+            raise validation_error(cls.__name__, [(("device",), what)])
+        found = {key: number.value for key in ("mass", "damping") if (number := getattr(known, key)) is not None}
+        return super().prepare({**found, **{key: value for key, value in raw.items() if key != "device"}})
+
+    device: DeviceForm | None = None
+    """Name of a published device, whose mass and damping are taken where none are written; or a device that is no mass
+    with damping: a linear system ('1 / 0.1 10 0' in s, or a mapping), or a measured response (FILE.csv)."""
+
+    mass: Annotated[float | None, quantity_of("mass"), WrapValidator(_mass)] = Field(
+        default=None, validate_default=True
+    )
+    """Moving mass m of the device in kg, > 0; of a rotary one its inertia in kg m^2."""
+
+    damping: Annotated[float, quantity_of("damping")] = 0.0
+    """Physical damping b of the device in N s/m, >= 0; of a rotary one in N m s/rad."""
+
+    rotary: Rotary = Field(default_factory=tell_rotary)
+    """Whether the device turns, as all of a file do where one quantity has a unit of rotation."""
+
+    rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
+    """Sampling rate 1/T in Hz; give it or the period."""
+
+    period: Annotated[float, quantity_of("period"), WrapValidator(_period)] = Field(default=None, validate_default=True)
+    """Sampling period T in s; give it or the rate. Always set once the file is loaded."""
+
+    delay: Delay = Span(0.0, "s")
+    """Delay t_d from the sample to the moment its force acts, in s or in periods, >= 0."""
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        yield from find_second_period(raw)
+        if raw.get("device") is not None:
+            yield from find_second_device(raw)

@@ -40,6 +40,11 @@ class Strict(BaseModel):
     described_by: ClassVar[tuple[type[Strict], ...]] = ()
     """Other models, which say what the fields of their names are."""
 
+    def __init_subclass__(cls, *, what: str = "", **config: Any) -> None:
+        super().__init_subclass__(**config)
+        if what:
+            cls.what = what
+
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
         """Hook: fill in what another part of the file supplies."""

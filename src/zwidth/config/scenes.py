@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import ConfigDict, WrapValidator
 
 from zwidth.arrays.xp import within
+from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.mass import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
 from zwidth.config.parts import (
     SimulatedVelocityField,
     build_parts,
@@ -111,7 +111,6 @@ class _PhysicalPlant(_Parts, SampledMass):
 class _NormalizedPlant(OneKind):
     """The same as two dimensionless numbers, those of a mass of 1 kg at a period of 1 s."""
 
-    foreign: ClassVar[frozenset[str]] = PHYSICAL_KEYS
     period: ClassVar[float] = 1.0
     parts_beyond: ClassVar[tuple[str, ...]] = ()
 
@@ -126,10 +125,8 @@ class _NormalizedPlant(OneKind):
         return Scene(Device(1.0, self.delta), Timing(self.period, self.d))
 
 
-class PhysicalDevice(_PhysicalPlant):
+class PhysicalDevice(_PhysicalPlant, what="a device"):
     """A device in SI units."""
-
-    what: ClassVar[str] = "a device"
 
     label: str | None = None
     """Name of the device in legends."""
@@ -142,32 +139,25 @@ class SimulatedDevice(PhysicalDevice):
     """How the velocity is estimated; the difference of two samples where left out."""
 
 
-class LabeledDevice(_PhysicalPlant):
+class LabeledDevice(_PhysicalPlant, what="a device"):
     """A device in SI units among others that a figure names."""
 
     # The scene may supply all the rest.
     model_config = ConfigDict(json_schema_extra={"required": ["label"]})
 
-    what: ClassVar[str] = "a device"
-
     label: str
     """Name of the device in the legend, each one its own."""
 
 
-class NormalizedDevice(_NormalizedPlant):
+class NormalizedDevice(_NormalizedPlant, what="a device"):
     """A normalized device."""
-
-    what: ClassVar[str] = "a device"
 
     label: str | None = None
     """Name of the device in legends."""
 
 
-class PhysicalWall(OneKind):
+class PhysicalWall(OneKind, what="a wall"):
     """A wall in SI units."""
-
-    what: ClassVar[str] = "a wall"
-    foreign: ClassVar[frozenset[str]] = NORMALIZED_KEYS
 
     stiffness: Annotated[float, quantity_of("stiffness")]
     """Stiffness K in N/m."""
@@ -176,11 +166,8 @@ class PhysicalWall(OneKind):
     """Damping B in N s/m."""
 
 
-class NormalizedWall(OneKind):
+class NormalizedWall(OneKind, what="a wall"):
     """A normalized wall."""
-
-    what: ClassVar[str] = "a wall"
-    foreign: ClassVar[frozenset[str]] = PHYSICAL_KEYS
 
     alpha: Number
     """Normalized stiffness K T^2/m."""
@@ -195,10 +182,8 @@ def _pick_wall(scene: Any, kind: Any) -> Any:
     return None if set(given.values()) == {None} else kind(**{name: value or 0.0 for name, value in given.items()})
 
 
-class PhysicalScene(_PhysicalPlant):
+class PhysicalScene(_PhysicalPlant, what="a scene"):
     """The file's device, timing and wall in SI units."""
-
-    what: ClassVar[str] = "a scene"
 
     stiffness: Annotated[float, quantity_of("stiffness")] | None = None
     """Stiffness K of the wall in N/m."""
@@ -240,10 +225,8 @@ class PhysicalScene(_PhysicalPlant):
         return _pick_wall(self, PhysicalWall)
 
 
-class NormalizedScene(_NormalizedPlant):
+class NormalizedScene(_NormalizedPlant, what="a scene"):
     """The file's device, timing and wall, normalized."""
-
-    what: ClassVar[str] = "a scene"
 
     alpha: Number | None = None
     """Normalized stiffness K T^2/m of the wall."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
-from typing import Annotated, Any, ClassVar, TypeAlias, cast
+from typing import Annotated, Any, TypeAlias, cast
 
 import numpy as np
 from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, ValidationInfo
@@ -184,10 +184,8 @@ def _read_end(raw: Any, info: ValidationInfo) -> float:
     return cast(Entry, info.context)(raw)
 
 
-class _EqualSteps(Strict):
+class _EqualSteps(Strict, what="an axis with 'linear'"):
     """The mapping below ``linear``."""
-
-    what: ClassVar[str] = "an axis with 'linear'"
 
     start: Annotated[float, BeforeValidator(_read_end)]
     stop: Annotated[float, BeforeValidator(_read_end)]
@@ -211,10 +209,8 @@ class _EqualSteps(Strict):
         return []
 
 
-class _EqualRatios(_EqualSteps):
+class _EqualRatios(_EqualSteps, what="an axis with 'log'"):
     """The mapping below ``log``."""
-
-    what: ClassVar[str] = "an axis with 'log'"
 
 
 _SPACINGS: dict[str, tuple[Any, type[_EqualSteps]]] = {

@@ -8,9 +8,10 @@ from .curves import draw_outlines as draw_outlines
 from .design import draw_filter_noise as draw_filter_noise
 from .design import draw_filters as draw_filters
 from .design import draw_requirement as draw_requirement
-from .device_fit import draw_device_fit as draw_device_fit
 from .limit_cycle import draw_limit_cycle_curves as draw_limit_cycle_curves
 from .limit_cycle import draw_limit_cycles as draw_limit_cycles
+from .measured import draw_device_fit as draw_device_fit
+from .measured import draw_response as draw_response
 from .motion import draw_energy as draw_energy
 from .motion import draw_motion as draw_motion
 from .motion import draw_phase_plane as draw_phase_plane
@@ -20,9 +21,8 @@ from .over_damping import draw_ridge as draw_ridge
 from .over_damping import draw_slope as draw_slope
 from .over_damping import draw_zero_stiffness as draw_zero_stiffness
 from .plane import draw_plane as draw_plane
-from .response import draw_response as draw_response
+from .plane import draw_workspace as draw_workspace
 from .stable_set import draw_recommendation as draw_recommendation
 from .stable_set import draw_stable_set as draw_stable_set
 from .style import house_style as house_style
 from .style import save as save
-from .workspace import draw_workspace as draw_workspace

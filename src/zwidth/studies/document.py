@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Annotated, Any, ClassVar, Literal, Union
+from typing import Annotated, Any, Literal, Union
 
 from pydantic import (
     BeforeValidator,
@@ -100,10 +100,8 @@ class _Place:
     folder: Path = field(compare=False)
 
 
-class FigureLook(Strict):
+class FigureLook(Strict, what="the look of figures"):
     """How the figures of a run are written."""
-
-    what: ClassVar[str] = "the look of figures"
 
     width: Annotated[float, Quantity("m", Range(0.05, 0.5), turns=False)] | None = None
     """Width of every figure, as 85 mm of a journal's column; type is no smaller for it."""
@@ -122,10 +120,8 @@ class FigureLook(Strict):
         return None if self.width is None else (self.width / 0.0254, None)
 
 
-class Config(Strict):
+class Config(Strict, what="a configuration"):
     """A configuration file, checked and complete: every study holds the values that it runs with."""
-
-    what: ClassVar[str] = "a configuration"
 
     version: Annotated[int, BeforeValidator(_check_version), WithJsonSchema({"const": FORMAT_VERSION})]
     """Version of the format, 1."""

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BeforeValidator, GetJsonSchemaHandler, PrivateAttr, WithJsonSchema, WrapValidator
@@ -50,10 +50,8 @@ def _read_resolution(raw: Any) -> Any:
 Step = Annotated[float | str, BeforeValidator(_read_resolution), WithJsonSchema(describe_entry("m", "rad", "deg"))]
 
 
-class LogSection(Strict):
+class LogSection(Strict, what="a log"):
     """One log: a file of columns and which of them is what."""
-
-    what: ClassVar[str] = "a log"
 
     csv: str
     """Name of the file, relative to the configuration: a text of columns, .npz, .npy or .mat."""
@@ -124,10 +122,8 @@ class _OneOrSeveral:
         return {"anyOf": [several["items"], several]}
 
 
-class BuzzSection(Strict):
+class BuzzSection(Strict, what="a wall that buzzed"):
     """A wall at the onset of buzzing."""
-
-    what: ClassVar[str] = "a wall that buzzed"
 
     stiffness: Annotated[float, Quantity("N/m", POSITIVE)]
     """K in N/m or with a unit, raised at this damping until the wall buzzed."""

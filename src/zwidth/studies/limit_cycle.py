@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 from pydantic import WrapValidator, create_model
@@ -50,17 +50,15 @@ _Own: Any = create_model("_Own", __base__=Strict, **_OWN)
 class CycleCondition(_Own):
     """What one panel of a limit_cycle study has of its own."""
 
-    what: ClassVar[str] = "a condition"
+    what = "a condition"
     described_by = (Circumstances,)
 
     label: str
     """Name of the condition, each one its own."""
 
 
-class CycleAxes(Strict):
+class CycleAxes(Strict, what="the axes of a limit_cycle study"):
     """Parameters of a limit_cycle study, one or two of them with several values."""
-
-    what: ClassVar[str] = "the axes of a limit_cycle study"
 
     stiffness: Annotated[Axis, axis_of("stiffness")]
     """Stiffness K of the wall, in N/m or with a unit."""

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, fields
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.device_table import DeviceTable, TableField, read_table
-from zwidth.config.devices import DeviceForm, ResponseSection
+from zwidth.config.devices import (
+    DeviceForm,
+    ResponseSection,
+    Rotary,
+    find_second_device,
+    find_second_period,
+    tell_rotary,
+)
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
-from zwidth.config.mass import Rotary, find_second_device, find_second_period, tell_rotary
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import HeldOnly, Study, register
@@ -66,7 +72,7 @@ _Axes: Any = create_model("_Axes", __base__=Strict, **_FIELDS)
 class Axes(_Axes):
     """The parameters of a sweep and the values that each of them takes."""
 
-    what: ClassVar[str] = "the axes of a sweep"
+    what = "the axes of a sweep"
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:

@@ -7,7 +7,7 @@ from run_folders import BOTH, SMALL
 from unpainted import painting_nothing
 
 from zwidth.runs import run
-from zwidth.studies.map import MapStudy
+from zwidth.studies.boundary import MapStudy
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from run_folders import BOTH, SMALL, contents, record_of, states
 import zwidth
 from zwidth.runs import run
 from zwidth.studies import Outcome, load_config
-from zwidth.studies.map import MapStudy
+from zwidth.studies.boundary import MapStudy
 from zwidth.sweep.dataset import verify
 from zwidth.words.errors import ConfigError, InputError, StoreError, StoreExistsError
 

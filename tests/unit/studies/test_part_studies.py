@@ -11,7 +11,7 @@ from zwidth import figures
 from zwidth.figures.table import SI_COLUMNS, select
 from zwidth.studies.boundary import BoundaryStudy, CompareStudy
 from zwidth.studies.design import FiltersStudy
-from zwidth.studies.recommend import RecommendStudy
+from zwidth.studies.responses import RecommendStudy
 from zwidth.words.formatting import with_unit
 
 DEVICE = {"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": "1 periods"}

@@ -10,12 +10,10 @@ from zwidth.config.scenes import PhysicalScene
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.loops.rigid.poles import radius_by_companion
-from zwidth.studies.boundary import BoundaryStudy, outline, stable_intervals
-from zwidth.studies.map import MapStudy
+from zwidth.studies.boundary import BoundaryStudy, MapStudy, outline, stable_intervals
 from zwidth.studies.outcome import csv_text
-from zwidth.studies.recommend import RecommendStudy
+from zwidth.studies.responses import RecommendStudy, StepStudy
 from zwidth.studies.ridge import PassivityStudy, RidgeStudy, needed_models, ridge_table, slope_table, unit_outline
-from zwidth.studies.step import StepStudy
 
 DELTAS = np.array([0.0, 0.5, 2.0, 2.5, 4.0])
 DELAYS = np.array([0.0, 0.25, 0.9, 1.0, 4.0])

@@ -1,11 +1,13 @@
-"""What the page shows of a scene, as plain arrays; nothing here knows of a browser.
+"""What the page shows of a scene, as plain arrays, part by part; nothing here knows of a browser.
 
 K and B stand for alpha and beta where the scene is normalized (m = 1, T = 1).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import atan2, ceil, floor, inf, isfinite, log10, nan, pi
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -14,8 +16,9 @@ from zwidth.loops.linear.curve import end_lines
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
-from zwidth.pages.words import pole_words, row
-from zwidth.scenes.assessment import Assessment, passive_edge
+from zwidth.pages.words import check_lines, list_slopes, pole_words, row
+from zwidth.parts.device import Device
+from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import plain
@@ -265,3 +268,71 @@ def normalized_lines(verdict: Assessment) -> list[str]:
 
 def word_of(verdict: Assessment) -> str:
     return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
+
+
+# Held while JAX is being imported: what looks for it meanwhile would find half of it.
+IMPORTING = Lock()
+
+# What a part of the page shows: the columns of a source, or a text, by name.
+Update = dict[str, Any]
+
+
+def compute_details(
+    scene: Scene, across: Range, up: Range, *, normalized: bool, outline: bool, contact: bool, costly: bool
+) -> Iterator[Update]:
+    """What takes longer than a drag, part by part as it is wanted; whoever asks may stop after each.
+
+    Args:
+        scene: the scene with its wall.
+        across: the range of stiffness that is shown, for contours.
+        up: that of damping.
+        normalized: whether its units are those of m = 1 and T = 1.
+        outline: whether what hangs on the device is wanted, for it has changed.
+        contact: whether a hit of the wall is.
+        costly: whether what takes seconds in a scene with parts is.
+    """
+    quick = scene.loop.outline() is not None
+    # The page shows millimeters.
+    length = 1.0 if normalized else 1e3
+    if outline and not quick:
+        yield {**show_outlines(outlines(scene)), "islands": name_islands(scene)}
+    verdict = assess(scene)
+    own = normalized_lines(verdict) if normalized else None
+    lines = own or check_lines(scene, verdict, [])
+    word = word_of(verdict)
+    captions = {"poles_words": caption_poles(scene.poles(), word), **caption_curves(verdict, normalized)}
+    time, position = step_motion(scene, length_of(scene, verdict))
+    curves = {
+        **open_loop(scene, verdict),
+        "step": {"x": time, "y": position * length},
+        "best": {"x": [verdict.stiffness_max], "y": [verdict.virtual_damping_at_max]},
+    }
+    yield {"word": word, "verdict": "\n".join(lines), **captions, **curves}
+    if outline:
+        x, y = passive_set(scene) or (np.empty(0), np.empty(0))
+        yield {"passive": {"x": x, "y": y}, "contours": contours(scene, across, up)}
+    if not own:
+        yield {"verdict": "\n".join(check_lines(scene, verdict, limits_of(scene)))}
+    if contact or (costly and not quick):
+        with IMPORTING:
+            import jax  # noqa: F401
+    # Of a linear system no damping is known that could grow, and no place to hit the wall from.
+    bodies = isinstance(scene.device, Device)
+    if quick or costly:
+        x, y = ridge_path(scene) if bodies else (np.empty(0), np.empty(0))
+        yield {"ridge": {"x": x, "y": y}}
+        yield {"slopes": "\n".join([] if normalized else [slope.line() for slope in list_slopes(scene)])}
+    if contact and not bodies:
+        empty = {"x": [], "position": [], "force": []}
+        yield {"contact": empty, "contact_words": "(a linear system has no body that comes with a velocity)"}
+    elif contact:
+        time, position, force, text = contact_motion(scene, 2 * length_of(scene, verdict))
+        position = position * length
+        yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}
+
+
+def show_outlines(outlines: list[Curve]) -> Update:
+    """All outlines, closed, as one line and as one area: what lies within two of them is a hole."""
+    xs, ys = ([np.append(outline[axis], outline[axis][:1]) for outline in outlines] for axis in (0, 1))
+    x, y = (np.concatenate([np.append(ring, np.nan) for ring in rings] or [np.empty(0)]) for rings in (xs, ys))
+    return {"area": {"xs": [[xs]], "ys": [[ys]]}, "edge": {"x": x, "y": y}}

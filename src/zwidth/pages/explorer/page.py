@@ -18,7 +18,7 @@ from bokeh.plotting import figure
 from zwidth.figures import style
 from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls, read_link, to_link, to_python, to_yaml
-from zwidth.pages.explorer.details import IMPORTING, Update, compute_details, show_outlines
+from zwidth.pages.explorer.model import IMPORTING, Update, compute_details, show_outlines
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import ZwidthError

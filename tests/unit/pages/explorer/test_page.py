@@ -127,7 +127,7 @@ def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
     def fail(scene):
         raise ZeroDivisionError("far away")
 
-    monkeypatch.setattr("zwidth.pages.explorer.details.assess", fail)
+    monkeypatch.setattr("zwidth.pages.explorer.model.assess", fail)
     say(page, rest=True)
     page.queue.work()
     assert page.texts["error"] == "ZeroDivisionError: far away"
