@@ -54,7 +54,9 @@ def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
             continue
         # What is infinite gets a status, as what is negative.
         least, most = SIZES[name]
-        size = abs(value) if least else value
+        # In single precision the ends of the ranges would overflow.
+        size = value.item() if isinstance(value, np.generic) else value
+        size = abs(size) if least else size
         if 0 < size < least or most < size < math.inf:
             allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"0 to {most:g}"
             raise InputError(f"{name}: got {value!r}; it must be {allowed}")

@@ -123,6 +123,8 @@ def test_a_number_beyond_the_range_of_its_name_is_refused():
         check_scalars({"alpha": 1e-70})
     # Arrays get a status, and other names have no range.
     check_scalars({"delta": np.array([1e13]), "omega": 1e-70, "alpha": np.inf, "beta": -1.0})
+    # Without a warning of NumPy that the ends of the range overflow in single precision.
+    check_scalars({"alpha": np.float32(0.1)})
 
 
 def rooted(x, y, factor):
