@@ -17,7 +17,7 @@ import numpy as np
 
 from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import FEW
-from zwidth.arrays.xp import is_jax, is_traced, namespace
+from zwidth.arrays.xp import is_jax, is_traced, namespace, within
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import AnyChain, chain_of
@@ -30,6 +30,7 @@ from zwidth.loops.linear.ridge import BoundRidge, SceneSensitivities, differenti
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import Island, bound_intervals, label_walls, stable_dampings
 from zwidth.loops.rigid.boundary import boundary_point, stable_region
+from zwidth.loops.rigid.device import wall_status
 from zwidth.loops.rigid.margins import Margins, margins, margins_kernel
 from zwidth.loops.rigid.outermost_poles import slowest_pole
 from zwidth.loops.rigid.passivity import passivity_margin
@@ -39,6 +40,7 @@ from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import Stability, StabilityMethod, decide_stability, is_stable
 from zwidth.parts.paths import AnyScene, list_parameters, replace_parameters
 from zwidth.words.errors import InputError, ZwidthError
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array, DelayModel
 
@@ -185,8 +187,8 @@ class LinearLoop:
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod, exact: tuple[np.ndarray, np.ndarray]
     ) -> Stability:
         """Labels with status and method; ``exact`` are the walls in SI units, as "certified" takes them."""
-        known = np.isfinite(alpha) & np.isfinite(beta)
-        status = np.where(known, np.int32(Status.OK), np.int32(Status.INVALID_INPUT))
+        # Device and delay were checked as the parts of the scene.
+        status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         if method == "certified":
             from zwidth.loops.linear.certified import decide_walls
 
@@ -205,8 +207,10 @@ class LinearLoop:
         return 1.0 + poles_less_one(self.roots, alpha, beta)
 
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """The spectral radius, below 1 exactly where a wall is stable."""
+        """The spectral radius, below 1 exactly where a wall is stable; NaN where one is out of range."""
         stable = label_walls(self.boundary, alpha, beta).reshape(-1)
+        known = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
+        alpha, beta = (np.where(known, value, np.nan) for value in (alpha, beta))
         found = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)
         return found.reshape(alpha.shape)[()]
 

@@ -151,10 +151,14 @@ def test_shapes_and_what_is_not_finite():
 
 @pytest.mark.parametrize("method, used", [("auto", Method.CROSSOVER), ("companion", Method.COMPANION)])
 def test_a_decision_says_what_decided_and_where_it_could_not(method, used):
-    found = FILTERED.decide_stability([1e3, 60e3, np.nan, np.inf], 4.0, method=method)
-    np.testing.assert_array_equal(found.stable, [True, False, False, False])
-    np.testing.assert_array_equal(found.status, [Status.OK, Status.OK, *[Status.INVALID_INPUT] * 2])
-    np.testing.assert_array_equal(found.method, [used] * 4)
+    K = [1e3, 60e3, np.nan, np.inf, 1e70]
+    found = FILTERED.decide_stability(K, 4.0, method=method)
+    np.testing.assert_array_equal(found.stable, [True, False, False, False, False])
+    np.testing.assert_array_equal(
+        found.status, [Status.OK, Status.OK, *[Status.INVALID_INPUT] * 2, Status.OUT_OF_RANGE]
+    )
+    np.testing.assert_array_equal(found.method, [used] * 5)
+    assert np.isnan(FILTERED.spectral_radius(K, 4.0)[2:]).all()
 
 
 def test_rigid_scenes_take_the_closed_functions():

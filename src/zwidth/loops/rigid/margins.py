@@ -12,9 +12,9 @@ import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.roots import false_position, follow_root
-from zwidth.arrays.xp import along, epsilon, frozen, namespace, nan_with_nan_slopes, store_once
+from zwidth.arrays.xp import along, epsilon, frozen, horner, namespace, nan_with_nan_slopes, store_once
 from zwidth.loops.rigid.crossover import gain_crossover, stable_at
-from zwidth.loops.rigid.device import ANY, DeviceTerms, device, split_delay, valid_wall
+from zwidth.loops.rigid.device import ANY, DeviceTerms, device, short_curve, split_delay, valid_wall
 from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, find_angle, modulus, size_and_phase
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
@@ -27,6 +27,8 @@ _FRACTIONS = 64
 _STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
 # Of a stable wall whose margins vanish in rounding.
 _LEAST_MARGIN = float(np.finfo(np.float32).tiny)
+# A phase in radians below which its rounding may matter.
+_SMALL_PHASE = 0.1
 # A phase that says unstable, where |L| is above 1 at every frequency.
 _NO_CROSSOVER = -1e-3
 
@@ -138,16 +140,23 @@ def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple
     """The factor on the wall at which its ray leaves the stable set, and the frequency there.
 
     The phase of L does not depend on the factor, and the gain crossover rises with it: the first zero of the phase
-    ends the stable part, or the line of z = -1 does, where ``|L(-1)| = 1``.
+    ends the stable part, or where there is none before z = -1 the line of that, where ``|L(-1)| = 1``.
     """
 
     whole, em = here.whole, here.em
+    (u0, u1), size, shape = short_curve(here)
 
     def phase(log_w: Array) -> Array:
         # Times a positive factor: of order one on either side of sqrt(em), where for light damping the phase itself
         # is below rounding long before it changes sign.
         w = xp.exp(log_w)
-        return size_and_phase(w, alpha, beta, here)[1] * ((w + em) / (w * w + em))
+        found = size_and_phase(w, alpha, beta, here)[1]
+        # Below one period it vanishes at z = -1 in any case, and its other zero is lost in rounding beside that: there
+        # the curve is read, which has that one only, by its sign ``beta alpha_w > alpha beta_w``.
+        y = xp.sin(0.5 * w) ** 2
+        terms = 4.0 * beta * y * horner(y, shape), here.delta * alpha * horner(y, size), -alpha * y * (u0 + u1 * y)
+        ahead = sum(terms) / frozen(sum(map(xp.abs, terms)), xp)
+        return xp.where((whole == 0) & (xp.abs(found) < _SMALL_PHASE), ahead, found * ((w + em) / (w * w + em)))
 
     # Here the phase of an undamped device is still that of its slope, of any other it is above pi/2 - 1/2.
     slowness = 1.0 / xp.where(em > 0, em, 1e-9) + whole + 2.0 + xp.abs(beta) / alpha
@@ -161,9 +170,11 @@ def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple
     w = xp.minimum(xp.exp(follow_root(phase, found, _falling)), np.pi)
     first = 1.0 / size_and_phase(w, alpha, beta, here)[0]
     line = xp.abs(here.gap * (alpha + 2.0 * beta))
-    last = xp.where(line > 0, 2.0 * (1.0 + here.c) / xp.where(line > 0, line, 1.0), xp.inf)
-    gain = xp.where(none, 0.0, xp.minimum(first, last))
-    return gain, xp.where(last < first, np.pi, w) + nan_with_nan_slopes(~none, alpha, beta, here.em)
+    last = 2.0 * (1.0 + here.c) / xp.where(line > 0, line, 1.0)
+    # From one period on the phase falls to 0 before, but for rounding.
+    at_line = (whole == 0) & (line > 0) & (phase(high) > 0)
+    gain = xp.where(none, 0.0, xp.where(at_line, last, first))
+    return gain, xp.where(at_line, np.pi, w) + nan_with_nan_slopes(~none, alpha, beta, here.em)
 
 
 def _falling(slope: Array, step: Array) -> Array:

@@ -258,6 +258,13 @@ def test_traced(x64):
             along(np.array([edge.alpha * by, edge.beta, 0.3, 1.0]), side) for by in (1.0, 1.0 - 1e-7)
         )
         np.testing.assert_allclose(slopes[:2], beside[:2], rtol=1e-5)
+    # Next to a corner, in 50 digits: a zero of the phase beside z = -1, and the line of z = -1 without one before it.
+    for wall, expected in (
+        ((232.74593597019737, -57.112690872135914, 57.18779732288607, 0.0), (-6.0587189e-6, 0.017484553, 0.017533416)),
+        ((16533.94525926982, -4132.485346166673, 4132.486315063933, 0.0), (-1.2093398e-4, -2.4186796e-4, 2.418679e-4)),
+    ):
+        slopes = [tuple(along(np.array(wall), side))[1][0] for side in np.eye(4)[:3]]
+        np.testing.assert_allclose(slopes, expected, rtol=1e-5, atol=1e-8)
 
 
 def test_the_margin_is_the_distance_of_p_over_its_open_loop():
