@@ -102,7 +102,7 @@ class SceneAnswers:
         turn = np.abs(np.arctan2(zeta.imag, 1.0 + zeta.real))
         with np.errstate(all="ignore"):
             # A pole at z = 0 is gone after one period.
-            ratio = np.where(np.isinf(size), 1.0, -size / np.hypot(size, turn))
+            ratio = np.where(np.isneginf(size), 1.0, -size / np.hypot(size, turn))
             ratio = np.where((size == 0) & (turn == 0), 0.0, ratio)
             return PoleTable(1.0 + zeta, turn / (2.0 * np.pi * period), ratio, -period / size)
 
