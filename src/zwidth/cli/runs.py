@@ -90,7 +90,7 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **op
     if dry_run:
         _print_plan(path, **options)
         return
-    command = _spell_resume_command(path, **options)
+    command = _spell_resume_command(path, size=size, **options)
     with _interrupt_on_sigterm() as stopped_by:
         try:
             with reporter() as progress, style_sheet(size=size):
@@ -144,8 +144,9 @@ def _print_plan(path: Path, *, out: Path | None, memory: int, workers: int | Non
 def _spell_resume_command(path: Path, *, out: Path | None, shard: tuple[int, int] | None, **given: Any) -> str:
     """The command that goes on with a run, as a shell takes it."""
     words = ["zwidth", "run", path, *(["--out", out] if out else []), "--resume"]
-    for name, value in {**given, "shard": shard and f"{shard[0]}/{shard[1]}"}.items():
-        words += [f"--{name}", value] if value and name in ("shard", "workers", "scheduler") else []
+    size = given["size"] and "x".join(f"{25.4 * side:.12g}" for side in given["size"] if side) + "mm"
+    for name, value in {**given, "shard": shard and f"{shard[0]}/{shard[1]}", "size": size}.items():
+        words += [f"--{name}", value] if value and name in ("shard", "workers", "scheduler", "size") else []
     return shlex.join(map(str, words))
 
 
