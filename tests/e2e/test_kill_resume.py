@@ -163,7 +163,9 @@ def done_files(out):
     return {name: ((out / name).stat().st_ino, (out / name).stat().st_mtime_ns) for name in names}
 
 
-@pytest.mark.parametrize("number, options", [(signal.SIGINT, ["--size", "85mm", "--workers", "1"]), (signal.SIGTERM, [])])
+@pytest.mark.parametrize(
+    "number, options", [(signal.SIGINT, ["--size", "85mm", "--workers", "1"]), (signal.SIGTERM, [])]
+)
 def test_stopped_a_run_says_how_to_go_on(config, tmp_path, number, options):
     process = start("run", config, "--out", tmp_path / "an out", *options)
     wait_for_chunks(process, tmp_path / "an out", 1)
