@@ -10,7 +10,7 @@ import click
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
 from zwidth.pages.words import row, tell
-from zwidth.words.formatting import plain, with_unit
+from zwidth.words.formatting import plain, round_safely, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -86,10 +86,11 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     needed = scene.required(path, wanted, within=within)
     result = {"parameter": path, "value": needed.value, "unit": own_unit(unit), "enough": needed.enough}
     result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
-    text = with_unit(needed.value, unit)
+    text = with_unit(round_safely(needed.value, needed.enough), unit)
     if path == "period":
         result["rate"] = 1.0 / needed.value
-        text += f" (a rate of {with_unit(1.0 / needed.value, 'Hz')}; the same delay in seconds)"
+        rate = round_safely(result["rate"], {"above": "below", "below": "above"}.get(needed.enough, ""))
+        text += f" (a rate of {with_unit(rate, 'Hz')}; the same delay in seconds)"
     if needed.enough in ("nowhere", "everywhere"):
         low, high = (with_unit(end, unit) for end in needed.range)
         reached = "reached nowhere" if needed.enough == "nowhere" else "reached everywhere"

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, select
-from zwidth.words.formatting import header
+from zwidth.words.formatting import header, round_safely
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 
@@ -188,11 +188,4 @@ def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, eno
     if not known:
         return ""
     ax.plot([value], [target], linestyle="", marker="o", markersize=6, color=color, label="required", zorder=6)
-    return f"{_round_safely(value, enough):g} {unit} {_WORDS[enough]}"
-
-
-def _round_safely(value: float, enough: str) -> float:
-    """Three digits, to the side on which there is enough."""
-    step = 10.0 ** (np.floor(np.log10(value)) - 2)
-    # A value that has three digits stays, whatever the rounding of the quotient.
-    return float((np.ceil(value / step - 1e-9) if enough == "above" else np.floor(value / step + 1e-9)) * step)
+    return f"{round_safely(value, enough, 3):g} {unit} {_WORDS[enough]}"

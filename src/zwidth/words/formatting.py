@@ -63,6 +63,16 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     return f"{plain(value / 10**power, digits)} {_PREFIXES[power]}{unit}"
 
 
+def round_safely(value: float, enough: str, digits: int = 4) -> float:
+    """A positive number to few digits, rounded to the side, "above" or "below", on which there is enough."""
+    if not (0 < value < math.inf and enough in ("above", "below")):
+        return value
+    step = 10.0 ** (math.floor(math.log10(value)) + 1 - digits)
+    # A value that has so few digits stays, whatever the rounding of the quotient.
+    steps = math.ceil(value / step - 1e-9) if enough == "above" else math.floor(value / step + 1e-9)
+    return steps * step
+
+
 def spell_stiffness(value: float) -> str:
     """A stiffness with its unit; of a rotary device per degree as well, as people picture it."""
     text = with_unit(value, "N/m")

@@ -37,6 +37,20 @@ def test_what_is_needed_agrees_with_the_closed_form_of_a_rigid_device():
     assert rate["rate"] == 1 / rate["value"]
 
 
+def test_what_is_printed_is_enough_as_it_is_rounded():
+    for stiffness in range(30, 50):
+        for name, factor, unit in (
+            ("damping", 1.0, "N s/m or more"),
+            ("mass", 1e-3, "g or more"),
+            ("delay", 1e-6, "µs or less"),
+        ):
+            words = design("--stiffness", f"{stiffness} kN/m", *DEVICE, "--find", name).partition("needed")[2]
+            value, _, rest = words.strip().partition(" ")
+            assert rest == unit
+            scene = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 0.5e-3))
+            assert scene.replace(**{name: factor * float(value)}).max_stiffness().stiffness >= 1e3 * stiffness
+
+
 def test_a_cutoff_is_enough_and_a_lower_one_is_not():
     filtered = ["--stiffness", "15 kN/m", *DEVICE, "--velocity-cutoff", "100", "--find", "cutoff"]
     found = needed(*filtered)
