@@ -39,13 +39,12 @@ class BoundIntervals(NamedTuple):
 
 def bound_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
     """Where the rows of these dampings, shape (rows,), are stable, and what of the boundary ends each interval."""
-    return join_rows([_some_intervals(boundary, beta[k : k + _ROWS]) for k in range(0, max(beta.size, 1), _ROWS)])
+    parts = [_some_intervals(boundary, beta[k : k + _ROWS]) for k in range(0, max(beta.size, 1), _ROWS)]
+    return parts[0] if len(parts) == 1 else join_rows(parts)
 
 
 def join_rows(parts: Sequence[BoundIntervals], order: np.ndarray | slice = slice(None)) -> BoundIntervals:
     """The rows of several parts in one, in an order of their own."""
-    if len(parts) == 1:
-        return parts[0]
     most = max(part.low.shape[1] for part in parts)
 
     def widen(column: np.ndarray, none: float) -> np.ndarray:
