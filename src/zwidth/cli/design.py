@@ -10,7 +10,7 @@ import click
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
 from zwidth.pages.words import row, tell
-from zwidth.words.formatting import plain, round_safely, with_unit
+from zwidth.words.formatting import ENOUGH, plain, round_safely, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -97,7 +97,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         text = f"K_max = {with_unit(wanted, 'N/m')} is {reached} from {low} to {high}"
     else:
         others = len(needed.crossings) - 1
-        text += f" or {'more' if needed.enough == 'above' else 'less'}"
+        text += f" {ENOUGH[needed.enough]}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
     return result, [row(f"{path} needed", text)]
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, select
-from zwidth.words.formatting import header, round_safely
+from zwidth.words.formatting import ENOUGH, header, round_safely
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 
@@ -25,7 +25,6 @@ _KINDS: dict[str, tuple[Any, str, str]] = {
     "windowed_difference": (style.DOTTED, "", "window"),
     "backward_difference": ("", "s", "one-sample difference"),
 }
-_WORDS = {"above": "or more", "below": "or less"}
 
 
 @draws_tables
@@ -180,7 +179,7 @@ def _mark_present(ax: Axes, values: np.ndarray, stiffness: np.ndarray, present: 
 def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, enough: str, color: Any, unit: str) -> str:
     """Mark the wanted stiffness, and where on the curve there is enough for it; returns the value that is, in words."""
     ax.axhline(target, color=color, linewidth=0.9, linestyle=style.DASHED, zorder=2, label=f"wanted {target:g}")
-    known = np.isfinite(value) and enough in _WORDS
+    known = np.isfinite(value) and enough in ENOUGH
     x, y = (np.append(part, end) for part, end in zip(curve, (value, target) if known else (np.nan,) * 2, strict=True))
     order = np.argsort(x)
     band = np.where(y[order] >= target, target, np.nan)
@@ -188,4 +187,4 @@ def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, eno
     if not known:
         return ""
     ax.plot([value], [target], linestyle="", marker="o", markersize=6, color=color, label="required", zorder=6)
-    return f"{round_safely(value, enough, 3):g} {unit} {_WORDS[enough]}"
+    return f"{round_safely(value, enough, 3):g} {unit} {ENOUGH[enough]}"

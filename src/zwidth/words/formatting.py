@@ -63,9 +63,13 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     return f"{plain(value / 10**power, digits)} {_PREFIXES[power]}{unit}"
 
 
+# Words behind a number, by the side of it on which there is enough.
+ENOUGH = {"above": "or more", "below": "or less"}
+
+
 def round_safely(value: float, enough: str, digits: int = 4) -> float:
-    """A positive number to few digits, rounded to the side, "above" or "below", on which there is enough."""
-    if not (0 < value < math.inf and enough in ("above", "below")):
+    """A positive number to few digits, rounded to the side on which there is enough."""
+    if not (0 < value < math.inf and enough in ENOUGH):
         return value
     step = 10.0 ** (math.floor(math.log10(value)) + 1 - digits)
     # A value that has so few digits stays, whatever the rounding of the quotient.
