@@ -16,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple, get_args
 import numpy as np
 
 from zwidth.arrays.circle import circle
-from zwidth.arrays.evaluate import FEW
+from zwidth.arrays.evaluate import FEW, check_scalars
 from zwidth.arrays.xp import is_jax, is_traced, namespace, within
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
@@ -117,7 +117,8 @@ class RigidVariants(Variants):
 
     @np.errstate(all="ignore")
     def stiffest(self) -> tuple[np.ndarray, np.ndarray]:
-        alpha, beta = self.ask(lambda *at: np.stack(alpha_max(*at)[:2]), self.delta, self.d)
+        model = self.scene.timing.delay_model
+        alpha, beta = self.ask(lambda *at: np.stack(alpha_max(*at, delay=model)[:2]), self.delta, self.d)
         return alpha * self.rate / self.period, beta * self.rate
 
     @staticmethod
@@ -181,7 +182,8 @@ class LinearLoop:
 
     def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """Whether walls are stable; the two need only broadcast."""
-        return label_walls(self.boundary, alpha, beta)[()]
+        check_scalars({"alpha": alpha, "beta": beta})
+        return label_walls(self.boundary, *_in_range(alpha, beta))[()]
 
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod, exact: tuple[np.ndarray, np.ndarray]
@@ -189,10 +191,13 @@ class LinearLoop:
         """Labels with status and method; ``exact`` are the walls in SI units, as "certified" takes them."""
         # Device and delay were checked as the parts of the scene.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
+        alpha, beta = _in_range(alpha, beta)
         if method == "certified":
             from zwidth.loops.linear.certified import decide_walls
 
-            stable, status = decide_walls(self.scene, *exact)
+            stable, proved = decide_walls(self.scene, *exact)
+            inside = status == Status.OK
+            stable, status = stable & inside, np.where(inside, proved, status)
             used = Method.CERTIFIED
         elif method == "companion":
             with np.errstate(invalid="ignore"):
@@ -208,9 +213,8 @@ class LinearLoop:
 
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """The spectral radius, below 1 exactly where a wall is stable; NaN where one is out of range."""
+        alpha, beta = _in_range(alpha, beta)
         stable = label_walls(self.boundary, alpha, beta).reshape(-1)
-        known = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
-        alpha, beta = (np.where(known, value, np.nan) for value in (alpha, beta))
         found = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)
         return found.reshape(alpha.shape)[()]
 
@@ -226,11 +230,11 @@ class LinearLoop:
 
     def row(self, beta: np.ndarray) -> np.ndarray:
         """The stable intervals of alpha at each damping: shape (rows, intervals, 2), NaN where a row has fewer."""
-        return np.stack(bound_intervals(self.boundary, beta)[:2], -1)
+        return np.stack(bound_intervals(self.boundary, *_in_range(beta))[:2], -1)
 
     def column(self, alpha: float) -> np.ndarray:
         """The stable intervals of beta at a stiffness: shape (intervals, 2)."""
-        return stable_dampings(self.boundary, alpha)
+        return stable_dampings(self.boundary, float(*_in_range(alpha)))
 
     def explain(self, alpha: float, beta: float) -> list[str]:
         """What keeps a wall undecided, a sentence each: nothing, where there is a model."""
@@ -294,6 +298,7 @@ class LinearLoop:
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """The device's own damping in excess of what passive walls need."""
         condition = PassivityCondition.derive(self.chain.estimate, self.scene.d)
+        alpha, beta = _in_range(alpha, beta)
         return passivity_margins(condition, alpha, beta, self.scene.own_delta)[()]
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:
@@ -308,6 +313,11 @@ class LinearLoop:
                 f"delay_model: got {model!r}, which is known of a rigid device with the backward difference only; use "
                 "'held'"
             )
+
+
+def _in_range(*walls: Any) -> Iterator[np.ndarray]:
+    """Walls, NaN where one is beyond the range that is computed."""
+    return (np.where(within(part, WALL_RANGE), part, np.nan) for part in walls)
 
 
 class RigidLoop(LinearLoop):

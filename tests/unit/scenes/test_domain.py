@@ -43,6 +43,26 @@ def test_normalized_entries_beyond_the_range_are_nan():
     np.testing.assert_array_equal(np.isnan(wall.alpha), [False, True])
 
 
+@pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=100)], ids=["rigid", "parts"])
+def test_walls_beyond_the_range_have_no_answer(velocity):
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1.5e-3), velocity=velocity)
+    walls = np.array([1e3, 1e70, 1e-80, 1e3]), np.array([5.0, 5.0, 5.0, 1e80])
+    none = [False, True, True, True]
+    for answer in (scene.spectral_radius(*walls), scene.passivity_margin(*walls), scene.margins(*walls).gain_margin):
+        np.testing.assert_array_equal(np.isnan(answer), none)
+    for answer in (scene.poles(*walls), scene.pole_table(*walls).time_constant):
+        np.testing.assert_array_equal(np.isnan(answer).all(-1), none)
+    np.testing.assert_array_equal(scene.is_stable(*walls), np.logical_not(none))
+    for method in ("auto", "companion", "certified"):
+        found = scene.decide_stability(*walls, method=method)
+        assert found.status.tolist() == [Status.OK] + 3 * [Status.OUT_OF_RANGE]
+        np.testing.assert_array_equal(found.stable, np.logical_not(none))
+    assert scene.stable_damping(1e-80).shape == (0, 2)
+    assert np.isnan(scene.stable_stiffness([1e80, 1e-80])).all()
+    with pytest.raises(zwidth.InputError, match=r"^alpha: got .*must be"):
+        scene.is_stable(1e70, 5.0)
+
+
 def test_single_devices_need_no_jax():
     program = (
         "import sys, zwidth\n"

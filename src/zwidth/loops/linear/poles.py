@@ -15,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import Jet
+from zwidth.arrays.xp import within
 from zwidth.loops.linear.roots import LoopRoots, affine_polynomial, closed_loop_roots
 from zwidth.loops.rigid.counting import count_poles
 from zwidth.loops.rigid.poles import companion
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
-from zwidth.words.quantities import MOST_POLES
+from zwidth.words.quantities import MOST_POLES, WALL_RANGE
 from zwidth.words.types import Array
 
 # Aberth's steps at most, and the step, in units of the pole's own distance from z = 1, that ends them.
@@ -131,7 +132,7 @@ def _take_steps(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, rows: A
 
 
 def poles_less_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
-    """``z - 1`` for all poles of walls of one shape, along a new last axis; NaN where a wall is not finite."""
+    """``z - 1`` for all poles of walls of one shape, along a new last axis; NaN where a wall is out of range."""
     order, shape = loop.order, alpha.shape
     if order > MOST_POLES:
         raise InputError(
@@ -140,7 +141,7 @@ def poles_less_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
         )
     alpha, beta = alpha.reshape(-1), beta.reshape(-1)
     out = np.full((alpha.size, order), complex(np.nan, np.nan))
-    known = np.flatnonzero(np.isfinite(alpha) & np.isfinite(beta))
+    known = np.flatnonzero(within(alpha, WALL_RANGE) & within(beta, WALL_RANGE))
     block = max(1, _NUMBERS // order**2)
     for damped in (True, False):
         walls = known[(beta[known] != 0) == damped]
