@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
@@ -65,8 +66,13 @@ def soft_dampings(scene: Any, stiffness: float, negative_damping: bool | None = 
 
 # How far the range reaches to both sides of the present value where none is given, and its points.
 _REACH, _POINTS = 30.0, 25
+# Closer than that a value and the present one are the same.
+_SAME = 1e-9
 # By what share of the value both sides of a crossing are proved, the closest that tells them apart.
 _BESIDE = (1e-11, 1e-9, 1e-7, 1e-5)
+
+# How close, in logarithms, its highest and lowest values are sought.
+_TURN = {"xatol": 1e-6}
 
 # The logarithm of a stiffness that counts as none.
 _HARDLY_ANY = 60.0
@@ -122,11 +128,31 @@ def _range(parameter: str, now: float, within: tuple[Any, Any] | None) -> tuple[
     return low, high
 
 
+def _find_turns(surplus: Callable[[float], float], grid: list[float], values: list[float]) -> list[float]:
+    """Where K_max is highest between values that all have too little, and lowest between values that have enough."""
+    from scipy.optimize import minimize_scalar
+
+    found = []
+    for k in range(1, len(grid) - 1):
+        side = 1.0 if values[k] >= 0 else -1.0
+        if side * values[k - 1] > side * values[k] < side * values[k + 1]:
+            ends = math.log(grid[k - 1]), math.log(grid[k + 1])
+            turn = minimize_scalar(
+                lambda x, side=side: side * surplus(math.exp(x)), bounds=ends, method="bounded", options=_TURN
+            )
+            found.append(math.exp(turn.x))
+    return found
+
+
 def _cross(surplus: Callable[[float], float], low: float, high: float) -> Crossing | None:
     """The crossing between two values, proved by a value on each side of it; None where it cannot be."""
     from scipy.optimize import brentq
 
-    root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
+    try:
+        root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
+    except ValueError:
+        # On the way there is a value whose K_max cannot be computed.
+        return None
     place = math.exp(cast("float", root))
     for share in _BESIDE:
         ends = place * (1.0 - share), place * (1.0 + share)
@@ -253,8 +279,9 @@ class SceneOptima:
             ``status``, UNREACHABLE with NaN where the range never reaches the stiffness.
 
         Numerics:
-            25 values across the range, then each crossing to 1e-11 relative. K_max need not be monotone; two crossings
-            between neighboring values are not seen.
+            The present value and 25 across the range, and where K_max turns between them without passing the stiffness
+            the place where it does; then each crossing to 1e-11 relative. Peaks and dips narrower than the values are
+            apart are not seen.
 
         Example:
             >>> import zwidth
@@ -274,16 +301,19 @@ class SceneOptima:
                 return -_HARDLY_ANY
             return math.log(wall.stiffness / stiffness) if wall.status == Status.OK else math.nan
 
-        grid, values = [], []
-        for value in np.geomspace(low, high, _POINTS).tolist():
-            try:
-                values.append(surplus(value))
-            except InputError:
-                # The range ends where values are refused, as for a cut-off at half the sampling rate.
-                continue
-            grid.append(value)
-        if not grid:
+        tried, known = np.geomspace(low, high, _POINTS), {}
+        if low <= now <= high:
+            tried = np.append(tried[np.abs(tried / now - 1.0) > _SAME], now)
+        for value in tried.tolist():
+            # The range ends where values are refused, as for a cut-off at half the sampling rate.
+            with suppress(InputError):
+                known[value] = surplus(value)
+        if not known:
             raise InputError(f"within: {parameter} cannot have any value from {low:g} to {high:g}")
+        grid = sorted(known)
+        known |= {turn: surplus(turn) for turn in _find_turns(surplus, grid, [known[value] for value in grid])}
+        grid = sorted(known)
+        values = [known[value] for value in grid]
         low, high = grid[0], grid[-1]
         enough = [value >= 0 for value in values if not math.isnan(value)]
         if not enough or not any(enough):

@@ -5,6 +5,7 @@ import pytest
 from required_values import find_required
 
 from zwidth import Device, LowPass, Scene, Status, Timing
+from zwidth.scenes.stiffest import Crossing, _cross
 from zwidth.words.errors import InputError
 
 RIGID = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3))
@@ -43,6 +44,16 @@ def test_of_several_crossings_the_nearest_is_told():
         assert scene.replace(mass=found.value).max_stiffness().stiffness == pytest.approx(7.8e3, rel=1e-9)
 
 
+@pytest.mark.parametrize("mass, above", [(0.0204557, 1e-3), (0.023, 1e-3), (0.03, 1e-6)])
+def test_no_dip_between_the_values_is_passed_over(mass, above):
+    """K_max is 7585.93 N/m at 20.5 g, and more with less mass and with more."""
+    stiffness, scene = 7585.93 * (1.0 + above), RIGID.replace(velocity=LowPass(cutoff=100.0), mass=mass)
+    got = scene.required("mass", stiffness, within=(0.000592, 0.5326))
+    assert [crossing.enough for crossing in got.crossings] == ["below", "above"]
+    assert got.crossings[0].value < 0.0204557 < got.crossings[1].value
+    assert scene.replace(mass=got.value).max_stiffness().stiffness >= stiffness
+
+
 def test_a_rate_is_the_inverse_of_a_period():
     rate, period = (FILTERED.required(name, 8.5e3) for name in ("rate", "period"))
     assert (rate.enough, period.enough) == ("above", "below")
@@ -61,6 +72,11 @@ def test_the_range_ends_where_values_are_refused():
     got = FILTERED.required("velocity.cutoff", 9e3, within=(20.0, 5e3))
     assert got.range[1] < 500.0
     assert [crossing.enough for crossing in got.crossings] == ["above"]
+
+
+def test_a_crossing_next_to_what_cannot_be_computed_is_none():
+    assert _cross(lambda x: np.log(x) if abs(x - 1.5) > 0.6 else np.nan, 0.5, 3.0) is None
+    assert _cross(np.log, 0.5, 3.0) == Crossing(1.0 + 1e-11, "above")
 
 
 @pytest.mark.parametrize(
