@@ -85,7 +85,7 @@ class SceneAnswers:
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
     def poles(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
-        """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.
+        """All poles of walls, along a new last axis and in no particular order; NaN where a wall is out of range.
 
         Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
         is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
@@ -180,10 +180,11 @@ class SceneAnswers:
             method: as for `decide_stability`, which has the statuses as well.
 
         Returns:
-            Boolean array of the broadcast shape, False for what is NaN.
+            Boolean array of the broadcast shape, False for what is NaN or, in arrays, out of range.
 
         Raises:
-            InputError: it is not said which wall is meant. K alone, with B = 0, is meant where the scene has no wall.
+            InputError: a single wall is out of range; it is not said which wall is meant. K alone, with B = 0, is meant
+                where the scene has no wall.
 
         Numerics:
             Closed form for a rigid device with the backward difference. Otherwise by the signed crossings of each
@@ -244,7 +245,7 @@ class SceneAnswers:
         return self.loop.explain(*one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))))
 
     def passivity_margin(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
-        """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is not finite.
+        """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is out of range.
 
         Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
         (`loops.linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
