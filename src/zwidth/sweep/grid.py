@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.config.device_table import LABEL
+from zwidth.config.sweep import SweepStudy
 from zwidth.loops.normalization import normalize
-from zwidth.sweep.study import SweepStudy
 from zwidth.words.quantities import PARAMETERS, WALL, Family
 from zwidth.words.rotation import own_unit
 
