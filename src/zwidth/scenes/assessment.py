@@ -10,14 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
-from zwidth.parts.velocity import (
-    FOAW,
-    BackwardDifference,
-    Butterworth,
-    LowPass,
-    VelocityFilter,
-    WindowedDifference,
-)
+from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.scenes.answers import SceneAnswers
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
