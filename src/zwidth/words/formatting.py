@@ -63,6 +63,11 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     return f"{plain(value / 10**power, digits)} {_PREFIXES[power]}{unit}"
 
 
+def name_wall(stiffness: Any, virtual_damping: Any) -> str:
+    """A wall by its numbers."""
+    return f"K = {with_unit(float(stiffness), 'N/m')}, B = {with_unit(float(virtual_damping), 'N s/m')}"
+
+
 # Words behind a number, by the side of it on which there is enough.
 ENOUGH = {"above": "or more", "below": "or less"}
 
