@@ -65,12 +65,12 @@ def foresee(
     for shape in np.unique(shapes[known & finite], axis=0):
         at = np.flatnonzero(known & finite & (shapes == shape).all(1))
         group = gather(lanes, options, state, push, periods, at)
-        for name, part in _foresee(group, sensed[:, at], periods, options.bodies).items():
-            getattr(outlook, name)[at] = part
+        for whole, part in zip(outlook, _foresee(group, sensed[:, at], periods, options.bodies), strict=True):
+            whole[at] = part
     return outlook
 
 
-def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int, bodies: bool) -> dict[str, np.ndarray]:
+def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int, bodies: bool) -> Outlook:
     lanes, motor, touching = group.lanes, group.lanes.motor, group.touching
     exact, dry = lanes.resolution == 0, motor.static > 0
     endless = np.isinf(motor.max_force) & np.isinf(motor.max_rate)
@@ -82,7 +82,7 @@ def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int, bodies: bool) -
     settles, grows = linear & (squarings > 0), linear & unstable
     if not bodies:
         # The poles of the loop are all that is known.
-        return {"settles": settles, "grows": grows, "pace": pace}
+        return Outlook(settles, grows, settles & False, settles & False, pace)
     stuck = dry & (group.slip == 0)
     # The decisions in force; what slips on feels a constant friction.
     modes = np.stack([exact & touching, touching, stuck], 1)
@@ -101,8 +101,7 @@ def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int, bodies: bool) -
     own = ~linear & unstable & lanes.bilateral & endless & lanes.pulling & ~settles
     if own.any():
         grows[own] = _outgrows(take(group, own), take(loop, own), periods)
-    restless = _is_restless(group, unstable)
-    return {"settles": settles, "grows": grows, "repeats": repeats, "restless": restless, "pace": pace}
+    return Outlook(settles, grows, repeats, _is_restless(group, unstable), pace)
 
 
 def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> np.ndarray:
