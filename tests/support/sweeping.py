@@ -14,11 +14,11 @@ from waiting import LONGEST
 
 from zwidth import run
 from zwidth.cli import main
+from zwidth.config.sweep import SweepStudy
 from zwidth.studies.document import Config
 from zwidth.sweep import plan
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import find_stores
-from zwidth.sweep.study import SweepStudy
 
 AXES = {
     "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 40}},

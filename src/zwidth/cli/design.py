@@ -10,7 +10,7 @@ import click
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
 from zwidth.pages.words import row, tell
-from zwidth.words.formatting import ENOUGH, plain, round_safely, with_unit
+from zwidth.words.formatting import ENOUGH, name_wall, plain, round_safely, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -128,9 +128,8 @@ def _tolerate(
     percent = f"{100 * found.reliability:g} %"
     share = f"{plain(100 * found.stable)} % of {found.samples} devices drawn"
     known = f"{plain(100 * found.stable_low)} to {plain(100 * found.stable_high)} % of all, with 95 % confidence"
-    wall = scene.wall
     lines = [
-        row("wall", f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
+        row("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping)),
         row("stable", f"{share} ({known})"),
         row(f"borne by {percent}", f"K up to {with_unit(found.stiffness, 'N/m')} at this B"),
     ]

@@ -23,7 +23,7 @@ from zwidth.cli.options import (
 )
 from zwidth.pages.words import row, tell
 from zwidth.words.errors import UnusableValueError
-from zwidth.words.formatting import with_unit
+from zwidth.words.formatting import name_wall, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.units import tell_kind
 
@@ -170,7 +170,7 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
     if made.expected is not None and made.limit is not None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         found |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
-        lines += [row("will tell", f"{_wall(made.expected)} as safe, {100 * share:.0f} % of K_max by now")]
+        lines += [row("will tell", f"{name_wall(*made.expected[:2])} as safe, {100 * share:.0f} % of K_max by now")]
     tell(found, [*lines, row("wrote", str(out))], as_json)
 
 
@@ -217,9 +217,10 @@ def respond(
     if device.deviation is not None:
         lines.append(row("deviation", f"{_compliance(device.deviation)} in the median"))
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == 0 else []
-    lines.append(row("K_max", f"{_wall(top)}, by the curve that was measured" if top.status == 0 else "undecided"))
+    words = f"{name_wall(*top[:2])}, by the curve that was measured" if top.status == 0 else "undecided"
+    lines.append(row("K_max", words))
     given = safe.status == 0 and device.deviation is not None and not doubts
-    words = f"{_wall(safe)}: stable for every response in the band" if given else "none is told"
+    words = f"{name_wall(*safe[:2])}: stable for every response in the band" if given else "none is told"
     lines.append(row("safe wall", words))
     lines += [row("a stiffer one" if k == 0 else "", text) for k, text in enumerate(said)]
     lines += [row("doubt", text) for text in doubts]
@@ -237,10 +238,6 @@ def _compliance(deviation: Any) -> str:
     import numpy as np
 
     return with_unit(float(np.median(deviation)), "m/N", 3)
-
-
-def _wall(wall: Any) -> str:
-    return f"K = {with_unit(float(wall.stiffness), 'N/m')}, B = {with_unit(float(wall.virtual_damping), 'N s/m')}"
 
 
 def _plain(wall: Any) -> dict[str, float]:

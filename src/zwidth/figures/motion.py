@@ -71,7 +71,7 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
         largest = max(float(np.nanmax(np.abs(each.position))) for each in responses)
         factor, length = style.si_unit(max(finals, default=largest), "m")
     for each in responses:
-        text = rf"{style.literal(each.label)}  ($\alpha = {each.alpha:.3g}$, $\beta = {each.beta:.3g}$)"
+        text = rf"{each.label}  ($\alpha = {each.alpha:.3g}$, $\beta = {each.beta:.3g}$)"
         text += ", not settled" if each.settled is False else ""
         ax.plot(each.time * clock, each.position * factor, label=text, zorder=3, **each.look)
         if np.isfinite(each.final_position):
@@ -90,13 +90,10 @@ def _read_responses(table: Table) -> list[Any]:
     """The responses in a table; ``settled``: for good, at the end of the time shown; None where that is not known."""
     spelled = ((name, key) for name, unit in _UNITS.items() for key in (name + unit, name))
     columns = {name: np.asarray(table[key]) for name, key in spelled if key in table}
-    columns |= {name: np.asarray(table[name]) for name in ("label", "alpha", "beta")}
-    # Each begins at time 0: two of them may be alike in all but that.
-    columns["number"] = np.cumsum(columns["time"] == 0.0)
-    responses = curves(columns, "number")
-    for k, each in enumerate(responses):
-        each.look = style.look(k)
-        for name in {"label", "alpha", "beta", "final_position", "settling_time"} & set(columns):
+    columns |= {name: table[name] for name in ("label", "alpha", "beta")}
+    responses = _read_motions(columns, "time")
+    for each in responses:
+        for name in {"alpha", "beta", "final_position", "settling_time"} & set(columns):
             setattr(each, name, getattr(each, name)[0])
         each.settled = bool(each.settling_time <= each.time[-1]) if "settling_time" in columns else None
     return responses
@@ -104,7 +101,7 @@ def _read_responses(table: Table) -> list[Any]:
 
 def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:
     for each in responses:
-        look = {**each.look, **_HELD, "label": f"wall_force, {style.literal(each.label)}"}
+        look = {**each.look, **_HELD, "label": f"wall_force, {each.label}"}
         ax.plot(each.time * clock, each.wall_force, zorder=3, **look)
     ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
 
@@ -195,10 +192,10 @@ def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     return panels
 
 
-def _read_motions(table: Table) -> list[Any]:
+def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
     """The motions in a table, each with its look; two of them may be alike in all but that each begins at time 0."""
     columns = {str(name): np.asarray(table[name]) for name in table}
-    motions = curves({**columns, "number": np.cumsum(columns["time_s"] == 0.0)}, "number")
+    motions = curves({**columns, "number": np.cumsum(columns[time] == 0.0)}, "number")
     for k, each in enumerate(motions):
         each.label = style.literal(each.label[0])
         each.look = style.look(k)

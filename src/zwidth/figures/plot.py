@@ -28,7 +28,7 @@ from zwidth.arrays.evaluate import as_float64
 from zwidth.figures import style
 from zwidth.figures.grid import scale_axis
 from zwidth.figures.motion import draw_motion, draw_step
-from zwidth.figures.stable_set import draw_recommendation, draw_stable_set, name_wall, tabulate_sets, tabulate_walls
+from zwidth.figures.stable_set import draw_recommendation, draw_stable_set, tabulate_sets, tabulate_walls
 from zwidth.figures.table import Parameters, Result, Table, stack
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.checks import read_texts
@@ -39,6 +39,7 @@ from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError
+from zwidth.words.formatting import name_wall
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import in_own_units, own_unit
 from zwidth.words.types import ArrayLike

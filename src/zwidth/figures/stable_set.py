@@ -15,7 +15,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from zwidth.figures import style
 from zwidth.figures.motion import draw_positions
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select, stack
-from zwidth.words.formatting import with_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -165,10 +164,6 @@ def tabulate_sets(scenes: Mapping[str, Scene]) -> tuple[dict[str, Any], dict[str
     outlines = stack(piece for label, scene in scenes.items() for piece in trace_outlines(scene, label=label))
     tops = {label: tabulate_walls(scene, *scene.max_stiffness()[:2]) for label, scene in scenes.items()}
     return outlines, stack({"label": label, "wall": "stiffest", **wall} for label, wall in tops.items())
-
-
-def name_wall(stiffness: float, virtual_damping: float) -> str:
-    return f"K = {with_unit(stiffness, 'N/m')}, B = {with_unit(virtual_damping, 'N s/m')}"
 
 
 @draws_tables

@@ -22,6 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.words.errors import InputError
+from zwidth.words.formatting import PREFIXES
 from zwidth.words.rotation import own_unit
 
 # Okabe and Ito's palette, told apart with any color vision.
@@ -296,9 +297,6 @@ def add_si_axes(ax: Axes, scale: tuple[float, float]) -> None:
         add(side, functions=both).set(**{"xlabel" if side == "top" else "ylabel": f"{words}  in {spelled}"})
 
 
-_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
-
-
 def si_unit(values: Any, unit: str) -> tuple[float, str]:
     """The factor and the unit in which the largest of some values has one to three digits before the point."""
     unit, largest = own_unit(unit), float(np.nanmax(np.abs(values), initial=0.0))
@@ -310,4 +308,4 @@ def si_unit(values: Any, unit: str) -> tuple[float, str]:
     if unit == "kg m^2":
         return 1e7, "g cm$^2$"
     power = int(np.clip(3 * np.floor(np.log10(largest) / 3), -12, 9))
-    return 10.0**-power, _PREFIXES[power] + unit
+    return 10.0**-power, PREFIXES[power] + unit

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64, join_shapes
+from zwidth.arrays.evaluate import as_float64, evaluate, join_shapes
 from zwidth.arrays.xp import is_jax, is_traced, namespace, nan_unless, within
 from zwidth.parts.checks import accept_units, in_periods
 from zwidth.words.errors import InputError
@@ -83,8 +83,6 @@ def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: Arr
     checked = {name: _check_quantity(name, value) for name, value in values.items()}
     join_shapes((name, np.shape(value)) for name, value in checked.items())
     if any(map(is_jax, values.values())):
-        from zwidth.arrays.evaluate import evaluate
-
         return evaluate(_formula_at, values, formula, tuple(values))
     with np.errstate(all="ignore"):
         result = _formula_at(*checked.values(), formula, tuple(values))

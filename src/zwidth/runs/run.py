@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.study import Study
+from zwidth.config.sweep import SweepStudy
 from zwidth.figures.style import style_sheet
 from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
@@ -21,7 +22,6 @@ from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_swe
 from zwidth.sweep.files import hidden_beside, holding, hopeless
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
-from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import InputError
 from zwidth.words.rotation import use_kind
 

@@ -221,7 +221,7 @@ class SceneAnswers:
             Array (n, 2) in N s/m. The ends are not stable themselves.
         """
         stiffness = resolve_wall(self.wall, None, None)[0] if stiffness is None else stiffness
-        alpha, _ = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, 0.0)))
+        alpha, _ = one_wall(*self.normalize_walls(stiffness, 0.0))
         return self.loop.column(alpha) * self.units.virtual_damping
 
     def decide_stability(
@@ -242,7 +242,7 @@ class SceneAnswers:
 
         A sentence each; none where the wall is decided, as it is of every device that is a model.
         """
-        return self.loop.explain(*one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))))
+        return self.loop.explain(*one_wall(*self.normalize_walls(stiffness, virtual_damping)))
 
     def passivity_margin(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is out of range.
@@ -288,7 +288,7 @@ class SceneAnswers:
 def _realize(scene: Any, build: Callable[..., Matrices], unit: float, alpha: Any, beta: Any) -> StateSpace:
     """A loop with one wall, its states in m, m/s and N in place of units of the period and the mass."""
     chain, period, mass = scene.loop.chain, scene.timing.period, float(scene.mass)
-    loop = build(chain, *one_wall(*np.broadcast_arrays(alpha, beta)))
+    loop = build(chain, *one_wall(alpha, beta))
     force = mass / period**2
     own = np.array(chain.state_units(1.0 / period, force))
     waiting = delayed_device(chain).A.shape[0] - own.size
@@ -332,6 +332,7 @@ def to_control(scene: Any, stiffness: Wall = None, virtual_damping: Wall = None)
 
 def one_wall(alpha: np.ndarray, beta: np.ndarray) -> tuple[float, float]:
     """The numbers of a single wall."""
+    alpha, beta = np.broadcast_arrays(alpha, beta)
     if alpha.size != 1:
         raise InputError(f"stiffness, virtual_damping: got shape {alpha.shape}; one wall of finite numbers is needed")
     for name, value in (("stiffness", alpha), ("virtual_damping", beta)):

@@ -5,19 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
-from zwidth.parts.velocity import (
-    FOAW,
-    BackwardDifference,
-    Butterworth,
-    LowPass,
-    VelocityFilter,
-    WindowedDifference,
-)
+from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.scenes.answers import SceneAnswers
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
@@ -25,9 +18,6 @@ from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
-
-if TYPE_CHECKING:
-    from zwidth.scenes.scene import Scene
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
 
@@ -92,11 +82,11 @@ class Assessment:
 
 
 @in_own_units
-def assess(scene: Scene) -> Assessment:
+def assess(scene: Any) -> Assessment:
     """Judge the wall of a scene.
 
     Args:
-        scene: device, timing, parts and wall; the delay model must be "held", the one that has poles.
+        scene: a `zwidth.Scene` with a wall; its delay model must be "held", the one that has poles.
 
     Returns:
         Assessment: stability, distances to the boundary in K and in B, passivity, the stiffest stable wall of the
@@ -148,7 +138,7 @@ def assess(scene: Scene) -> Assessment:
     )
 
 
-def check_held(scene: Scene) -> None:
+def check_held(scene: Any) -> None:
     """Refuse the delay model in which no wall can be judged."""
     if scene.timing.delay_model != "held":
         raise InputError(
@@ -167,11 +157,11 @@ def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
     return intervals[away.index(min(away))] if away else (math.nan, math.nan)
 
 
-def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str, Any]]:
+def assess_many(scenes: Iterable[Any] | Mapping[str, Any]) -> list[dict[str, Any]]:
     """Judge the walls of many scenes, one record each; a scene that has no answer leaves the others alone.
 
     Args:
-        scenes: scenes of any kind, or a mapping of names to scenes.
+        scenes: a `zwidth.Scene` each, of any kind, or a mapping of names to scenes.
 
     Returns:
         A list of dicts with the same keys, a row of a table each: ``scene``, its name or number; ``status`` and
@@ -197,16 +187,16 @@ def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str,
     return [{name: record.get(name) for name in names} for record in records]
 
 
-def _record(name: str | int, scene: Scene) -> dict[str, Any]:
+def _record(name: str | int, scene: Any) -> dict[str, Any]:
     head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
+    known = issubclass(type(scene), SceneAnswers)
     try:
-        if not isinstance(scene, SceneAnswers):
+        if not known:
             raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed")
         verdict = assess(scene).as_dict()
     except InputError as error:
         verdict, head = {}, head | {"status": Status.INVALID_INPUT.name, "message": str(error)}
-    own = scene.parameters() if isinstance(scene, SceneAnswers) else {}
-    return head | own | verdict
+    return head | (scene.parameters() if known else {}) | verdict
 
 
 # What somebody can buy of a parameter, by its path: the factor on it, and the words.
@@ -238,7 +228,7 @@ class Limit(NamedTuple):
 
 
 @in_own_units
-def limits_of(scene: Scene) -> list[Limit]:
+def limits_of(scene: Any) -> list[Limit]:
     """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 
     Each thing that the scene has is improved by itself, by a step that somebody can buy: twice the rate (delay and
@@ -247,7 +237,7 @@ def limits_of(scene: Scene) -> list[Limit]:
     structure behind the modes.
 
     Args:
-        scene: a scene of plain numbers.
+        scene: a `zwidth.Scene` of plain numbers.
 
     Returns:
         One record each, the largest gain first. What makes the wall softer is listed as well, with a gain below 1: a
@@ -274,19 +264,19 @@ def limits_of(scene: Scene) -> list[Limit]:
 
 
 @in_own_units
-def describe_islands(scene: Scene) -> list[str]:
+def describe_islands(scene: Any) -> list[str]:
     """A line for each island: stable walls that K_max does not count."""
     lines = []
     for island in scene.islands():
         units = {"K": (island.stiffness, "N/m"), "B": (island.virtual_damping, "N s/m")}
-        ends = (f"{name} from {' to '.join(tell_apart(*ends, u))}" for name, (ends, u) in units.items())
+        ends = (f"{name} from {' to '.join(tell_apart(low, high, u))}" for name, ((low, high), u) in units.items())
         lines.append(
             f"an island of stable walls, {', '.join(ends)}: no stable softer walls lead to it, K_max leaves it out"
         )
     return lines
 
 
-def _stiffness(scene: Scene) -> float:
+def _stiffness(scene: Any) -> float:
     """K_max in N/m; NaN where there is none or it cannot be computed."""
     try:
         wall = scene.max_stiffness()
@@ -296,7 +286,7 @@ def _stiffness(scene: Scene) -> float:
     return float(wall.stiffness) if wall.status == Status.OK else float("nan")
 
 
-def _improve(scene: Scene) -> Iterator[tuple[str, str, Scene]]:
+def _improve(scene: Any) -> Iterator[tuple[str, str, Any]]:
     """The scene with one thing improved, for each thing it has: the part's name, the step in words, the scene."""
     if _can_sample_faster(scene):
         same = ", the delay the same in seconds" if scene.timing.delay else ""
@@ -321,7 +311,7 @@ def _improve(scene: Scene) -> Iterator[tuple[str, str, Scene]]:
         yield "modes", "a structure twice as stiff", scene.replace(modes=stiffer)
 
 
-def _can_sample_faster(scene: Scene) -> bool:
+def _can_sample_faster(scene: Any) -> bool:
     """Whether twice the rate can be computed; nobody knows what a filter of coefficients were then."""
     if isinstance(scene.velocity, VelocityFilter):
         return False
@@ -329,7 +319,7 @@ def _can_sample_faster(scene: Scene) -> bool:
     return 2 * (window + scene.d) <= scene.loop.most_periods
 
 
-def _sample_faster(scene: Scene, faster: int) -> Scene:
+def _sample_faster(scene: Any, faster: int) -> Any:
     """The scene at so many times the rate, filter and delay the same in seconds."""
     changes: dict[str, float] = {"period": scene.timing.period / faster}
     if isinstance(scene.velocity, WindowedDifference):
@@ -363,7 +353,7 @@ def friction_rule(
     return FrictionRule(2.0 * damping / period if damping else None, by_friction)
 
 
-def passive_edge(scene: Scene, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
+def passive_edge(scene: Any, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
     """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping.
 
     The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.

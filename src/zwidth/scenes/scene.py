@@ -32,12 +32,13 @@ from zwidth.words.rotation import in_own_units, wrap_methods
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
 
-_EXAMPLES = {
-    "device": "zwidth.Device(mass=0.1, damping=10)",
-    "timing": "zwidth.Timing(period=1e-3, delay=1e-3)",
-    "wall": "zwidth.VirtualWall(stiffness=10e3)",
-    "velocity": "zwidth.LowPass(cutoff=100)",
-    "operator": "zwidth.Operator(mass=0.5)",
+# What each part may be, and an example.
+_KINDS = {
+    "device": (Device | LinearDevice | MeasuredDevice, "zwidth.Device(mass=0.1, damping=10)"),
+    "timing": (Timing, "zwidth.Timing(period=1e-3, delay=1e-3)"),
+    "wall": (VirtualWall, "zwidth.VirtualWall(stiffness=10e3)"),
+    "velocity": (Velocity, "zwidth.LowPass(cutoff=100)"),
+    "operator": (Operator | None, "zwidth.Operator(mass=0.5)"),
 }
 
 
@@ -78,16 +79,10 @@ class Scene(Part, SceneAnswers, SceneOptima, SceneAdvice):
     def __post_init__(self) -> None:
         if isinstance(self.wall, Velocity):
             self._move_up()
-        kinds = {
-            "device": Device | LinearDevice | MeasuredDevice,
-            "timing": Timing,
-            "wall": VirtualWall,
-            "velocity": Velocity,
-        }
-        for name, kind in {**kinds, "operator": Operator | None}.items():
+        for name, (kind, example) in _KINDS.items():
             part = getattr(self, name)
             if not isinstance(part, kind):
-                raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {_EXAMPLES[name]}")
+                raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {example}")
         named = {name: getattr(self, name) for name in ("wall", "operator", "velocity")}
         check_kind(bool(self.device.rotary), named)
         if self.operator is not None and not isinstance(self.device, Device):

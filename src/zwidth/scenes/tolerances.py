@@ -52,12 +52,7 @@ class ToleranceEstimate:
 
 @in_own_units
 def simulate_tolerances(
-    scene: Scene,
-    tolerances: dict[str, Any],
-    *,
-    samples: int = 10_000,
-    seed: int = 0,
-    reliability: float = 0.99,
+    scene: Scene, tolerances: dict[str, Any], *, samples: int = 10_000, seed: int = 0, reliability: float = 0.99
 ) -> ToleranceEstimate:
     """Draw devices within tolerances and judge the scene's wall on each of them.
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import check_choice
-from zwidth.words.formatting import with_unit
+from zwidth.words.formatting import name_wall, with_unit
 from zwidth.words.rotation import is_rotary, own_unit
 
 # A root is real whose imaginary part is no more of it than rounding.
@@ -115,8 +115,8 @@ def lay_program(scene: Any) -> WallProgram:
         force += [f"w = u{back}", f"u = {' + '.join(parts)}", *(f"{last} += {name}" for name in inner)]
         force.append(f"{names[0]} += w")
     K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
-    wall = f"K = {with_unit(K, 'N/m')}, B = {with_unit(B, 'N s/m')}"
-    head = f"Virtual wall: {wall}, velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}."
+    estimated = f"velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}"
+    head = f"Virtual wall: {name_wall(K, B)}, {estimated}."
     return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], f"-({K!r} * x + {B!r} * v)")
 
 

@@ -97,7 +97,7 @@ def worst_motion(
     """
     longest = check_whole("longest", longest, _SHORTEST, _LONGEST)
     given = resolve_wall(scene.wall, stiffness, virtual_damping)
-    alpha, beta = one_wall(*np.broadcast_arrays(*scene.normalize_walls(*given)))
+    alpha, beta = one_wall(*scene.normalize_walls(*given))
     wall = np.asarray(given[0], float).item(), np.asarray(given[1], float).item()
     margin = float(scene.passivity_margin(*wall))
     if not margin < 0:

@@ -157,8 +157,7 @@ def _summarize(
         jnp.where(first, v, known.impact),
         jnp.fmax(known.given, work.wall),
         Extent(
-            known.extent.low.at[half].set(jnp.fmin(low, places)),
-            known.extent.high.at[half].set(jnp.fmax(high, places)),
+            known.extent.low.at[half].set(jnp.fmin(low, places)), known.extent.high.at[half].set(jnp.fmax(high, places))
         ),
         known.turns.at[half].add(turning),
         jnp.where(turning & (half > 0) & jnp.isnan(known.first_turn), moment, known.first_turn),

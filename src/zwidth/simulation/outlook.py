@@ -65,32 +65,25 @@ def foresee(
     for shape in np.unique(shapes[known & finite], axis=0):
         at = np.flatnonzero(known & finite & (shapes == shape).all(1))
         group = gather(lanes, options, state, push, periods, at)
-        proved = _foresee(group, sensed[:, at], periods) if options.bodies else _foresee_linear(group)
-        for name, part in proved.items():
-            getattr(outlook, name)[at] = part
+        for whole, part in zip(outlook, _foresee(group, sensed[:, at], periods, options.bodies), strict=True):
+            whole[at] = part
     return outlook
 
 
-def _foresee_linear(group: LaneGroup) -> dict[str, np.ndarray]:
-    """What the poles of the linear loop tell, of lanes with nothing else."""
-    lanes, motor = group.lanes, group.lanes.motor
-    linear = (lanes.resolution == 0) & lanes.bilateral & lanes.pulling
-    linear &= np.isinf(motor.max_force) & np.isinf(motor.max_rate)
-    squarings = square(lay_loop(group, True, True, False).A)
-    pace = np.where(squarings == 0, np.inf, np.exp2(np.abs(squarings)))
-    return {"settles": linear & (squarings > 0), "grows": linear & (squarings < 0), "pace": pace}
-
-
-def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int) -> dict[str, np.ndarray]:
+def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int, bodies: bool) -> Outlook:
     lanes, motor, touching = group.lanes, group.lanes.motor, group.touching
     exact, dry = lanes.resolution == 0, motor.static > 0
     endless = np.isinf(motor.max_force) & np.isinf(motor.max_rate)
-    stuck = dry & (group.slip == 0)
     loop = lay_loop(group, True, True, False)
     squarings = square(loop.A)
+    pace = np.where(squarings == 0, np.inf, np.exp2(np.abs(squarings)))
     unstable = squarings < 0
     linear = exact & lanes.bilateral & endless & ~dry & lanes.pulling
-    settles = linear & (squarings > 0)
+    settles, grows = linear & (squarings > 0), linear & unstable
+    if not bodies:
+        # The poles of the loop are all that is known.
+        return Outlook(settles, grows, settles & False, settles & False, pace)
+    stuck = dry & (group.slip == 0)
     # The decisions in force; what slips on feels a constant friction.
     modes = np.stack([exact & touching, touching, stuck], 1)
     slip = np.where(dry, group.slip, 0.0)
@@ -105,17 +98,10 @@ def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int) -> dict[str, np
     own = ~exact & ~dry & ~settles
     if own.any() and not lanes.estimator.A.size:
         repeats[own] = _repeats(take(group, own), sensed[:, own], periods)
-    grows = linear & unstable
     own = ~linear & unstable & lanes.bilateral & endless & lanes.pulling & ~settles
     if own.any():
         grows[own] = _outgrows(take(group, own), take(loop, own), periods)
-    return {
-        "settles": settles,
-        "grows": grows,
-        "repeats": repeats,
-        "restless": _is_restless(group, unstable),
-        "pace": np.where(squarings == 0, np.inf, np.exp2(np.abs(squarings))),
-    }
+    return Outlook(settles, grows, repeats, _is_restless(group, unstable), pace)
 
 
 def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> np.ndarray:
@@ -160,10 +146,7 @@ def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> n
     signed[:, 1, sent + late] = group.halfway[:, m // 2, m]
     low, high, above = np.full(ends.shape, np.nan), np.full(ends.shape, np.nan), np.zeros(len(reading), bool)
     low[settled], high[settled], above[settled] = bound_rows(
-        (loop.A - both)[settled],
-        (group.state - rest)[settled],
-        rows[settled],
-        (signed * slip[:, None, None])[settled],
+        (loop.A - both)[settled], (group.state - rest)[settled], rows[settled], (signed * slip[:, None, None])[settled]
     )
     # Or what is left could not turn the force of friction: that takes more than twice of it.
     left = np.maximum(np.abs(low), np.abs(high))[:, 3:].max(-1) <= 1e-9 * motor.static

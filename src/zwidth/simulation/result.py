@@ -194,12 +194,7 @@ def classify(known: Any, outlook: Any, course: Any) -> np.ndarray:
 
 @np.errstate(all="ignore")
 def to_si(
-    found: Any,
-    given: Any,
-    dry: np.ndarray,
-    outlook: Any,
-    bodies: tuple[str, ...],
-    course: Any,
+    found: Any, given: Any, dry: np.ndarray, outlook: Any, bodies: tuple[str, ...], course: Any
 ) -> dict[str, np.ndarray]:
     """Columns of one row a simulation, by the names of `Motion`; ``bodies`` names the positions of all bodies."""
     state, reading, frame = found

@@ -24,7 +24,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-import zwidth.sweep.study  # noqa: F401  (registers its kind)
+import zwidth.config.sweep  # noqa: F401  (registers its kind)
 from zwidth.config.device_table import find_file
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Name, Strict, find_kind, members

@@ -28,7 +28,7 @@ from zwidth.config.scenes import (
 )
 from zwidth.config.study import HeldOnly, refuse_parts, register
 from zwidth.config.values import Duration, Fraction, Quantity
-from zwidth.figures.stable_set import name_wall, trace_outlines
+from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.style import WIDTH, house_style, new_figure
 from zwidth.figures.table import Table, stack
 from zwidth.loops.rigid.response import step_response
@@ -37,7 +37,7 @@ from zwidth.parts.checks import Span
 from zwidth.parts.device import Device
 from zwidth.scenes.recommendation import RANGES, Recommendation
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
-from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
+from zwidth.words.formatting import name_wall, plain, tell_apart, to_json, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, Range
 
 

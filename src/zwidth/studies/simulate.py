@@ -15,7 +15,6 @@ from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, locate_r
 from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
 from zwidth.config.study import HeldOnly, register
 from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity
-from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
@@ -25,7 +24,7 @@ from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
 from zwidth.simulation.simulate import Contact
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import header, with_unit
+from zwidth.words.formatting import header, name_wall, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, Range
 
 Length = Annotated[float, Quantity("m", NOT_NEGATIVE)]

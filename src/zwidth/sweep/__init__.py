@@ -1,4 +1,4 @@
-"""Runs described by a YAML file: what to compute, in which order, and where the results are kept.
+"""Sweeps: chunks of a grid, who computes them, and the stores that keep them.
 
-The modules are imported by name, so that reading a configuration does not wait for JAX or a store.
+The modules are imported by name, so that a plan does not wait for JAX or a store.
 """

@@ -12,11 +12,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from zwidth.config.sweep import SweepStudy
 from zwidth.sweep.files import differences, digest, versions
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, in_this_process, in_workers
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.store import SUFFIX, Store, create
-from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import StoreError, StoreExistsError
 from zwidth.words.formatting import describe
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.config.device_table import LABEL
+from zwidth.config.sweep import SweepStudy
 from zwidth.loops.normalization import normalize
-from zwidth.sweep.study import SweepStudy
 from zwidth.words.quantities import PARAMETERS, WALL, Family
 from zwidth.words.rotation import own_unit
 
@@ -29,12 +29,20 @@ class Block(NamedTuple):
 
     delta: np.ndarray  # shape (D,)
     d: np.ndarray  # shape (D,)
-    alpha: np.ndarray  # shape (D, A)
-    beta: np.ndarray  # shape (D, B)
+    plane: Plane  # the whole grid's walls, of which the block may hold a part only
     mass: np.ndarray  # in SI units, shape (D,); empty in a normalized sweep, likewise the period
     period: np.ndarray
-    plane: Plane  # the whole grid's walls, of which the block may hold a part only
     devices: int  # of the whole grid
+
+    @property
+    def alpha(self) -> np.ndarray:
+        """Those of its walls, shape (D, A)."""
+        return self.plane.alpha[:, self.plane.alphas]
+
+    @property
+    def beta(self) -> np.ndarray:
+        """Those of its walls, shape (D, B)."""
+        return self.plane.beta[:, self.plane.betas]
 
     @property
     def rows(self) -> int:
@@ -48,10 +56,10 @@ class Block(NamedTuple):
 
 
 class SceneBlock(NamedTuple):
-    """A block of the grid in SI units: D devices by their parameters, with A x B walls each."""
+    """A block of the grid as it is given: D devices by their parameters, with A x B walls each."""
 
     parameters: dict[str, np.ndarray]  # each of shape (D,)
-    stiffness: np.ndarray  # shape (D, A)
+    stiffness: np.ndarray  # shape (D, A); alpha in a normalized sweep, likewise beta
     virtual_damping: np.ndarray  # shape (D, B)
 
 
@@ -61,6 +69,7 @@ class Grid:
     def __init__(self, study: SweepStudy) -> None:
         self.axes = study.axes
         self.physical = study.axes.physical
+        self.of_wall = ("stiffness", "virtual_damping") if self.physical else ("alpha", "beta")
         sizes = study.axes.sizes
         self.wall_dims = tuple(name for name in sizes if name in WALL)
         self.device_dims = tuple(name for name in sizes if name not in WALL)
@@ -100,66 +109,43 @@ class Grid:
             found[variable] = (dims, values if dims else values[0], attributes)
         return found
 
-    def block(self, place: tuple[slice, ...]) -> Block:
-        """The normalized parameters of a block, given one slice for every dimension, or for those of devices."""
-        slices, shape = self._cut(place)
-        cut = [slice(0, 1), slice(0, 1)]
-        if len(place) == len(self.dims):
-            names = ("stiffness", "virtual_damping") if self.physical else ("alpha", "beta")
-            cut = [slice(*slices.get(name, slice(0, 1)).indices(self.sizes.get(name, 1))[:2]) for name in names]
-            slices |= dict.fromkeys(self.wall_dims, slice(None))
-        if self.physical:
-            delta, d, alpha, beta, mass, period = self._physical_block(slices, shape)
-        else:
-            delta, d = (self._device(name, slices, shape) for name in ("delta", "d"))
-            alpha, beta = (self._wall(name, slices, shape) for name in ("alpha", "beta"))
-            mass, period = np.empty(0), np.empty(0)
-        alpha, beta = self._broadcast_walls(alpha, beta, delta.size)
-        plane = Plane(alpha, beta, *cut)
-        return Block(
-            delta,
-            d,
-            alpha[:, plane.alphas],
-            beta[:, plane.betas],
-            mass,
-            period,
-            plane,
-            math.prod(self.shape_of("device")),
-        )
-
     def scene_block(self, place: tuple[slice, ...]) -> SceneBlock:
-        """The same in SI units, of a sweep whose devices have parts."""
-        slices, shape = self._cut(place)
-        names = [name for name in self.axes.given if name not in WALL]
-        parameters = {name: self._device(name, slices, shape) for name in names}
-        stiffness, damping = (self._wall(name, slices, shape) for name in ("stiffness", "virtual_damping"))
-        return SceneBlock(parameters, *self._broadcast_walls(stiffness, damping, math.prod(shape)))
-
-    def _cut(self, place: tuple[slice, ...]) -> tuple[dict[str, slice], tuple[int, ...]]:
-        """The slice of every dimension, and the shape of the devices."""
+        """A block as its parameters are given; ``place`` has a slice for every dimension, or for those of devices."""
         slices = dict(zip(self.dims, place, strict=False))
         for name in self.wall_dims:
             slices.setdefault(name, slice(0, 1))
-        return slices, tuple(len(range(*slices[name].indices(self.sizes[name]))) for name in self.device_dims)
+        shape = tuple(len(range(*slices[name].indices(self.sizes[name]))) for name in self.device_dims)
+        parameters = {name: self._device(name, slices, shape) for name in self.axes.given if name not in WALL}
+        walls = [self._wall(name, slices, shape) for name in self.of_wall]
+        return SceneBlock(parameters, *(np.broadcast_to(part, (math.prod(shape), part.shape[1])) for part in walls))
 
-    def _physical_block(self, slices: dict[str, slice], shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
-        mass, damping, delay = (self._device(name, slices, shape) for name in ("mass", "damping", "delay"))
-        period = (
-            1.0 / self._device("rate", slices, shape)
-            if "rate" in self._values
-            else self._device("period", slices, shape)
-        )
+    def block(self, place: tuple[slice, ...]) -> Block:
+        """The same normalized, with the walls of the whole grid."""
+        cut = [slice(0, 1), slice(0, 1)]
+        if len(place) == len(self.dims):
+            slices = dict(zip(self.dims, place, strict=True))
+            cut = [slice(*slices.get(name, cut[0]).indices(self.sizes.get(name, 1))[:2]) for name in self.of_wall]
+            place = (*place[: len(self.device_dims)], *[slice(None)] * len(self.wall_dims))
+        given = self.scene_block(place)
+        count = math.prod(self.shape_of("device"))
+        if self.physical:
+            return self._normalize(given, cut, count)
+        plane = Plane(given.stiffness, given.virtual_damping, *cut)
+        return Block(given.parameters["delta"], given.parameters["d"], plane, np.empty(0), np.empty(0), count)
+
+    def _normalize(self, given: SceneBlock, cut: list[slice], count: int) -> Block:
+        none = np.zeros(len(given.stiffness))
+        mass, damping, delay = (given.parameters.get(name, none) for name in ("mass", "damping", "delay"))
+        rate = given.parameters.get("rate")
+        period = given.parameters["period"] if rate is None else 1.0 / rate
         in_periods = self.axes.delay_in_periods
         # Beyond float64 is a status of the point, not a warning.
         with np.errstate(all="ignore"):
-            device = normalize(mass=mass, damping=damping, period=period, delay=np.zeros(1) if in_periods else delay)
-            stiffness, virtual_damping = (self._wall(name, slices, shape) for name in ("stiffness", "virtual_damping"))
-            walls = normalize(
-                mass=mass[:, None], period=period[:, None], stiffness=stiffness, virtual_damping=np.zeros((1, 1))
-            )
-            damped = normalize(mass=mass[:, None], period=period[:, None], virtual_damping=virtual_damping)
-        d = delay if in_periods else device.d
-        return device.delta, np.broadcast_to(d, mass.shape), walls.alpha, damped.beta, mass, period
+            device = normalize(mass=mass, damping=damping, period=period, delay=none if in_periods else delay)
+            units = {"mass": mass[:, None], "period": period[:, None]}
+            alpha = normalize(**units, stiffness=given.stiffness).alpha
+            beta = normalize(**units, virtual_damping=given.virtual_damping).beta
+        return Block(device.delta, delay if in_periods else device.d, Plane(alpha, beta, *cut), mass, period, count)
 
     def _device(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
         """A parameter of the devices of a block, flat; 0 where it is not given."""
@@ -181,10 +167,6 @@ class Grid:
         if table is not None and name in table.columns:
             return "device"
         return name if name in self.sizes else None
-
-    @staticmethod
-    def _broadcast_walls(alpha: np.ndarray, beta: np.ndarray, devices: int) -> tuple[np.ndarray, np.ndarray]:
-        return np.broadcast_to(alpha, (devices, alpha.shape[1])), np.broadcast_to(beta, (devices, beta.shape[1]))
 
     def size_of(self, family: Family) -> int:
         return math.prod(self.shape_of(family))

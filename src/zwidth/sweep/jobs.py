@@ -18,12 +18,12 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.arrays.kernel_cache import mend_compilation_cache
+from zwidth.config.sweep import SweepStudy
 from zwidth.scenes.scene import Scene
 from zwidth.sweep.files import content, hopeless
 from zwidth.sweep.grid import SceneBlock
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
-from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import InputError, ZwidthError
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, Family
 from zwidth.words.status import Status

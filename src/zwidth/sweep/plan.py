@@ -12,9 +12,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from zwidth.config.sweep import SweepStudy
 from zwidth.sweep.files import check_folder, existing
 from zwidth.sweep.grid import Grid
-from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import ResourceError
 from zwidth.words.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.config.sweep import SweepStudy
 from zwidth.sweep.files import checksum, content, digest, hidden_beside, remove_quietly, write_whole
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.plan import Plan, Task, kept_plan
-from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import InputError, StoreError
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.words.rotation import own_unit

@@ -23,7 +23,7 @@ from typing import Any
 from zwidth.words.errors import InputError
 from zwidth.words.rotation import ROTARY, is_rotary, own_unit
 
-_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 LONGEST_VALUE = 60
 _REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 _TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
@@ -60,7 +60,12 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     # 999.96 with four digits reads 1000: the next prefix is meant.
     if abs(float(f"{value / 10**power:.{digits - 1}e}")) >= 1000 and power < 9:
         power += 3
-    return f"{plain(value / 10**power, digits)} {_PREFIXES[power]}{unit}"
+    return f"{plain(value / 10**power, digits)} {PREFIXES[power]}{unit}"
+
+
+def name_wall(stiffness: Any, virtual_damping: Any) -> str:
+    """A wall by its numbers."""
+    return f"K = {with_unit(float(stiffness), 'N/m')}, B = {with_unit(float(virtual_damping), 'N s/m')}"
 
 
 # Words behind a number, by the side of it on which there is enough.

@@ -34,10 +34,9 @@ def shown(
 ) -> Callable[[Kind], Kind]:
     """Give a result, a dataclass or a named tuple, a short ``repr`` and a table in notebooks.
 
-    ``units`` are those of its fields, or the codes that stand there; a stiffness, a virtual
-    damping and a status need none. ``only``
-    are the fields that are shown, all where left out; ``missing`` says by field why one is NaN; ``picture`` draws what
-    stands below the table, as HTML.
+    ``units`` are those of its fields, or the codes that stand there; a stiffness, a virtual damping and a status need
+    none. ``only`` are the fields that are shown, all where left out; ``missing`` says by field why one is NaN;
+    ``picture`` draws what stands below the table, as HTML.
     """
 
     def decorate(kind: Kind) -> Kind:

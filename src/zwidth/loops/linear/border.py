@@ -278,15 +278,9 @@ def _narrow(
 
 def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:
     """First and last index of every run of true values within one piece."""
-    runs = []
-    start = None
-    for k in range(held.size):
-        if held[k] and start is None:
-            start = k
-        if start is not None and (k + 1 == held.size or not held[k + 1] or piece[k + 1] != piece[k]):
-            runs.append((start, k))
-            start = None
-    return runs
+    joined = held[1:] & held[:-1] & (piece[1:] == piece[:-1])
+    first, last = held & ~np.append(False, joined), held & ~np.append(joined, False)
+    return list(zip(np.flatnonzero(first).tolist(), np.flatnonzero(last).tolist(), strict=True))
 
 
 @shown()

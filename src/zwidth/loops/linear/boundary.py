@@ -1,8 +1,6 @@
-"""The boundary curve of any linear loop, cut into arcs on which the damping is monotone; rows of it and their counts.
+"""Rows of the boundary of any linear loop, and how many poles of each wall lie outside (docs/theory/scenes.md).
 
-On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``
-(docs/theory/scenes.md, V8). Between the zeros of ``d beta/dw`` and of Im F beta is monotone (V12), so that each row
-meets an arc once at most. Along a row a pole leaves the circle where
+A row meets each arc of `loops.linear.curve` once at most (V12). Along it a pole leaves the circle where
 ``Im(q' - beta F') > 0``, which at z = 1 and z = -1 holds for the real poles as well. Hence
 
     poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)

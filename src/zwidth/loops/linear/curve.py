@@ -181,12 +181,7 @@ class Arc(NamedTuple):
 
 
 def cut_arcs(
-    loop: LoopRoots,
-    w: np.ndarray,
-    here: CurvePoints,
-    poles: np.ndarray,
-    turns: np.ndarray,
-    limits: dict[float, float],
+    loop: LoopRoots, w: np.ndarray, here: CurvePoints, poles: np.ndarray, turns: np.ndarray, limits: dict[float, float]
 ) -> list[Arc]:
     """Cut the curve where beta turns or runs to infinity, and where Im F changes its sign."""
     ends = np.unique(np.concatenate([list(limits), poles, turns]))

@@ -160,7 +160,5 @@ def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
     # A pole pair at w, or a real pole where w stays.
     meet = jnp.stack([r.real, jnp.where(codes == Condition.PAIR, r.imag, stays)], -1)
     which = jnp.maximum(codes[1] - Condition.PLUS_ONE, 0)
-    second = jnp.stack(
-        [meet[1], jnp.stack([across[0], stays[1]]), jnp.stack([unknowns[1], stays[1]])],
-    )[which]
+    second = jnp.stack([meet[1], jnp.stack([across[0], stays[1]]), jnp.stack([unknowns[1], stays[1]])])[which]
     return jnp.concatenate([meet[0], second])

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, fields
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator, create_model
+from pydantic import Field, GetPydanticSchema, ValidationError, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.device_table import DeviceTable, TableField, read_table
@@ -18,7 +18,7 @@ from zwidth.config.devices import (
     find_second_period,
     tell_rotary,
 )
-from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
+from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
@@ -151,13 +151,7 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
     yield from find_second_period(keys)
 
 
-def _check_output(name: Any) -> str:
-    if not isinstance(name, str) or name not in OUTPUTS:
-        raise unlisted(name, tuple(OUTPUTS))
-    return name
-
-
-OutputName = Annotated[str, BeforeValidator(_check_output), WithJsonSchema({"type": "string", "enum": list(OUTPUTS)})]
+OutputName = Annotated[str, GetPydanticSchema(lambda _, handler: handler.generate_schema(Literal[tuple(OUTPUTS)]))]
 
 
 class _Swept(Study):
