@@ -223,7 +223,7 @@ class _Round(NamedTuple):
     proved: Array
     low: Array  # halved interval of logarithms of the radius
     high: Array
-    places: Array  # arguments of the crossovers on the circle of that radius, and its ends
+    places: Array  # arguments of the crossovers on the last circle
 
 
 def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
@@ -237,8 +237,8 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
 
     tolerance = epsilon(loop.c) ** 0.58
     high = _largest(loop)
-    places = xp.stack([0.0 * high, 0.0 * high + np.pi, *([0.0 * high] * (3 if fractional else 2))])
-    looks = len(places)
+    # At the ends of the circle, then at the crossovers.
+    looks = 5 if fractional else 4
     last = looks + _POLISHING + _NEWTON
     # By rounds: the steps on a pole, the first of which look at the places, and the counts, the last of which proves.
     steps = xp.asarray([(looks + _POLISHING - _LARGER, last), (last, last), (0, last)])
@@ -250,7 +250,8 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
         def step(k: Any, at: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             re, im, within = at
             looking = k < looks
-            place = xp.where(looking, known.places[xp.minimum(k, looks - 1)], im)
+            place = xp.where(k < 2, np.pi * k, known.places[xp.clip(k - 2, 0, looks - 3)])
+            place = xp.where(looking, place, im)
             by = newton_step(re, place, loop, fractional)
             ahead = halley_step(re, place, loop, fractional), move_pole(re, place, by.re, by.im)
             to_re, to_im = (xp.where(k < last - _NEWTON, *pair) for pair in zip(*ahead, strict=True))
@@ -277,7 +278,7 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
                 at.proved | proved,
                 xp.where((k < _HALVINGS) & (inside == 0), middle, at.low),
                 xp.where((k < _HALVINGS) & (inside > 0), middle, at.high),
-                xp.where(k == _HALVINGS, xp.stack([*places[:2], *seen.crossings]), at.places),
+                xp.stack(seen.crossings),
             )
 
         return turn + 1, fori_loop(*counts[turn], look, known)
@@ -285,7 +286,8 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
     def going(state: tuple[Any, _Round]) -> Any:
         return (state[0] == 0) | ((state[0] < len(steps)) & ~(state[1].proved | xp.isnan(loop.alpha)).all())
 
-    start = _Round(*larger_pole(loop, fractional), high > np.inf, 0.0 * high + _SMALLEST, high, places)
+    none = xp.stack([0.0 * high] * (looks - 2))
+    start = _Round(*larger_pole(loop, fractional), high > np.inf, 0.0 * high + _SMALLEST, high, none)
     return while_loop(going, run, (0, start))[1][:3]
 
 
