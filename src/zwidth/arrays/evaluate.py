@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from zwidth.arrays.threads import run_in_threads
-from zwidth.arrays.xp import WIDE, is_jax, is_traced, tree_map
+from zwidth.arrays.xp import WIDE, is_jax, is_traced, store_once, tree_map
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
@@ -269,8 +269,9 @@ def compile_traced(
         sides = tuple(
             side.reshape(-1, *(1,) * ones.ndim) * ones[None] for side in np.eye(len(moving), dtype=ones.dtype)
         )
-        # The values are computed once for all sides.
-        return jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
+        # The values are computed once for all sides, and a side once for all that is made of it.
+        value, slopes = jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
+        return value, tree_map(lambda leaf: leaf if leaf.dtype == jax.dtypes.float0 else store_once(leaf, leaf), slopes)
 
     function = jax.custom_jvp(jax.jit(plain))
 

@@ -101,7 +101,7 @@ def false_position(
 ) -> Array:
     """Where a function that is positive at ``low`` and not at ``high`` changes sign.
 
-    False position with halved weights, every sixth step a bisection. NumPy stops when every point is done: its value
+    False position with halved weights, every sixth step a bisection, until every point is done: its value
     no more than rounding, or the bracket no wider than two of ``width``; so far from its ends it is cut at least, or
     the end that is not next to the zero would stay.
     """
@@ -110,7 +110,11 @@ def false_position(
     def done(at: _Bracket) -> Array:
         return (xp.abs(at.value) <= _ROUNDING) | (at.high - at.low <= 2.0 * width)
 
-    def step(k: Any, at: _Bracket) -> _Bracket:
+    def going(state: tuple[Any, _Bracket]) -> Any:
+        return (state[0] < steps) & ~xp.all(done(state[1]))
+
+    def step(state: tuple[Any, _Bracket]) -> tuple[Any, _Bracket]:
+        k, at = state
         gap = at.at_low - at.at_high
         trial = at.low + (at.high - at.low) * (at.at_low / xp.where(gap > 0, gap, 1.0))
         trial = xp.minimum(xp.maximum(trial, at.low + width), at.high - width)
@@ -120,7 +124,7 @@ def false_position(
         value = function(trial)
         # A point that is done keeps its value: it must not depend on the points beside it.
         above, better = value > 0, (xp.abs(value) < xp.abs(at.value)) & ~done(at)
-        return _Bracket(
+        return k + 1, _Bracket(
             xp.where(above, trial, at.low),
             xp.where(above, at.high, trial),
             xp.where(above, value, xp.where(at.side < 0, 0.5 * at.at_low, at.at_low)),
@@ -132,16 +136,15 @@ def false_position(
 
     lower = at_low < -at_high
     none = 0.0 * at_low
-    at = _Bracket(low, high, at_low, at_high, none, xp.where(lower, low, high), xp.where(lower, at_low, at_high))
-    if xp is np:
-        for k in range(steps):
-            at = step(k, at)
-            if np.all(done(at)):
-                break
-        return at.best
-    from jax.lax import fori_loop
+    best = xp.where(lower, low, high), xp.where(lower, at_low, at_high)
+    state = 0, _Bracket(low, high, at_low, at_high, none, *best)
+    if xp is not np:
+        from jax.lax import while_loop
 
-    return fori_loop(0, steps, step, at).best
+        return while_loop(going, step, state)[1].best
+    while going(state):
+        state = step(state)
+    return state[1].best
 
 
 # Steps towards a zero between two nodes at most, and how near, as a share of its place, it is told.
@@ -160,22 +163,30 @@ def zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: 
         return false_position(lambda at: function(at) * scale, *ends, _BETWEEN_STEPS, _CLOSED * high)
 
 
-def follow_root(function: Function, root: Array, usable: Callable[[Array, Array], Array]) -> Array:
-    """A zero, in JAX with its derivatives in whatever the function depends on, to the second order.
+def follow_root(function: Callable[..., Array], root: Array, usable: Callable[..., Array], *known: Any) -> Array:
+    """A zero x of ``function(x, *known)``, in JAX with its derivatives of every order in what is known.
 
-    Each of two Newton steps makes one order exact; one is taken where ``usable(slope, step)``.
+    They are those of the implicit function, so that nothing of a search is differentiated, and 0 but where
+    ``usable(x, slope, step)``, of the function and of Newton's next step.
     """
     xp = namespace(root)
     if xp is np:
         return root
     import jax
 
-    def step(root: Array) -> Array:
-        value, slope = jax.jvp(function, (root,), (xp.ones_like(root),))
-        taken = usable(*frozen((slope, value / xp.where(slope == 0, 1.0, slope)), xp))
-        return root - xp.where(taken, value / xp.where(taken, slope, 1.0), 0.0)
+    @jax.custom_jvp
+    def follow(root: Array, *known: Any) -> Array:
+        return root
 
-    return repeat(2, step, frozen(root, xp), xp)
+    @follow.defjvp
+    def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+        x, known = follow(*primals), primals[1:]
+        value, change = jax.jvp(lambda *known: function(x, *known), known, tangents[1:])
+        slope = jax.jvp(lambda x: function(x, *known), (x,), (xp.ones_like(x),))[1]
+        taken = usable(*frozen((x, slope, value / xp.where(slope == 0, 1.0, slope)), xp))
+        return x, xp.where(taken, -change / xp.where(taken, slope, 1.0), 0.0)
+
+    return follow(frozen(root, xp), *known)
 
 
 def integrate(function: Callable[[Array], Array], low: Array, high: Array, nodes: int) -> Array:

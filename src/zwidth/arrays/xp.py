@@ -187,7 +187,7 @@ def store_once(values: Values, witness: Array) -> Values:
     import jax.numpy as jnp
 
     one = jax.lax.stop_gradient(jnp.where(jnp.isnan(witness), jnp.nan, 1.0))
-    return jax.tree.map(lambda value: value / one, values)
+    return jax.tree.map(lambda value: value / one > 0 if value.dtype == bool else value / one, values)
 
 
 def fit_arcsine(terms: int) -> list[float]:

@@ -37,7 +37,7 @@ def test_false_position_and_its_derivative(x64):
     assert found == pytest.approx(-np.log(0.3), rel=1e-15)
 
     def root(shift):
-        return follow_root(lambda x: function(x, shift), jax.numpy.asarray(found), lambda slope, step: slope < 0)
+        return follow_root(function, jax.numpy.asarray(found), lambda x, slope, step: slope < 0, shift)
 
     assert jax.grad(root)(0.3) == pytest.approx(-1 / 0.3, rel=1e-14)
     assert jax.grad(jax.grad(root))(0.3) == pytest.approx(1 / 0.09, rel=1e-13)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from zwidth.arrays.evaluate import as_number, check_count, check_scalars, evaluate
-from zwidth.arrays.roots import integrate
-from zwidth.arrays.xp import frozen, namespace, nan_with_nan_slopes, repeat
+from zwidth.arrays.roots import follow_root, integrate
+from zwidth.arrays.xp import frozen, namespace, nan_with_nan_slopes, store_once
 from zwidth.loops.rigid.curve import (
-    Lobe,
-    LobePoint,
     column_end,
     creeps,
     frequency,
@@ -35,8 +32,6 @@ from zwidth.words.types import Array, ArrayLike, DelayModel, Vertices
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
 _METHODS: tuple[str, ...] = ("auto", "optimistix")
 
-# One Newton step through which derivatives pass makes the first ones exact, a second one the second ones.
-_EXACT_STEPS = 2
 # Closer to pi the frequency of a fractional power of less than one has too few digits.
 _NEAREST_PI = 1e-3
 
@@ -167,21 +162,23 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
     creeping = creeps(delay_model, kind)
     fixed, still = frozen((curve, number), xp)
     if is_row:
-        row = frozen(row_end(still, fixed, delay_model, kind), xp)
+        row = store_once(row_end(still, fixed, delay_model, kind), delta)
         x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
-        smooth, at = _follow(x, curve, lambda at: (at.b - (number + delta), at.d_b))
+        x = follow_root(lambda x, curve, beta: wall(x, curve).b - (beta + curve.here.delta), x, _always, curve, number)
+        at = wall(x, curve)
         # The number that `zwidth.is_stable` compares with.
         alpha, beta = _with_slope(row.alpha, at.alpha, xp), number
     else:
         top = peak(fixed, delay_model, kind)
         exists = (still > 0) & (still < top.alpha)
         goal = xp.where(exists, still, 0.5 * top.alpha)
-        x, cut = frozen(column_end(goal, top, fixed, line == "upper", creeping), xp)
+        x, cut = store_once(column_end(goal, top, fixed, line == "upper", creeping), delta)
         on_lobe = ~cut
-        smooth, at = _follow(x, curve, lambda at: (at.alpha - number, at.d_alpha))
+        x = follow_root(lambda x, curve, alpha: wall(x, curve).alpha - alpha, x, _always, curve, number)
+        at = wall(x, curve)
         # Beside the ridge a step more would be rounding over rounding.
-        alpha, beta = number, _with_slope(wall(x, fixed).b, at.b, xp) - delta
-    omega = frequency(smooth, curve)
+        alpha, beta = number, at.b - delta
+    omega = frequency(x, curve)
     if curve.short is not None and line != "lower":
         # On the line of z = -1, alpha + 2 beta is known.
         rest = on_line(curve) - (2.0 * number if is_row else number)
@@ -199,16 +196,8 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
     return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
 
 
-def _follow(x: Array, curve: Lobe, offset: Callable[[LobePoint], tuple[Array, Array]]) -> tuple[Array, LobePoint]:
-    """A root that moves with the curve and the line: it stands still in NumPy, which knows no derivative."""
-
-    def step(x: Array) -> Array:
-        value, slope = offset(wall(x, curve))
-        return x - value / slope
-
-    xp = namespace(x)
-    x = x if xp is np else repeat(_EXACT_STEPS, step, x, xp)
-    return x, wall(x, curve)
+def _always(*_: Any) -> bool:
+    return True
 
 
 def _with_slope(value: Array, moving: Array, xp: Any) -> Array:

@@ -254,17 +254,17 @@ def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> C
     zeros = [xp.where(valid, x, 0.5) for valid, x in zip(inside, zeros, strict=True)]
 
     def phase(x: Array) -> tuple[Array, Array, Array]:
-        return _phase(x, at, loop, fractional, xp)
+        theta, w, rate = _phase(x, at, loop, fractional, xp)
+        # The rounding of theta, and that of x where the two sizes cross at a small angle.
+        return theta, w, rate * at.parts(x) / (xp.abs(at.slope(x)) * xp.sqrt(x * (1.0 - x)))
 
     # One text for all three takes half of the time to compile; of two it would run half as fast.
     phases = list(map(phase, zeros)) if len(zeros) < 3 else apply_each(phase, zeros, xp)
-    for valid, x, (theta, w, rate) in zip(inside, zeros, phases, strict=True):
+    for valid, (theta, w, shift) in zip(inside, phases, strict=True):
         part = theta / (2.0 * np.pi)
         whole = xp.round(part)
         turn = turn + xp.where(valid, xp.where(outer, whole, -whole), 0.0)
         outer = outer != valid
-        # The rounding of theta, and that of x where the two sizes cross at a small angle.
-        shift = rate * at.parts(x) / (xp.abs(at.slope(x)) * xp.sqrt(x * (1.0 - x)))
         sure = sure & (~valid | (0.5 - xp.abs(part - whole) > blur + 4.0 * eps * shift))
         crossings.append(w)
     # Rounding must not have changed the number of crossovers.

@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import ARCSINE, COSINE, SINE, horner, namespace, roots, within
+from zwidth.arrays.roots import follow_root
+from zwidth.arrays.xp import ARCSINE, COSINE, SINE, frozen, horner, namespace, roots, within
 from zwidth.loops.rigid.device import ANY, DelayClasses, DeviceTerms, device, long_curve, short_curve
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
@@ -186,9 +187,14 @@ def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> Crossover:
         cubic[3],
     )
     far = sum(cubic[1:], cubic[0]) > 0
-    near = first_zero(tuple(xp.where(far, *pair) for pair in zip(behind, cubic, strict=True)))
+    known = tuple(xp.where(far, *pair) for pair in zip(behind, cubic, strict=True))
+    near = follow_root(_sum_powers, first_zero(frozen(known, xp)), lambda x, slope, _: slope != 0, *known)
     exists = (xp.abs(other) < one) & (near > 0) & (near <= 1.0)
     return Crossover(xp.where(far, 2.0 - near, near), xp.where(far, near, 2.0 - near), exists)
+
+
+def _sum_powers(x: Array, *coefficients: Array) -> Array:
+    return horner(x, coefficients)
 
 
 def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:

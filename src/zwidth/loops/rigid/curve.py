@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import bisect
-from zwidth.arrays.xp import frozen, horner, namespace, repeat, tree_map
+from zwidth.arrays.xp import frozen, horner, namespace, repeat, store_once, tree_map
 from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, Plant, device, short_curve
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (
@@ -84,7 +84,7 @@ def creeps(delay_model: str, kind: DelayClasses) -> bool:
 def lobe(delta: Array, d: Array, delay_model: str, kind: DelayClasses) -> Lobe:
     """The lobe of a device, or of arrays of one shape, from the delays that `DelayClasses` says may occur."""
     xp = namespace(delta, d)
-    here = describe_device(delta, d, delay_model, kind)
+    here = store_once(describe_device(delta, d, delay_model, kind), delta)
     creeping = creeps(delay_model, kind)
     is_short = here.whole < 1 if delay_model == "held" else here.whole == 0
     short, long, ends = None, None, []

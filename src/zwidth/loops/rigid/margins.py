@@ -12,10 +12,10 @@ import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.roots import false_position, follow_root
-from zwidth.arrays.xp import along, epsilon, frozen, horner, namespace, nan_with_nan_slopes, store_once
-from zwidth.loops.rigid.crossover import gain_crossover, stable_at
+from zwidth.arrays.xp import along, apply_each, epsilon, frozen, horner, namespace, nan_with_nan_slopes, store_once
+from zwidth.loops.rigid.crossover import stable_at
 from zwidth.loops.rigid.device import ANY, DeviceTerms, device, short_curve, split_delay, valid_wall
-from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, find_angle, modulus, size_and_phase
+from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, gain_frequency, modulus, size_and_phase
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
 
@@ -102,11 +102,8 @@ def margins_kernel(
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
     here = store_once(device(delta, d), delta)
-    crossover = gain_crossover(alpha, beta, here)
-    crosses = crossover.exists
-    w = xp.where(crosses, find_angle(crossover), 1.0)
-    phase = size_and_phase(w, alpha, beta, here)[1]
-    stable = stable_at(alpha, beta, here, ANY)
+    w, phase, crosses = gain_frequency(alpha, beta, here)
+    stable = store_once(stable_at(*frozen((alpha, beta, here), xp), ANY), delta)
     gain, phase_crossover = _gain_margin(alpha, beta, here, xp)
     delay = distance = closest = xp.nan * alpha
     if with_delay:
@@ -143,13 +140,11 @@ def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple
     ends the stable part, or where there is none before z = -1 the line of that, where ``|L(-1)| = 1``.
     """
 
-    whole, em = here.whole, here.em
-    (u0, u1), size, shape = short_curve(here)
-
-    def phase(log_w: Array) -> Array:
+    def phase(log_w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:
         # Times a positive factor: of order one on either side of sqrt(em), where for light damping the phase itself
         # is below rounding long before it changes sign.
-        w = xp.exp(log_w)
+        w, whole, em = xp.exp(log_w), here.whole, here.em
+        (u0, u1), size, shape = short_curve(here)
         found = size_and_phase(w, alpha, beta, here)[1]
         # Below one period it vanishes at z = -1 in any case, and its other zero is lost in rounding beside that: there
         # the curve is read, which has that one only, by its sign ``beta alpha_w > alpha beta_w``.
@@ -159,25 +154,24 @@ def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple
         return xp.where((whole == 0) & (xp.abs(found) < _SMALL_PHASE), ahead, found * ((w + em) / (w * w + em)))
 
     # Here the phase of an undamped device is still that of its slope, of any other it is above pi/2 - 1/2.
+    whole, em = here.whole, here.em
     slowness = 1.0 / xp.where(em > 0, em, 1e-9) + whole + 2.0 + xp.abs(beta) / alpha
-    low, high = -xp.log(2.0 * slowness), xp.log(np.pi / (whole + 1.0))
-    start = phase(low)
+    wall, (low, high) = frozen(((alpha, beta, here), (-xp.log(2.0 * slowness), xp.log(np.pi / (whole + 1.0)))), xp)
+    start, end = apply_each(lambda x: phase(x, *wall), [low, high], xp)
     none = ~(start > 0)
-    bracket = frozen((low, high, xp.where(none, 1.0, start)), xp)
-    found = false_position(
-        lambda x: frozen(phase(x), xp), bracket[0], bracket[1], bracket[2], -1.0 + 0.0 * low, _STEPS, 1e-15
-    )
-    w = xp.minimum(xp.exp(follow_root(phase, found, _falling)), np.pi)
+    ends = low, high, xp.where(none, 1.0, start), -1.0 + 0.0 * low
+    found = false_position(lambda x: phase(x, *wall), *ends, _STEPS, 1e-15)
+    w = xp.minimum(xp.exp(follow_root(phase, found, _falling, alpha, beta, here)), np.pi)
     first = 1.0 / size_and_phase(w, alpha, beta, here)[0]
     line = xp.abs(here.gap * (alpha + 2.0 * beta))
     last = 2.0 * (1.0 + here.c) / xp.where(line > 0, line, 1.0)
     # From one period on the phase falls to 0 before, but for rounding.
-    at_line = (whole == 0) & (line > 0) & (phase(high) > 0)
+    at_line = (whole == 0) & (line > 0) & (end > 0)
     gain = xp.where(none, 0.0, xp.where(at_line, last, first))
     return gain, xp.where(at_line, np.pi, w) + nan_with_nan_slopes(~none, alpha, beta, here.em)
 
 
-def _falling(slope: Array, step: Array) -> Array:
+def _falling(_: Array, slope: Array, step: Array) -> Array:
     """At an end of the range there is no zero to follow."""
     return (slope < 0) & (abs(step) < 1e-3)
 
@@ -192,7 +186,7 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     whole, fraction = split_delay(d)
     nodes = along(np.minimum(np.arange(_FRACTIONS + 1) / _FRACTIONS, 1.0 - epsilon(d)), xp.asarray(d))
     grid = nodes + 0.0 * d[..., None]
-    phases, crossings, exist = _bound_undelayed(grid, *(value[..., None] + 0.0 * grid for value in still))
+    crossings, phases, exist = _bound_undelayed(grid, *(value[..., None] + 0.0 * grid for value in still))
     periods = xp.where(exist, phases / crossings, -xp.inf)
     # One period on, f = 0 again, but for n: exactly so, whatever the rounding.
     periods = xp.concatenate([periods[..., :-1], periods[..., :1] - 1.0], axis=-1)
@@ -213,21 +207,17 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     low = xp.where(here_first, part, low)[()]
     at_low = xp.where(here_first, frozen(phase, xp), at_low)[()]
 
-    def excess(f: Array, *wall: Array) -> Array:
-        phase, w, exists = _bound_undelayed(f, *wall)
+    def excess(f: Array, there: Array, *wall: Array) -> Array:
+        w, phase, exists = _bound_undelayed(f, *wall)
         return xp.where(exists, phase - there * w, _NO_CROSSOVER)
 
     high, at_high = sample(grid, place), xp.minimum(sample(excess_of, place), 0.0)
     # The delay is known to a rounding error of the whole of it.
     width = 4e-16 * (1.0 + there)
-    f = false_position(lambda f: excess(f, *still), low, high, at_low, at_high, _STEPS, width)
-    return there + follow_root(lambda f: excess(f, *wall), f, _falling) - d
+    f = false_position(lambda f: excess(f, there, *still), low, high, at_low, at_high, _STEPS, width)
+    return there + follow_root(excess, f, _falling, there, *wall) - d
 
 
 def _bound_undelayed(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
-    """Below one period of delay: the phase at the crossover, the crossover, and whether there is one."""
-    xp = namespace(f, alpha)
-    here = store_once(device(delta, f), f)
-    crossover = gain_crossover(alpha, beta, here)
-    w = xp.where(crossover.exists, find_angle(crossover), 1.0)
-    return size_and_phase(w, alpha, beta, here)[1], w, crossover.exists
+    """Below one period of delay: the crossover, the phase there, and whether there is one."""
+    return gain_frequency(alpha, beta, store_once(device(delta, f), f))

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.xp import along, apply_each, find_turn, frozen, namespace, repeat
+from zwidth.arrays.roots import follow_root
+from zwidth.arrays.xp import along, apply_each, find_turn, frozen, namespace, repeat, store_once
 from zwidth.loops.rigid.crossover import Crossover, gain_crossover
 from zwidth.loops.rigid.device import DeviceTerms
 from zwidth.words.types import Array
@@ -46,6 +47,14 @@ def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tu
     return size, phase - (here.whole + 0.5) * w
 
 
+def gain_frequency(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array, Array]:
+    """The gain crossover, the phase there, and whether there is one, without which both mean nothing."""
+    xp = namespace(alpha, here.delta)
+    found = gain_crossover(alpha, beta, here)
+    w, exists = store_once((xp.where(found.exists, find_angle(found), 1.0), found.exists), alpha)
+    return w, size_and_phase(w, alpha, beta, here)[1], exists
+
+
 # For the samples of a point. Compiled they would take many seconds and then win nothing over NumPy.
 SAMPLES_WEIGHT = 8
 # Samples over the turns and over the decades below the crossover; how many dips are refined, by how many zooms.
@@ -63,30 +72,28 @@ def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> 
 def modulus(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
     """The least ``|1 + L|`` over (0, pi] and its w, for alpha > 0, elementwise."""
     xp = namespace(alpha, here.c)
-    w = frozen(_lowest(*frozen((alpha, beta, here), xp), xp), xp)
-    square = squared_distance(w, alpha, beta, here)
+    wall = alpha, beta, here
+    w = _lowest(*frozen(wall, xp), xp)
     if xp is not np:
-        gained, moved = _shift_frequency(w, alpha, beta, here)
-        square, w = square - gained, w - moved
-    return xp.sqrt(xp.maximum(square, 0.0)), w
+        import jax
+
+        # The vertex of a parabola knows a flat minimum to fewer digits than its derivatives need.
+        w = store_once(w, alpha)
+        first, second = jax.jvp(lambda w: _slope(w, *frozen(wall, xp)), (w,), (xp.ones_like(w),))
+        w = store_once(w - xp.where(_is_dip(w, second), first / second, 0.0), w)
+        w = follow_root(_slope, w, _is_dip, *wall)
+    return xp.sqrt(xp.maximum(squared_distance(w, *wall), 0.0)), w
 
 
-def _shift_frequency(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
-    """One Newton step more, 0 but for its derivatives: by how much it lowers the square, and by how much it moves w."""
+def _is_dip(w: Array, bend: Array, _: Any = None) -> Array:
+    return (w < np.pi) & (bend > 0)
+
+
+def _slope(w: Array, *wall: Any) -> Array:
+    """The derivative of the squared distance, in JAX."""
     import jax
-    import jax.numpy as jnp
 
-    def value(w: Array) -> Array:
-        return squared_distance(w, alpha, beta, here)
-
-    def slope(w: Array) -> Array:
-        return jax.jvp(value, (w,), (jnp.ones_like(w),))[1]
-
-    first = slope(w)
-    second = frozen(jax.jvp(slope, (w,), (jnp.ones_like(w),))[1], jnp)
-    regular = (w < np.pi) & (second > 0)
-    move = jnp.where(regular, first / jnp.where(regular, second, 1.0), 0.0)
-    return 0.5 * first * move, move
+    return jax.jvp(lambda w: squared_distance(w, *wall), (w,), (jax.numpy.ones_like(w),))[1]
 
 
 def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
@@ -95,7 +102,8 @@ def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
     def at(level: Array) -> Array:
         """Where |L| has a value; pi if it is larger everywhere."""
         found = gain_crossover(alpha / level, beta / level, here)
-        return xp.where(found.exists, find_angle(found), np.pi)
+        w = xp.where(found.exists, find_angle(found), np.pi)
+        return store_once(w, w)
 
     def distance(w: Array) -> Array:
         fields = DeviceTerms(*(field[..., None] for field in here))
@@ -142,7 +150,7 @@ def _refine_minimum(grid: Array, values: Array, distance: Any, xp: Any) -> Array
     low, high = repeat(_ZOOMS, zoom, (low, high), xp)
     # The vertex of a parabola: values alone know a minimum to half of the digits.
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    left, at, right = distance(low), distance(middle), distance(high)
+    left, at, right = apply_each(distance, [low, middle, high], xp)
     bend = left + right - 2.0 * at
     vertex = middle + half * xp.where(bend > 0, 0.5 * (left - right) / xp.where(bend > 0, bend, 1.0), 0.0)
     vertex = xp.minimum(xp.maximum(vertex, low), high)

@@ -24,7 +24,7 @@ from zwidth.arrays.xp import (
 )
 from zwidth.loops.rigid.circle import Loop, count, factor_loop
 from zwidth.loops.rigid.device import valid_wall
-from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step
+from zwidth.loops.rigid.pole_step import Pair, halley_step, move_pole, newton_step, value_at
 from zwidth.words.types import Array
 
 # Steps on both starts, then on the larger of the two; on both where that was not enough, next to double poles.
@@ -36,7 +36,7 @@ _AFTER = 1.4
 _COUNTED, _RELATIVE = 4096.0, 2e-11
 # From the smallest radius that float64 has, to the last digit: where many poles are of nearly one size, the places of
 # crossovers depend on it.
-_SMALLEST, _HALVINGS, _POLISHING = -690.0, 62, 6
+_SMALLEST, _HALVINGS, _POLISHING, _NEWTON = -690.0, 62, 6, 3
 _TOGETHER = 3
 # Off the real axis, of the angle of the first pair.
 _OFF = 0.1
@@ -121,13 +121,18 @@ def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, 
     return (*slow, *pair)
 
 
-def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
-    """The larger of the two, nearly."""
+def larger_pole(loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """The larger of the two, roughly."""
     xp = namespace(loop.alpha)
     slow_re, slow_im, re, im = both_poles(_BOTH, loop, fractional)
     first = (slow_re >= re) | xp.isnan(re)
-    state = xp.where(first, slow_re, re), xp.where(first, slow_im, im)
-    return repeat(_LARGER, lambda at: halley_step(*at, loop, fractional), state, xp)
+    return xp.where(first, slow_re, re), xp.where(first, slow_im, im)
+
+
+def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """The larger of the two, nearly."""
+    start = larger_pole(loop, fractional)
+    return repeat(_LARGER, lambda at: halley_step(*at, loop, fractional), start, namespace(loop.alpha))
 
 
 def certification_width(re: Array, tolerance: Any) -> Array:
@@ -158,8 +163,7 @@ def quick_kernel(
 
 def has_bound(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Array:
     """Whether two counts prove that the radius is ``e^log_r`` within a relative tolerance."""
-    sides = [log_r + tolerance, log_r - tolerance]
-    above, below = apply_each(lambda side: count(side, loop, fractional), sides, namespace(log_r, loop.alpha))
+    above, below = (count(side, loop, fractional) for side in (log_r + tolerance, log_r - tolerance))
     return above.full & above.sure & ~below.full & below.sure
 
 
@@ -187,59 +191,136 @@ def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> OutermostP
 
 
 def search(tolerance: Array, loop: Loop, fractional: bool) -> OutermostPoles:
-    """The outermost pole by halvings of the interval that counts leave, then a few steps."""
-    xp = namespace(loop.alpha)
-    # Of few walls NumPy has several radii counted in the time of one.
-    together = _TOGETHER if xp is np else 1
-    parts = 2**together
+    """The outermost pole by halvings of the interval that counts leave, then a few steps, in NumPy."""
+    # Of few walls several radii are counted in the time of one.
+    parts = 2**_TOGETHER
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
         low, width = state[0], (state[1] - state[0]) / parts
-        radii = xp.stack([low + k * width for k in range(1, parts)])
-        full = count(radii, Loop(*(xp.broadcast_to(part, radii.shape) for part in loop)), fractional).full
+        radii = np.stack([low + k * width for k in range(1, parts)])
+        full = count(radii, Loop(*(np.broadcast_to(part, radii.shape) for part in loop)), fractional).full
         low = low + width * (~full).sum(0)
         return low, low + width
 
     high = _largest(loop)
-    _, radius = repeat(-(-_HALVINGS // together), step, (0.0 * high + _SMALLEST, high), xp)
+    _, radius = repeat(-(-_HALVINGS // _TOGETHER), step, (0.0 * high + _SMALLEST, high), np)
     best, im = np.inf, 0.0 * radius
     # On that circle the pole is at a crossover or at one of the ends.
-    places = [0.0 * radius, 0.0 * radius + np.pi, *count(radius, loop, fractional).crossings]
-    distances = apply_each(lambda place: newton_step(radius, place, loop, fractional).within, places, xp)
-    for place, within in zip(places, distances, strict=True):
-        im, best = xp.where(within < best, place, im), xp.minimum(within, best)
-    at = repeat(_POLISHING, lambda at: halley_step(*at, loop, fractional), (radius, im), xp)
+    for place in (0.0 * radius, 0.0 * radius + np.pi, *count(radius, loop, fractional).crossings):
+        within = newton_step(radius, place, loop, fractional).within
+        im, best = np.where(within < best, place, im), np.minimum(within, best)
+    at = repeat(_POLISHING, lambda at: halley_step(*at, loop, fractional), (radius, im), np)
     found = certify_pole(*at, tolerance, loop, fractional, False)
     # Next to multiple poles the steps end anywhere; the counts still know the radius.
-    return found._replace(re=xp.where(found.proved, found.re, radius))
+    return found._replace(re=np.where(found.proved, found.re, radius))
+
+
+class _Round(NamedTuple):
+    """What a round of `_find_traced` knows."""
+
+    re: Array
+    im: Array
+    proved: Array
+    low: Array  # halved interval of logarithms of the radius
+    high: Array
+    places: Array  # arguments of the crossovers on the last circle
+
+
+def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
+    """The outermost pole, and whether it is proved to be it, and to be single: as `quick_kernel` and `search` find it.
+
+    A step on a pole and a count, which take a compiler its time, stand in two loops that every round runs through: the
+    larger pole and its proof; where that leaves any wall, the halvings; the pole on the circle they lead to, its proof.
+    """
+    import jax.numpy as xp
+    from jax.lax import fori_loop, while_loop
+
+    tolerance = epsilon(loop.c) ** 0.58
+    high = _largest(loop)
+    # At the ends of the circle, then at the crossovers.
+    looks = 5 if fractional else 4
+    last = looks + _POLISHING + _NEWTON
+    # By rounds: the steps on a pole, the first of which look at the places, and the counts, the last of which proves.
+    steps = xp.asarray([(looks + _POLISHING - _LARGER, last), (last, last), (0, last)])
+    counts = xp.asarray([(_HALVINGS + 1, _HALVINGS + 2), (0, _HALVINGS + 1), (_HALVINGS + 1, _HALVINGS + 2)])
+
+    def run(state: tuple[Any, _Round]) -> tuple[Any, _Round]:
+        turn, known = state
+
+        def step(k: Any, at: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            re, im, within = at
+            looking = k < looks
+            place = xp.where(k < 2, np.pi * k, known.places[xp.clip(k - 2, 0, looks - 3)])
+            place = xp.where(looking, place, im)
+            by = newton_step(re, place, loop, fractional)
+            ahead = halley_step(re, place, loop, fractional), move_pole(re, place, by.re, by.im)
+            to_re, to_im = (xp.where(k < last - _NEWTON, *pair) for pair in zip(*ahead, strict=True))
+            # Of the places the nearest to a pole is kept.
+            kept = looking & ~(by.within < within)
+            im = xp.where(kept, im, xp.where(looking, place, to_im))
+            return xp.where(looking, re, to_re), im, xp.where(kept, within, by.within)
+
+        begin = xp.where(turn == 0, known.re, known.high), known.im, xp.full_like(high, np.inf)
+        re, im, within = fori_loop(*steps[turn], step, begin)
+        # A wall without stiffness has a pole at 1.
+        at_one = (loop.alpha == 0) & ~(re > tolerance)
+        re, im = xp.where(at_one, 0.0, re), xp.where(at_one, 0.0, im)
+
+        def look(k: Any, at: _Round) -> _Round:
+            middle = xp.where(k < _HALVINGS, 0.5 * (at.low + at.high), at.high)
+            log_r = xp.where(k > _HALVINGS, re + certification_width(re, tolerance), middle)
+            seen = count(log_r, loop, fractional)
+            inside = store_once(xp.where(seen.full, xp.where(seen.sure, 2.0, 1.0), 0.0), log_r)
+            proved = (k > _HALVINGS) & ~at.proved & (inside > 1) & (at_one | (_AFTER * within <= tolerance))
+            return _Round(
+                xp.where(proved, re, at.re),
+                xp.where(proved, im, at.im),
+                at.proved | proved,
+                xp.where((k < _HALVINGS) & (inside == 0), middle, at.low),
+                xp.where((k < _HALVINGS) & (inside > 0), middle, at.high),
+                xp.stack(seen.crossings),
+            )
+
+        return turn + 1, fori_loop(*counts[turn], look, known)
+
+    def going(state: tuple[Any, _Round]) -> Any:
+        return (state[0] == 0) | ((state[0] < len(steps)) & ~(state[1].proved | xp.isnan(loop.alpha)).all())
+
+    none = xp.stack([0.0 * high] * (looks - 2))
+    start = _Round(*larger_pole(loop, fractional), high > np.inf, 0.0 * high + _SMALLEST, high, none)
+    return while_loop(going, run, (0, start))[1][:3]
+
+
+def _follow_pole(re: Array, im: Array, loop: Loop, fractional: bool) -> Array:
+    """The logarithm of a pole's modulus, with its derivatives of every order: those of an implicit function."""
+    import jax
+
+    @jax.custom_jvp
+    def follow(re: Array, im: Array, loop: Loop) -> tuple[Array, Array]:
+        return re, im
+
+    @follow.defjvp
+    def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+        place, loop = follow(*primals), primals[2]
+
+        def value(loop: Loop) -> tuple[Array, Array]:
+            at = value_at(*place, loop, fractional)
+            return at.p.real, at.p.imag
+
+        change = Pair(*jax.jvp(value, (loop,), (tangents[2],))[1])
+        by = (change * -1.0).over(value_at(*place, loop, fractional).first)
+        return place, (by.real, by.imag)
+
+    return follow(*frozen((re, im), jax.numpy), loop)[0]
 
 
 def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Array:
     """The logarithm of the radius with its derivatives, inside somebody's transformation.
 
-    NaN where it was not found; derivatives are those of the outermost pole, NaN where that is a multiple one.
+    NaN where it was not found or the outermost pole is a multiple one.
     """
-    from jax.lax import cond
-
     xp = namespace(alpha, beta, delta, d)
     loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
-    still = frozen(loop, xp)
-    eps = epsilon(still.c)
-    found = certify_pole(*candidate(still, fractional), eps**0.58, still, fractional, False)
-    late = cond(found.proved.all(), lambda: found, lambda: search(eps**0.58, still, fractional))
-    start, im, error, _ = frozen(tuple(xp.where(found.proved, *pair) for pair in zip(found, late, strict=True)), xp)
-
-    def step(at: tuple[Array, Array]) -> tuple[Array, Array]:
-        by = newton_step(*at, loop, fractional)
-        return at[0] + by.re, at[1] + by.im
-
-    # Each step doubles the order to which the derivatives are right: two make first and second ones exact.
-    re, _ = repeat(2, step, (start, im), xp)
-    simple = error < np.inf
-    known = simple | has_bound(start, eps**0.25, still, fractional)
-    (change,) = nan_unless(simple, re - start)
-    value = frozen(xp.where(simple, re, start), xp)
-    value = xp.where(simple, value + (change - frozen(change, xp)), value + 0.0 * change)
-    return xp.where(known, value, np.nan) + nan_with_nan_slopes(
-        valid_wall(alpha, beta, delta, d), alpha, beta, delta, d
-    )
+    re, im, proved = _find_traced(frozen(loop, xp), fractional)
+    (value,) = nan_unless(proved, _follow_pole(re, im, loop, fractional))
+    return value + nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
