@@ -189,14 +189,14 @@ def assess_many(scenes: Iterable[Any] | Mapping[str, Any]) -> list[dict[str, Any
 
 def _record(name: str | int, scene: Any) -> dict[str, Any]:
     head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
-    known = issubclass(type(scene), SceneAnswers)
     try:
-        if not known:
+        if not isinstance(scene, SceneAnswers):
             raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed")
         verdict = assess(scene).as_dict()
     except InputError as error:
         verdict, head = {}, head | {"status": Status.INVALID_INPUT.name, "message": str(error)}
-    return head | (scene.parameters() if known else {}) | verdict
+    own = scene.parameters() if isinstance(scene, SceneAnswers) else {}
+    return head | own | verdict
 
 
 # What somebody can buy of a parameter, by its path: the factor on it, and the words.
@@ -269,7 +269,7 @@ def describe_islands(scene: Any) -> list[str]:
     lines = []
     for island in scene.islands():
         units = {"K": (island.stiffness, "N/m"), "B": (island.virtual_damping, "N s/m")}
-        ends = (f"{name} from {' to '.join(tell_apart(low, high, u))}" for name, ((low, high), u) in units.items())
+        ends = (f"{name} from {' to '.join(tell_apart(*ends, u))}" for name, (ends, u) in units.items())
         lines.append(
             f"an island of stable walls, {', '.join(ends)}: no stable softer walls lead to it, K_max leaves it out"
         )
