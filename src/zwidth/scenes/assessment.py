@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
+
+if TYPE_CHECKING:
+    from zwidth.scenes.scene import Scene
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
 
@@ -82,11 +85,11 @@ class Assessment:
 
 
 @in_own_units
-def assess(scene: Any) -> Assessment:
+def assess(scene: Scene) -> Assessment:
     """Judge the wall of a scene.
 
     Args:
-        scene: a `zwidth.Scene` with a wall; its delay model must be "held", the one that has poles.
+        scene: device, timing, parts and wall; the delay model must be "held", the one that has poles.
 
     Returns:
         Assessment: stability, distances to the boundary in K and in B, passivity, the stiffest stable wall of the
@@ -138,7 +141,7 @@ def assess(scene: Any) -> Assessment:
     )
 
 
-def check_held(scene: Any) -> None:
+def check_held(scene: Scene) -> None:
     """Refuse the delay model in which no wall can be judged."""
     if scene.timing.delay_model != "held":
         raise InputError(
@@ -157,11 +160,11 @@ def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
     return intervals[away.index(min(away))] if away else (math.nan, math.nan)
 
 
-def assess_many(scenes: Iterable[Any] | Mapping[str, Any]) -> list[dict[str, Any]]:
+def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str, Any]]:
     """Judge the walls of many scenes, one record each; a scene that has no answer leaves the others alone.
 
     Args:
-        scenes: a `zwidth.Scene` each, of any kind, or a mapping of names to scenes.
+        scenes: scenes of any kind, or a mapping of names to scenes.
 
     Returns:
         A list of dicts with the same keys, a row of a table each: ``scene``, its name or number; ``status`` and
@@ -187,7 +190,7 @@ def assess_many(scenes: Iterable[Any] | Mapping[str, Any]) -> list[dict[str, Any
     return [{name: record.get(name) for name in names} for record in records]
 
 
-def _record(name: str | int, scene: Any) -> dict[str, Any]:
+def _record(name: str | int, scene: Scene) -> dict[str, Any]:
     head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
     try:
         if not isinstance(scene, SceneAnswers):
@@ -228,7 +231,7 @@ class Limit(NamedTuple):
 
 
 @in_own_units
-def limits_of(scene: Any) -> list[Limit]:
+def limits_of(scene: Scene) -> list[Limit]:
     """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 
     Each thing that the scene has is improved by itself, by a step that somebody can buy: twice the rate (delay and
@@ -237,7 +240,7 @@ def limits_of(scene: Any) -> list[Limit]:
     structure behind the modes.
 
     Args:
-        scene: a `zwidth.Scene` of plain numbers.
+        scene: a scene of plain numbers.
 
     Returns:
         One record each, the largest gain first. What makes the wall softer is listed as well, with a gain below 1: a
@@ -264,7 +267,7 @@ def limits_of(scene: Any) -> list[Limit]:
 
 
 @in_own_units
-def describe_islands(scene: Any) -> list[str]:
+def describe_islands(scene: Scene) -> list[str]:
     """A line for each island: stable walls that K_max does not count."""
     lines = []
     for island in scene.islands():
@@ -276,7 +279,7 @@ def describe_islands(scene: Any) -> list[str]:
     return lines
 
 
-def _stiffness(scene: Any) -> float:
+def _stiffness(scene: Scene) -> float:
     """K_max in N/m; NaN where there is none or it cannot be computed."""
     try:
         wall = scene.max_stiffness()
@@ -286,7 +289,7 @@ def _stiffness(scene: Any) -> float:
     return float(wall.stiffness) if wall.status == Status.OK else float("nan")
 
 
-def _improve(scene: Any) -> Iterator[tuple[str, str, Any]]:
+def _improve(scene: Scene) -> Iterator[tuple[str, str, Scene]]:
     """The scene with one thing improved, for each thing it has: the part's name, the step in words, the scene."""
     if _can_sample_faster(scene):
         same = ", the delay the same in seconds" if scene.timing.delay else ""
@@ -311,7 +314,7 @@ def _improve(scene: Any) -> Iterator[tuple[str, str, Any]]:
         yield "modes", "a structure twice as stiff", scene.replace(modes=stiffer)
 
 
-def _can_sample_faster(scene: Any) -> bool:
+def _can_sample_faster(scene: Scene) -> bool:
     """Whether twice the rate can be computed; nobody knows what a filter of coefficients were then."""
     if isinstance(scene.velocity, VelocityFilter):
         return False
@@ -319,7 +322,7 @@ def _can_sample_faster(scene: Any) -> bool:
     return 2 * (window + scene.d) <= scene.loop.most_periods
 
 
-def _sample_faster(scene: Any, faster: int) -> Any:
+def _sample_faster(scene: Scene, faster: int) -> Scene:
     """The scene at so many times the rate, filter and delay the same in seconds."""
     changes: dict[str, float] = {"period": scene.timing.period / faster}
     if isinstance(scene.velocity, WindowedDifference):
@@ -353,7 +356,7 @@ def friction_rule(
     return FrictionRule(2.0 * damping / period if damping else None, by_friction)
 
 
-def passive_edge(scene: Any, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
+def passive_edge(scene: Scene, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
     """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping.
 
     The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
