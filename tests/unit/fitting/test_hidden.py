@@ -1,6 +1,7 @@
 """Logs of devices that are more than a rigid mass, moved by matrix exponentials: modelled, or refused with no wall."""
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,23 @@ def record(plant, seed, step=1e-5):
     return OtherDevice.of(plant, step).record(np.random.default_rng(seed))
 
 
+@cache
+def fit_other(name):
+    """The fit of a log of one of them."""
+    force, position = record(OTHERS[name], 0)
+    return zwidth.fit_log(PERIOD, position, force)
+
+
+@cache
+def fit_hidden():
+    """The fit of a log whose coarse encoder hides a resonance of 200 Hz."""
+    force, position = record(add_mode(RIGID, 200, 0.03, 0.4), 3, step=2e-4)
+    return zwidth.fit_log(PERIOD, position, force)
+
+
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_device_with_more_parts_is_modelled_with_them_or_has_no_wall(name):
-    true = OtherDevice.of(OTHERS[name])
-    force, position = record(OTHERS[name], 0)
-    fit = zwidth.fit_log(PERIOD, position, force)
+    true, fit = OtherDevice.of(OTHERS[name]), fit_other(name)
     safe, wall = fit.safe_wall(), choose_wall(fit)
     if fit.is_doubted:
         assert wall is None
@@ -67,8 +80,7 @@ def test_a_resonance_whose_numbers_are_open_has_no_safe_wall():
 
 
 def test_a_lag_is_found_and_the_delay_without_it():
-    force, position = record(OTHERS["amplifier, lag of 1 ms"], 1)
-    fit = zwidth.fit_log(PERIOD, position, force)
+    fit = fit_other("amplifier, lag of 1 ms")
     assert fit.actuator is not None
     assert fit.actuator.order == 1
     assert abs(fit.actuator.time_constant - 1e-3) < 4 * fit.errors["actuator.time_constant"]
@@ -113,8 +125,7 @@ def test_logs_of_rigid_devices_keep_their_walls():
 
 def test_a_resonance_that_a_coarse_encoder_hides_bounds_the_safe_wall():
     hidden = TrueDevice("", MASS, DAMPING, 0.0, ((200.0, 0.03, MASS / 0.4),), DELAY, PERIOD, 2e-4, 3.0)
-    force, position = record(add_mode(RIGID, 200, 0.03, 0.4), 3, step=hidden.encoder)
-    fit = zwidth.fit_log(PERIOD, position, force)
+    fit = fit_hidden()
     assert fit.doubts == ()
     safe, rigid = fit.safe_wall(), fit.safe_wall(rigid=True)
     assert hidden.is_stable(*safe[:2])
@@ -130,8 +141,7 @@ def test_a_resonance_that_a_coarse_encoder_hides_bounds_the_safe_wall():
 
 
 def test_a_hidden_resonance_lies_within_the_radius_of_the_response():
-    force, position = record(add_mode(RIGID, 200, 0.03, 0.4), 3, step=2e-4)
-    response = zwidth.fit_log(PERIOD, position, force).response
+    response = fit_hidden().response
     assert response is not None
     devices = (zwidth.Device(MASS, DAMPING, modes=modes) for modes in ([zwidth.Mode(200, 0.03, MASS / 0.4)], []))
     timing = zwidth.Timing(period=PERIOD, delay=DELAY)
