@@ -171,8 +171,8 @@ Route: TypeAlias = Literal["auto", "numpy", "jax"]
 # The values of a kernel at concrete points, and for each argument how every result moves with it.
 Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
 
-# Up to so many points NumPy is done before a compiler, which takes seconds: in some tenths of one. A compiler pays at ten
-# times as many; a second call takes two to five times as long as a compiled one.
+# Up to so many points NumPy is done before a compiler, which takes seconds: in some tenths of one. A compiler pays at
+# ten times as many; a second call takes two to five times as long as a compiled one.
 FEW = 1 << 18
 # NumPy gets so many at most: its arrays then stay in the caches of a processor.
 _AT_ONCE = 1 << 15
