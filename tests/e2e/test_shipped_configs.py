@@ -91,3 +91,15 @@ def test_a_shipped_configuration_opens_in_the_explorer(config, tmp_path):
     page.queue.work()
     assert page.texts["error"] == ""
     assert page.texts["word"] in page.texts["verdict"]
+
+
+def test_what_a_filter_costs_is_as_its_configuration_says():
+    scene = zwidth.load_config(CONFIGS / "velocity_filter.yaml").scene.to_scene().replace(damping=10.0)
+
+    def is_without_damping(velocity):
+        return scene.replace(velocity=velocity).max_stiffness().virtual_damping == 0.0
+
+    windows = {count: zwidth.WindowedDifference(count) for count in (9, 10, 20, 21, 24, 25, 34, 35)}
+    assert [count for count, velocity in windows.items() if is_without_damping(velocity)] == [10, 20, 21, 24, 35]
+    assert [count for count, velocity in windows.items() if scene.replace(velocity=velocity).islands()] == [21, 24]
+    assert [is_without_damping(zwidth.LowPass(cutoff)) for cutoff in (15.0, 16.0)] == [True, False]

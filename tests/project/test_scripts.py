@@ -148,6 +148,10 @@ def test_every_processor_is_tried_even_when_one_fails(project):
     assert called[1] == ["pytest", *ON_EVERY_CORE, numbers, "-x"]
     assert called[3] == ["pytest", *ON_EVERY_CORE, "@tests/printed.txt", numbers, "-x"]
     assert called[2::2] == [["AVX2", "Haswell"], ["SSE4_2", "Nehalem"]]
+    # One that has no AVX-512 stands in for itself in all other tests.
+    stand_in(project / ".venv" / "bin" / "python", os.devnull)
+    code, called = calls_of(project, "test-processors")
+    assert (code, called[2::2]) == (0, [["SSE4_2", "Nehalem"]])
 
 
 @pytest.mark.parametrize("which, again", [("oldest", 0), ("newest", 1)])

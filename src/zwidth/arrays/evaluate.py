@@ -171,8 +171,11 @@ Route: TypeAlias = Literal["auto", "numpy", "jax"]
 # The values of a kernel at concrete points, and for each argument how every result moves with it.
 Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
 
-# Up to so many points NumPy is done long before a compiler, which takes seconds: in a tenth of one, or a few.
-FEW = 1 << 15
+# Up to so many points NumPy is done before a compiler, which takes seconds: in some tenths of one. A compiler pays at
+# ten times as many; a second call takes two to five times as long as a compiled one.
+FEW = 1 << 18
+# NumPy gets so many at most: its arrays then stay in the caches of a processor.
+_AT_ONCE = 1 << 15
 # A compiled call gets so many points at most: one compilation, bounded memory, work for every processor.
 BLOCK = 1 << 16
 # The compiler treats shorter arrays differently, to the last place.
@@ -216,8 +219,8 @@ def evaluate_columns(
     kernel: Callable[..., Any], columns: Sequence[np.ndarray], *static: Any, weight: int = 1, route: Route = "auto"
 ) -> Any:
     """`evaluate` of concrete columns of one length; one of a single value goes to the kernel as a number."""
-    count, few = _length(columns), max(1, FEW // weight)
-    if route == "jax" or (route == "auto" and count > few):
+    count = _length(columns)
+    if route == "jax" or (route == "auto" and count > max(1, FEW // weight)):
         return map_blocks(_compile_columns(kernel, static), columns, BLOCK // weight)
 
     def at_once(*parts: np.ndarray) -> Any:
@@ -229,7 +232,8 @@ def evaluate_columns(
             return tree_map(lambda leaf: np.array(leaf)[None], result)
         return tree_map(lambda leaf: leaf if np.ndim(leaf) > 1 else np.array(np.broadcast_to(leaf, shape)), result)
 
-    return at_once(*columns) if count <= few else map_blocks(at_once, columns, few, within=nullcontext)
+    size = max(1, _AT_ONCE // weight)
+    return at_once(*columns) if count <= size else map_blocks(at_once, columns, size, within=nullcontext)
 
 
 def _plain(leaf: Any) -> Any:

@@ -27,7 +27,6 @@ from zwidth.words.errors import InputError, ZwidthError, check_choice
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
 
-_COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
 _PACKAGE = Path(__file__).resolve().parents[1]
 # A table that a configuration reads from its own folder.
 _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
@@ -164,22 +163,16 @@ def schema() -> None:
 @click.argument("name", required=False)
 @json_option
 def devices(name: str | None, as_json: bool) -> None:
-    """List devices with published numbers, or those of one NAME.
-
-    A dash stands where nothing is published.
-    """
-    from zwidth.parts.devices import DEVICES, Published, find_device
+    """List devices with published numbers, or those of one NAME with their sources."""
+    from zwidth.parts.devices import DEVICES, find_device
 
     chosen = DEVICES if name is None else (find_device(name),)
-
-    def cell(number: Published | None) -> str:
-        return "-" if number is None else number.spell()
-
     if name is None:
-        table = [("name", *(column.replace("_", " ") for column in _COLUMNS))]
-        table += [(device.name, *(cell(getattr(device, column)) for column in _COLUMNS)) for device in chosen]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        lines = ["  ".join(map(str.ljust, texts, widths)).rstrip() for texts in table]
+        lines = []
+        for device in chosen:
+            numbers = (f"{key.replace('_', ' ')} {each.spell()}" for key, each in device.numbers.items())
+            # Of counts the unit says what they are.
+            lines.append(row(device.name, ", ".join(number.removeprefix("counts ") for number in numbers)))
     else:
         notes = {quantity: f" ({number.note})" if number.note else "" for quantity, number in chosen[0].numbers.items()}
         lines = [f"{chosen[0].title} ({chosen[0].motion})"]

@@ -224,7 +224,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 
 @cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--at", multiple=True, type=_SLICE, help="Draw this slice, as in --at delta=0.1 --at d=1.")
+@click.option("--at", multiple=True, type=_SLICE, help="Draw this slice, as in --at delta=0.1 --at delay=1ms.")
 @click.option("--x", metavar="NAME", help="The parameter from left to right.")
 @click.option("--y", metavar="NAME", help="The parameter from bottom to top, of a plane.")
 @click.option("--hue", metavar="NAME", help="Draw curves, one for each value of this parameter.")
@@ -242,8 +242,8 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
     """Draw the sweeps in DIR, as PNG and SVG.
 
     Stable and passive walls with their boundaries, contours of margins and decay times, surfaces of the stiffest
-    wall. --at chooses slices by the nearest value that the sweep has, in the units of the store; without it up to
-    three values of a parameter have a panel each.
+    wall. --at chooses slices by the nearest value that the sweep has, in the units of the store where it has none;
+    without it up to three values of a parameter have a panel each.
     """
     from zwidth.runs.draw import draw_stores
 

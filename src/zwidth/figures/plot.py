@@ -31,6 +31,7 @@ from zwidth.figures.motion import draw_motion, draw_step
 from zwidth.figures.stable_set import draw_recommendation, draw_stable_set, tabulate_sets, tabulate_walls
 from zwidth.figures.table import Parameters, Result, Table, stack
 from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.rigid.response import settling_time
 from zwidth.parts.checks import read_texts
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
@@ -144,8 +145,12 @@ def recommendation(
         # As long as the slowest motion takes to decay, or so many periods.
         decay = told["recommended"]["decay_time"] or 0.0
         periods = int(min(max(_PERIODS, 1.5 * decay / scene.timing.period), _MOST_PERIODS))
-        response = stack([_tabulate_step(scene, K, B, periods)])
-    elif response is not None and np.isfinite(response["settling_time_s"][0]):
+        columns = _tabulate_step(scene, K, B, periods)
+        if not scene.parts_beyond:
+            wall = found.verdict.alpha, found.verdict.beta, float(scene.delta), float(scene.d)
+            columns["settling_time_s"] = settling_time(*wall) * scene.timing.period
+        response = stack([columns])
+    if response is not None and "settling_time_s" in response and np.isfinite(response["settling_time_s"][0]):
         told["recommended"]["settling_time"] = float(response["settling_time_s"][0])
     return draw_recommendation(told, outlines, response, axes)
 

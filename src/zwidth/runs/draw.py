@@ -15,12 +15,13 @@ from zwidth.figures.grid import choose_axes, list_varied
 from zwidth.figures.plane import draw_plane
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.style import Size, save, style_sheet
+from zwidth.parts.checks import check_number
 from zwidth.studies.ridge import find_edges
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import SUFFIX, Store, find_stores
 from zwidth.words.errors import InputError, StoreError
 from zwidth.words.formatting import short
-from zwidth.words.quantities import OUTPUTS, VARIABLES
+from zwidth.words.quantities import ANY, OUTPUTS, VARIABLES
 
 if TYPE_CHECKING:
     import xarray
@@ -97,8 +98,9 @@ def draw_stores(
     Args:
         path: a store ``<study>.zarr`` or the folder of a run.
         out: where the figures go; ``figures`` beside the stores where left out. Figures that are there are replaced.
-        at: values of parameters by name, in the units of the store, or the label of a device: the slices to draw. The
-            nearest values that the sweep has are taken; of a parameter that is not given, up to three are shown.
+        at: values of parameters by name, in the units of the store or with one, as "1 ms", or the label of a device:
+            the slices to draw. The nearest values that the sweep has are taken; of a parameter that is not given, up to
+            three are shown.
         axes: the parameters to draw over: x from left to right, y from bottom to top, of a plane, hue with a curve and
             col with a panel for each of its values; chosen from the sweep where left out.
         formats: the kinds of files, of "png", "svg" and "pdf".
@@ -200,30 +202,33 @@ def _cut(
     store: Path, data: xarray.Dataset, wanted: Mapping[str, float | str], note: Callable[[str], None]
 ) -> xarray.Dataset:
     """The slice of a sweep that is nearest to what is wanted of it."""
-    places = {str(dim): _nearest(data, str(dim), wanted[str(dim)]) for dim in data.dims if dim in wanted}
-    for dim, place in places.items():
-        if dim != "device" and not np.isclose(float(data[dim][place]), float(wanted[dim]), rtol=1e-9, atol=0.0):
+    found = {str(dim): _nearest(data, str(dim), wanted[str(dim)]) for dim in data.dims if dim in wanted}
+    for dim, (place, exact) in found.items():
+        if not exact:
             taken = _spell(float(data[dim][place]), data[dim].attrs["units"])
             note(f"{store.name}: {dim} = {taken}, the nearest to {wanted[dim]} that the sweep has")
-    return data.isel(places)
+    return data.isel({dim: place for dim, (place, _) in found.items()})
 
 
 def _spell(value: float, unit: str) -> str:
     return f"{short(value)} {unit}".removesuffix(" 1")
 
 
-def _nearest(data: xarray.Dataset, dim: str, value: float | str) -> int:
-    """The index of the value that the sweep has and that is closest to the one wanted."""
+def _nearest(data: xarray.Dataset, dim: str, value: float | str) -> tuple[int, bool]:
+    """The index of the value that the sweep has and that is closest to the one wanted, and whether it is that."""
     if dim == "device":
         labels = [str(label) for label in data["device"].values]
         if str(value) not in labels:
             raise InputError(f"at: there is no device {str(value)!r}; choose from {', '.join(labels)}")
-        return labels.index(str(value))
+        return labels.index(str(value)), True
     unit = data[dim].attrs["units"]
     try:
         wanted = float(value)
-    except ValueError as error:
-        raise InputError(f"at: {dim}: got {value!r}; write a number in {unit}") from error
+    except ValueError:
+        if unit in ("1", "sampling periods"):
+            remedy = f"write a number in {unit}".removesuffix(" in 1")
+            raise InputError(f"at: {dim}: got {value!r}; {remedy}") from None
+        wanted = check_number(f"at: {dim}", value, unit, ANY)
     if not np.isfinite(wanted):
         raise InputError(f"at: {dim}: got {value!r}; write a finite number")
     values = np.asarray(data[dim].values, dtype=float)
@@ -234,4 +239,4 @@ def _nearest(data: xarray.Dataset, dim: str, value: float | str) -> int:
     if not ordered[0] - 0.5 * steps[0] - slack <= wanted <= ordered[-1] + 0.5 * steps[-1] + slack:
         has = " to ".join(_spell(float(end), unit) for end in dict.fromkeys((ordered[0], ordered[-1])))
         raise InputError(f"at: {dim}: got {_spell(wanted, unit)}, the sweep has {has}; choose a value that it has")
-    return place
+    return place, bool(np.isclose(values[place], wanted, rtol=1e-9, atol=0.0))

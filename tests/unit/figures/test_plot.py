@@ -67,6 +67,13 @@ def test_a_recommendation_is_drawn_with_its_response():
     time, position = np.asarray(response.lines[0].get_data())
     expected = found.scene.state_space().step(time.size)
     np.testing.assert_allclose(position * 1e-6, expected, rtol=1e-9, atol=1e-12)
+    assert response.get_legend() is None
+    rigid = RIGID.recommend(stiffness_fraction=0.5)
+    (mark,) = plot.recommendation(rigid)[1].get_legend().get_texts()
+    verdict, period = rigid.verdict, RIGID.timing.period
+    assert verdict is not None
+    settled = zwidth.step_response(verdict.alpha, verdict.beta, RIGID.delta, RIGID.d).settling_time * period
+    assert mark.get_text() == f"settled to 2 % after {settled * 1e3:.3g} ms"
     (alone,) = plot.recommendation(RIGID.replace(damping=0.0).recommend(passive=True))
     assert alone is plt.gca()
 

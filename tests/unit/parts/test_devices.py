@@ -63,7 +63,9 @@ def test_the_hand_is_a_rigid_grasp_or_stands_behind_a_spring():
 
 def test_the_command_lists_them_and_tells_the_sources_of_one():
     listed = CliRunner().invoke(cli, ["devices"]).output.splitlines()
-    assert [line.split()[0] for line in listed[1:]] == [device.name for device in DEVICES]
+    assert [line.split()[0] for line in listed] == [device.name for device in DEVICES]
+    for line, device in zip(listed, DEVICES, strict=True):
+        assert all(number.spell() in line for number in device.numbers.values())
     one = CliRunner().invoke(cli, ["devices", "haptic_wheel"]).output
     assert "4500 g cm^2" in one
     assert find_device("haptic_wheel").numbers["mass"].source in one

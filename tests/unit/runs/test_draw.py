@@ -146,8 +146,12 @@ def test_slices_are_the_nearest_values(folder, capsys, tmp_path, monkeypatch):
     found = []
     with monkeypatch.context() as patch:
         patch.setattr(draw, "save", lambda drawn, stem, *_, **__: found.append((stem.name, drawn)) or ())
+        notes: list[str] = []
+        draw_stores(folder / "devices.zarr", tmp_path, at={"rate": "2.1 kHz"}, note=notes.append)
+        draw_stores(folder / "devices.zarr", tmp_path, at={"rate": "2kHz"}, note=notes.append)
         draw_stores(folder / "plane.zarr", tmp_path, at={"delta": "0.12", "d": 0.9})
         draw_stores(folder / "devices.zarr", tmp_path, at={"device": "heavy"})
+    assert notes == ["devices.zarr: rate = 2000 Hz, the nearest to 2.1 kHz that the sweep has"]
     drawn = dict(found)
     assert titles(drawn["plane_stable"]) == [r"$d = 1$,  $\delta = 0.1$"]
     assert titles(drawn["devices_stiffness_max"]) == ["heavy"]
@@ -185,7 +189,9 @@ def test_what_is_not_computed_is_left_blank_and_said(tmp_path):
     "at, says",
     [
         ({"mu": 1}, "at: no sweep in .* varies 'mu'; choose from .*d, delta"),
-        ({"delta": "x"}, "at: delta: got 'x'; write a number in 1"),
+        ({"delta": "x"}, "at: delta: got 'x'; write a number$"),
+        ({"rate": "2 ms"}, "at: rate: got '2 ms'; the units allowed are Hz, kHz, MHz"),
+        ({"delay": "1 ms"}, "at: delay: got '1 ms'; write a number in sampling periods"),
         ({"delta": "nan"}, "at: delta: got 'nan'; write a finite number"),
         ({"device": "x"}, "at: there is no device 'x'; choose from light, heavy"),
     ],

@@ -102,7 +102,7 @@ def map_by_degree(
 
 def few_poles(degree: Degree) -> int:
     """Up to how many points of a degree NumPy has done before a compiler has begun."""
-    return max(1, FEW * 8 // max(8, degree.poles**2))
+    return max(1, FEW // max(8, degree.poles**2))
 
 
 def _same_length(leaves: tuple[Any, ...], lead: bool, xp: Any) -> list[Any]:

@@ -42,6 +42,8 @@ _REAL = 1e-6
 SMALLEST_MAP = 1 << 11
 # Listed walls whose poles are found at one time without a compiler: in smaller lists they take longer.
 _AT_ONCE = 1 << 13
+# So few walls take less one by one than in cells.
+FEW_FOR_CELLS = 1 << 15
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
 
@@ -217,8 +219,8 @@ def _find_listed(
 def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = False) -> WallPoles:
     """The outermost poles of arrays of one shape, as a map where they are one."""
     shape = arrays[0].shape
-    # A line lacks an axis. Few walls one by one take less than cells.
-    laid = as_area(Points(*(fold(array[None]) for array in arrays))) if arrays[0].size > FEW else None
+    # A line lacks an axis.
+    laid = as_area(Points(*(fold(array[None]) for array in arrays))) if arrays[0].size > FEW_FOR_CELLS else None
     if laid is None:
         columns = [array.reshape(-1) for array in arrays]
         return list_poles(columns, accuracy, with_rate).map(lambda leaf: leaf.reshape(shape))

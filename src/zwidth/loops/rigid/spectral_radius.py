@@ -61,7 +61,7 @@ def spectral_radius(
         TracedDelayError: d is traced with method "companion".
 
     Numerics:
-        Float64 when called directly, maps and up to 32,768 other walls without JAX; the ambient precision inside
+        Float64 when called directly, maps and up to 262,144 other walls without JAX; the ambient precision inside
         `jit`, where d may be traced. On a map a Taylor series serves a cell of walls (`loops.rigid.pole_map`); its
         terms fall faster than the bound that is proved of them. Derivatives are those of the outermost pole, of every
         order up to the second; NaN where it is a multiple one. Next to a k-fold pole the radius is known to about

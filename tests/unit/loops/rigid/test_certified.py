@@ -11,7 +11,7 @@ from mpmath import mpf
 from waiting import LONGEST
 
 import zwidth
-from zwidth.arrays.evaluate import FEW
+from zwidth.arrays import evaluate
 from zwidth.loops.rigid import certified
 from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.certified_filter import OPEN, SPECIAL, each_code, filter_walls, has_rows
@@ -68,10 +68,11 @@ def test_every_adversarial_label_is_found():
     assert 0.02 < (result.bits > 0).mean() < 0.2
 
 
+@pytest.mark.usefixtures("early_compiler")
 def test_compiled_and_plain_filters_agree_with_the_labels():
     # More points than NumPy is given, by repetition; the compiled filter's labels must be right as well.
     points = adversarial()
-    times = FEW // points["label"].size + 1
+    times = evaluate.FEW // points["label"].size + 1
     alpha, beta, delta, d = (np.tile(points[name], times) for name in NAMES)
     code, label = filter_walls(fold_arguments((alpha, beta, delta, d)).points), np.tile(points["label"], times)
     decided = code < OPEN
@@ -248,6 +249,7 @@ def test_too_little_precision_is_undecided(monkeypatch):
     assert (result.status, result.stable, result.bits) == (Status.UNDECIDED, False, 256)
 
 
+@pytest.mark.usefixtures("early_compiler")
 @pytest.mark.parametrize("value", [0.0, -0.0, 5e-324, -5e-324, np.nan, np.inf, 1e-61, -1e61, -0.1])
 @pytest.mark.parametrize("which", range(4))
 def test_special_values_have_one_status_on_either_route(value, which):
@@ -256,7 +258,10 @@ def test_special_values_have_one_status_on_either_route(value, which):
     point[which] = value
     few = certified_stable(*point)
     many = certified_stable(
-        *(np.append(np.full(FEW, other), each) for other, each in zip((0.1, 0.2, 0.1, 1.5), point, strict=True))
+        *(
+            np.append(np.full(evaluate.FEW, other), each)
+            for other, each in zip((0.1, 0.2, 0.1, 1.5), point, strict=True)
+        )
     )
     assert (many.status[-1], many.stable[-1]) == (few.status, few.stable)
     assert few.status == wall_status(*(np.float64(x) for x in point)) or few.status == Status.ON_BOUNDARY

@@ -5,9 +5,8 @@ import pytest
 from bounds import bound_radius
 
 import zwidth
-from zwidth.arrays.evaluate import FEW
 from zwidth.loops.rigid.folding import Points, fold
-from zwidth.loops.rigid.outermost_poles import SMALLEST_MAP, area_poles, as_area, outermost_poles
+from zwidth.loops.rigid.outermost_poles import FEW_FOR_CELLS, SMALLEST_MAP, area_poles, as_area, outermost_poles
 from zwidth.loops.rigid.pole_map import Area, follow_poles
 from zwidth.words.status import Status
 
@@ -116,7 +115,7 @@ def test_what_is_no_map_is_left_to_the_points():
     assert found is not None
     assert found[2] == (2, BETA.size, ALPHA.size)
     # Of so many walls maps are looked for; fewer are taken one by one.
-    assert ALPHA.size * BETA.size > FEW >= SMALLEST_MAP
+    assert ALPHA.size * BETA.size > FEW_FOR_CELLS >= SMALLEST_MAP
 
 
 def double_pole(z, delta, d):
