@@ -3,6 +3,7 @@
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from unpainted import painting_nothing
@@ -94,7 +95,8 @@ def test_a_shipped_configuration_opens_in_the_explorer(config, tmp_path):
 
 
 def test_what_a_filter_costs_is_as_its_configuration_says():
-    scene = zwidth.load_config(CONFIGS / "velocity_filter.yaml").scene.to_scene().replace(damping=10.0)
+    given: Any = zwidth.load_config(CONFIGS / "velocity_filter.yaml").scene
+    scene = given.to_scene().replace(damping=10.0)
 
     def is_without_damping(velocity):
         return scene.replace(velocity=velocity).max_stiffness().virtual_damping == 0.0

@@ -261,7 +261,7 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
             return xp.where(looking, re, to_re), im, xp.where(kept, within, by.within)
 
         begin = xp.where(turn == 0, known.re, known.high), known.im, xp.full_like(high, np.inf)
-        re, im, within = fori_loop(*steps[turn], step, begin)
+        re, im, within = fori_loop(steps[turn, 0], steps[turn, 1], step, begin)
         # A wall without stiffness has a pole at 1.
         at_one = (loop.alpha == 0) & ~(re > tolerance)
         re, im = xp.where(at_one, 0.0, re), xp.where(at_one, 0.0, im)
@@ -281,7 +281,7 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
                 xp.stack(seen.crossings),
             )
 
-        return turn + 1, fori_loop(*counts[turn], look, known)
+        return turn + 1, fori_loop(counts[turn, 0], counts[turn, 1], look, known)
 
     def going(state: tuple[Any, _Round]) -> Any:
         return (state[0] == 0) | ((state[0] < len(steps)) & ~(state[1].proved | xp.isnan(loop.alpha)).all())
