@@ -50,8 +50,9 @@ EDITS = {
         "    operator: Operator | None = None\n": (
             "    operator: Operator | None = None\n    mount: Mount | None = None\n"
         ),
-        '"zwidth.Operator(mass=0.5)",': '"zwidth.Operator(mass=0.5)",\n    "mount": "zwidth.Mount(stiffness=100)",',
-        '"operator": Operator | None}': '"operator": Operator | None, "mount": Mount | None}',
+        '"zwidth.Operator(mass=0.5)"),\n': (
+            '"zwidth.Operator(mass=0.5)"),\n    "mount": (Mount | None, "zwidth.Mount(stiffness=100)"),\n'
+        ),
         "from zwidth.parts.operator": f"{IMPORT}from zwidth.parts.operator",
     },
     "loops/linear/chain.py": {
