@@ -174,10 +174,9 @@ Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
 # Up to so many points NumPy is done before a compiler, which takes seconds: in some tenths of one. A compiler pays at
 # ten times as many; a second call takes two to five times as long as a compiled one.
 FEW = 1 << 18
-# NumPy gets so many at most: its arrays then stay in the caches of a processor.
-_AT_ONCE = 1 << 15
-# A compiled call gets so many points at most: one compilation, bounded memory, work for every processor.
-BLOCK = 1 << 16
+# At most so many points go at one time to NumPy, whose arrays then stay in caches, and to what is compiled: one
+# compilation, bounded memory, work for every processor.
+_AT_ONCE, BLOCK = 1 << 15, 1 << 16
 # The compiler treats shorter arrays differently, to the last place.
 _LEAST = 1 << 4
 

@@ -21,8 +21,8 @@ from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import NeededAnswer
 from zwidth.fitting.device_rows import DeviceRows, find_highest
 from zwidth.loops.linear.state_space import delayed_device, open_loop
-from zwidth.loops.loop import RigidVariants
 from zwidth.loops.rigid.device import device_status
+from zwidth.loops.variants import RigidVariants
 from zwidth.parts.checks import check_whole
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.scenes.scene import Scene

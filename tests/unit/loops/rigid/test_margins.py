@@ -10,7 +10,7 @@ from compiling import QUICKLY
 import zwidth
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import device
-from zwidth.loops.rigid.modulus import squared_distance
+from zwidth.loops.rigid.modulus import modulus, squared_distance
 from zwidth.words.errors import InputError
 
 # Beyond this from a margin the verdict must have changed; the margins themselves are good to 1e-13 or so.
@@ -279,3 +279,17 @@ def test_the_margin_is_the_distance_of_p_over_its_open_loop():
 def test_the_margin_vanishes_on_the_boundary():
     edge = zwidth.boundary(0.5, 0.3, 1.0)
     assert zwidth.margins(np.array([edge.alpha]), edge.beta, 0.3, 1.0).modulus_margin[0] < 1e-8
+
+
+def test_second_derivatives_of_the_modulus_margin_and_of_its_frequency(x64):
+    wall = np.array([0.1, 0.4, 0.1, 1.3])
+
+    def nearest(wall):
+        alpha, beta, delta, d = wall
+        return jax.numpy.stack(modulus(alpha, beta, device(delta, d)))
+
+    slopes = jax.jit(jax.jacfwd(nearest), compiler_options=QUICKLY)
+    bends = np.asarray(jax.jit(jax.jacfwd(jax.jacfwd(nearest)), compiler_options=QUICKLY)(wall))
+    for side, bend in zip(np.eye(4), np.moveaxis(bends, -1, 0), strict=True):
+        up, down = (np.asarray(slopes(wall + sign * 1e-5 * side)) for sign in (1, -1))
+        np.testing.assert_allclose(bend, (up - down) / 2e-5, rtol=1e-5, atol=1e-6)
