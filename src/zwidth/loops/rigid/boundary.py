@@ -164,7 +164,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
     if is_row:
         row = store_once(row_end(still, fixed, delay_model, kind), delta)
         x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
-        x = follow_root(lambda x, curve, beta: wall(x, curve).b - (beta + curve.here.delta), x, _always, curve, number)
+        x = follow_root(lambda x, curve, b: wall(x, curve).b - b, x, lambda *_: True, curve, number + delta)
         at = wall(x, curve)
         # The number that `zwidth.is_stable` compares with.
         alpha, beta = _with_slope(row.alpha, at.alpha, xp), number
@@ -174,7 +174,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
         goal = xp.where(exists, still, 0.5 * top.alpha)
         x, cut = store_once(column_end(goal, top, fixed, line == "upper", creeping), delta)
         on_lobe = ~cut
-        x = follow_root(lambda x, curve, alpha: wall(x, curve).alpha - alpha, x, _always, curve, number)
+        x = follow_root(lambda x, curve, alpha: wall(x, curve).alpha - alpha, x, lambda *_: True, curve, number)
         at = wall(x, curve)
         # Beside the ridge a step more would be rounding over rounding.
         alpha, beta = number, at.b - delta
@@ -194,10 +194,6 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
     # NaN, derivatives included, where there is no point.
     spoiled = nan_with_nan_slopes(status == int(Status.OK), delta, d, number)
     return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
-
-
-def _always(*_: Any) -> bool:
-    return True
 
 
 def _with_slope(value: Array, moving: Array, xp: Any) -> Array:

@@ -188,13 +188,11 @@ def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> Crossover:
     )
     far = sum(cubic[1:], cubic[0]) > 0
     known = tuple(xp.where(far, *pair) for pair in zip(behind, cubic, strict=True))
-    near = follow_root(_sum_powers, first_zero(frozen(known, xp)), lambda x, slope, _: slope != 0, *known)
+    near = follow_root(
+        lambda x, *powers: horner(x, powers), first_zero(frozen(known, xp)), lambda x, slope, _: slope != 0, *known
+    )
     exists = (xp.abs(other) < one) & (near > 0) & (near <= 1.0)
     return Crossover(xp.where(far, 2.0 - near, near), xp.where(far, near, 2.0 - near), exists)
-
-
-def _sum_powers(x: Array, *coefficients: Array) -> Array:
-    return horner(x, coefficients)
 
 
 def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
