@@ -147,6 +147,11 @@ def within(value: Array, limits: tuple[float, float]) -> Array:
     return (size == 0) | ((size >= limits[0]) & (size <= most))
 
 
+def nan_beyond(limits: tuple[float, float], *values: Array) -> list[np.ndarray]:
+    """The values, NaN where one is not `within` the limits."""
+    return [np.where(within(value, limits), value, np.nan) for value in values]
+
+
 # A bad point is NaN, and so are its derivatives: `where(ok, value, nan)` alone would give it the derivative 0, a finite
 # number that means nothing. What may compute with NaN is voided before; what may not (a solver, a search, an
 # exponent) gets harmless numbers, and its results are poisoned behind.

@@ -16,7 +16,7 @@ import numpy as np
 
 from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import check_scalars
-from zwidth.arrays.xp import is_jax, is_traced, namespace
+from zwidth.arrays.xp import is_jax, is_traced, namespace, nan_beyond
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import AnyChain, chain_of
@@ -29,7 +29,7 @@ from zwidth.loops.linear.ridge import BoundRidge, SceneSensitivities, differenti
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import Island, bound_intervals, label_walls, stable_dampings
 from zwidth.loops.rigid.boundary import boundary_point, stable_region
-from zwidth.loops.rigid.device import in_range, wall_status
+from zwidth.loops.rigid.device import wall_status
 from zwidth.loops.rigid.margins import Margins, margins, margins_kernel
 from zwidth.loops.rigid.outermost_poles import slowest_pole
 from zwidth.loops.rigid.passivity import passivity_margin
@@ -40,6 +40,7 @@ from zwidth.loops.rigid.verdict import Stability, StabilityMethod, decide_stabil
 from zwidth.loops.variants import RIGID_PARAMETERS, RigidVariants, Variants
 from zwidth.parts.paths import AnyScene, list_parameters, replace_parameters
 from zwidth.words.errors import InputError, ZwidthError
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array, DelayModel
 
@@ -96,7 +97,7 @@ class LinearLoop:
     def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """Whether walls are stable; the two need only broadcast."""
         check_scalars({"alpha": alpha, "beta": beta})
-        return label_walls(self.boundary, *in_range(alpha, beta))[()]
+        return label_walls(self.boundary, *nan_beyond(WALL_RANGE, alpha, beta))[()]
 
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod, exact: tuple[np.ndarray, np.ndarray]
@@ -104,7 +105,7 @@ class LinearLoop:
         """Labels with status and method; ``exact`` are the walls in SI units, as "certified" takes them."""
         # Device and delay were checked as the parts of the scene.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
-        alpha, beta = in_range(alpha, beta)
+        alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         if method == "certified":
             from zwidth.loops.linear.certified import decide_walls
 
@@ -126,7 +127,7 @@ class LinearLoop:
 
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """The spectral radius, below 1 exactly where a wall is stable; NaN where one is out of range."""
-        alpha, beta = in_range(alpha, beta)
+        alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         stable = label_walls(self.boundary, alpha, beta).reshape(-1)
         found = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)
         return found.reshape(alpha.shape)[()]
@@ -143,11 +144,11 @@ class LinearLoop:
 
     def row(self, beta: np.ndarray) -> np.ndarray:
         """The stable intervals of alpha at each damping: shape (rows, intervals, 2), NaN where a row has fewer."""
-        return np.stack(bound_intervals(self.boundary, *in_range(beta))[:2], -1)
+        return np.stack(bound_intervals(self.boundary, *nan_beyond(WALL_RANGE, beta))[:2], -1)
 
     def column(self, alpha: float) -> np.ndarray:
         """The stable intervals of beta at a stiffness: shape (intervals, 2)."""
-        return stable_dampings(self.boundary, float(*in_range(alpha)))
+        return stable_dampings(self.boundary, float(*nan_beyond(WALL_RANGE, alpha)))
 
     def explain(self, alpha: float, beta: float) -> list[str]:
         """What keeps a wall undecided, a sentence each: nothing, where there is a model."""
@@ -211,7 +212,7 @@ class LinearLoop:
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """The device's own damping in excess of what passive walls need."""
         condition = PassivityCondition.derive(self.chain.estimate, self.scene.d)
-        alpha, beta = in_range(alpha, beta)
+        alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         return passivity_margins(condition, alpha, beta, self.scene.own_delta)[()]
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:

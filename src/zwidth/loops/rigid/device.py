@@ -218,11 +218,6 @@ def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     return valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
 
 
-def in_range(*walls: Array) -> list[np.ndarray]:
-    """Walls' numbers, NaN where one is beyond the range that is computed."""
-    return [np.where(within(part, WALL_RANGE), part, np.nan) for part in walls]
-
-
 def device_status(delta: Array, d: Array) -> Array:
     """The `Status` of a device and its delay."""
     return _status(valid_device(delta, d), delta, d)

@@ -25,9 +25,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import FEW, Route, evaluate_columns
-from zwidth.arrays.xp import COSINE, SINE, horner, namespace, repeat
-from zwidth.loops.rigid.device import DeviceTerms, device, in_range, long_curve, short_curve
+from zwidth.arrays.xp import COSINE, SINE, horner, namespace, nan_beyond, repeat
+from zwidth.loops.rigid.device import DeviceTerms, device, long_curve, short_curve
 from zwidth.loops.rigid.folding import Points, group_by
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
 
 # From the starting points below each sequence doubles its digits a step: 6 steps end a lobe, the last one to confirm;
@@ -266,7 +267,7 @@ def boundary_map(points: Points) -> np.ndarray:
 
     The limit is right to about 1e-15 relative, and to 1e-15 of the largest limit near the lobe's end.
     """
-    alpha, beta = in_range(points.alpha, points.beta)
+    alpha, beta = nan_beyond(WALL_RANGE, points.alpha, points.beta)
     return _compare(alpha, row_limits(beta, points.delta, points.d))
 
 
