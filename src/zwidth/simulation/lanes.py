@@ -5,7 +5,7 @@ Everything is in units of the period and of the mass that the wall's force acts 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
 
@@ -113,8 +113,8 @@ class Lanes(NamedTuple):
     motion: Array
     energy: Array  # (n, n, lanes)
     durations: Array  # (substeps, pieces, lanes), without jitter
-    pieces: Flow  # over these, (substeps, pieces, ..., lanes)
-    digits: Flow  # slipping and held, (2, DIGITS, ..., lanes)
+    pieces: Flow  # over these, slipping and held, (1 or 2, substeps, pieces, ..., lanes)
+    digits: Flow  # as pieces, (1 or 2, DIGITS, ..., lanes)
     longest: Array  # step with friction
 
 
@@ -178,10 +178,13 @@ def find_longest_steps(machine: Mechanics) -> np.ndarray:
 def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, options: Options) -> dict[str, Any]:
     """The fields of `Lanes` that the bodies and the links between them decide."""
     ways = (machine.rate, machine.held) if options.friction else (machine.rate,)
+
+    def lay(flows: Iterable[Flow]) -> Flow:
+        return Flow(*(np.stack(column) for column in zip(*(_lay(each, which) for each in flows), strict=True)))
+
     digits = Flow(*(np.zeros((1, 1, 1, 1, 1)) for _ in Flow._fields))
     if options.friction or options.jitter:
-        found = [_lay(digit_flow(way, machine.drain), which) for way in ways]
-        digits = Flow(*(np.stack(column) for column in zip(*found, strict=True)))
+        digits = lay(digit_flow(way, machine.drain) for way in ways)
     longest = find_longest_steps(machine) if options.friction else np.array([2.0])
     return {
         "rate": _lay(machine.rate, which),
@@ -189,7 +192,7 @@ def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, o
         "motion": machine.motion[..., None],
         "energy": _lay(machine.energy, which),
         "durations": _lay(durations, which),
-        "pieces": _lay(flow(machine.rate, machine.drain, durations), which),
+        "pieces": lay(flow(way, machine.drain, durations) for way in ways),
         "digits": digits,
         "longest": _lay(longest, which),
     }

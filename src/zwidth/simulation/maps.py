@@ -68,7 +68,7 @@ def _rows(part: Any, at: np.ndarray) -> Any:
 
 def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The bodies' map over a period and until the command changes, and what a push adds, piece by piece."""
-    change = _rows(lanes.pieces.change, at)
+    change = _rows(lanes.pieces.change[0], at)
     size = change.shape[-2]
     whole = np.concatenate([np.eye(size), np.zeros((size, 2))], 1)
     whole = halfway = np.broadcast_to(whole, (at.size, size, size + 2))

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zwidth.simulation.flow import DIGITS, Flow
 from zwidth.simulation.lanes import Lanes
@@ -20,6 +21,9 @@ from zwidth.words.types import Array
 # More events within a period than a motion has: what is left then is unknown, NaN.
 _MOST_EVENTS = 512
 _LAST_DIGIT = 0.5 ** (DIGITS - 1)
+# An event takes a hundred times the work of a way without one, and few lanes have one at a time: these go on together,
+# this share of all.
+_SHARE = 8
 
 
 class BodyState(NamedTuple):
@@ -27,14 +31,6 @@ class BodyState(NamedTuple):
 
     x: Array  # (n, lanes)
     slip: Array
-
-
-class _Slide(NamedTuple):
-    body: BodyState
-    left: Array  # of the duration
-    lost: Array
-    rubbed: Array
-    events: Array
 
 
 def times(matrix: Array, vector: Array) -> Array:
@@ -48,12 +44,22 @@ def dot(row: Array, vector: Array) -> Array:
 
 
 def advance(
-    digits: Flow, held: Array, x: Array, forces: Array, limit: Array, keep: Callable[[Array], Array] | None = None
+    digits: Flow,
+    held: Array,
+    x: Array,
+    forces: Array,
+    limit: Array,
+    keep: Callable[[Array], Array] | None = None,
+    which: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """The state after as long a time up to ``limit`` as ``keep`` holds at, that time, and what dampers have taken."""
+    """The state after as long a time up to ``limit`` as ``keep`` holds at, that time, and what dampers have taken.
+
+    Of the lanes ``which``, where these are not all that have digits.
+    """
 
     def pick(part: Array, k: Array) -> Array:
-        return jnp.where(held, part[1, k], part[0, k]) if part.shape[0] > 1 else part[0, k]
+        ways = [_take(way[k], which) for way in part]
+        return jnp.where(held, ways[1], ways[0]) if len(ways) > 1 else ways[0]
 
     def remain(state: tuple[Array, ...]) -> Array:
         k, _, time, _ = state
@@ -72,79 +78,172 @@ def advance(
     return jax.lax.while_loop(remain, step, (first, x, jnp.zeros_like(limit), jnp.zeros_like(limit)))[1:]
 
 
-def slide(lanes: Lanes, body: BodyState, forces: Array, duration: Array) -> tuple[BodyState, Array, Array]:
-    """The motion under constant forces, of which friction adds to the last; what dampers and friction have taken."""
-    motion, (*lead, force) = lanes.motion[0], forces
-    pull = [dot(motion, column) for column in jnp.moveaxis(lanes.rate, 1, 0)]
-    coulomb, static = lanes.motor.coulomb, lanes.motor.static
+class _Slide(NamedTuple):
+    body: BodyState
+    left: Array  # of the duration
+    lost: Array
+    rubbed: Array
+    events: Array
 
-    def pressed(x: Array) -> Array:
-        """The force on the first body but for friction: its acceleration, for its mass is the unit."""
-        return dot(pull[:-1], [*x, *lead]) + force
+    @property
+    def pending(self) -> Array:
+        return (self.left > 0) & (self.events < _MOST_EVENTS)
 
-    def speed(x: Array) -> Array:
-        return dot(motion, x)
 
-    def decide(x: Array, slip: Array, stopped: Array) -> BodyState:
+class _Trip(NamedTuple):
+    x: Array
+    time: Array
+    lost: Array
+    far: Array  # where all of the way leads
+    spent: Array  # what dampers take on all of it
+    over: Array  # whether an event ends it
+
+
+def _take(part: Array, which: Array | None) -> Array:
+    """Some of the lanes; all of them where one serves all. Beyond the last lane stands the last."""
+    return part if which is None or part.shape[-1] == 1 else part.at[..., which].get(mode="clip")
+
+
+class _Joint(NamedTuple):
+    """Friction of the first body in some lanes, under constant forces, of which it adds to the last."""
+
+    motion: Array  # the velocity that friction acts on
+    place: Array
+    rate: Array
+    pull: Array  # its acceleration, for the first body's mass is the unit
+    longest: Array
+    coulomb: Array
+    static: Array
+    forces: Array
+
+    def pressed(self, x: Array) -> Array:
+        """The force on the first body but for friction."""
+        return dot(self.pull[:-1], [*x, *self.forces[:-1]]) + self.forces[-1]
+
+    def speed(self, x: Array) -> Array:
+        return dot(self.motion, x)
+
+    def drive(self, slip: Array) -> Array:
+        """The forces with friction's."""
+        return jnp.stack([*self.forces[:-1], self.forces[-1] - slip * self.coulomb])
+
+    def decide(self, x: Array, slip: Array, stopped: Array) -> BodyState:
         """Hold or let go a body that has no velocity."""
-        push = pressed(x)
+        push = self.pressed(x)
         # What is left of the velocity goes as an impulse would, into the first body.
-        x = jnp.where(stopped, x - lanes.rate[:, -1] * speed(x), x)
-        return BodyState(x, jnp.where(stopped, jnp.where(jnp.abs(push) > static, jnp.sign(push), 0.0), slip))
+        x = jnp.where(stopped, x - self.rate[:, -1] * self.speed(x), x)
+        return BodyState(x, jnp.where(stopped, jnp.where(jnp.abs(push) > self.static, jnp.sign(push), 0.0), slip))
 
-    def step(state: _Slide) -> _Slide:
-        x, slip = state.body
-        held, driven = slip == 0, jnp.stack([*lead, force - slip * coulomb])
-        limit = jnp.minimum(state.left, lanes.longest)
-        far, time, lost = advance(lanes.digits, held, x, driven, limit)
-        side = jnp.sign(pressed(x) + pressed(far))
+    def remains(self, x: Array, slip: Array, side: Array) -> Array:
+        """What is left until the event: of the speed, or of the force that friction can still bear."""
+        return jnp.where(slip == 0, self.static - side * self.pressed(x), slip * self.speed(x))
 
-        def remains(x: Array) -> Array:
-            """What is left until the event: of the speed, or of the force that friction can still bear."""
-            return jnp.where(held, static - side * pressed(x), slip * speed(x))
+    def rises(self, x: Array, slip: Array, side: Array) -> Array:
+        change = times(self.rate, jnp.concatenate([x, self.drive(slip)]))
+        stuck = -side * dot(self.pull[: len(x)], change - self.rate[:, -1] * self.speed(change))
+        return jnp.where(slip == 0, stuck, slip * (self.pressed(x) - slip * self.coulomb))
 
-        def rises(x: Array) -> Array:
-            change = times(lanes.rate, jnp.concatenate([x, driven]))
-            stuck = -side * dot(pull[: len(x)], change - lanes.rate[:, -1] * dot(motion, change))
-            return jnp.where(held, stuck, slip * (pressed(x) - slip * coulomb))
+    def find_side(self, x: Array, far: Array) -> Array:
+        """To which side a held body is pressed on the way."""
+        return jnp.sign(self.pressed(x) + self.pressed(far))
 
+    def dips(self, x: Array, slip: Array, far: Array, side: Array) -> Array:
+        """Whether less remains on the way than at both of its ends."""
+        falls, recovers = self.rises(x, slip, side) < 0, self.rises(far, slip, side) > 0
         # A body just let go starts with rounding errors for a velocity and an acceleration: it leaves.
-        dips = (remains(far) > 0) & (rises(x) < 0) & (rises(far) > 0) & (held | (speed(x) != 0))
+        return (self.remains(far, slip, side) > 0) & falls & recovers & ((slip == 0) | (self.speed(x) != 0))
 
-        def find_lowest(_: Any) -> tuple[Array, Array]:
-            low, when, _ = advance(lanes.digits, held, x, driven, limit, lambda after: rises(after) < 0)
-            return jnp.where(dips, low, far), jnp.where(dips, when, time)
-
-        low, when = jax.lax.cond(jnp.any(dips), find_lowest, lambda _: (far, time), None)
-        over = (remains(low) < 0) & (state.left > 0)
-
-        def find_event(_: Any) -> tuple[BodyState, Array, Array]:
-            at, moment, taken = advance(lanes.digits, held, x, driven, when, lambda after: remains(after) >= 0)
-            after = decide(at, slip, over)
-            # What friction can bear no longer is let go, whatever rounding says of the force.
-            towards = jnp.where(held, side, after.slip)
-            return (
-                BodyState(jnp.where(over, after.x, far), jnp.where(over, towards, slip)),
-                jnp.where(over, moment, time),
-                jnp.where(over, taken, lost),
-            )
-
-        after, time, lost = jax.lax.cond(jnp.any(over), find_event, lambda _: (BodyState(far, slip), time, lost), None)
-        moving = state.left > 0
-        left = jnp.where(over, state.left - time, state.left - limit)
-        way = dot(lanes.place[0], after.x - x)
+    def account(self, state: _Slide, moving: Array, after: BodyState, left: Array, lost: Array) -> _Slide:
+        """The state where those that move have come."""
+        (x, slip), way = state.body, dot(self.place, after.x - state.body.x)
         return _Slide(
             BodyState(jnp.where(moving, after.x, x), jnp.where(moving, after.slip, slip)),
-            jnp.where(moving, jnp.where(left > _LAST_DIGIT, left, 0.0), 0.0),
+            jnp.where(moving, jnp.where(left > _LAST_DIGIT, left, 0.0), state.left),
             state.lost + jnp.where(moving, lost, 0.0),
-            state.rubbed + jnp.where(moving, slip * coulomb * way, 0.0),
+            state.rubbed + jnp.where(moving, slip * self.coulomb * way, 0.0),
             state.events + moving,
         )
 
+    def glide(self, state: _Slide, whole: Flow) -> _Slide:
+        """All of the way at once where nothing happens on it; the others have not moved."""
+        x, slip = state.body
+
+        def go(_: Any) -> tuple[Array, Array, Array]:
+            z = jnp.concatenate([x, self.drive(slip)])
+            change, loss = (jnp.where(slip == 0, part[1], part[0]) for part in whole)
+            far = x + times(change, z)
+            side = self.find_side(x, far)
+            # What never falls, or falls to the end.
+            plain = (self.rises(x, slip, side) >= 0) | (self.rises(far, slip, side) <= 0)
+            calm = (self.remains(far, slip, side) >= 0) & plain & (state.left > 0) & (state.left <= self.longest)
+            return far, dot(z, times(loss, z)), calm
+
+        # A command often lasts for no time; and what is chosen by is computed once, not with each of its choices.
+        far, lost, calm = jax.lax.cond(
+            jnp.any(state.left > 0), go, lambda _: (x, 0.0 * state.left, state.left < 0), None
+        )
+        return self.account(state, calm, BodyState(far, slip), 0.0 * state.left, lost)
+
+    def step(self, state: _Slide, digits: Flow, which: Array | None) -> _Slide:
+        """As far as the next event, or one longest step."""
+        x, slip = state.body
+        held, driven, limit = slip == 0, self.drive(slip), jnp.minimum(state.left, self.longest)
+
+        def search(trip: _Trip, turn: Array) -> tuple[_Trip, None]:
+            """All of the way, then to where least remains, then to the event; by one program, for it is long."""
+            side = self.find_side(x, trip.far)
+            wanted = jnp.stack([self.dips(x, slip, trip.far, side), self.remains(trip.x, slip, side) < 0])
+            wanted = jnp.where(turn == 0, True, wanted[turn - 1])
+
+            def keep(after: Array) -> Array:
+                bounds = jnp.stack([self.rises(after, slip, side) < 0, self.remains(after, slip, side) >= 0])
+                return (turn == 0) | bounds[turn - 1]
+
+            found = advance(digits, held, x, driven, jnp.where(wanted, trip.time, 0.0), keep, which)
+            there, time, lost = (jnp.where(wanted, *each) for each in zip(found, trip[:3], strict=True))
+            far, spent = (jnp.where(turn == 0, *each) for each in ((there, trip.far), (lost, trip.spent)))
+            return _Trip(there, time, lost, far, spent, wanted), None
+
+        none = 0.0 * limit
+        trip = jax.lax.scan(search, _Trip(x, limit, none, x, none, none > 0), np.arange(3))[0]
+        over, side = trip.over & (state.left > 0), self.find_side(x, trip.far)
+        after = self.decide(trip.x, slip, over)
+        # What friction can bear no longer is let go, whatever rounding says of the force.
+        after = BodyState(jnp.where(over, after.x, trip.far), jnp.where(over & held, side, after.slip))
+        left, lost = state.left - jnp.where(over, trip.time, limit), jnp.where(over, trip.lost, trip.spent)
+        return self.account(state, state.left > 0, after, left, lost)
+
+
+def slide(
+    lanes: Lanes, body: BodyState, forces: Array, duration: Array, whole: Flow | None
+) -> tuple[BodyState, Array, Array]:
+    """The motion under constant forces, of which friction adds to the last; what dampers and friction have taken.
+
+    ``whole`` is the flow over all of the duration, slipping and held, where it is known.
+    """
+    motion, motor, none = lanes.motion[0], lanes.motor, 0.0 * forces[-1]
+    pull = jnp.stack([dot(motion, column) for column in jnp.moveaxis(lanes.rate, 1, 0)])
+    joint = _Joint(motion, lanes.place[0], lanes.rate, pull, lanes.longest, motor.coulomb, motor.static, forces)
     # A new force may let go what was held, and a body may start at rest.
-    start = decide(body.x, body.slip, (body.slip == 0) | (speed(body.x) == 0))
-    none = 0.0 * force
-    state = _Slide(start, duration + none, none, none, jnp.zeros_like(none, int))
-    state = jax.lax.while_loop(lambda state: jnp.any((state.left > 0) & (state.events < _MOST_EVENTS)), step, state)
+    start = joint.decide(body.x, body.slip, (body.slip == 0) | (joint.speed(body.x) == 0))
+    state = _Slide(start, duration + none, none, none, none)
+    size = none.shape[-1]
+    few = max(size // _SHARE, min(size, 16))
+
+    def go_on(joint: _Joint, state: _Slide, which: Array | None) -> _Slide:
+        return jax.lax.while_loop(
+            lambda state: jnp.any(state.pending), lambda state: joint.step(state, lanes.digits, which), state
+        )
+
+    def go_on_with_few(state: _Slide) -> _Slide:
+        which = jnp.nonzero(state.pending, size=few, fill_value=size)[0]
+        own, part = jax.tree.map(lambda part: _take(part, which), (joint, state))
+        part = go_on(own, part._replace(left=jnp.where(which < size, part.left, 0.0)), which)
+        return jax.tree.map(lambda every, some: every.at[..., which].set(some, mode="drop"), state, part)
+
+    if whole is None or few == size:
+        state = go_on(joint, state, None)
+    else:
+        state = jax.lax.while_loop(lambda state: jnp.any(state.pending), go_on_with_few, joint.glide(state, whole))
     known = state.left <= 0
     return BodyState(jnp.where(known, state.body.x, jnp.nan), state.body.slip), state.lost, state.rubbed

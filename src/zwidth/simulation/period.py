@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from zwidth.simulation.flow import Flow
 from zwidth.simulation.lanes import Lanes, Options
 from zwidth.simulation.motion import BodyState, advance, dot, slide, times
 from zwidth.words.types import Array
@@ -126,16 +127,17 @@ def move(
     """The motion over one piece of a period, ``place`` its substep and its number, and what it costs."""
     none, at_once = 0.0 * body.x[0], lanes.rate.shape[1] == lanes.rate.shape[0] + 1
     forces = jnp.stack([force + push + none] if at_once else [force + none, push + none])
+    whole = None if options.jitter else Flow(*(part[:, *place] for part in lanes.pieces))
     if options.friction:
-        after, lost, rubbed = slide(lanes, body, forces, time)
-    elif options.jitter:
+        after, lost, rubbed = slide(lanes, body, forces, time, whole)
+    elif whole is None:
         x, _, lost = advance(lanes.digits, np.zeros((), bool), body.x, forces, time + none)
         after, rubbed = BodyState(x, body.slip), 0.0
     else:
         z = jnp.concatenate([body.x, forces])
-        x = body.x + times(lanes.pieces.change[place], z)
+        x = body.x + times(whole.change[0], z)
         after, rubbed = BodyState(x, body.slip), 0.0
-        lost = dot(z, times(lanes.pieces.loss[place], z))
+        lost = dot(z, times(whole.loss[0], z))
     way = dot(lanes.place[0], after.x - body.x)
     # What an actuator or modes make of the command varies within the piece: its work by the balance of the others.
     given = force * way if at_once else stored(lanes, after.x) - stored(lanes, body.x) + lost + rubbed - push * way
