@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
-from numpy.lib.stride_tricks import sliding_window_view
 
 from zwidth.figures import style
 from zwidth.figures.motion import draw_positions
@@ -103,11 +102,26 @@ def name_axes(ax: Axes, spring: str, damper: str) -> None:
 
 def agrees(outlines: Outlines, x: np.ndarray, y: np.ndarray, good: np.ndarray) -> bool:
     """Whether the cells (y, x) that are good lie within, but for those next to a change, which the outline parts."""
-    points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    inside = np.zeros(good.shape, dtype=bool)
-    for closed, _ in outlines:
-        inside ^= Path(closed).contains_points(points).reshape(good.shape)
+    inside = _cells_inside(outlines, x, y)
     return not np.any((inside != good) & ~_changes(inside) & ~_changes(good))
+
+
+def _cells_inside(outlines: Outlines, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Cells (y, x) with an odd number of edges to their left; axes may run either way."""
+    columns, rows = np.argsort(x), np.argsort(y)
+    crossed = np.zeros((y.size, x.size + 1), int)
+    for closed, _ in outlines:
+        begin, end = closed, np.roll(closed, -1, 0)
+        low, high = np.sort(np.searchsorted(y[rows], [begin[:, 1], end[:, 1]]), axis=0)
+        edge = np.repeat(np.arange(len(closed)), high - low)
+        row = np.arange(edge.size) - np.repeat(np.cumsum(high - low) - high, high - low)
+        begin, end = begin[edge], end[edge]
+        share = (y[rows[row]] - begin[:, 1]) / (end[:, 1] - begin[:, 1])
+        place = np.searchsorted(x[columns], begin[:, 0] + share * (end[:, 0] - begin[:, 0]))
+        np.add.at(crossed, (rows[row], place), 1)
+    inside = np.empty((y.size, x.size), bool)
+    inside[:, columns] = np.cumsum(crossed, 1)[:, :-1] % 2
+    return inside
 
 
 def draw_exact(
@@ -123,8 +137,13 @@ def draw_exact(
 
 def _changes(cells: np.ndarray) -> np.ndarray:
     """Cells that differ from one beside them."""
-    around = sliding_window_view(np.pad(cells, 1, mode="edge"), (3, 3))
-    return around.min(axis=(2, 3)) != around.max(axis=(2, 3))
+
+    def around(both: np.ufunc) -> np.ndarray:
+        padded = np.pad(cells, 1, mode="edge")
+        rows = both(both(padded[:-2], padded[1:-1]), padded[2:])
+        return both(both(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+
+    return around(np.logical_or) & ~around(np.logical_and)
 
 
 def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
