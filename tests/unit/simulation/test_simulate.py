@@ -92,6 +92,21 @@ def test_scenes_of_different_periods_and_bodies_move_in_a_batch_as_alone():
     assert np.isfinite(together.tip_position[1]).all()
 
 
+@pytest.mark.parametrize(("tip", "delay"), [(None, 1.3e-3), (zwidth.Coupling(0.05, 2e3, 0.1), 0.5e-3)])
+def test_many_walls_on_friction_move_as_alone(tip, delay):
+    """Those that friction stops or lets go in a period go on by themselves; all others take it in one step."""
+    scene = zwidth.Scene(zwidth.Device(0.1, 0.1, tip), zwidth.Timing(1e-3, delay))
+    walls = np.linspace(200.0, 4e3, 80), np.linspace(0.0, 20.0, 80)
+    rough = {"coulomb": 0.05, "static": 0.08, "substeps": 2}
+    together = run(scene, stiffness=walls[0], virtual_damping=walls[1], **rough)
+    for place in (0, 17, 40, 63, 79):
+        alone = run(scene, stiffness=walls[0][place], virtual_damping=walls[1][place], **rough)
+        turns = np.count_nonzero(np.diff(np.sign(alone.velocity)))
+        assert turns > 1
+        for name in ("position", "velocity", "energy"):
+            assert_again(getattr(together, name)[place], getattr(alone, name), name)
+
+
 @pytest.mark.parametrize("delay", [0.0, 1.0, 0.3, 2.75, 100.0])
 def test_a_command_acts_its_delay_later_and_substeps_change_nothing(delay):
     scene = zwidth.Scene(SCENE.device, zwidth.Timing(1e-3, delay * 1e-3))
