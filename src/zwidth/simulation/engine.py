@@ -20,6 +20,8 @@ from zwidth.simulation.period import Program, Reading, Work, control, forces_of,
 from zwidth.words.types import Array
 
 BLOCK = 128
+# XLA's older emitters of loops, in one piece: compiles in half of the time, and runs no slower.
+_PLAIN = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 
 
 class Extent(NamedTuple):
@@ -173,7 +175,7 @@ def compile_block(options: Options) -> Any:
     def block(lanes: Lanes, ends: Array, state: State, given: Inputs) -> tuple[State, Any]:
         return jax.lax.scan(partial(_period, lanes, options, ends), state, given)
 
-    return jax.jit(block, donate_argnums=2)
+    return jax.jit(block, donate_argnums=2, compiler_options=_PLAIN)
 
 
 def run_lanes(
