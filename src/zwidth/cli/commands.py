@@ -60,7 +60,8 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     if as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
     if friction is not None or resolution is not None:
-        device = {"damping": scene.damping, "period": scene.timing.period}
+        # The device's own: the rule is for any hand.
+        device = {"damping": scene.device.damping, "period": scene.timing.period}
         rule = friction_rule(**device, friction=friction, resolution=resolution)
         result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
         lines += words.friction_lines(rule)

@@ -140,7 +140,7 @@ def _tolerate(
 
 def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
     """What every device of the box bears."""
-    from zwidth.scenes.robust import Interval, robust_max_stiffness, robust_wall
+    from zwidth.scenes.robust import DIGITS, Interval, robust_max_stiffness, robust_wall
 
     nominal = (scene.mass, scene.damping, scene.timing.period, scene.timing.delay)
     box: dict[str, Any] = dict(zip(_BOX, nominal, strict=True))
@@ -156,6 +156,8 @@ def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[s
         "virtual_damping": float(wall.virtual_damping),
         "stiffness_max": float(best.stiffness),
     }
-    stiffness, damping, most = map(with_unit, result.values(), ("N/m", "N s/m", "N/m"))
+    # Of a damping that is proved softer walls are proved too.
+    stiffness, most = (with_unit(round_safely(result[name], "below"), "N/m") for name in ("stiffness", "stiffness_max"))
+    damping = with_unit(result["virtual_damping"], "N s/m", DIGITS)
     text = f"K = {stiffness} at B = {damping}; {most}, each with a B of its own"
     return result, [row("proved for every one", text)]

@@ -19,7 +19,7 @@ from zwidth.scenes.assessment import Assessment, Limit, assess, check_held, desc
 from zwidth.scenes.stiffest import StiffestWall, choose_damping, find_lowest, soft_dampings
 from zwidth.scenes.wall_code import write_wall
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import plain, spell_stiffness, tell_apart, to_json, with_unit
+from zwidth.words.formatting import plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
@@ -145,7 +145,9 @@ class Recommendation:
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        K, B, largest = spell_stiffness(self.stiffness), with_unit(self.virtual_damping, "N s/m"), self.stiffest[0]
+        # Rounded up it might no longer have what is wanted.
+        K = spell_stiffness(round_safely(self.stiffness, "below"))
+        B, largest = with_unit(self.virtual_damping, "N s/m"), self.stiffest[0]
         share = 100.0 * self.stiffness / float(largest)
         first = f"K = {K}, B = {B}: {share:.4g} % of the stiffest stable wall, {spell_stiffness(float(largest))}"
         if self.limited_by != "stiffness_fraction":

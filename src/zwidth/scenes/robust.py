@@ -38,6 +38,8 @@ _MOST_PARTS, _AT_ONCE = 1 << 18, 1 << 11
 # Rounds of proof and counterexample.
 _ROUNDS = 40
 _SEARCH_ROUNDS = 60
+# Of the damping of a wall for all devices.
+DIGITS = 8
 # Shares this close to 0 or 1 are taken for it.
 _AT_END = 1e-12
 
@@ -343,7 +345,8 @@ def _wall(low: np.ndarray, high: np.ndarray) -> tuple:
     for tolerance in (_TOLERANCE, *_LOOSER):
         for _ in range(_ROUNDS):
             stiffness = limit * (1.0 - tolerance)
-            damping = middle(stiffness)
+            # A wall that is read and set is the one that is proved: no more digits than are printed.
+            damping = float(f"{middle(stiffness):.{DIGITS}g}")
             holds, failing = _prove(stiffness, lambda centers, b=damping: np.full(len(centers), b), low, high)
             if holds:
                 status = Status.OK if tolerance == _TOLERANCE else Status.UNDECIDED

@@ -173,6 +173,9 @@ def test_friction_and_resolution():
     assert printed["by_friction"] == pytest.approx(2 * 0.24 / 15.7e-6, rel=1e-15)
     assert printed["stiffness"] == printed["by_damping"]
     assert "2 b/T = 20.00 kN/m, 2 f_c/Q = 30.57 kN/m" in run("check", *WALL, *DEVICE, *RATE, *given).stdout
+    # As passivity, the rule is for any hand: that of a held device counts on nobody's damping.
+    held = json.loads(run("check", *WALL, *DEVICE, *RATE, *given, "--operator-damping", "5", "--json").stdout)
+    assert held["friction_rule"] == printed
     assert "both are needed" in run("check", *WALL, *DEVICE, *RATE, "--friction", "1").stdout
 
 

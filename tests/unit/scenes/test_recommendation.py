@@ -1,6 +1,7 @@
 """The wall to set: the stiffest with all that is wanted, against walls on a grid judged one by one."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -99,6 +100,15 @@ def test_what_no_wall_has_is_said_and_leaves_no_wall():
     known = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert known["recommended"]["stiffness"] is None
     assert known["maximum"]["stiffness"] == undamped.max_stiffness().stiffness
+
+
+@pytest.mark.parametrize("damping, delay", [(2, 1e-3), (8, 0), (10, 0.5e-3)])
+def test_the_wall_that_is_printed_is_no_stiffer(damping, delay):
+    scene = zwidth.Scene(zwidth.Device(0.1, damping), zwidth.Timing(period=1e-3, delay=delay))
+    found = scene.recommend(passive=True)
+    K, B = re.match("K = (.*?), B = (.*?):", found.lines()[0]).groups()
+    assert found.stiffness * (1 - 1e-3) < zwidth.VirtualWall(K).stiffness <= found.stiffness
+    assert scene.is_passive(K, B)
 
 
 def test_steps_are_those_of_limits_that_help():

@@ -35,6 +35,8 @@ from zwidth.words.types import Array
 
 # Halvings beside a zero of the wall, and how much of itself the wall may change from node to node.
 _HALVINGS, _SHARE = 40, 0.25
+# The offset from z = 1 of a pole there.
+_AT_ONE = 1e-13
 # An L so small, as a share of what it changes by over w, is a zero of it.
 _NOTHING = 1e-10
 
@@ -52,6 +54,12 @@ class OpenLoop(NamedTuple):
     def lay_out(cls, loop: LoopRoots, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
         """Refine the nodes of a loop for a wall."""
         w = np.append(nodes[nodes < np.pi], np.pi)
+        free = int(np.count_nonzero(np.abs(loop.poles) <= _AT_ONE))
+        soft = abs(alpha * loop.response(circle(w[:1])).value[0])
+        if free and 0.0 < soft < 1.0:
+            # To a free device L has no end towards w = 0: that of a soft wall passes 1 below all nodes.
+            most = 1.0 - np.log2(soft) / free
+            w = np.concatenate([w[0] * np.exp2(-np.linspace(most, 1.0, int(np.ceil(most)))), w])
         for _ in range(_HALVINGS):
             f = loop.estimate.jet(circle(w))
             wall = np.abs(alpha + beta * f.value)

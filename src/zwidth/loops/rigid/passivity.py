@@ -31,7 +31,9 @@ _NO_DELAY = DelayClasses(True, False, False)
 def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d)
-    stiff, damper, delay = xp.where(ok, xp.maximum(alpha, 0.0), 0.0), xp.where(ok, beta, 0.0), xp.where(ok, d, 0.0)
+    # At 0 with the slope from the right, which the larger of the two would halve.
+    stiff = xp.where(ok & (alpha >= 0), alpha, 0.0)
+    damper, delay = xp.where(ok, beta, 0.0), xp.where(ok, d, 0.0)
     margin = delta - needed_damping(stiff, damper, delay, kind)
     return _limit_margin(margin, alpha) + nan_with_nan_slopes(ok, alpha, beta, delta, d)
 
@@ -148,7 +150,9 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
     Numerics:
         About 1e-15 of what is needed, at a cost that does not grow with d. Where the condition peaks is proved for
         whole d, and seen for held delays (`loops.rigid.needed_damping`). Many walls that share a delay go by a
-        polynomial of their direction. Traceable, also twice; at whole d derivatives in d are those from the right.
+        polynomial of their direction. Traceable, also twice; at whole d derivatives in d are those from the right, as
+        those in alpha at alpha = 0; those in beta at beta = 0 are from below where d = 0, and 0 at the peak without a
+        wall.
 
     References:
         Colgate, Schenkel 1994; Hulin, Preusche, Hirzinger 2006, eqs. (20), (21), here extended to any delay.

@@ -179,3 +179,24 @@ def test_a_zero_of_the_open_loop_is_no_crossover():
     found = scene.margins(2.5e3, 4.4)
     assert found.gain_margin == 0
     assert np.isnan(found.phase_crossover)
+
+
+@pytest.mark.parametrize("stiffness", [1e-2, 1e-6])
+def test_a_soft_wall_on_a_free_device_has_its_crossover_at_any_frequency(stiffness):
+    # L = K/(b s) and K (1 + (B/K) s)/(m s^2) so far below every other frequency of the loop.
+    damped = FILTERED.margins(stiffness, 0.0)
+    assert damped.gain_crossover == pytest.approx(stiffness / 3.0 / (2 * np.pi), rel=1e-5)
+    assert damped.phase_margin == pytest.approx(90.0, abs=1e-2)
+    # Its end is beyond the delays that are looked for, and not known to be none.
+    assert np.isnan(damped.delay_margin)
+    undamped = FILTERED.replace(damping=0.0)
+    lead = 6e-3
+    found = undamped.margins(stiffness, lead * stiffness)
+    crossover = np.sqrt(stiffness / 0.1)
+    # The force comes 1.5 ms late; the difference and its filter are slow by 0.5 ms and p T/(1 - p) more, by B only.
+    turn = crossover * (lead - 1.5e-3)
+    assert found.gain_crossover == pytest.approx(crossover / (2 * np.pi), rel=1e-4)
+    assert found.phase_margin == pytest.approx(np.degrees(turn), rel=1e-3)
+    assert found.delay_margin == pytest.approx(lead - 1.5e-3, rel=1e-4)
+    # Where |L| passes 1 it is nearest to -1.
+    assert found.modulus_margin == pytest.approx(turn, rel=1e-3)

@@ -202,6 +202,13 @@ def test_the_derivative_where_stiffness_and_damping_balance():
     assert float(jax.grad(lambda alpha: zwidth.passivity_margin(alpha, 0.1, 1.0, 0))(0.2)) == -0.5
 
 
+@pytest.mark.parametrize("beta, d", [(0.3, 0), (0.3, 0.5), (-0.3, 0.5), (0.3, 2)])
+def test_the_derivative_in_stiffness_of_a_damper_alone_is_that_from_the_right(beta, d, x64):
+    found = jax.grad(lambda alpha: zwidth.passivity_margin(alpha, beta, 1.0, d))(0.0)
+    at = zwidth.passivity_margin(np.array([0.0, 1e-6, 2e-6]), beta, 1.0, d)
+    assert float(found) == pytest.approx((4 * at[1] - 3 * at[0] - at[2]) / 2e-6, rel=1e-8)
+
+
 def printed(omega, alpha, beta, n, f):
     """The damping that the condition as printed in the model asks for at one frequency, in mpmath."""
     z = mp.expj(omega)
