@@ -11,7 +11,7 @@ from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.poles import log_size, poles_less_one
 from zwidth.loops.linear.rows import Island
-from zwidth.loops.linear.state_space import Matrices, closed_loop, delayed_device, open_loop
+from zwidth.loops.linear.state_space import StateSpace, closed_loop, delayed_device, open_loop
 from zwidth.loops.rigid.margins import Margins
 from zwidth.loops.rigid.verdict import STABILITY_METHODS, Stability, StabilityMethod
 from zwidth.parts.checks import read_texts
@@ -27,26 +27,6 @@ if TYPE_CHECKING:
 # K or B of walls, texts with a unit as well; None means those of the scene's own wall.
 Walls: TypeAlias = ArrayLike | None
 Wall: TypeAlias = float | str | None
-
-
-@shown(dt="s")
-class StateSpace(NamedTuple):
-    """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, a step every ``dt`` seconds."""
-
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    D: np.ndarray
-    dt: float
-
-    def step(self, periods: int) -> np.ndarray:
-        """The output at so many samples, with an input of 1 from the first one on; inf or NaN beyond float64."""
-        state, found = np.zeros(self.A.shape[0]), np.empty(periods)
-        with np.errstate(all="ignore"):
-            for k in range(periods):
-                found[k] = (self.C @ state)[0] + self.D[0, 0]
-                state = self.A @ state + self.B[:, 0]
-        return found
 
 
 @shown(frequency="Hz", time_constant="s")
@@ -285,7 +265,7 @@ class SceneAnswers:
         )
 
 
-def _realize(scene: Any, build: Callable[..., Matrices], unit: float, alpha: Any, beta: Any) -> StateSpace:
+def _realize(scene: Any, build: Callable[..., StateSpace], unit: float, alpha: Any, beta: Any) -> StateSpace:
     """A loop with one wall, its states in m, m/s and N in place of units of the period and the mass."""
     chain, period, mass = scene.loop.chain, scene.timing.period, float(scene.mass)
     loop = build(chain, *one_wall(alpha, beta))

@@ -125,14 +125,17 @@ class Scene(Part, SceneAnswers, SceneOptima, SceneAdvice):
     @cached_property
     def mass(self) -> Any:
         """The mass that the wall's force acts on, in kg: the unit of the normalized stiffness."""
-        held = self.operator is not None and self.operator.rigid and self.device.coupling is None
-        return self.device.mass + (self.operator.mass if held and self.operator is not None else 0.0)
+        return self._with_hand("mass")
 
     @cached_property
     def damping(self) -> Any:
         """The damping to ground of that mass, in N s/m."""
+        return self._with_hand("damping")
+
+    def _with_hand(self, name: str) -> Any:
+        """A number of the device, with that of a hand that holds it rigidly."""
         held = self.operator is not None and self.operator.rigid and self.device.coupling is None
-        return self.device.damping + (self.operator.damping if held and self.operator is not None else 0.0)
+        return getattr(self.device, name) + (getattr(self.operator, name) if held else 0.0)
 
     @cached_property
     def normalized(self) -> Normalized:
