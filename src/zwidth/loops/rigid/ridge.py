@@ -63,11 +63,6 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
 
 
-def differentiable_plant(delta: Array, fraction: Array) -> Plant:
-    """`loops.rigid.device.held_plant`, in JAX with its derivatives in closed form."""
-    return held_plant(delta, fraction) if namespace(delta, fraction) is np else _jax_plant()(delta, fraction)
-
-
 def follow(
     s: Array, plant: Plant, lag: Array, delay_model: str, kind: DelayClasses
 ) -> tuple[Array, Array, Array, Array]:
@@ -110,6 +105,7 @@ def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: st
 
 @cache
 def _jax_plant() -> Any:
+    """`loops.rigid.device.held_plant` with its derivatives in closed form."""
     import jax
 
     function = jax.custom_jvp(lambda delta, fraction: held_plant(delta, fraction))
@@ -281,7 +277,10 @@ def _solve_ridge(
     if delay_model == "fractional_power":
         whole, f = d, 0.0 * d
     start = guess_start(delta, d, f, kind)
-    plant = differentiable_plant(delta, f) if kind.fractional and delay_model == "held" else held_plant(delta)
+    if kind.fractional and delay_model == "held":
+        plant = held_plant(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
+    else:
+        plant = held_plant(delta)
     ridge = differentiable_ridge(plant, whole, start, delay_model, kind)
     return ridge, status, plant, whole, (delta, f)
 
