@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zwidth.arrays.xp import epsilon, namespace, nan_with_nan_slopes, repeat
+from zwidth.arrays.xp import epsilon, namespace, nan_with_nan_slopes, repeat, store_once
 from zwidth.loops.rigid.circle import Loop, factor_loop
 from zwidth.loops.rigid.device import valid_wall
 from zwidth.loops.rigid.folding import Degree
@@ -24,9 +24,10 @@ _ROUNDING = 32.0
 
 
 def product_form(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Loop:
-    """The factors of P of every wall, with a new first axis for its poles."""
+    """The factors of P of every wall, NaN where it is out of range, with a new first axis for its poles."""
     xp = namespace(alpha, beta, delta, d)
-    return Loop(*(xp.asarray(part)[None] for part in factor_loop(alpha, beta, delta, d, degree.fractional)))
+    loop = store_once(factor_loop(alpha, beta, delta, d, degree.fractional), delta)
+    return Loop(*(xp.asarray(part)[None] for part in loop))
 
 
 def _power(z: Pair, power: int) -> Pair:
@@ -48,7 +49,7 @@ def evaluate(z: Pair, loop: Loop, degree: Degree, spring: bool) -> tuple[Pair, P
         value, slope = lag * z * quadratic, lag * (quadratic * power + body)
     else:
         value, slope = quadratic, one + pole
-    n, n_slope = z * loop.a2 + loop.h, Pair(loop.a2, 0.0)
+    n, n_slope = z * loop.a2 + loop.h, loop.a2
     if degree.fractional:
         late = z + loop.q
         n, n_slope = n * late, late * loop.a2 + n
@@ -56,7 +57,7 @@ def evaluate(z: Pair, loop: Loop, degree: Degree, spring: bool) -> tuple[Pair, P
         wall, stiffness = Pair(loop.alpha, 0.0), 0.0
     else:
         wall, stiffness = Pair(loop.alpha * z.real + loop.beta * one.real, loop.s * z.imag), loop.s
-    return value + n * wall, slope + n_slope * wall + n * stiffness
+    return value + n * wall, slope + wall * n_slope + n * stiffness
 
 
 def rounding(z: Pair, loop: Loop, degree: Degree, spring: bool, unit: float) -> Array:
@@ -147,8 +148,7 @@ def aberth_kernel(
     alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool
 ) -> tuple[Roots, Radii, Array]:
     """All poles, how far each is off at most, and whether that is proved and no digit is missing."""
-    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
-    loop = product_form(*walls, degree)
+    loop, spoiled = product_form(alpha, beta, delta, d, degree), replace_invalid(alpha, beta, delta, d, degree)[1]
     xp, steps = namespace(loop.c), _FIRST_STEPS + (degree.poles - spring) // 2
     z = repeat(steps, lambda z: _step(z, loop, degree, spring), _start(loop, degree, spring), xp)
     within, proved, settled = discs(z, loop, degree, spring)

@@ -68,8 +68,7 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
 def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Roots:
     """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
     xp = namespace(z, alpha)
-    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
-    loop = product_form(*walls, degree)
+    loop, spoiled = product_form(alpha, beta, delta, d, degree), replace_invalid(alpha, beta, delta, d, degree)[1]
 
     def at(z: RootsFirst) -> tuple[Pair, Pair]:
         return evaluate(split(z), loop, degree, spring)
