@@ -46,7 +46,7 @@ EDITS = {
         '"actuator": Actuator}': '"actuator": Actuator, "mount": Mount}',
         "from zwidth.parts.operator": f"{IMPORT}from zwidth.parts.operator",
     },
-    "scenes/scene.py": {
+    "scenes/base.py": {
         "    operator: Operator | None = None\n": (
             "    operator: Operator | None = None\n    mount: Mount | None = None\n"
         ),

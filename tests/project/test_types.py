@@ -49,7 +49,7 @@ CALLS = [
     (companion, {"monic": coefficients(**KERNEL)}),
     (pole_kernel, KERNEL),
     (aberth_kernel, {**KERNEL, "spring": False}),
-    (discs, {"z": ROOTS_FIRST, "form": product_form(**KERNEL, spring=False)}),
+    (discs, {"z": ROOTS_FIRST, "loop": product_form(**KERNEL), "degree": HALF, "spring": False}),
     (frequency_boundary, {"omega": np.full((2, 3), 0.3), "loop": LOOP, "delay_model": "held"}),
 ]
 

@@ -220,7 +220,7 @@ def evaluate_columns(
     """`evaluate` of concrete columns of one length; one of a single value goes to the kernel as a number."""
     count = _length(columns)
     if route == "jax" or (route == "auto" and count > max(1, FEW // weight)):
-        return map_blocks(_compile_columns(kernel, static), columns, BLOCK // weight)
+        return map_blocks(compile_columns(kernel, static), columns, BLOCK // weight)
 
     def at_once(*parts: np.ndarray) -> Any:
         with np.errstate(all="ignore"):
@@ -338,7 +338,7 @@ def _no_change(leaf: Any) -> Any:
 
 
 @cache
-def _compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+def compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
     """A kernel compiled for blocks of columns."""
     import jax
 

@@ -163,16 +163,25 @@ def zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: 
         return false_position(lambda at: function(at) * scale, *ends, _BETWEEN_STEPS, _CLOSED * high)
 
 
-def follow_root(function: Callable[..., Array], root: Array, usable: Callable[..., Array], *known: Any) -> Array:
+def follow_root(
+    function: Callable[..., Array],
+    root: Array,
+    usable: Callable[..., Array],
+    *known: Any,
+    slope: Callable[..., Array] | None = None,
+) -> Array:
     """A zero x of ``function(x, *known)``, in JAX with its derivatives of every order in what is known.
 
     They are those of the implicit function, so that nothing of a search is differentiated, and 0 but where
-    ``usable(x, slope, step)``, of the function and of Newton's next step.
+    ``usable(x, slope, step)``, of the function and of Newton's next step. ``slope`` is its derivative where known.
     """
     xp = namespace(root)
     if xp is np:
         return root
     import jax
+
+    def differentiate(x: Array, *known: Any) -> Array:
+        return jax.jvp(lambda x: function(x, *known), (x,), (xp.ones_like(x),))[1]
 
     @jax.custom_jvp
     def follow(root: Array, *known: Any) -> Array:
@@ -182,9 +191,9 @@ def follow_root(function: Callable[..., Array], root: Array, usable: Callable[..
     def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
         x, known = follow(*primals), primals[1:]
         value, change = jax.jvp(lambda *known: function(x, *known), known, tangents[1:])
-        slope = jax.jvp(lambda x: function(x, *known), (x,), (xp.ones_like(x),))[1]
-        taken = usable(*frozen((x, slope, value / xp.where(slope == 0, 1.0, slope)), xp))
-        return x, xp.where(taken, -change / xp.where(taken, slope, 1.0), 0.0)
+        rate = (slope or differentiate)(x, *known)
+        taken = usable(*frozen((x, rate, value / xp.where(rate == 0, 1.0, rate)), xp))
+        return x, xp.where(taken, -change / xp.where(taken, rate, 1.0), 0.0)
 
     return follow(frozen(root, xp), *known)
 

@@ -11,12 +11,13 @@ from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.poles import log_size, poles_less_one
 from zwidth.loops.linear.rows import Island
-from zwidth.loops.linear.state_space import Matrices, closed_loop, delayed_device, open_loop
+from zwidth.loops.linear.state_space import StateSpace, closed_loop, delayed_device, open_loop
 from zwidth.loops.rigid.margins import Margins
 from zwidth.loops.rigid.verdict import STABILITY_METHODS, Stability, StabilityMethod
 from zwidth.parts.checks import read_texts
+from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.stiffest import allows_negative
+from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
@@ -27,26 +28,6 @@ if TYPE_CHECKING:
 # K or B of walls, texts with a unit as well; None means those of the scene's own wall.
 Walls: TypeAlias = ArrayLike | None
 Wall: TypeAlias = float | str | None
-
-
-@shown(dt="s")
-class StateSpace(NamedTuple):
-    """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, a step every ``dt`` seconds."""
-
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    D: np.ndarray
-    dt: float
-
-    def step(self, periods: int) -> np.ndarray:
-        """The output at so many samples, with an input of 1 from the first one on; inf or NaN beyond float64."""
-        state, found = np.zeros(self.A.shape[0]), np.empty(periods)
-        with np.errstate(all="ignore"):
-            for k in range(periods):
-                found[k] = (self.C @ state)[0] + self.D[0, 0]
-                state = self.A @ state + self.B[:, 0]
-        return found
 
 
 @shown(frequency="Hz", time_constant="s")
@@ -64,16 +45,14 @@ class SceneMargins(Margins):
     """`zwidth.Margins` of a wall of a scene, with the delay margin in s and the frequencies in Hz."""
 
 
-class SceneAnswers:
+class SceneAnswers(SceneParts):
     """The questions of `zwidth.Scene` about walls; of the scene they need its parts, loop and boundary.
 
     Without a stiffness and a damping each means the scene's own wall (`zwidth.parts.wall.resolve_wall`). A quantity
     may be a text with a unit, "10 kN/m".
     """
 
-    def normalize_walls(
-        self: Any, stiffness: Walls = None, virtual_damping: Walls = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def normalize_walls(self, stiffness: Walls = None, virtual_damping: Walls = None) -> tuple[np.ndarray, np.ndarray]:
         """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
         units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping, self.device.rotary)
         if are_numbers(*both):
@@ -84,7 +63,7 @@ class SceneAnswers:
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
-    def poles(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
+    def poles(self, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
         """All poles of walls, along a new last axis and in no particular order; NaN where a wall is out of range.
 
         Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
@@ -92,7 +71,7 @@ class SceneAnswers:
         """
         return self.loop.poles(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
 
-    def pole_table(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> PoleTable:
+    def pole_table(self, stiffness: Walls = None, virtual_damping: Walls = None) -> PoleTable:
         """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         zeta: Array = poles_less_one(self.loop.roots, alpha, beta)
@@ -106,14 +85,14 @@ class SceneAnswers:
             ratio = np.where((size == 0) & (turn == 0), 0.0, ratio)
             return PoleTable(1.0 + zeta, turn / (2.0 * np.pi * period), ratio, -period / size)
 
-    def spectral_radius(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
+    def spectral_radius(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
 
         From all poles; beyond 150 of them by counting poles in circles, at a cost that does not grow with the delay.
         """
         return self.loop.radius(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
 
-    def islands(self: Any, *, negative_damping: bool | None = None) -> list[Island]:
+    def islands(self, *, negative_damping: bool | None = None) -> list[Island]:
         """The islands: pieces of the stable set that no path of stable walls leads to from soft ones.
 
         A wall on an island is stable, but as its stiffness falls it becomes unstable before it is soft, whatever B does
@@ -137,7 +116,7 @@ class SceneAnswers:
         found = self.loop.islands(-np.inf if allows_negative(self, negative_damping) else 0.0)
         return [Island(*(tuple(pair.tolist()) for pair in np.array(one) * units)) for one in found]
 
-    def state_space(self: Any, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
+    def state_space(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
         """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
 
         Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
@@ -145,12 +124,12 @@ class SceneAnswers:
         compliance = self.timing.period**2 / float(self.mass)
         return _realize(self, closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
-    def open_loop(self: Any, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
+    def open_loop(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
         """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
         return _realize(self, open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
     def frequency_response(
-        self: Any, stiffness: Walls = None, virtual_damping: Walls = None, frequency: ArrayLike | None = None
+        self, stiffness: Walls = None, virtual_damping: Walls = None, frequency: ArrayLike | None = None
     ) -> Array:
         """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
 
@@ -170,7 +149,7 @@ class SceneAnswers:
         return np.where(inside, value, complex(np.nan, np.nan))[()]
 
     def is_stable(
-        self: Any, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
+        self, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
     ) -> Array:
         """Whether walls are stable: every pole strictly inside the unit circle.
 
@@ -195,7 +174,7 @@ class SceneAnswers:
             return self.decide_stability(stiffness, virtual_damping, method=method).stable
         return self.loop.labels(*self.normalize_walls(stiffness, virtual_damping))
 
-    def stable_stiffness(self: Any, virtual_damping: ArrayLike | None = None) -> np.ndarray:
+    def stable_stiffness(self, virtual_damping: ArrayLike | None = None) -> np.ndarray:
         """The stable intervals of the stiffness at a damping, several where there are several.
 
         Args:
@@ -211,7 +190,7 @@ class SceneAnswers:
         both = self.loop.row(beta.reshape(-1)) * self.units.stiffness
         return both.reshape(*beta.shape, *both.shape[1:])
 
-    def stable_damping(self: Any, stiffness: Wall = None) -> np.ndarray:
+    def stable_damping(self, stiffness: Wall = None) -> np.ndarray:
         """The stable intervals of the virtual damping at one stiffness, several where there are several.
 
         Args:
@@ -225,7 +204,7 @@ class SceneAnswers:
         return self.loop.column(alpha) * self.units.virtual_damping
 
     def decide_stability(
-        self: Any, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
+        self, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
     ) -> Stability:
         """Labels of walls with a status and what decided each, as `zwidth.decide_stability` has them.
 
@@ -234,17 +213,18 @@ class SceneAnswers:
         """
         check_choice("method", method, STABILITY_METHODS)
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        walls = [np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping)]
-        return self.loop.decide(alpha, beta, method, tuple(np.broadcast_arrays(*walls)))
+        walls = (np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping))
+        K, B = np.broadcast_arrays(*walls)
+        return self.loop.decide(alpha, beta, method, (K, B))
 
-    def explain_undecided(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> list[str]:
+    def explain_undecided(self, stiffness: Walls = None, virtual_damping: Walls = None) -> list[str]:
         """Why the measured response of a device leaves one wall UNDECIDED, and at which frequencies to measure.
 
         A sentence each; none where the wall is decided, as it is of every device that is a model.
         """
         return self.loop.explain(*one_wall(*self.normalize_walls(stiffness, virtual_damping)))
 
-    def passivity_margin(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
+    def passivity_margin(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is out of range.
 
         Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
@@ -258,11 +238,11 @@ class SceneAnswers:
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         return self.loop.passivity_margin(alpha, beta) * self.units.virtual_damping
 
-    def is_passive(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
+    def is_passive(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
         return np.asarray(self.passivity_margin(stiffness, virtual_damping)) > 0
 
-    def margins(self: Any, stiffness: Walls = None, virtual_damping: Walls = None) -> SceneMargins:
+    def margins(self, stiffness: Walls = None, virtual_damping: Walls = None) -> SceneMargins:
         """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
 
         Of several crossovers the nearest counts, as in python-control: ``gain_margin`` is the factor nearest to 1 on K
@@ -285,7 +265,12 @@ class SceneAnswers:
         )
 
 
-def _realize(scene: Any, build: Callable[..., Matrices], unit: float, alpha: Any, beta: Any) -> StateSpace:
+def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
+    """Whether walls with B < 0 count: by default only where B acts on the plain difference of two samples."""
+    return isinstance(scene.velocity, BackwardDifference) if negative_damping is None else bool(negative_damping)
+
+
+def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, alpha: Any, beta: Any) -> StateSpace:
     """A loop with one wall, its states in m, m/s and N in place of units of the period and the mass."""
     chain, period, mass = scene.loop.chain, scene.timing.period, float(scene.mass)
     loop = build(chain, *one_wall(alpha, beta))
@@ -298,7 +283,7 @@ def _realize(scene: Any, build: Callable[..., Matrices], unit: float, alpha: Any
     return StateSpace(A, B, loop.C / scale, loop.D * unit, period)
 
 
-def to_control(scene: Any, stiffness: Wall = None, virtual_damping: Wall = None) -> control.StateSpace:
+def to_control(scene: SceneAnswers, stiffness: Wall = None, virtual_damping: Wall = None) -> control.StateSpace:
     """Return the closed loop of a scene and a wall as a model of python-control.
 
     From a force held on the device (N) to the sensed position (m), exactly discretized: ``scene.state_space``.

@@ -5,22 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
-from zwidth.scenes.answers import SceneAnswers
-from zwidth.scenes.stiffest import StiffestWall
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
-
-if TYPE_CHECKING:
-    from zwidth.scenes.scene import Scene
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
 
@@ -85,7 +81,7 @@ class Assessment:
 
 
 @in_own_units
-def assess(scene: Scene) -> Assessment:
+def assess(scene: SceneOptima) -> Assessment:
     """Judge the wall of a scene.
 
     Args:
@@ -141,7 +137,7 @@ def assess(scene: Scene) -> Assessment:
     )
 
 
-def check_held(scene: Scene) -> None:
+def check_held(scene: SceneOptima) -> None:
     """Refuse the delay model in which no wall can be judged."""
     if scene.timing.delay_model != "held":
         raise InputError(
@@ -160,7 +156,7 @@ def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
     return intervals[away.index(min(away))] if away else (math.nan, math.nan)
 
 
-def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str, Any]]:
+def assess_many(scenes: Iterable[SceneOptima] | Mapping[str, SceneOptima]) -> list[dict[str, Any]]:
     """Judge the walls of many scenes, one record each; a scene that has no answer leaves the others alone.
 
     Args:
@@ -190,15 +186,15 @@ def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str,
     return [{name: record.get(name) for name in names} for record in records]
 
 
-def _record(name: str | int, scene: Scene) -> dict[str, Any]:
+def _record(name: str | int, scene: SceneOptima) -> dict[str, Any]:
     head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
     try:
-        if not isinstance(scene, SceneAnswers):
+        if not isinstance(scene, SceneOptima):
             raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed")
         verdict = assess(scene).as_dict()
     except InputError as error:
         verdict, head = {}, head | {"status": Status.INVALID_INPUT.name, "message": str(error)}
-    own = scene.parameters() if isinstance(scene, SceneAnswers) else {}
+    own = scene.parameters() if isinstance(scene, SceneOptima) else {}
     return head | own | verdict
 
 
@@ -231,7 +227,7 @@ class Limit(NamedTuple):
 
 
 @in_own_units
-def limits_of(scene: Scene) -> list[Limit]:
+def limits_of(scene: SceneOptima) -> list[Limit]:
     """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 
     Each thing that the scene has is improved by itself, by a step that somebody can buy: twice the rate (delay and
@@ -267,7 +263,7 @@ def limits_of(scene: Scene) -> list[Limit]:
 
 
 @in_own_units
-def describe_islands(scene: Scene) -> list[str]:
+def describe_islands(scene: SceneOptima) -> list[str]:
     """A line for each island: stable walls that K_max does not count."""
     lines = []
     for island in scene.islands():
@@ -279,7 +275,7 @@ def describe_islands(scene: Scene) -> list[str]:
     return lines
 
 
-def _stiffness(scene: Scene) -> float:
+def _stiffness(scene: SceneOptima) -> float:
     """K_max in N/m; NaN where there is none or it cannot be computed."""
     try:
         wall = scene.max_stiffness()
@@ -289,11 +285,11 @@ def _stiffness(scene: Scene) -> float:
     return float(wall.stiffness) if wall.status == Status.OK else float("nan")
 
 
-def _improve(scene: Scene) -> Iterator[tuple[str, str, Scene]]:
+def _improve(scene: SceneOptima) -> Iterator[tuple[str, str, SceneOptima]]:
     """The scene with one thing improved, for each thing it has: the part's name, the step in words, the scene."""
     if _can_sample_faster(scene):
         same = ", the delay the same in seconds" if scene.timing.delay else ""
-        yield "period", f"twice the rate{same}", _sample_faster(scene, 2)
+        yield "period", f"twice the rate{same}", _double_rate(scene)
     values = scene.parameters()
     for path, (factor, words) in _STEPS.items():
         if not (now := values.get(path)):
@@ -314,7 +310,7 @@ def _improve(scene: Scene) -> Iterator[tuple[str, str, Scene]]:
         yield "modes", "a structure twice as stiff", scene.replace(modes=stiffer)
 
 
-def _can_sample_faster(scene: Scene) -> bool:
+def _can_sample_faster(scene: SceneOptima) -> bool:
     """Whether twice the rate can be computed; nobody knows what a filter of coefficients were then."""
     if isinstance(scene.velocity, VelocityFilter):
         return False
@@ -322,13 +318,13 @@ def _can_sample_faster(scene: Scene) -> bool:
     return 2 * (window + scene.d) <= scene.loop.most_periods
 
 
-def _sample_faster(scene: Scene, faster: int) -> Scene:
-    """The scene at so many times the rate, filter and delay the same in seconds."""
-    changes: dict[str, float] = {"period": scene.timing.period / faster}
+def _double_rate(scene: SceneOptima) -> SceneOptima:
+    """The scene at twice the rate, filter and delay the same in seconds."""
+    changes: dict[str, float] = {"period": scene.timing.period / 2}
     if isinstance(scene.velocity, WindowedDifference):
-        changes["velocity.samples"] = scene.velocity.samples * faster
+        changes["velocity.samples"] = scene.velocity.samples * 2
     if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:
-        changes["velocity.coded_period"] = scene.velocity.coded_period / faster
+        changes["velocity.coded_period"] = scene.velocity.coded_period / 2
     return scene.replace(**changes)
 
 
@@ -356,7 +352,7 @@ def friction_rule(
     return FrictionRule(2.0 * damping / period if damping else None, by_friction)
 
 
-def passive_edge(scene: Scene, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
+def passive_edge(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
     """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping.
 
     The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.

@@ -16,7 +16,7 @@ from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.assessment import Assessment, Limit, assess, check_held, describe_islands, limits_of, name_kind
-from zwidth.scenes.stiffest import StiffestWall, choose_damping, find_lowest, soft_dampings
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, find_lowest, soft_dampings
 from zwidth.scenes.wall_code import write_wall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
@@ -209,7 +209,7 @@ class Recommendation:
 Surplus = Callable[[float, Any], dict[str, np.ndarray]]
 
 
-def _measure(scene: Any, wanted: Wanted) -> Surplus | None:
+def _measure(scene: SceneOptima, wanted: Wanted) -> Surplus | None:
     """By how much walls have more than is wanted, by its name, negative for too little; None where nothing is."""
     own = float(scene.device.damping)
     if not (wanted.gain_margin or wanted.phase_margin or wanted.passive):
@@ -233,7 +233,7 @@ def _measure(scene: Any, wanted: Wanted) -> Surplus | None:
     return surplus
 
 
-def _search(scene: Any, surplus: Surplus, most: float) -> tuple[float, float]:
+def _search(scene: SceneOptima, surplus: Surplus, most: float) -> tuple[float, float]:
     """K and B of the stiffest wall that has all that is wanted, from the most downwards; NaN where none was found."""
     dampings: dict[float, float] = {}
 
@@ -275,11 +275,11 @@ def _search(scene: Any, surplus: Surplus, most: float) -> tuple[float, float]:
     return math.nan, math.nan
 
 
-class SceneAdvice:
+class SceneAdvice(SceneOptima):
     """The question of `zwidth.Scene` what to set."""
 
     def recommend(
-        self: Any,
+        self,
         *,
         stiffness_fraction: float | None = None,
         gain_margin: float | None = None,

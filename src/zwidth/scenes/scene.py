@@ -2,56 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64
 from zwidth.loops.linear.border import Outline, outlines
 from zwidth.loops.linear.curve import curve_at
-from zwidth.loops.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.loops.measured.loop import MeasuredLoop
-from zwidth.loops.normalization import Normalized, Physical, denormalize, normalize
-from zwidth.parts.checks import Part, check_kind
-from zwidth.parts.device import Device
-from zwidth.parts.linear_device import LinearDevice
-from zwidth.parts.measured import MeasuredDevice
-from zwidth.parts.operator import Operator
-from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
-from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import BackwardDifference, Velocity
-from zwidth.parts.wall import NoWall, VirtualWall
-from zwidth.scenes.answers import SceneAnswers
+from zwidth.scenes.base import WallSI
 from zwidth.scenes.recommendation import SceneAdvice
-from zwidth.scenes.stiffest import SceneOptima
 from zwidth.simulation.simulate import simulate
-from zwidth.words.errors import InputError
-from zwidth.words.rotation import in_own_units, wrap_methods
-from zwidth.words.showing import shown
-from zwidth.words.types import Array, ArrayLike
-
-# What each part may be, and an example.
-_KINDS = {
-    "device": (Device | LinearDevice | MeasuredDevice, "zwidth.Device(mass=0.1, damping=10)"),
-    "timing": (Timing, "zwidth.Timing(period=1e-3, delay=1e-3)"),
-    "wall": (VirtualWall, "zwidth.VirtualWall(stiffness=10e3)"),
-    "velocity": (Velocity, "zwidth.LowPass(cutoff=100)"),
-    "operator": (Operator | None, "zwidth.Operator(mass=0.5)"),
-}
-
-
-@shown()
-class WallSI(NamedTuple):
-    """Walls by stiffness in N/m and damping in N s/m."""
-
-    stiffness: Array
-    virtual_damping: Array
+from zwidth.words.rotation import wrap_methods
+from zwidth.words.types import ArrayLike
 
 
 @dataclass(frozen=True, repr=False)
-class Scene(Part, SceneAnswers, SceneOptima, SceneAdvice):
+class Scene(SceneAdvice):
     """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
 
     Args:
@@ -69,125 +36,6 @@ class Scene(Part, SceneAnswers, SceneOptima, SceneAdvice):
         >>> scene.is_stable(10e3, [5, 40])
         array([False,  True])
     """
-
-    device: Device | LinearDevice | MeasuredDevice
-    timing: Timing
-    wall: VirtualWall = field(default_factory=NoWall)
-    velocity: Velocity = field(default_factory=BackwardDifference)
-    operator: Operator | None = None
-
-    def __post_init__(self) -> None:
-        if isinstance(self.wall, Velocity):
-            self._move_up()
-        for name, (kind, example) in _KINDS.items():
-            part = getattr(self, name)
-            if not isinstance(part, kind):
-                raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {example}")
-        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity")}
-        check_kind(bool(self.device.rotary), named)
-        if self.operator is not None and not isinstance(self.device, Device):
-            raise InputError(
-                "operator: a hand holds a body, and of this device no body is known; make the hand a part of it"
-            )
-
-    def _move_up(self) -> None:
-        """Without a wall the velocity estimate is the third part, and the hand the fourth."""
-        estimate, fourth, hand = self.wall, self.velocity, self.operator
-        if isinstance(fourth, Operator) and hand is None:
-            hand = fourth
-        elif fourth != BackwardDifference():
-            raise InputError(f"wall: got {estimate!r}, and {fourth!r} as the velocity as well; name parts that follow")
-        moved = {"wall": NoWall(), "velocity": estimate, "operator": hand}
-        for name, part in moved.items():
-            object.__setattr__(self, name, part)
-
-    @cached_property
-    def parts_beyond(self) -> tuple[str, ...]:
-        """What makes it more than a rigid mass with the difference of two samples: names of its parts."""
-        hand = self.operator
-        grasp = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
-        plain = isinstance(self.velocity, BackwardDifference) and self.velocity.coded_period is None
-        within = {"velocity": plain, "operator": grasp}
-        device = () if isinstance(self.device, Device) else ("device",)
-        return device + tuple(name for name in find_parts(self) if not within.get(name))
-
-    @cached_property
-    def loop(self) -> LinearLoop:
-        """Its loop, normalized, that answers every question about its walls."""
-        if isinstance(self.device, MeasuredDevice):
-            return MeasuredLoop(self)
-        return LinearLoop(make_plain(self)) if self.parts_beyond else RigidLoop(self)
-
-    def check_parts(self) -> None:
-        """Raise `InputError` for what its parts refuse only together, such as a cut-off beyond half the rate."""
-        _ = self.loop.walls if isinstance(self.loop, MeasuredLoop) else self.loop.roots
-
-    @cached_property
-    def mass(self) -> Any:
-        """The mass that the wall's force acts on, in kg: the unit of the normalized stiffness."""
-        held = self.operator is not None and self.operator.rigid and self.device.coupling is None
-        return self.device.mass + (self.operator.mass if held and self.operator is not None else 0.0)
-
-    @cached_property
-    def damping(self) -> Any:
-        """The damping to ground of that mass, in N s/m."""
-        held = self.operator is not None and self.operator.rigid and self.device.coupling is None
-        return self.device.damping + (self.operator.damping if held and self.operator is not None else 0.0)
-
-    @cached_property
-    def normalized(self) -> Normalized:
-        """``alpha``, ``beta``, ``delta``, ``d`` of this scene and its wall."""
-        return normalize(
-            mass=self.mass,
-            damping=self.damping,
-            period=self.timing.period,
-            delay=self.timing.delay,
-            stiffness=self.wall.stiffness,
-            virtual_damping=self.wall.virtual_damping,
-        )._replace(d=self.d)
-
-    @property
-    def alpha(self) -> float:
-        """Normalized stiffness of the wall."""
-        return self.normalized.alpha
-
-    @property
-    def beta(self) -> float:
-        """Normalized damping of the wall."""
-        return self.normalized.beta
-
-    @cached_property
-    def delta(self) -> float:
-        """Normalized damping of the device, with that of a hand held rigidly."""
-        return self.normalized.delta
-
-    @property
-    def own_delta(self) -> float:
-        """The same without the hand: what passivity, which is for any hand, counts on."""
-        return self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
-
-    @cached_property
-    def d(self) -> float:
-        """Delay in periods."""
-        return self.timing.d
-
-    @property
-    def whole_delay(self) -> int:
-        """Whole periods of it."""
-        return int(np.floor(self.d))
-
-    def to_si(self, *, alpha: ArrayLike = 0.0, beta: ArrayLike = 0.0) -> Physical:
-        """Stiffness in N/m and damping in N s/m of a normalized wall on this device."""
-        return denormalize(
-            mass=self.mass, period=self.timing.period, alpha=alpha, beta=beta, delta=self.delta, d=self.d
-        )
-
-    @cached_property
-    @in_own_units
-    def units(self) -> WallSI:
-        """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
-        rate = self.mass / self.timing.period
-        return WallSI(rate / self.timing.period, rate)
 
     def boundary(self, omega: ArrayLike) -> WallSI:
         """The walls that put a pole pair on the unit circle at a frequency.
@@ -225,47 +73,6 @@ class Scene(Part, SceneAnswers, SceneOptima, SceneAdvice):
 
     simulate = simulate
     """A method: `zwidth.simulate` of this scene, with all its arguments."""
-
-    def parameters(self) -> dict[str, Any]:
-        """Every number of every part by its dotted path.
-
-        Returns:
-            For example ``{"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 0.0, "velocity.cutoff": 100.0, ...}``;
-            the wall's ``stiffness`` and ``virtual_damping`` come last. What is left out (None) is not listed, nor what
-            is chosen by a word, as ``coupling.sensor``, and the coefficients of a filter.
-        """
-        return list_parameters(self)
-
-    def replace(self, **changes: Any) -> Scene:
-        """A new scene with one or several parameters changed; all others stay as they are, in SI units.
-
-        Args:
-            **changes: by dotted path, as ``**{"velocity.cutoff": 50}``, ``period=5e-4`` or ``rate=2000``; or a whole
-                part, as ``operator=zwidth.Operator(mass=0.5)``.
-
-        Raises:
-            InputError: no part of this scene has such a parameter, or the value is refused.
-
-        Example:
-            >>> import zwidth
-            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3), velocity=zwidth.LowPass(cutoff=100))
-            >>> scene.replace(**{"velocity.cutoff": 50}).parameters()["velocity.cutoff"]
-            50.0
-        """
-        at_rate = {"period", "rate", "delay", "timing"} & changes.keys()
-        if at_rate and isinstance(changes.get("device", self.device), MeasuredDevice):
-            raise InputError(
-                f"{min(at_rate)}: a measured response holds the rate and the delay that it was measured with; measure "
-                "again at others"
-            )
-        made = replace_parameters(self, changes)
-        if made.device.rotary != self.device.rotary and not {"device", "rotary"} & changes.keys():
-            kind = "rotary" if made.device.rotary else "linear"
-            raise InputError(
-                f"{', '.join(changes)}: the device would become a {kind} one, and other numbers of the scene mean "
-                "another unit; make a new scene, of a new zwidth.Device"
-            )
-        return made
 
 
 # Labels have no units, and walls that are texts are read in those of the device.

@@ -14,8 +14,8 @@ from zwidth.arrays.xp import is_jax, is_traced
 from zwidth.loops.linear.margins import OpenLoop
 from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.parts.checks import read_texts
-from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
+from zwidth.scenes.answers import SceneAnswers, allows_negative
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import FIELDS
 from zwidth.words.rotation import own_unit
@@ -38,12 +38,7 @@ class StiffestWall(NamedTuple):
     status: Array
 
 
-def allows_negative(scene: Any, negative_damping: bool | None) -> bool:
-    """Whether walls with B < 0 count: by default only where B acts on the plain difference of two samples."""
-    return isinstance(scene.velocity, BackwardDifference) if negative_damping is None else bool(negative_damping)
-
-
-def choose_damping(scene: Any, top: StiffestWall, stiffness: float) -> float:
+def choose_damping(scene: SceneAnswers, top: StiffestWall, stiffness: float) -> float:
     """A damping with which a softer wall than the stiffest is stable, where it can be so without leaving its piece.
 
     That of the stiffest wall, if all walls of that damping between the two are stable; else the middle of the widest
@@ -58,7 +53,9 @@ def choose_damping(scene: Any, top: StiffestWall, stiffness: float) -> float:
     return 0.5 * (low + high) * scene.units.virtual_damping if column else damping
 
 
-def soft_dampings(scene: Any, stiffness: float, negative_damping: bool | None = None) -> list[tuple[float, float]]:
+def soft_dampings(
+    scene: SceneAnswers, stiffness: float, negative_damping: bool | None = None
+) -> list[tuple[float, float]]:
     """The intervals of beta with which walls of a stiffness are stable in a piece with soft walls."""
     least = -math.inf if allows_negative(scene, negative_damping) else 0.0
     return scene.loop.soft_column(stiffness / scene.units.stiffness, least)
@@ -106,7 +103,7 @@ def _read_stiffness(given: Any) -> float:
     return float(stiffness)
 
 
-def _present_value(scene: Any, parameter: str) -> float:
+def _present_value(scene: SceneAnswers, parameter: str) -> float:
     known = scene.parameters()
     known = {path: value for path, value in known.items() if path not in ("stiffness", "virtual_damping")}
     known["rate"] = 1.0 / known["period"]
@@ -191,10 +188,10 @@ def find_lowest(
     return float(middle[np.argmin(value)])
 
 
-class SceneOptima:
+class SceneOptima(SceneAnswers):
     """The questions of `zwidth.Scene` that look for a wall, or for a device that bears it."""
 
-    def max_stiffness(self: Any, *, negative_damping: bool | None = None) -> StiffestWall:
+    def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
         """The stiffest stable wall that soft ones lead to, and what binds it.
 
         ``sup {K : some B is stable}`` over the pieces of the stable set that contain soft walls, down to K = 0: along a
@@ -232,7 +229,7 @@ class SceneOptima:
         values = (alpha * rate / period, beta * rate, omega / (2.0 * math.pi * period), kind, status)
         return StiffestWall(*(value if is_jax(value) else np.asarray(value)[()] for value in values))
 
-    def sensitivities(self: Any, *, negative_damping: bool | None = None) -> SceneSensitivities:
+    def sensitivities(self, *, negative_damping: bool | None = None) -> SceneSensitivities:
         """What a little more of every parameter of every part buys.
 
         Args:
@@ -257,7 +254,7 @@ class SceneOptima:
         return self.loop.sensitivities(allows_negative(self, negative_damping))
 
     def required(
-        self: Any,
+        self,
         parameter: str,
         stiffness: float | str,
         *,
@@ -334,7 +331,7 @@ class SceneOptima:
         return RequiredValue(best.value, best.enough, proved, (low, high), Status.OK)
 
     def best_damping(
-        self: Any, stiffness: float | str | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None
+        self, stiffness: float | str | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None
     ) -> BestDamping:
         """The virtual damping that suits a stiffness best.
 

@@ -10,11 +10,12 @@ has the states ``p = zeta W`` and ``q = W`` with ``zeta^2 W = w = u - a1 p - a0 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zwidth.parts.velocity import Estimate
+from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import check_choice
 from zwidth.words.formatting import name_wall, with_unit
 from zwidth.words.rotation import is_rotary, own_unit
@@ -80,14 +81,14 @@ class WallProgram(NamedTuple):
     law: str
 
 
-def write_wall(scene: Any, language: str = "c") -> str:
+def write_wall(scene: SceneParts, language: str = "c") -> str:
     """See `zwidth.scenes.recommendation.Recommendation.code`."""
     check_choice("language", language, ("c", "python"))
     program = lay_program(scene)
     return _write_c(program) if language == "c" else _write_python(program)
 
 
-def lay_program(scene: Any) -> WallProgram:
+def lay_program(scene: SceneParts) -> WallProgram:
     """The wall of a scene and its velocity estimate as statements."""
     period = float(scene.timing.period)
     estimate = scene.velocity.estimate(period)

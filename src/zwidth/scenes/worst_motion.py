@@ -8,7 +8,7 @@ energy is then summed in time, of the motion that is returned, which shares noth
 from __future__ import annotations
 
 from itertools import zip_longest
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from zwidth.loops.linear.passivity import PassivityCondition, needed_damping
 from zwidth.parts.checks import check_whole
 from zwidth.parts.velocity import Estimate
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.answers import one_wall
+from zwidth.scenes.answers import SceneAnswers, one_wall
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
@@ -54,7 +54,7 @@ class WorstMotion(NamedTuple):
 
 @in_own_units
 def worst_motion(
-    scene: Any, stiffness: float | None = None, virtual_damping: float | None = None, *, longest: int = 1 << 20
+    scene: SceneAnswers, stiffness: float | None = None, virtual_damping: float | None = None, *, longest: int = 1 << 20
 ) -> WorstMotion:
     """Return a motion over which device and wall give energy, the proof that the wall is not passive.
 
@@ -124,7 +124,7 @@ def worst_motion(
     return _no_motion(Status.NOT_CONVERGED)
 
 
-def _shorten_push(scene: Any, wall: tuple[float, float], periods: int, motion: WorstMotion) -> WorstMotion:
+def _shorten_push(scene: SceneAnswers, wall: tuple[float, float], periods: int, motion: WorstMotion) -> WorstMotion:
     """The shortest push that gives energy: what a push needs has no end, it grows with its length."""
     low = 0
     while periods - low > 1:
@@ -185,7 +185,7 @@ def _delay(values: np.ndarray, count: int) -> np.ndarray:
     return np.concatenate([np.zeros(count, values.dtype), values])[: values.size]
 
 
-def _move(scene: Any, wall: tuple[float, float], x: np.ndarray, damping: float) -> WorstMotion | None:
+def _move(scene: SceneAnswers, wall: tuple[float, float], x: np.ndarray, damping: float) -> WorstMotion | None:
     """The motion through these samples; None where it does not give energy for certain.
 
     Between them it bends, where a force arrives, as takes least energy under this damping.

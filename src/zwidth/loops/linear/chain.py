@@ -96,8 +96,68 @@ class Chain:
         return [1.0] * count + [speed] * count + [force, force * speed][:behind]
 
     def realize(self) -> Realization:
-        """The matrices of its motion."""
-        return _realize(self)
+        """The matrices of its motion, of numbers, JAX's arrays or balls alike."""
+        lag = self.actuator
+        numbers = [value for part in (*self.bodies, *self.links, *self.modes) for value in part]
+        xp = namespace(*numbers, *(lag if isinstance(lag, Resonance) else () if lag is None else (lag,)))
+        bodies, modes = len(self.bodies), len(self.modes)
+        count, behind = bodies + modes, 0 if lag is None else 2 if isinstance(lag, Resonance) else 1
+        zero = 0.0 * (self.bodies[0].mass + self.bodies[-1].damping + sum(mode.rate for mode in self.modes))
+        size = 2 * count + behind
+
+        def row(*entries: tuple[int, Any]) -> list[Any]:
+            found = [zero] * size
+            for place, value in entries:
+                found[place] = found[place] + value
+            return found
+
+        accelerations = []
+        for k, body in enumerate(self.bodies):
+            force = row()
+            for j, side in body_position(k, self.sensor, bodies, modes):
+                force[j] = force[j] - side * body.stiffness
+                force[count + j] = force[count + j] - side * body.damping
+            if k:
+                link = self.links[k - 1]
+                force[k], force[count + k] = force[k] - link.stiffness, force[count + k] - link.damping
+            if k + 1 < bodies:
+                link = self.links[k]
+                force[k + 1], force[count + k + 1] = force[k + 1] + link.stiffness, force[count + k + 1] + link.damping
+            accelerations.append([value / body.mass for value in force])
+        swings = [
+            row((bodies + k, -mode.rate * mode.rate), (count + bodies + k, -2.0 * mode.damping_ratio * mode.rate))
+            for k, mode in enumerate(self.modes)
+        ]
+        seen = accelerations[self.sensor]
+        for swing in swings:
+            seen = [a + b for a, b in zip(seen, swing, strict=True)]
+        stretches = [
+            [a - b for a, b in zip(accelerations[k], accelerations[k - 1], strict=True)] for k in range(1, bodies)
+        ]
+        rows = [row((count + k, 1.0)) for k in range(count)] + [seen, *stretches, *swings]
+        first = 1.0 / self.bodies[0].mass + zero
+        # A body beyond a link feels the push through the link alone.
+        push = [zero] * count + [zero if self.sensor else first] + [-first, zero][: bodies - 1] + [zero] * modes
+        swung = [1.0 / mode.mass + zero for mode in self.modes]
+        driven = [zero] * count + [push[count] + sum(swung, zero)] + push[count + 1 : count + bodies] + swung
+        push, driven = push + [zero] * behind, driven + [zero] * behind
+        if lag is not None:
+            rows = [
+                [*line[: 2 * count], force, *[zero] * (behind - 1)] for line, force in zip(rows, driven, strict=False)
+            ]
+            driven = [zero] * size
+            if isinstance(lag, Resonance):
+                square = lag.rate * lag.rate
+                rows += [
+                    row((size - 1, 1.0)),
+                    row((size - 2, -square), (size - 1, -2.0 * lag.damping_ratio * lag.rate)),
+                ]
+                driven[-1] = square + zero
+            else:
+                rows.append(row((size - 1, -lag)))
+                driven[-1] = lag + zero
+        A = xp.stack([xp.stack([xp.asarray(v) for v in r]) for r in rows])
+        return Realization(A, *(xp.stack([xp.asarray(v) for v in column]) for column in (driven, push)))
 
     @cached_property
     def continuous(self) -> tuple[np.ndarray, np.ndarray]:
@@ -181,64 +241,6 @@ def chain_of(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Estim
 def is_zero(value: Any) -> bool:
     """Whether a number is zero for good, and not only where it is traced."""
     return isinstance(value, float | np.floating) and value == 0.0
-
-
-def _realize(chain: Chain) -> Realization:
-    """Rows of numbers, JAX's arrays or balls alike."""
-    lag = chain.actuator
-    numbers = [value for part in (*chain.bodies, *chain.links, *chain.modes) for value in part]
-    xp = namespace(*numbers, *(lag if isinstance(lag, Resonance) else () if lag is None else (lag,)))
-    bodies, modes = len(chain.bodies), len(chain.modes)
-    count, behind = bodies + modes, 0 if lag is None else 2 if isinstance(lag, Resonance) else 1
-    zero = 0.0 * (chain.bodies[0].mass + chain.bodies[-1].damping + sum(mode.rate for mode in chain.modes))
-    size = 2 * count + behind
-
-    def row(*entries: tuple[int, Any]) -> list[Any]:
-        found = [zero] * size
-        for place, value in entries:
-            found[place] = found[place] + value
-        return found
-
-    accelerations = []
-    for k, body in enumerate(chain.bodies):
-        force = row()
-        for j, side in body_position(k, chain.sensor, bodies, modes):
-            force[j] = force[j] - side * body.stiffness
-            force[count + j] = force[count + j] - side * body.damping
-        if k:
-            link = chain.links[k - 1]
-            force[k], force[count + k] = force[k] - link.stiffness, force[count + k] - link.damping
-        if k + 1 < bodies:
-            link = chain.links[k]
-            force[k + 1], force[count + k + 1] = force[k + 1] + link.stiffness, force[count + k + 1] + link.damping
-        accelerations.append([value / body.mass for value in force])
-    swings = [
-        row((bodies + k, -mode.rate * mode.rate), (count + bodies + k, -2.0 * mode.damping_ratio * mode.rate))
-        for k, mode in enumerate(chain.modes)
-    ]
-    seen = accelerations[chain.sensor]
-    for swing in swings:
-        seen = [a + b for a, b in zip(seen, swing, strict=True)]
-    stretches = [[a - b for a, b in zip(accelerations[k], accelerations[k - 1], strict=True)] for k in range(1, bodies)]
-    rows = [row((count + k, 1.0)) for k in range(count)] + [seen, *stretches, *swings]
-    first = 1.0 / chain.bodies[0].mass + zero
-    # A body beyond a link feels the push through the link alone.
-    push = [zero] * count + [zero if chain.sensor else first] + [-first, zero][: bodies - 1] + [zero] * modes
-    swung = [1.0 / mode.mass + zero for mode in chain.modes]
-    driven = [zero] * count + [push[count] + sum(swung, zero)] + push[count + 1 : count + bodies] + swung
-    push, driven = push + [zero] * behind, driven + [zero] * behind
-    if lag is not None:
-        rows = [[*line[: 2 * count], force, *[zero] * (behind - 1)] for line, force in zip(rows, driven, strict=False)]
-        driven = [zero] * size
-        if isinstance(lag, Resonance):
-            square = lag.rate * lag.rate
-            rows += [row((size - 1, 1.0)), row((size - 2, -square), (size - 1, -2.0 * lag.damping_ratio * lag.rate))]
-            driven[-1] = square + zero
-        else:
-            rows.append(row((size - 1, -lag)))
-            driven[-1] = lag + zero
-    A = xp.stack([xp.stack([xp.asarray(v) for v in r]) for r in rows])
-    return Realization(A, *(xp.stack([xp.asarray(v) for v in column]) for column in (driven, push)))
 
 
 def body_position(body: int, sensor: int, bodies: int, modes: int) -> list[tuple[int, float]]:

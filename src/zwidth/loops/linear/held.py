@@ -18,9 +18,9 @@ from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.xp import namespace
 from zwidth.loops.linear.certified import prove_zeros
 from zwidth.loops.linear.chain import AnyChain, Chain, is_zero
-from zwidth.loops.linear.roots import LoopRoots
+from zwidth.loops.linear.roots import LoopRoots, step_apart
 from zwidth.loops.linear.system import System
-from zwidth.loops.rigid.device import Plant, held_plant, undelayed_plant
+from zwidth.loops.rigid.device import Plant, factor_numerator, held_plant
 
 # Continuous zeros slower than this a period lead to sampled ones; Aberth's steps at most, and the last one's share.
 _SLOW, _MOST_STEPS, _ARRIVED = 0.1, 30, 1e-13
@@ -30,21 +30,15 @@ _DOUBLINGS = 36
 
 def flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
     """``e^(A t) - 1`` and the answer ``Gamma(t)`` to a unit force held for t."""
-    phi1 = _matrix_phi1(rate * time)
-    # e^A - 1 = A phi1(A) keeps the digits of slow motions.
-    return rate * time @ phi1, time * (phi1 @ push)
+    A = rate * time
+    # phi1(A) = 1 + A/2! + A^2/3! + ...; e^A - 1 = A phi1(A) keeps the digits of slow motions.
+    phi1 = _known_phi1(A.tobytes(), len(A), A.dtype.char) if namespace(A) is np else _traced_phi1(A)
+    return A @ phi1, time * (phi1 @ push)
 
 
 def hold(chain: AnyChain, rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
     """The `flow` of a chain's matrices; those of a sampled one are it, whatever the time."""
     return (rate - np.eye(len(push)), push) if chain.sampled else flow(rate, push, time)
-
-
-def _matrix_phi1(rate: Any) -> Any:
-    """``phi1(A) = 1 + A/2! + A^2/3! + ...``."""
-    if namespace(rate) is not np:
-        return _traced_phi1(rate)
-    return _known_phi1(rate.tobytes(), len(rate), rate.dtype.char)
 
 
 @lru_cache(maxsize=64)
@@ -120,8 +114,8 @@ def required_wall(chain: AnyChain, w: Any, parts: Sampled | Plant | None = None)
 
 
 def _rigid_plant(chain: Chain) -> Plant:
-    fraction, delta = chain.d - chain.whole, chain.bodies[0].damping
-    return undelayed_plant(delta) if is_zero(fraction) else held_plant(delta, fraction)
+    fraction = chain.d - chain.whole
+    return held_plant(chain.bodies[0].damping, None if is_zero(fraction) else fraction)
 
 
 def find_roots(chain: AnyChain) -> LoopRoots:
@@ -176,11 +170,10 @@ def _polished_zeros(parts: Sampled, zeros: np.ndarray) -> np.ndarray:
     at_rest[:size, :size], at_rest[:size, size], at_rest[size, 0] = -parts.psi, parts.full, 1.0
     growing = np.eye(size + 1)
     growing[:, size] = np.append(np.zeros(size) if parts.late is None else parts.late, 0.0)
-    same = np.eye(zeros.size, dtype=bool)
     for _ in range(_MOST_STEPS):
         with np.errstate(all="ignore"):
             slope = np.array([_relative_slope(at_rest + zeta * growing, growing) for zeta in zeros])
-            step = 1.0 / (slope - (1.0 / np.where(same, np.inf, zeros[:, None] - zeros)).sum(1))
+            step = step_apart(zeros, slope)
         step = np.where(np.isfinite(step), step, 0.0)
         zeros = zeros - step
         if np.all(np.abs(step) <= _ARRIVED * np.abs(zeros)):
@@ -198,13 +191,12 @@ def _relative_slope(matrix: np.ndarray, growing: np.ndarray) -> complex:
 
 def _rigid_loop(chain: Chain) -> LoopRoots:
     delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.whole)
-    if fraction == 0:
-        plant = undelayed_plant(delta)
-        # At delta = 0 the zero is at -1 exactly.
-        zeros = np.array([2.0 + plant.gap * -1.0 / plant.a2 + 0j])
-        return LoopRoots(float(plant.a2), chain.whole, zeros, np.array([0.0, plant.em], complex), chain.estimate)
-    plant = held_plant(delta, fraction)
-    root = np.sqrt(max(plant.a1 * plant.a1 - 4.0 * plant.a2 * plant.a0, 0.0))
-    far = -0.5 * (plant.a1 + root)
-    zeros = np.array([1.0 - far / plant.a2, 1.0 - plant.a0 / far], complex)
-    return LoopRoots(float(plant.a2), chain.whole + 1, zeros, np.array([0.0, plant.em], complex), chain.estimate)
+    plant = held_plant(delta, fraction if fraction else None)
+    if fraction:
+        h, q = factor_numerator(plant)
+        zeros = [1.0 + h / plant.a2, 1.0 + q]
+    else:
+        # At delta = 0 it is at -1 exactly.
+        zeros = [2.0 - plant.gap / plant.a2]
+    roots = (np.array(offsets, complex) for offsets in (zeros, [0.0, plant.em]))
+    return LoopRoots(float(plant.a2), chain.whole + len(zeros) - 1, *roots, estimate=chain.estimate)

@@ -16,8 +16,9 @@ import numpy as np
 
 from zwidth.arrays.circle import Jet
 from zwidth.arrays.xp import within
-from zwidth.loops.linear.roots import LoopRoots, affine_polynomial, closed_loop_roots
+from zwidth.loops.linear.roots import LoopRoots, affine_polynomial, closed_loop_roots, step_apart
 from zwidth.loops.rigid.counting import count_poles
+from zwidth.loops.rigid.pole_step import square
 from zwidth.loops.rigid.poles import companion
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
@@ -58,22 +59,17 @@ def _power(zeta: Array, turns: int) -> Jet:
 def _difference(zeta: Array, window: int) -> Jet:
     """``(z^window - 1)/window``: next to z = 1 by the binomial's product, where the subtraction has no digit left."""
     power, slope = _power(zeta, window)
-    log = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -0.999)) + 1j * np.arctan2(zeta.imag, 1.0 + zeta.real)
-    turned = window * log
+    size = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + square(zeta), -0.999))
+    turned = window * (size + 1j * np.arctan2(zeta.imag, 1.0 + zeta.real))
     near = np.abs(turned) < 1.0
     small = np.where(near, turned, 0.0)
     return Jet(np.where(near, np.expm1(small), power - 1.0) / window, slope / window)
 
 
-def abs2(z: Array) -> Array:
-    """``|z|^2``."""
-    return z.real * z.real + z.imag * z.imag
-
-
 def log_size(zeta: Array) -> Array:
     """``log|z|``, with the digits of a slow pole."""
     with np.errstate(divide="ignore"):
-        return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -1.0))
+        return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + square(zeta), -1.0))
 
 
 def evaluate(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> PolynomialValue:
@@ -114,16 +110,13 @@ def _polish(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> Array:
 
 def _take_steps(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, rows: Array) -> None:
     """Move some walls' poles until they stay."""
-    same = np.eye(zeta.shape[1], dtype=bool)
     for _ in range(_STEPS):
         if not rows.size:
             break
         now = zeta[rows]
         at = evaluate(loop, alpha[rows, None], beta[rows, None], now)
         with np.errstate(all="ignore"):
-            newton = at.value / at.slope
-            apart = np.where(same, np.inf, now[:, :, None] - now[:, None, :])
-            step = newton / (1.0 - newton * (1.0 / apart).sum(-1))
+            step = step_apart(now, at.slope / at.value)
         # Below the rounding of P a step moves nothing but noise.
         good = np.isfinite(step) & (np.abs(at.value) > 1e-16 * at.size) & (np.abs(step) < 0.5)
         step = np.where(good, step, 0.0)
@@ -252,7 +245,7 @@ def _polish_on_circle(loop: LoopRoots, alpha: float, beta: float, low: float, hi
         for _ in range(8):
             at = evaluate(loop, a, b, zeta)
             step = at.value / at.slope
-            zeta = zeta - np.where(np.isfinite(step) & (abs2(step) < 1e-2), step, 0.0)
+            zeta = zeta - np.where(np.isfinite(step) & (square(step) < 1e-2), step, 0.0)
     logs = log_size(zeta)
     spare = 1e-13 + (high - low)
     near = (logs > low - spare) & (logs < high + spare)

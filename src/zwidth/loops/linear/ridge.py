@@ -20,7 +20,6 @@ import numpy as np
 from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.evaluate import evaluate
 from zwidth.loops.linear.border import Border
-from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import chain_of
 from zwidth.loops.linear.held import hold
 from zwidth.loops.linear.roots import LoopRoots
@@ -118,9 +117,13 @@ def _tops(border: Border, least: float) -> list[_Top]:
         if alpha > 0 and beta >= least:
             line = next(k for k, line in enumerate(b.lines) if line.w == w)
             found.append(_Top(alpha, beta, w, len(b.arcs) + line, False))
+    if np.isfinite(least):
+        # The upper ends of the row's stable intervals.
+        row = bound_intervals(b, np.array([least]))
+        ends = zip(row.high[0].tolist(), row.w_above[0].tolist(), row.above[0].tolist(), strict=True)
+        found += [_Top(high, least, w, place, False) for high, w, place in ends if 0 < high < np.inf]
     # Along the edge of a real pole that does not depend on B, corners differ by rounding: the most damping counts.
-    ends = _ends_of_row(b, least) if np.isfinite(least) else []
-    return sorted(found + ends, key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta))
+    return sorted(found, key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta))
 
 
 def _describe(border: Border, top: _Top, negative: bool) -> BoundRidge:
@@ -136,13 +139,6 @@ def _condition(w: float) -> Condition:
     if w == 0.0:
         return Condition.PLUS_ONE
     return Condition.MINUS_ONE if w == np.pi else Condition.PAIR
-
-
-def _ends_of_row(boundary: Boundary, beta: float) -> list[_Top]:
-    """The upper ends with alpha > 0 of a row's stable intervals."""
-    found = bound_intervals(boundary, np.array([beta]))
-    ends = zip(found.high[0].tolist(), found.w_above[0].tolist(), found.above[0].tolist(), strict=True)
-    return [_Top(high, beta, w, place, False) for high, w, place in ends if 0 < high < np.inf]
 
 
 def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:

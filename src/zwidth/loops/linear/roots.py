@@ -58,6 +58,12 @@ class LoopRoots:
         return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0
 
 
+def step_apart(roots: Array, rate: Array) -> Array:
+    """Aberth's step from approximations along the last axis, Newton's by ``P'/P``, from which each keeps off others."""
+    apart = np.where(np.eye(roots.shape[-1], dtype=bool), np.inf, roots[..., :, None] - roots[..., None, :])
+    return 1.0 / (rate - (1.0 / apart).sum(-1))
+
+
 def _product(*offsets: np.ndarray) -> np.ndarray:
     """The monic polynomial of roots given by their offsets from 1; real, for they come in pairs."""
     return np.atleast_1d(np.poly(1.0 - np.concatenate(offsets))).real

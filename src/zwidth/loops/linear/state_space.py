@@ -18,18 +18,30 @@ import numpy as np
 from zwidth.loops.linear.chain import AnyChain
 from zwidth.loops.linear.held import hold, sampled
 from zwidth.parts.velocity import Estimate
+from zwidth.words.showing import shown
 
 
-class Matrices(NamedTuple):
-    """``x+ = A x + B u``, ``y = C x + D u``."""
+@shown(dt="s")
+class StateSpace(NamedTuple):
+    """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, a step every ``dt`` seconds."""
 
     A: np.ndarray
     B: np.ndarray
     C: np.ndarray
     D: np.ndarray
+    dt: float = 1.0
+
+    def step(self, periods: int) -> np.ndarray:
+        """The output at so many samples, with an input of 1 from the first one on; inf or NaN beyond float64."""
+        state, found = np.zeros(self.A.shape[0]), np.empty(periods)
+        with np.errstate(all="ignore"):
+            for k in range(periods):
+                found[k] = (self.C @ state)[0] + self.D[0, 0]
+                state = self.A @ state + self.B[:, 0]
+        return found
 
 
-def _filter(estimate: Estimate) -> Matrices:
+def _filter(estimate: Estimate) -> StateSpace:
     """What follows the window's difference, in controllable form around z = 1; it has no more zeros than poles."""
     zeros = np.concatenate([estimate.zeros, np.ones(max(-estimate.lag, 0))])
     poles = np.concatenate([estimate.poles, np.ones(max(estimate.lag, 0))])
@@ -42,18 +54,18 @@ def _filter(estimate: Estimate) -> Matrices:
     if size:
         A[0] -= bottom[1:]
         B[0] = 1.0
-    return Matrices(A, B, (top[1:] - top[0] * bottom[1:])[None, :], top[:1, None])
+    return StateSpace(A, B, (top[1:] - top[0] * bottom[1:])[None, :], top[:1, None])
 
 
-def in_series(first: Matrices, second: Matrices) -> Matrices:
+def in_series(first: StateSpace, second: StateSpace) -> StateSpace:
     """The second behind the first."""
     n, m = first.A.shape[0], second.A.shape[0]
     A = np.block([[first.A, np.zeros((n, m))], [second.B @ first.C, second.A]])
     B = np.concatenate([first.B, second.B @ first.D])
-    return Matrices(A, B, np.concatenate([second.D @ first.C, second.C], 1), second.D @ first.D)
+    return StateSpace(A, B, np.concatenate([second.D @ first.C, second.C], 1), second.D @ first.D)
 
 
-def estimate_matrices(estimate: Estimate) -> Matrices:
+def estimate_matrices(estimate: Estimate) -> StateSpace:
     """The velocity estimate, from sampled position."""
     behind, count = _filter(estimate), estimate.window
     if not count:
@@ -61,11 +73,11 @@ def estimate_matrices(estimate: Estimate) -> Matrices:
     weights = np.zeros((1, count + 1))
     weights[0, [0, -1]] = 1.0 / count, -1.0 / count
     # A register of the last inputs, the newest first.
-    difference = Matrices(np.eye(count, k=-1), np.eye(count, 1), weights[:, 1:], weights[:, :1])
+    difference = StateSpace(np.eye(count, k=-1), np.eye(count, 1), weights[:, 1:], weights[:, :1])
     return in_series(difference, behind)
 
 
-def delayed_device(chain: AnyChain) -> Matrices:
+def delayed_device(chain: AnyChain) -> StateSpace:
     """G: from the wall's force to the sampled position, with the forces that are on their way."""
     parts = sampled(chain)
     size = parts.psi.shape[0]
@@ -84,16 +96,16 @@ def delayed_device(chain: AnyChain) -> Matrices:
     if held:
         A[:size, size + chain.whole] += parts.full - now
     C = np.eye(1, size + count)
-    return Matrices(A, B, C, np.zeros((1, 1)))
+    return StateSpace(A, B, C, np.zeros((1, 1)))
 
 
-def open_loop(chain: AnyChain, alpha: float, beta: float) -> Matrices:
+def open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
     """``L = (alpha + beta F) G``, from the position that the wall is given to the one that its force answers."""
     f = estimate_matrices(chain.estimate)
-    return in_series(Matrices(f.A, f.B, beta * f.C, alpha + beta * f.D), delayed_device(chain))
+    return in_series(StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D), delayed_device(chain))
 
 
-def closed_loop(chain: AnyChain, alpha: float, beta: float) -> Matrices:
+def closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
     """From a force held on the device to the sampled position, in contact with the wall."""
     loop = open_loop(chain, alpha, beta)
     size = loop.A.shape[0]
@@ -101,4 +113,4 @@ def closed_loop(chain: AnyChain, alpha: float, beta: float) -> Matrices:
     filtered = size - delayed_device(chain).A.shape[0]
     push = np.zeros((size, 1))
     push[filtered : filtered + len(held), 0] = hold(chain, A, held, 1.0)[1]
-    return Matrices(loop.A - loop.B @ loop.C, push, loop.C, np.zeros((1, 1)))
+    return StateSpace(loop.A - loop.B @ loop.C, push, loop.C, np.zeros((1, 1)))

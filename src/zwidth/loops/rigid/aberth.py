@@ -8,15 +8,13 @@ disjoint each holds exactly one.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from zwidth.arrays.xp import epsilon, namespace, nan_with_nan_slopes, repeat
+from zwidth.arrays.xp import epsilon, namespace, nan_with_nan_slopes, repeat, store_once
+from zwidth.loops.rigid.circle import Loop, factor_loop
 from zwidth.loops.rigid.device import valid_wall
 from zwidth.loops.rigid.folding import Degree
-from zwidth.loops.rigid.pole_step import Pair
-from zwidth.loops.rigid.polynomial import choose_plant
+from zwidth.loops.rigid.pole_step import Pair, join
 from zwidth.words.types import Array, Radii, RadiiFirst, Reals, Roots, RootsFirst
 
 # With half as many more as there are poles, all but some 2 walls in 1,000 are settled.
@@ -25,31 +23,11 @@ _FIRST_STEPS = 9
 _ROUNDING = 32.0
 
 
-class ProductForm(NamedTuple):
-    """``P(z) = z^power (z - 1)(z - c) + N(z) (alpha z + beta (z - 1))``, N by its coefficients, highest power first.
-
-    Rounding errors stay small where the coefficients of P cancel. Without virtual damping a factor z is left out.
-    """
-
-    power: int
-    c: Array
-    n: tuple[Array, ...]
-    alpha: Array
-    beta: Array | None
-
-    @property
-    def poles(self) -> int:
-        """The degree of P."""
-        return self.power + 2
-
-
-def product_form(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> ProductForm:
-    """The polynomial of every wall, with a new first axis for its poles; of walls with ``spring`` beta is 0."""
+def product_form(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Loop:
+    """The factors of P of every wall, NaN where it is out of range, with a new first axis for its poles."""
     xp = namespace(alpha, beta, delta, d)
-    plant = choose_plant(delta, d, degree)
-    n = (plant.a2, plant.a1, plant.a0)[: 3 if degree.fractional else 2]
-    c, alpha, beta, *n = (xp.asarray(part)[None] for part in (plant.c, alpha, beta, *n))
-    return ProductForm(degree.poles - 2 - spring, c, tuple(n), alpha, None if spring else beta)
+    loop = store_once(factor_loop(alpha, beta, delta, d, degree.fractional), delta)
+    return Loop(*(xp.asarray(part)[None] for part in loop))
 
 
 def _power(z: Pair, power: int) -> Pair:
@@ -61,48 +39,36 @@ def _power(z: Pair, power: int) -> Pair:
     return square * z if power % 2 else square
 
 
-def evaluate(z: Pair, form: ProductForm) -> tuple[Pair, Pair]:
-    """P(z) and P'(z)."""
-    one, pole = z + -1.0, z + -form.c
+def evaluate(z: Pair, loop: Loop, degree: Degree, spring: bool) -> tuple[Pair, Pair]:
+    """P(z) and P'(z); of walls with ``spring``, without virtual damping, a factor z is left out."""
+    power = degree.poles - 2 - spring
+    one, pole = z + -1.0, z + -loop.c
     quadratic, body = one * pole, z * (one + pole)
-    if form.power:
-        lag = _power(z, form.power - 1)
-        value, slope = lag * z * quadratic, lag * (quadratic * form.power + body)
+    if power:
+        lag = _power(z, power - 1)
+        value, slope = lag * z * quadratic, lag * (quadratic * power + body)
     else:
         value, slope = quadratic, one + pole
-    zero = Pair(0.0 * z.real, 0.0 * z.imag)
-    n, n_slope = zero + form.n[0], zero
-    for coefficient in form.n[1:]:
-        n_slope = n_slope * z + n
-        n = n * z + coefficient
-    if form.beta is None:
-        wall, stiffness = Pair(form.alpha, 0.0), 0.0
+    n, n_slope = z * loop.a2 + loop.h, loop.a2
+    if degree.fractional:
+        late = z + loop.q
+        n, n_slope = n * late, late * loop.a2 + n
+    if spring:
+        wall, stiffness = Pair(loop.alpha, 0.0), 0.0
     else:
-        stiffness = form.alpha + form.beta
-        wall = Pair(form.alpha * z.real + form.beta * one.real, stiffness * z.imag)
-    return value + n * wall, slope + n_slope * wall + n * stiffness
+        wall, stiffness = Pair(loop.alpha * z.real + loop.beta * one.real, loop.s * z.imag), loop.s
+    return value + n * wall, slope + wall * n_slope + n * stiffness
 
 
-def rounding(z: Pair, form: ProductForm, unit: float) -> Array:
+def rounding(z: Pair, loop: Loop, degree: Degree, spring: bool, unit: float) -> Array:
     """What rounding errors may add up to in P(z)."""
-    xp = namespace(z.real)
+    xp, power = namespace(z.real), degree.poles - 2 - spring
     # Sums of the parts' sizes are upper bounds of moduli that neither overflow nor underflow.
-    r, one, pole = (xp.abs(z.real - zero) + xp.abs(z.imag) for zero in (0.0, 1.0, form.c))
-    lagged = r**form.power * one * ((3.0 * form.power + 8.0) * pole + 2.0 * form.c)
-    n = form.n[0]
-    for coefficient in form.n[1:]:
-        n = n * r + coefficient
-    wall = xp.abs(form.alpha) if form.beta is None else xp.abs(form.alpha) * r + xp.abs(form.beta) * one
+    r, one, pole = (xp.abs(z.real - zero) + xp.abs(z.imag) for zero in (0.0, 1.0, loop.c))
+    lagged = r**power * one * ((3.0 * power + 8.0) * pole + 2.0 * loop.c)
+    n = (loop.a2 * r + loop.h) * (r + loop.q if degree.fractional else 1.0)
+    wall = xp.abs(loop.alpha) if spring else xp.abs(loop.alpha) * r + xp.abs(loop.beta) * one
     return unit * (lagged + _ROUNDING * n * wall)
-
-
-def join(re: Array, im: Array) -> Array:
-    """A complex array. As one array it is computed by one loop, as two by two loops that repeat what they share."""
-    if namespace(re) is np:
-        return re + 1j * im
-    from jax.lax import complex as join
-
-    return join(re, im)
 
 
 def split(z: Array) -> Pair:
@@ -116,48 +82,47 @@ def _differences(z: RootsFirst) -> list[Pair]:
     return [split(z - twice[k : k + count]) for k in range(1, count)]
 
 
-def _step(z: RootsFirst, form: ProductForm) -> RootsFirst:
+def _step(z: RootsFirst, loop: Loop, degree: Degree, spring: bool) -> RootsFirst:
     q, *others = _differences(z)
     at = split(z)
     q_slope = Pair(0.0 * at.real + 1.0, 0.0 * at.imag)
     for difference in others:
         q_slope = q_slope * difference + q
         q = q * difference
-    value, slope = evaluate(at, form)
+    value, slope = evaluate(at, loop, degree, spring)
     step = (value * q).over(slope * q + value * q_slope * -1.0)
     return join(at.real - step.real, at.imag - step.imag)
 
 
-def _start(form: ProductForm) -> RootsFirst:
+def _start(loop: Loop, degree: Degree, spring: bool) -> RootsFirst:
     """Two poles near those of the device, the others around 0, where the two parts of P are about equally large."""
-    xp = namespace(form.c)
-    around = form.power
-    last = form.alpha if form.beta is None else form.beta
-    r = xp.clip(xp.abs(form.n[-1] * last) ** (1.0 / max(around, 1)), 0.02, 3.0)
+    xp, around = namespace(loop.c), degree.poles - 2 - spring
+    last = loop.h * (loop.alpha if spring else loop.beta) * (loop.q if degree.fractional else 1.0)
+    r = xp.clip(xp.abs(last) ** (1.0 / max(around, 1)), 0.02, 3.0)
     # No two are each other's conjugates: a symmetric set stays so, and could not change how many of it are real.
     circle = np.exp(1j * (2.0 * np.pi * np.arange(around) / max(around, 1) + 0.4)).reshape(-1, *[1] * (r.ndim - 1))
     return xp.concatenate([r * circle, 0.0 * r + (0.9 + 0.45j), 0.0 * r + (0.75 - 0.4j)])
 
 
-def discs(z: RootsFirst, form: ProductForm) -> tuple[RadiiFirst, Array, Array]:
+def discs(z: RootsFirst, loop: Loop, degree: Degree, spring: bool) -> tuple[RadiiFirst, Array, Array]:
     """Radii of discs round ``z``, the poles along the first axis: in each lies one pole if the second result says so.
 
     The third says whether P is as small at each of them as rounding lets it be seen.
     """
-    xp = namespace(z)
+    xp, poles = namespace(z), len(z)
     at, unit = split(z), epsilon(z.real)
     apart = [xp.sqrt(part.real * part.real + part.imag * part.imag) for part in _differences(z)]
     q = 0.0 * at.real + 1.0
     for distance in apart:
         q = q * distance
-    value, bound = evaluate(at, form)[0], rounding(at, form, unit)
+    value, bound = evaluate(at, loop, degree, spring)[0], rounding(at, loop, degree, spring, unit)
     size = xp.abs(value.real) + xp.abs(value.imag)
     # A thousandth more than N, for the rounding of q.
-    within = 1.001 * form.poles * (size + bound) / q
+    within = 1.001 * poles * (size + bound) / q
     twice = xp.concatenate([within, within])
     disjoint = xp.isfinite(within)
-    for k, distance in enumerate(apart[: form.poles // 2], start=1):
-        disjoint = disjoint & (distance > within + twice[k : k + form.poles])
+    for k, distance in enumerate(apart[: poles // 2], start=1):
+        disjoint = disjoint & (distance > within + twice[k : k + poles])
     settled = size <= bound + unit * (xp.abs(at.real) + xp.abs(at.imag)) * q
     return within, xp.all(disjoint, axis=0), xp.all(settled, axis=0)
 
@@ -183,11 +148,10 @@ def aberth_kernel(
     alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool
 ) -> tuple[Roots, Radii, Array]:
     """All poles, how far each is off at most, and whether that is proved and no digit is missing."""
-    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
-    form = product_form(*walls, degree, spring)
-    xp = namespace(form.c)
-    z = repeat(_FIRST_STEPS + form.poles // 2, lambda z: _step(z, form), _start(form), xp)
-    within, proved, settled = discs(z, form)
+    loop, spoiled = product_form(alpha, beta, delta, d, degree), replace_invalid(alpha, beta, delta, d, degree)[1]
+    xp, steps = namespace(loop.c), _FIRST_STEPS + (degree.poles - spring) // 2
+    z = repeat(steps, lambda z: _step(z, loop, degree, spring), _start(loop, degree, spring), xp)
+    within, proved, settled = discs(z, loop, degree, spring)
     # A disc on the real axis that holds one pole holds a real one, unless the pole's conjugate is in a disc close by.
     real = xp.abs(z.imag) <= within
     within = within + xp.where(real, xp.abs(z.imag), 0.0)

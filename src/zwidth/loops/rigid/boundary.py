@@ -9,7 +9,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_number, check_count, check_scalars, evaluate
 from zwidth.arrays.roots import follow_root, integrate
-from zwidth.arrays.xp import frozen, namespace, nan_with_nan_slopes, store_once
+from zwidth.arrays.xp import frozen, namespace, nan_with_nan_slopes, store_once, tree_map
 from zwidth.loops.rigid.curve import (
     column_end,
     creeps,
@@ -18,7 +18,6 @@ from zwidth.loops.rigid.curve import (
     on_line,
     peak,
     row_end,
-    spread,
     wall,
 )
 from zwidth.loops.rigid.device import DelayClasses, classify_delays, valid_device, wall_status
@@ -166,8 +165,9 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
         x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
         x = follow_root(lambda x, curve, b: wall(x, curve).b - b, x, lambda *_: True, curve, number + delta)
         at = wall(x, curve)
-        # The number that `zwidth.is_stable` compares with.
-        alpha, beta = _with_slope(row.alpha, at.alpha, xp), number
+        # The number that `zwidth.is_stable` compares with, with the derivatives of the curve.
+        alpha = row.alpha if xp is np else frozen(row.alpha, xp) + (at.alpha - frozen(at.alpha, xp))
+        beta = number
     else:
         top = peak(fixed, delay_model, kind)
         exists = (still > 0) & (still < top.alpha)
@@ -194,11 +194,6 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
     # NaN, derivatives included, where there is no point.
     spoiled = nan_with_nan_slopes(status == int(Status.OK), delta, d, number)
     return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
-
-
-def _with_slope(value: Array, moving: Array, xp: Any) -> Array:
-    """A value with the derivatives of another expression for it."""
-    return value if xp is np else frozen(value, xp) + (moving - frozen(moving, xp))
 
 
 class Piece(IntEnum):
@@ -318,7 +313,9 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
 def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
     curve = lobe(delta, d, "held", kind)
-    end, at_places = frozen(curve.end, xp), spread(curve)
+    end = frozen(curve.end, xp)
+    # For many places of each lobe.
+    at_places = tree_map(lambda value: None if value is None else value[..., None], curve)
 
     def rise(x: Array) -> Array:
         at = wall(x, at_places)

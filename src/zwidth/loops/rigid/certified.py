@@ -18,7 +18,7 @@ import numpy as np
 from zwidth.arrays.xp import horner
 from zwidth.loops.rigid.certified_filter import OPEN, STABLE, UNSTABLE, filter_walls
 from zwidth.loops.rigid.crossover import Lag, Verdict, first_zero, long_verdict, short_verdict
-from zwidth.loops.rigid.device import DeviceTerms, PhiFunctions, discretize, wall_status
+from zwidth.loops.rigid.device import DeviceTerms, PhiFunctions, held_plant, wall_status
 from zwidth.loops.rigid.folding import Points, fold_arguments
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
@@ -68,7 +68,7 @@ def device(delta: float, d: float, bits: int) -> DeviceTerms:
     with flint.ctx.workprec(bits + _EXTRA_BITS):
         x, f = flint.arb(delta), flint.arb(d - int(d))
         late = _phi(x * (1 - f))
-        p = discretize(x, f if f != 0 else None, _phi)
+        p = held_plant(x, f if f != 0 else None, _phi)
         a0 = p.a0 if f != 0 else None
         at = _phi(x)
         phis = at.phi1, at.phi2, at.psi, late.phi1, late.psi

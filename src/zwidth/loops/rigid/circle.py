@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.xp import angle, apply_each, epsilon, find_turn, namespace, nan_unless, repeat
-from zwidth.loops.rigid.device import held_plant, split_delay, undelayed_plant, valid_wall
+from zwidth.loops.rigid.device import factor_numerator, held_plant, split_delay, valid_wall
 from zwidth.words.types import Array
 
 # Steps of the bracketed Newton iteration for the zeros of the cubic.
@@ -53,13 +53,8 @@ def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: b
     ok = valid_wall(alpha, beta, delta, d)
     delta, d = xp.where(ok, delta, 1.0), xp.where(ok, d, 0.0)
     whole, f = split_delay(d)
-    if fractional:
-        plant = held_plant(delta, f)
-        h = 0.5 * (plant.a1 + xp.sqrt(xp.maximum(plant.a1 * plant.a1 - 4.0 * plant.a2 * plant.a0, 0.0)))
-        q = plant.a0 / h
-    else:
-        plant = undelayed_plant(delta)
-        h, q = plant.a1, 0.0 * plant.a1
+    plant = held_plant(delta, f if fractional else None)
+    h, q = factor_numerator(plant) if fractional else (plant.a1, 0.0 * plant.a1)
     alpha, beta, s = nan_unless(ok, alpha, beta, alpha + beta)
     return Loop(alpha, beta, s, whole + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)
 

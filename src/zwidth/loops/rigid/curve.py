@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import bisect
-from zwidth.arrays.xp import frozen, horner, namespace, repeat, store_once, tree_map
+from zwidth.arrays.xp import frozen, horner, namespace, repeat, store_once
 from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, Plant, device, short_curve
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (
@@ -66,13 +66,6 @@ class Peak(NamedTuple):
     alpha: Array
 
 
-def describe_device(delta: Array, d: Array, delay_model: str, kind: DelayClasses) -> DeviceTerms:
-    """The device whose curve is meant. A fractional power is the formula of whole delays at any other number."""
-    if delay_model == "held":
-        return device(delta, d, kind)
-    return device(delta, 0.0 * d, DelayClasses(True, False, False))._replace(whole=d)
-
-
 def creeps(delay_model: str, kind: DelayClasses) -> bool:
     """Whether there may be a fractional power of less than one, whose lobe ends within any distance of pi.
 
@@ -84,7 +77,12 @@ def creeps(delay_model: str, kind: DelayClasses) -> bool:
 def lobe(delta: Array, d: Array, delay_model: str, kind: DelayClasses) -> Lobe:
     """The lobe of a device, or of arrays of one shape, from the delays that `DelayClasses` says may occur."""
     xp = namespace(delta, d)
-    here = store_once(describe_device(delta, d, delay_model, kind), delta)
+    if delay_model == "held":
+        here = device(delta, d, kind)
+    else:
+        # The formula of whole delays at any other number.
+        here = device(delta, 0.0 * d, DelayClasses(True, False, False))._replace(whole=d)
+    here = store_once(here, delta)
     creeping = creeps(delay_model, kind)
     is_short = here.whole < 1 if delay_model == "held" else here.whole == 0
     short, long, ends = None, None, []
@@ -158,11 +156,6 @@ def frequency(x: Array, lobe: Lobe) -> Array:
     y = xp.where(inside, y, 0.25)
     angle = xp.where(inside, 2.0 * xp.arctan2(xp.sqrt(y), xp.sqrt(1.0 - y)), np.pi)
     return angle if lobe.is_short is None else xp.where(lobe.is_short, angle, x)
-
-
-def spread(lobe: Lobe) -> Lobe:
-    """The same with a new last axis, for many places of each lobe."""
-    return tree_map(lambda value: None if value is None else value[..., None], lobe)
 
 
 def on_line(lobe: Lobe) -> Array:

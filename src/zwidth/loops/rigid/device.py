@@ -39,8 +39,8 @@ _SERIES_BELOW = 2.5
 _TERMS = 11
 # phi1 = e^(-x/2) sum_k (x/2)^(2k) / (2k + 1)!
 _PHI1 = [1.0 / factorial(2 * k + 1) for k in range(_TERMS)]
-# gap = e^(-x/2) x sum_k (k + 1) (x/2)^(2k) / (2k + 3)!
-_GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(_TERMS)]
+# gap = -x phi2' = e^(-x/2) x sum_k (k + 1) (x/2)^(2k) / (2k + 3)!
+GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(_TERMS)]
 
 
 class PhiFunctions(NamedTuple):
@@ -62,7 +62,7 @@ def phi_functions(x: Array, exp: Callable[[Array], Array] | None = None) -> PhiF
     # Each branch gets an argument that is harmless where the other one holds.
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, _SERIES_BELOW, x)
     square = half * half
-    low1, low_gap = factor * horner(square, _PHI1), factor * (2.0 * half) * horner(square, _GAP)
+    low1, low_gap = factor * horner(square, _PHI1), factor * (2.0 * half) * horner(square, GAP)
     # Above the switch 1 - c loses nothing, and unlike expm1 has a derivative that is relatively exact.
     inverse = 1.0 / high
     high1 = (1.0 - c) * inverse
@@ -90,20 +90,10 @@ class Plant(NamedTuple):
     gap: Array  # N(-1) = a2 - a1 + a0 without cancellation
 
 
-def held_plant(delta: Array, fraction: Array) -> Plant:
-    """Discretize for a delay whose fractional part is ``fraction``, in [0, 1)."""
-    return discretize(delta, fraction, phi_functions)
+def held_plant(delta: Any, fraction: Any = None, functions: Functions = phi_functions, at: Any = None) -> Plant:
+    """Discretize for a delay whose fractional part is ``fraction``, in [0, 1), or None: N(z) = z (phi2 z + psi).
 
-
-def undelayed_plant(delta: Array) -> Plant:
-    """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
-    return discretize(delta, None, phi_functions)
-
-
-def discretize(delta: Any, fraction: Any, functions: Functions, at: Any = None) -> Plant:
-    """The plant in any arithmetic whose phi-functions are given; ``fraction`` is None for whole delays.
-
-    ``at`` are the functions at delta, where somebody has them.
+    In any arithmetic whose phi-functions are given; ``at`` are these at delta, where somebody has them.
     """
     at = functions(delta) if at is None else at
     if fraction is None:
@@ -119,6 +109,13 @@ def discretize(delta: Any, fraction: Any, functions: Functions, at: Any = None) 
         t * t * at_t.gap - t * f * at_f.phi1 * (e_t + at_t.phi1) - f * f * (at_f.gap + delta * t * at_t.phi1 * at_f.psi)
     )
     return Plant(at.c, delta * at.phi1, a2, a1, a0, gap)
+
+
+def factor_numerator(plant: Plant) -> tuple[Array, Array]:
+    """h and q of ``N(z) = (a2 z + h)(z + q)``: its zeros are real and not positive."""
+    xp = namespace(plant.a1)
+    h = 0.5 * (plant.a1 + xp.sqrt(xp.maximum(plant.a1 * plant.a1 - 4.0 * plant.a2 * plant.a0, 0.0)))
+    return h, plant.a0 / h
 
 
 def split_delay(d: Array) -> tuple[Array, Array]:
@@ -175,7 +172,7 @@ def device(delta: Array, d: Array, kind: DelayClasses = ANY, functions: Function
     whole, f = split_delay(d)
     at = functions(delta)
     late = functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
-    plant = discretize(delta, f if kind.fractional else None, functions, at)
+    plant = held_plant(delta, f if kind.fractional else None, functions, at)
     # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1; 0 where N(-1) = 0.
     tilt = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
     return DeviceTerms(

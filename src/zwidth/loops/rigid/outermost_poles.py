@@ -6,13 +6,11 @@ On maps of alpha and beta they come from series (`loops.rigid.pole_map`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import BLOCK, FEW, Route, map_blocks
-from zwidth.arrays.xp import WIDE
+from zwidth.arrays.evaluate import BLOCK, FEW, Route, compile_columns, map_blocks
 from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import classify_delays, wall_status
@@ -21,10 +19,10 @@ from zwidth.loops.rigid.pole_groups import DOUBTFUL
 from zwidth.loops.rigid.pole_map import Area, fill_up, follow_poles
 from zwidth.loops.rigid.pole_search import (
     OutermostPoles,
+    bound_radius,
     certification_width,
     certify_again,
     certify_starts,
-    has_bound,
     quick_kernel,
     search,
 )
@@ -53,13 +51,6 @@ _NONE = np.empty(0)
 SLOWEST_ACCURACY = 1e-9
 
 
-@cache
-def _compile_quick(fractional: bool) -> Any:
-    import jax
-
-    return jax.jit(lambda a, b, c, d, accuracy: quick_kernel(a, b, c, d, accuracy, fractional), compiler_options=WIDE)
-
-
 def outermost_poles(columns: list[np.ndarray], accuracy: float, route: Route = "auto") -> OutermostPoles:
     """The outermost poles of equally long columns of alpha, beta, delta and d.
 
@@ -78,28 +69,23 @@ def outermost_poles(columns: list[np.ndarray], accuracy: float, route: Route = "
 
 def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, route: Route) -> OutermostPoles:
     size = columns[0].size
+    asked = [*columns, np.full(size, accuracy)]
     with np.errstate(all="ignore"):
         if size == 1 and route == "auto":
             # Plain numbers are several times faster than arrays of one.
-            found = [np.reshape(leaf, 1) for leaf in _quick([column[0] for column in columns], accuracy, kind)]
+            found = [np.reshape(leaf, 1) for leaf in quick_kernel(*(column[0] for column in asked), fractional=kind)]
         elif route == "numpy" or (route == "auto" and size <= FEW):
-            full = [column[fill_up(np.arange(size))] for column in columns]
+            full = [column[fill_up(np.arange(size))] for column in asked]
             blocks = [
-                _quick([column[start : start + _AT_ONCE] for column in full], accuracy, kind)
+                quick_kernel(*(column[start : start + _AT_ONCE] for column in full), fractional=kind)
                 for start in range(0, max(size, 1), _AT_ONCE)
             ]
             found = [np.concatenate(leaves)[:size] for leaves in zip(*blocks, strict=True)]
         else:
             # Always of one size: other batches may round differently.
-            short = max(0, PIECE - size)
-            padded = [np.pad(c, (0, short), mode="edge") for c in (*columns, np.full(size, accuracy))]
-            found = [leaf[:size] for leaf in map_blocks(_compile_quick(kind), padded, PIECE)]
+            padded = [np.pad(column, (0, max(0, PIECE - size)), mode="edge") for column in asked]
+            found = [leaf[:size] for leaf in map_blocks(compile_columns(quick_kernel, (kind,)), padded, PIECE)]
     return _finish_poles(columns, OutermostPoles(*(np.array(leaf) for leaf in found)), accuracy, kind)
-
-
-def _quick(columns: list[Any], accuracy: float, kind: bool) -> OutermostPoles:
-    alpha, beta, delta, d = columns
-    return quick_kernel(alpha, beta, delta, d, accuracy + 0.0 * alpha, kind)
 
 
 def _finish_poles(columns: list[np.ndarray], poles: OutermostPoles, accuracy: float, kind: bool) -> OutermostPoles:
@@ -107,33 +93,23 @@ def _finish_poles(columns: list[np.ndarray], poles: OutermostPoles, accuracy: fl
     left = np.flatnonzero(~poles.proved)
     # Nothing is proved of bad walls.
     left = left[np.asarray(wall_status(*(column[left] for column in columns))) == Status.OK]
-    attempts: list[Any] = [certify_again, certify_starts, 1.0, search, *_LADDER[accuracy * _LADDER <= _LARGEST_ERROR]]
+    looser = accuracy * _LADDER
+    attempts = [(method, accuracy) for method in (certify_again, certify_starts, bound_radius, search)]
+    attempts += [(bound_radius, error) for error in looser[looser <= _LARGEST_ERROR].tolist()]
     with np.errstate(all="ignore"):
-        for attempt in attempts:
-            pieces = [left[start : start + _AT_ONCE] for start in range(0, left.size, _AT_ONCE)]
-            tried = [_attempt(attempt, columns, poles, piece, accuracy, kind) for piece in pieces]
-            left = np.concatenate([left[:0], *tried])
+        for method, tolerance in attempts:
+            tried = [left[:0]]
+            for start in range(0, left.size, _AT_ONCE):
+                some = left[start : start + _AT_ONCE]
+                full = fill_up(some)
+                loop = factor_loop(*(column[full] for column in columns), fractional=kind)
+                new = method(OutermostPoles(*(leaf[full] for leaf in poles)), tolerance, loop, kind)
+                good = np.isfinite(new.re[: some.size])
+                for whole, leaf in zip(poles, new, strict=True):
+                    whole[some[good]] = leaf[: some.size][good]
+                tried.append(some[~new.proved[: some.size]])
+            left = np.concatenate(tried)
     return poles
-
-
-def _attempt(
-    attempt: Any, columns: list[np.ndarray], poles: OutermostPoles, left: np.ndarray, accuracy: float, kind: bool
-) -> np.ndarray:
-    """Try to prove some poles, by another method or to a multiple of the accuracy, in place; what is left of them."""
-    full = fill_up(left)
-    loop = factor_loop(*(column[full] for column in columns), fractional=kind)
-    if isinstance(attempt, float):
-        proved = has_bound(poles.re[full], attempt * accuracy, loop, kind)[: left.size]
-        poles.error[left[proved]], poles.doubt[left[proved]] = attempt * accuracy, np.inf
-        return left[~proved]
-    if attempt is certify_again:
-        new = certify_again(poles.re[full], poles.im[full], accuracy, loop, kind)
-    else:
-        new = attempt(accuracy, loop, kind)
-    good = np.isfinite(new.re[: left.size])
-    for whole, leaf in zip(poles, new, strict=True):
-        whole[left[good]] = leaf[: left.size][good]
-    return left[~new.proved[: left.size]]
 
 
 def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.arrays.roots import follow_root
 from zwidth.arrays.xp import (
     angle,
     apply_each,
@@ -24,7 +25,7 @@ from zwidth.arrays.xp import (
 )
 from zwidth.loops.rigid.circle import Loop, count, factor_loop
 from zwidth.loops.rigid.device import valid_wall
-from zwidth.loops.rigid.pole_step import Pair, halley_step, move_pole, newton_step, value_at
+from zwidth.loops.rigid.pole_step import halley_step, join, move_pole, newton_step, value_at
 from zwidth.words.types import Array
 
 # Steps on both starts, then on the larger of the two; on both where that was not enough, next to double poles.
@@ -69,7 +70,7 @@ def _largest(loop: Loop) -> Array:
     return 1e-9 + xp.where(loop.turns > 1, xp.minimum(short, steep), short)
 
 
-def _slow_pole(loop: Loop) -> tuple[Array, Array]:
+def slow_pole(loop: Loop) -> tuple[Array, Array]:
     """The larger pole near 1, of P to second order in z - 1."""
     xp = namespace(loop.alpha)
     alpha, s, turns = loop.alpha, loop.s, loop.turns
@@ -88,7 +89,7 @@ def _slow_pole(loop: Loop) -> tuple[Array, Array]:
     return 0.5 * xp.log1p(re * (2.0 + re) + im * im), angle(1.0 + re, im)
 
 
-def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
+def first_pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
     """The first pair of the ring, where T and B have one size as they change with |z| from the unit circle on."""
     xp = namespace(loop.alpha)
     im = np.pi / (loop.lag + 1.0)
@@ -104,29 +105,16 @@ def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
     return xp.maximum(0.5 * xp.log(body * wall / (sizes[0] * sizes[1])) / turns, -1.0), im
 
 
-def both_starts(loop: Loop, fractional: bool) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """The slow pole and the first pair of the ring, roughly."""
-    return _slow_pole(loop), _pair(loop, fractional)
-
-
-def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, Array, Array]:
-    """The slow pole and the pair, after so many steps from their starts."""
-
+def larger_pole(loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """The larger of the slow pole and the first pair of the ring, roughly."""
     xp = namespace(loop.alpha)
 
     def follow(start: tuple[Array, Array]) -> tuple[Array, Array]:
-        return repeat(steps, lambda at: halley_step(*at, loop, fractional), start, xp)
+        return repeat(_BOTH, lambda at: halley_step(*at, loop, fractional), start, xp)
 
-    slow, pair = apply_each(follow, both_starts(loop, fractional), xp)
-    return (*slow, *pair)
-
-
-def larger_pole(loop: Loop, fractional: bool) -> tuple[Array, Array]:
-    """The larger of the two, roughly."""
-    xp = namespace(loop.alpha)
-    slow_re, slow_im, re, im = both_poles(_BOTH, loop, fractional)
-    first = (slow_re >= re) | xp.isnan(re)
-    return xp.where(first, slow_re, re), xp.where(first, slow_im, im)
+    slow, pair = apply_each(follow, [slow_pole(loop), first_pair(loop, fractional)], xp)
+    first = (slow[0] >= pair[0]) | xp.isnan(pair[0])
+    return xp.where(first, slow[0], pair[0]), xp.where(first, slow[1], pair[1])
 
 
 def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
@@ -161,15 +149,19 @@ def quick_kernel(
     return certify_pole(*candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
-def has_bound(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Array:
-    """Whether two counts prove that the radius is ``e^log_r`` within a relative tolerance."""
-    above, below = (count(side, loop, fractional) for side in (log_r + tolerance, log_r - tolerance))
-    return above.full & above.sure & ~below.full & below.sure
+# Attempts to prove what the quick kernel has found but not proved, in NumPy; the loops are those of the walls.
 
 
-def certify_again(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool) -> OutermostPoles:
-    """Where the quick kernel ended after one step more, with a count that may meet several crossovers."""
-    return certify_pole(*halley_step(re, im, loop, fractional), tolerance, loop, fractional, False)
+def certify_again(found: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
+    """What was found after one step more, with a count that may meet several crossovers."""
+    return certify_pole(*halley_step(found.re, found.im, loop, fractional), tolerance, loop, fractional, False)
+
+
+def bound_radius(found: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
+    """What was found, where two counts prove its radius alone."""
+    above, below = (count(found.re + side, loop, fractional) for side in (tolerance, -tolerance))
+    proved = above.full & above.sure & ~below.full & below.sure
+    return found._replace(error=np.where(proved, tolerance, np.inf), doubt=np.where(proved, np.inf, found.doubt))
 
 
 def all_starts(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -177,12 +169,12 @@ def all_starts(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
 
     Where the slow one is off the axis it is put on it, and the other way round.
     """
-    (slow, turn), pair = both_starts(loop, fractional)
+    (slow, turn), pair = slow_pole(loop), first_pair(loop, fractional)
     other = np.where(turn > 0, 0.0, _OFF * pair[1])
     return np.stack([slow, pair[0], slow, 0.0 * slow]), np.stack([turn, pair[1], other, _BETWEEN * pair[1]])
 
 
-def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> OutermostPoles:
+def certify_starts(_: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
     """What all of the starts lead to."""
     at = repeat(_PATIENT, lambda at: halley_step(*at, loop, fractional), all_starts(loop, fractional), np)
     found = certify_pole(*at, tolerance, loop, fractional, False)
@@ -190,8 +182,8 @@ def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> OutermostP
     return OutermostPoles(*(leaf[best, np.arange(best.size)] for leaf in found))
 
 
-def search(tolerance: Array, loop: Loop, fractional: bool) -> OutermostPoles:
-    """The outermost pole by halvings of the interval that counts leave, then a few steps, in NumPy."""
+def search(_: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
+    """The outermost pole by halvings of the interval that counts leave, then a few steps."""
     # Of few walls several radii are counted in the time of one.
     parts = 2**_TOGETHER
 
@@ -291,29 +283,6 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
     return while_loop(going, run, (0, start))[1][:3]
 
 
-def _follow_pole(re: Array, im: Array, loop: Loop, fractional: bool) -> Array:
-    """The logarithm of a pole's modulus, with its derivatives of every order: those of an implicit function."""
-    import jax
-
-    @jax.custom_jvp
-    def follow(re: Array, im: Array, loop: Loop) -> tuple[Array, Array]:
-        return re, im
-
-    @follow.defjvp
-    def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-        place, loop = follow(*primals), primals[2]
-
-        def value(loop: Loop) -> tuple[Array, Array]:
-            at = value_at(*place, loop, fractional)
-            return at.p.real, at.p.imag
-
-        change = Pair(*jax.jvp(value, (loop,), (tangents[2],))[1])
-        by = (change * -1.0).over(value_at(*place, loop, fractional).first)
-        return place, (by.real, by.imag)
-
-    return follow(*frozen((re, im), jax.numpy), loop)[0]
-
-
 def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Array:
     """The logarithm of the radius with its derivatives, inside somebody's transformation.
 
@@ -322,5 +291,10 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
     xp = namespace(alpha, beta, delta, d)
     loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
     re, im, proved = _find_traced(frozen(loop, xp), fractional)
-    (value,) = nan_unless(proved, _follow_pole(re, im, loop, fractional))
-    return value + nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+
+    def at(place: Array, loop: Loop) -> list[Array]:
+        return [join(part.real, part.imag) for part in value_at(place.real, place.imag, loop, fractional)[:2]]
+
+    place = follow_root(lambda *x: at(*x)[0], join(re, im), lambda *_: True, loop, slope=lambda *x: at(*x)[1])
+    (log_radius,) = nan_unless(proved, place.real)
+    return log_radius + nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)

@@ -12,16 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import epsilon, horner, namespace, store_once
+from zwidth.arrays.xp import COSINE, SINE, epsilon, horner, namespace, store_once
 from zwidth.loops.rigid.circle import Loop
 from zwidth.words.types import Array
 
-# sin(x)/x and cos(x) as series in x^2: on |x| <= pi/2 what is left out is below 1e-18.
-_SINE = [1.0]
-_COSINE = [1.0]
-for _k in range(1, 12):
-    _SINE.append(-_SINE[-1] / (2 * _k * (2 * _k + 1)))
-    _COSINE.append(-_COSINE[-1] / ((2 * _k - 1) * 2 * _k))
 # Rounding errors of P in units of the sum of its parts' moduli: of its factors, and of the angle p im.
 _ROUNDING = 16.0
 # The longest step, over the distance between the poles of a long delay: longer ones lead to other poles.
@@ -58,8 +52,12 @@ class Pair:
         return Pair(self.real, -self.imag)
 
 
-def join(re: np.ndarray, im: np.ndarray) -> np.ndarray:
-    """A complex array."""
+def join(re: Array, im: Array) -> Array:
+    """A complex array. As one array it is computed by one loop, as two by two loops that repeat what they share."""
+    if namespace(re) is not np:
+        from jax.lax import complex as join
+
+        return join(re, im)
     value = np.empty(np.broadcast_shapes(re.shape, im.shape), complex)
     value.real, value.imag = re, im
     return value
@@ -76,8 +74,6 @@ class Value(NamedTuple):
     p: Any
     first: Any
     second: Any
-    by_alpha: Any  # the derivatives of P by alpha and beta
-    by_beta: Any
     rounding: Array
 
 
@@ -87,7 +83,7 @@ def _half_turn(x: Array, xp: Any) -> tuple[Array, Array]:
         # Python's numbers stay Python's.
         return (float(np.sin(x)), float(np.cos(x))) if type(x) is float else (np.sin(x), np.cos(x))
     square = x * x
-    return x * horner(square, _SINE), horner(square, _COSINE)
+    return x * horner(square, SINE), horner(square, COSINE)
 
 
 def _store(value: Any, witness: Array) -> Any:
@@ -132,18 +128,14 @@ def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     if fractional:
         late = z + loop.q
         d, d1, d2 = d * late, d1 * late + d * z, d2 * late + (d1 * 2.0 + d) * z
-        lead, sizes = lead * late, sizes * (r + loop.q)
+        sizes = sizes * (r + loop.q)
     t1 = lag * (a * power + slope)
     t2 = lag * ((a * power + slope * 2.0) * power + slope + z * z * 2.0)
     turning = power * (xp.abs(re) + xp.abs(im))
     rounding = up * width * (width + loop.em) * (_ROUNDING + turning) + _ROUNDING * sizes
-    found = Value(lag * a + d, t1 + d1, t2 + d2, lead * z, lead * gap, epsilon(re) * rounding)
-    if number is not complex:
-        return found
+    found = lag * a + d, t1 + d1, t2 + d2
     # Unlike Python's numbers, NumPy's may be divided by zero.
-    return found._replace(
-        p=np.complex128(found.p), first=np.complex128(found.first), second=np.complex128(found.second)
-    )
+    return Value(*(map(np.complex128, found) if number is complex else found), rounding=epsilon(re) * rounding)
 
 
 class Step(NamedTuple):

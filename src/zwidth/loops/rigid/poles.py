@@ -10,10 +10,10 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, map_blocks, to_caller
 from zwidth.arrays.xp import is_traced, namespace, repeat
-from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, join, product_form, replace_invalid, split, with_zero
+from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, product_form, replace_invalid, split, with_zero
 from zwidth.loops.rigid.device import wall_status
 from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
-from zwidth.loops.rigid.pole_step import Pair, square
+from zwidth.loops.rigid.pole_step import Pair, join, square
 from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
@@ -68,12 +68,14 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
 def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Roots:
     """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
     xp = namespace(z, alpha)
-    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
-    form = product_form(*walls, degree, spring)
+    loop, spoiled = product_form(alpha, beta, delta, d, degree), replace_invalid(alpha, beta, delta, d, degree)[1]
+
+    def at(z: RootsFirst) -> tuple[Pair, Pair]:
+        return evaluate(split(z), loop, degree, spring)
 
     def step(z: RootsFirst) -> RootsFirst:
         here = split(z)
-        value, slope = evaluate(here, form)
+        value, slope = at(z)
         still = (slope.real == 0) & (slope.imag == 0)
         by = value.over(Pair(xp.where(still, 1.0, slope.real), slope.imag))
         taken = ~still & (square(by) < 1e-6 * xp.maximum(square(here), 1e-6))
@@ -81,7 +83,7 @@ def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, d
 
     first = xp.moveaxis(z, -1, 0)
     last = repeat(_POLISHING_STEPS, step, first, xp)
-    better = square(evaluate(split(last), form)[0]) < square(evaluate(split(first), form)[0])
+    better = square(at(last)[0]) < square(at(first)[0])
     return with_zero(xp.moveaxis(xp.where(better, last, first), 0, -1), spring) + spoiled[..., None]
 
 
@@ -111,32 +113,19 @@ def _check(values: tuple[ArrayLike, ...], delay_model: str = "held", method: str
     check_degree(values[3])
 
 
-def _companion_poles(values: tuple[ArrayLike, ...]) -> Roots:
-    """All poles by eigenvalues."""
-    kernel = _inside_jax() if is_traced(*values) else _by_companion
-    return map_by_degree(kernel, values, is_spring(values[1]), route="numpy")
-
-
-@cache
-def _inside_jax() -> Any:
-    """The kernel as one program: differentiated outside `jit`, every operation would be compiled alone."""
-    import jax
-
-    return jax.jit(pole_kernel, static_argnums=(4, 5))
-
-
-def _by_companion(*arguments: Any) -> np.ndarray:
-    """Poles of NumPy columns of one degree, with the eigenvalues from LAPACK on every processor."""
-    *columns, degree, spring = arguments
+def _by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Roots:
+    """Poles of columns of one degree, with the eigenvalues of concrete ones from LAPACK on every processor."""
+    columns = alpha, beta, delta, d
+    if is_traced(*columns):
+        # As one program: differentiated outside `jit`, every operation would be compiled alone.
+        return _compile_by_degree(pole_kernel, degree, spring)(*columns)
     # Of large matrices the eigenvalues take so long that nothing else is worth a compilation.
-    few = columns[0].size <= few_poles(degree)
-    compiled = not few and degree.poles <= _MOST_AT_ONE_TIME
+    few = alpha.size <= few_poles(degree)
 
-    def block(alpha: Any, beta: Any, delta: Any, d: Any) -> np.ndarray:
-        if not compiled:
+    def block(*walls: Any) -> np.ndarray:
+        if few or degree.poles > _MOST_AT_ONE_TIME:
             with np.errstate(all="ignore"):
-                return pole_kernel(alpha, beta, delta, d, degree, spring)
-        walls = alpha, beta, delta, d
+                return pole_kernel(*walls, degree=degree, spring=spring)
         matrices = np.asarray(_compile_by_degree(_matrices, degree, spring)(*walls))
         return np.asarray(_compile_by_degree(_polish_poles, degree, spring)(_eigenvalues(matrices), *walls))
 
@@ -208,26 +197,27 @@ def poles(
         raise InputError(
             "method: 'aberth' falls back on the host; inside a JAX transformation use 'auto' or 'companion'"
         )
-    if method == "companion" or is_traced(*values):
-        return _companion_poles(values)
-    return map_by_degree(_found_on_host, values, is_spring(values[1]), method, route="numpy")
+    return map_by_degree(_find_poles, values, is_spring(values[1]), method, route="numpy")
 
 
-def _found_on_host(*arguments: Any) -> Roots:
-    """Poles of NumPy columns of one degree, by Aberth's iteration where it pays and by eigenvalues where it must."""
-    alpha, beta, delta, d, degree, spring, method = arguments
-    columns = [alpha, beta, delta, d]
+def _find_poles(
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, method: PoleMethod
+) -> Roots:
+    """Poles of columns of one degree, by Aberth's iteration where it pays and by eigenvalues where it must."""
+    columns = alpha, beta, delta, d
     few = alpha.size <= few_poles(degree)
-    if method == "companion" or (method == "auto" and (few or degree.poles > _MOST_AT_ONE_TIME)):
+    if method == "auto" and (few or is_traced(*columns) or degree.poles > _MOST_AT_ONE_TIME):
+        method = "companion"
+    if method == "companion":
         return _by_companion(*columns, degree, spring)
     if few:
-        z, _, proved = aberth_kernel(alpha, beta, delta, d, degree, spring)
+        z, _, proved = aberth_kernel(*columns, degree, spring)
     else:
         block = _block(_NUMBERS // degree.poles)
         z, _, proved = map_blocks(_compile_by_degree(aberth_kernel, degree, spring), columns, block)
-    left = np.flatnonzero(~proved & (wall_status(alpha, beta, delta, d) == Status.OK))
+    left = np.flatnonzero(~proved & (wall_status(*columns) == Status.OK))
     if left.size:
-        z[left] = _by_companion(*(column[left] for column in columns), degree, spring)
+        z[left] = _by_companion(*(column[left] for column in columns), degree=degree, spring=spring)
     return z
 
 
@@ -235,7 +225,7 @@ def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: 
     """The spectral radius at every point, from the poles; NaN where the input is out of range."""
     values = (alpha, beta, delta, d)
     _check(values)
-    found = _companion_poles(values)
+    found = map_by_degree(_by_companion, values, is_spring(beta), route="numpy")
     xp = namespace(found) if is_traced(*values) else np
     z: Any = xp.asarray(found)
     # Of a wall that has fewer poles than others.

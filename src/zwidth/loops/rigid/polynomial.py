@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.xp import horner, namespace, nan_with_nan_slopes
-from zwidth.loops.rigid.device import Plant, held_plant, split_delay, undelayed_plant, valid_wall
+from zwidth.loops.rigid.device import Plant, held_plant, split_delay, valid_wall
 from zwidth.loops.rigid.folding import Degree, map_by_degree
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
@@ -30,14 +30,9 @@ class Affine(NamedTuple):
     N2: Coefficients
 
 
-def choose_plant(delta: Reals, d: Reals, degree: Degree) -> Plant:
-    """The plant with the part of the delay that is not whole periods."""
-    return held_plant(delta, d - degree.whole) if degree.fractional else undelayed_plant(delta)
-
-
 def affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
     """The three coefficient vectors of devices of one degree, along a new last axis of degree.poles + 1."""
-    plant = choose_plant(delta, d, degree)
+    plant = held_plant(delta, d - degree.whole if degree.fractional else None)
     xp = namespace(plant.a2)
     zero, one = 0.0 * plant.a2, 0.0 * plant.a2 + 1.0
     head = [one, -(1.0 + plant.c), plant.c]
@@ -76,7 +71,7 @@ class FrequencyLoop(NamedTuple):
 def frequency_loop(delta: Array, d: Array, delay_model: str) -> FrequencyLoop:
     """The loop of one (delta, d) for evaluation on the unit circle."""
     if delay_model == "fractional_power":
-        return FrequencyLoop(undelayed_plant(delta), d)
+        return FrequencyLoop(held_plant(delta), d)
     whole, fraction = split_delay(d)
     return FrequencyLoop(held_plant(delta, fraction), whole)
 
@@ -111,7 +106,11 @@ def frequency_boundary(omega: Reals, loop: FrequencyLoop, delay_model: str) -> W
     ratio = _cosine_ratio(omega, whole, c_safe, delay_model)
     beta = -(ratio * re_g - sin_k * im_g_over_c)
     alpha = 2.0 * s * (sin_k * re_g + cos_k * im_g_over_c * cos_half - s * beta)
-    return Wall(*_limits_at_pi(alpha, beta, finite, omega, whole))
+    # Where N(z) vanishes (delta = 0 at omega = pi) the curve runs to infinity with alternating sign.
+    far = xp.inf * (1.0 - 2.0 * xp.mod(whole, 2.0))
+    inside = (omega >= 0) & (omega <= np.pi)
+    limits = ((alpha, -far), (beta, far))
+    return Wall(*(xp.where(inside, xp.where(finite, value, limit), xp.nan) for value, limit in limits))
 
 
 def _cosine_ratio(omega: Array, lag: Array, cos_half: Array, delay_model: str) -> Array:
@@ -148,16 +147,6 @@ def _cardinal_sine(x: Array) -> Array:
     safe = xp.where(small, 2.0, x)
     inner = xp.where(small, x, 0.0)
     return xp.where(small, horner(inner * inner, _CARDINAL), xp.sin(safe) / safe)
-
-
-def _limits_at_pi(alpha: Array, beta: Array, finite: Array, omega: Array, whole: Array) -> tuple[Array, Array]:
-    """Where N(z) vanishes (delta = 0 at omega = pi) the curve runs to infinity with alternating sign."""
-    xp = namespace(alpha, omega, whole)
-    sign = 1.0 - 2.0 * xp.mod(whole, 2.0)
-    inside = (omega >= 0) & (omega <= np.pi)
-    alpha = xp.where(finite, alpha, -sign * xp.inf)
-    beta = xp.where(finite, beta, sign * xp.inf)
-    return xp.where(inside, alpha, xp.nan), xp.where(inside, beta, xp.nan)
 
 
 def check_delay_model(delay_model: str) -> None:

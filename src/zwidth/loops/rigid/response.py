@@ -125,8 +125,10 @@ def settling_time(alpha: float, beta: float, delta: float, d: float, band: float
         rate = -np.log(np.abs(found.z))
     if not np.all(rate > 0):
         return math.nan
-    last = _envelope_end(bound, rate, allowed)
-    return _last_outside(found, instants, last, allowed)
+    # The first period from which on the sum of the modes' sizes stays within the band.
+    longest = np.max(np.log(np.maximum(bound * bound.size / allowed, 1.0)) / rate)
+    last = bisect(lambda k: np.sum(bound * np.exp(-rate * k)) > allowed, np.float64(0.0), longest)
+    return _last_outside(found, instants, math.ceil(last), allowed)
 
 
 def decay_time(rate: Array) -> Array:
@@ -136,12 +138,6 @@ def decay_time(rate: Array) -> Array:
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(rate > 0, -math.log(SETTLING_BAND) / rate, np.where(np.isnan(rate), np.nan, np.inf))
-
-
-def _envelope_end(bound: np.ndarray, rate: np.ndarray, allowed: float) -> int:
-    """The first period from which on the sum of the modes' sizes stays within the band."""
-    longest = np.max(np.log(np.maximum(bound * bound.size / allowed, 1.0)) / rate)
-    return math.ceil(bisect(lambda k: np.sum(bound * np.exp(-rate * k)) > allowed, np.float64(0.0), longest))
 
 
 def _last_outside(found: Modes, instants: np.ndarray, last: int, allowed: float) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from math import factorial
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -12,6 +11,7 @@ from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward
 from zwidth.loops.rigid.device import (
     ANY,
+    GAP,
     DelayClasses,
     Plant,
     classify_delays,
@@ -19,7 +19,6 @@ from zwidth.loops.rigid.device import (
     held_plant,
     phi_functions,
     split_delay,
-    undelayed_plant,
     valid_device,
 )
 from zwidth.loops.rigid.polynomial import check_delay_model
@@ -39,16 +38,13 @@ from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
-# -phi2' = gap/x = e^(-x/2) sum_k (k + 1) (x/2)^(2k) / (2k + 3)!, as in `loops.rigid.device`
-_CHI = [(k + 1.0) / factorial(2 * k + 3) for k in range(13)]
-
 
 def _chi(x: Array, gap: Array) -> Array:
     """``gap/x = -phi2'``, 1/6 at 0; ``psi' = chi - psi`` and ``phi1' = -psi``."""
     xp = namespace(x)
     small = x < 2.5
     half = xp.where(small, 0.5 * x, 0.0)
-    return xp.where(small, xp.exp(-half) * horner(half * half, _CHI), gap / xp.where(small, 1.0, x))
+    return xp.where(small, xp.exp(-half) * horner(half * half, GAP), gap / xp.where(small, 1.0, x))
 
 
 def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
@@ -65,11 +61,6 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     slow, fast = t * at_t.phi1, e_t * f * at_f.phi1
     zero = 0.0 * c
     return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
-
-
-def differentiable_plant(delta: Array, fraction: Array) -> Plant:
-    """`loops.rigid.device.held_plant`, in JAX with its derivatives in closed form."""
-    return held_plant(delta, fraction) if namespace(delta, fraction) is np else _jax_plant()(delta, fraction)
 
 
 def follow(
@@ -114,9 +105,10 @@ def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: st
 
 @cache
 def _jax_plant() -> Any:
+    """`loops.rigid.device.held_plant` with its derivatives in closed form."""
     import jax
 
-    function = jax.custom_jvp(held_plant)
+    function = jax.custom_jvp(lambda delta, fraction: held_plant(delta, fraction))
 
     @function.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple[Plant, Plant]:
@@ -285,7 +277,10 @@ def _solve_ridge(
     if delay_model == "fractional_power":
         whole, f = d, 0.0 * d
     start = guess_start(delta, d, f, kind)
-    plant = differentiable_plant(delta, f) if kind.fractional and delay_model == "held" else undelayed_plant(delta)
+    if kind.fractional and delay_model == "held":
+        plant = held_plant(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
+    else:
+        plant = held_plant(delta)
     ridge = differentiable_ridge(plant, whole, start, delay_model, kind)
     return ridge, status, plant, whole, (delta, f)
 

@@ -7,7 +7,8 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import broadcast, check_scalars, evaluate, to_caller
-from zwidth.arrays.xp import is_traced
+from zwidth.arrays.xp import is_traced, namespace
+from zwidth.loops.rigid.device import classify_delays
 from zwidth.loops.rigid.folding import NAMES
 from zwidth.loops.rigid.outermost_poles import find_poles
 from zwidth.loops.rigid.pole_search import traced_kernel
@@ -82,7 +83,8 @@ def spectral_radius(
     if method == "companion":
         return radius_by_companion(*values)
     if is_traced(*values):
-        return _exp(evaluate(traced_kernel, arguments, _has_fraction(d)))
+        log_radius = evaluate(traced_kernel, arguments, classify_delays(d).fractional)
+        return namespace(log_radius).exp(log_radius)
     return to_caller(find_poles(broadcast(arguments), wanted).radius, values)
 
 
@@ -125,21 +127,8 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
     if is_traced(*values):
-        return -evaluate(traced_kernel, arguments, _has_fraction(d))
+        return -evaluate(traced_kernel, arguments, classify_delays(d).fractional)
     return to_caller(find_poles(broadcast(arguments), _DECAY_ACCURACY, with_rate=True).rate, values)
-
-
-def _exp(value: Array) -> Array:
-    import jax.numpy as jnp
-
-    return jnp.exp(value)
-
-
-def _has_fraction(d: ArrayLike) -> bool:
-    if is_traced(d):
-        return True
-    delays = np.asarray(d, np.float64)
-    return bool(np.any(delays != np.floor(delays)))
 
 
 def _check_radius(method: str, accuracy: float | None, delay_model: str) -> float:

@@ -10,7 +10,8 @@ import pytest
 import oracles
 import zwidth
 from zwidth.loops.rigid.circle import factor_loop
-from zwidth.loops.rigid.pole_search import both_poles
+from zwidth.loops.rigid.pole_search import first_pair, slow_pole
+from zwidth.loops.rigid.pole_step import halley_step
 from zwidth.words.errors import InputError
 
 REFERENCE = Path(__file__).resolve().parents[3] / "reference"
@@ -138,6 +139,14 @@ def troubled_walls(count, rng):
     return alpha, beta, delta, d
 
 
+def follow_both(steps, loop, fractional):
+    """The slow pole and the first pair of the ring, after so many steps from their starts."""
+    places = slow_pole(loop), first_pair(loop, fractional)
+    for _ in range(steps):
+        places = [halley_step(*place, loop, fractional) for place in places]
+    return places
+
+
 def walls_with_poles_of_one_size(count, rng):
     """The slow pole as large as the pair, by bisection in beta; then apart by rounding and more."""
     delta, d = 10.0 ** rng.uniform(-5, 1, count), rng.choice([0.0, 1.0, 2.0, 5.0, 0.5, 1.25], count)
@@ -145,7 +154,7 @@ def walls_with_poles_of_one_size(count, rng):
     low, high = (zwidth.boundary_point(delta, d, alpha=alpha, side=side).beta for side in ("lower", "upper"))
 
     def first(beta):
-        slow, _, pair, _ = both_poles(40, factor_loop(alpha, beta, delta, d, True), True)
+        (slow, _), (pair, _) = follow_both(40, factor_loop(alpha, beta, delta, d, True), True)
         return slow > pair
 
     low, high = np.array(low + 0.02 * (high - low)), np.array(high)
@@ -173,7 +182,7 @@ def walls_with_double_poles(count, rng):
     with np.errstate(all="ignore"):
         for _ in range(70):
             middle = np.sqrt(low * high)
-            pair = both_poles(30, factor_loop(middle, beta, delta, d, False), False)[1] > 1e-7
+            pair = follow_both(30, factor_loop(middle, beta, delta, d, False), False)[0][1] > 1e-7
             low, high = np.where(pair, low, middle), np.where(pair, middle, high)
     return high, beta, delta, d
 

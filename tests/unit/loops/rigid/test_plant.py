@@ -8,7 +8,7 @@ import tolerances as tol
 from mpmath import mp, mpf
 
 import oracles
-from zwidth.loops.rigid.device import held_plant, phi_functions, split_delay, undelayed_plant
+from zwidth.loops.rigid.device import held_plant, phi_functions, split_delay
 
 FRACTIONS = [0.0, 1e-300, 1e-16, 1e-8, 0.125, 0.25, 0.37, 0.5, 0.75, 0.9, 1 - 2.0**-30, 1 - 2.0**-53]
 DAMPINGS = [0.0, 1e-300, 1e-16, 1e-8, 1e-3, 0.1, 1.0, 2.31, 2.5, 3.0, 8.0, 30.0, 700.0, 1e4, 1e6]
@@ -59,7 +59,7 @@ def test_one_minus_c_keeps_its_digits(plants):
 def test_no_fraction_is_no_special_case(x64):
     delta = jnp.asarray(DAMPINGS)
     held = jax.vmap(held_plant)(delta, jnp.zeros_like(delta))
-    whole = jax.vmap(undelayed_plant)(delta)
+    whole = jax.vmap(held_plant)(delta)
     for with_fraction, without in zip(held, whole, strict=True):
         np.testing.assert_array_equal(with_fraction, without)
 
@@ -86,7 +86,7 @@ PHYSICAL = [(0.1, 10.0, 1e-3), (0.1, 100.0, 1e-3), (2.0, 1e-9, 5e-4), (0.045, 30
 def transfers(mass, damping, period):
     """Numerator and denominator of the paper's H_v and H_x, from held force in N to sampled velocity and position."""
     delta = np.float64(damping * period / mass)
-    plant = undelayed_plant(delta)
+    plant = held_plant(delta)
     gain = period * period / mass
     velocity = [period / mass * phi_functions(delta).phi1], [1.0, -plant.c]
     return velocity, ([gain * plant.a2, gain * plant.a1], [1.0, -(1.0 + plant.c), plant.c])

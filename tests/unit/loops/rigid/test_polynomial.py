@@ -10,8 +10,9 @@ from mpmath import mp, mpf
 
 import oracles
 import zwidth
+from zwidth.loops.rigid.device import held_plant
 from zwidth.loops.rigid.folding import find_degree
-from zwidth.loops.rigid.polynomial import affine, choose_plant
+from zwidth.loops.rigid.polynomial import affine
 from zwidth.words.errors import InputError, TracedDelayError
 
 WALLS = [(0.5, 0.5), (1e-8, -0.3), (40.0, -7.0), (-0.1, 0.0), (0.0, 1.0)]
@@ -137,7 +138,7 @@ def test_si_polynomial_without_damping_is_the_limit():
 @pytest.mark.parametrize("scene", PHYSICAL)
 def test_the_closed_loop_s_numerator_is_that_of_eq_10(scene, d):
     mass, damping, period, *_ = scene
-    plant = choose_plant(np.float64(damping * period / mass), np.float64(d), find_degree(d))
+    plant = held_plant(np.float64(damping * period / mass))
     got = period * period / mass * np.array([plant.a2, plant.a1])
     with mp.workdps(80):
         m, b, T = mpf(mass), mpf(damping), mpf(period)
