@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.fitting.hidden import HiddenPole, LagTest, PoleBank, find_hidden, look_for_lags
-from zwidth.fitting.output_error import FittedModel, follow_start, settle
+from zwidth.fitting.output_error import NEARLY, FittedModel, follow_start, settle
 from zwidth.fitting.structure import StructuredRecordings
 
 # So many parts, lags and resonances, are added at most; so many positions of each log tell which one.
@@ -61,9 +61,11 @@ def choose_structure(best: FittedModel, longest: float, resolution: float) -> _L
         if richer is None:
             break
         best, pole, banks, lags = _look(richer)
+    if best is rigid[0] or not (rival or (pole is None and best.excess <= ALIKE)):
+        return rigid
+    best = settle(best.model, best.theta, longest, resolution)
     known = best.arrived and not best.inverse.open[: best.model.parts.stop].any()
-    explained = rival is not None or (pole is None and best.excess <= ALIKE)
-    return (best, rival or pole, banks, lags) if explained and known else rigid
+    return (best, rival or pole, banks, lags) if known else rigid
 
 
 def _look(best: FittedModel) -> _Looked:
@@ -92,9 +94,9 @@ def _grow(
         tried.append(_Trial(model.measured.size * np.log(squares), np.log(model.measured.size), model, theta))
     likeliest = min(tried, key=lambda trial: trial.cost)
     model = replace(likeliest.model, logs=best.model.logs)
-    found = settle(model, likeliest.theta, longest, resolution)
+    found = settle(model, likeliest.theta, longest, resolution, (), NEARLY)
     if resolution:
-        found = settle(replace(model, noise=found.noise), found.theta, longest, resolution)
+        found = settle(replace(model, noise=found.noise), found.theta, longest, resolution, (), NEARLY)
     if best.lag_behind(found) <= (found.theta.size - best.theta.size) * np.log(best.count):
         return None, None
     for trial in tried:

@@ -28,8 +28,8 @@ _GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
 # Devices with other parts are compared at this promised reduction.
 _CLOSELY = 2e-5
-# Promised reductions of the squares that end the search, and excuse a corner; steps; how they are damped.
-_ARRIVED, _NEARLY, _STEPS = 1e-14, 1e-6, 100
+# Promised reductions of the squares that end the search, tell the noise and excuse a corner; steps; how they are damped.
+_ARRIVED, NEARLY, _STEPS = 1e-14, 1e-6, 100
 _EASY, _LIGHT, _STUBBORN = 1e-4, 1e-6, 1e12
 # A mass that slides back by less than this share of its way may do so for the noise alone.
 _BACK = 0.1
@@ -169,7 +169,7 @@ class FittedModel:
 def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: float) -> FittedModel:
     """The device of the least squares, with a constant force and friction."""
     model = Recordings(recordings)
-    best = _fit(model, _follow(model, _start(model, longest), longest), longest, resolution)
+    best = _fit(model, _follow(model, _start(model, longest), longest), longest, resolution, (), NEARLY if resolution else _ARRIVED)
     if resolution:
         # At rest an encoder errs by the same all the time: that counts once.
         model = replace(model, noise=best.noise)
@@ -271,14 +271,19 @@ def follow_start(model: Recordings, start: np.ndarray, longest: float, steps: in
 
 
 def _fit(
-    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
+    model: Recordings,
+    start: np.ndarray,
+    longest: float,
+    resolution: float,
+    held: tuple[int, ...] = (),
+    arrived: float = _ARRIVED,
 ) -> FittedModel:
     """Least squares from a start, or at rest where that is as good.
 
     First speeds that friction stops within the noise hardly move the positions. Beside such a speed the position's
     derivative is next to 0, and steps towards the best one hardly end.
     """
-    best = settle(model, start, longest, resolution, held)
+    best = settle(model, start, longest, resolution, held, arrived)
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.speeds]), best.theta
     # The way to the stop, v^2/(2 c) without damping and v/delta without friction.
     slid = speed**2 / (2.0 * friction + delta * speed)
@@ -286,21 +291,26 @@ def _fit(
     if idle.any():
         still = best.theta.copy()
         still[model.speeds[idle]] = 0.0
-        resting = settle(model, still, longest, resolution, held)
+        resting = settle(model, still, longest, resolution, held, arrived)
         if not best.arrived or resting.explains_as_well(best):
             return resting
     return best
 
 
 def settle(
-    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
+    model: Recordings,
+    start: np.ndarray,
+    longest: float,
+    resolution: float,
+    held: tuple[int, ...] = (),
+    arrived: float = _ARRIVED,
 ) -> FittedModel:
     """As `_refine`, with neither damping nor delay negative."""
-    best = _refine(model, start, longest, held)
+    best = _refine(model, start, longest, held, arrived=arrived)
     while negative := tuple(k for k in (1, 2) if best[0][k] < 0):
         best[0][list(negative)] = 0.0
         held = (*held, *negative)
-        best = _refine(model, best[0], longest, held)
+        best = _refine(model, best[0], longest, held, arrived=arrived)
     return FittedModel(model, *best, resolution)
 
 
@@ -364,4 +374,4 @@ def _refine(
         damping = 0.0 if damping < _LIGHT and less < 1.0 else less * damping
         if before - squares <= arrived * before and promised <= arrived * before:
             return theta, squares, True
-    return theta, squares, promised <= _NEARLY * squares
+    return theta, squares, promised <= NEARLY * squares
