@@ -24,7 +24,7 @@ _KINDS = ((1, 0), (2, 0), (0, 1), (1, 1))
 # Few walls: what further numbers explain of noise more often than this is no evidence of them.
 _CHANCE = 0.003
 # Slopes promise squares at most so many times as large as what they lead to.
-_HOPELESS = 2.0
+_HOPELESS = 1.2
 # Residuals that are rounding alone.
 _ROUNDING = 1e-9
 
@@ -112,11 +112,11 @@ def _try(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> FittedKind:
     # Parts are found where the walls tell their numbers; of a rigid device it is said which wall is missing.
     parts = onsets.lag + onsets.modes > 0
     for near, start in look_around(onsets, weights):
-        most = kind.equals[0].squares + AS_GOOD * scale if kind.equals else np.inf
+        most = _HOPELESS * (kind.equals[0].squares + AS_GOOD * scale) if kind.equals else np.inf
         known = any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found)
-        if near.found and (known or near.ahead > _HOPELESS * most):
+        if near.found and (known or near.ahead > most):
             continue
-        for fit in find_candidates(onsets, weights, near, start):
+        for fit in find_candidates(onsets, weights, near, start, most if parts else np.inf):
             found.append(fit)
             if not (fit.found and fit.squares < most and _at_edge(kind, fit)):
                 continue

@@ -67,12 +67,19 @@ def look_around(onsets: Onsets, weights: np.ndarray) -> list[tuple[Candidate, np
     return [each for each in near if not parts or (each[0].found and each[0].ahead <= _FAR * near[0][0].squares)]
 
 
-def find_candidates(onsets: Onsets, weights: np.ndarray, near: Candidate, start: np.ndarray) -> list[Candidate]:
-    """The local best fit there. Where damping or delay would be negative, those from the start with it held at 0."""
+def find_candidates(
+    onsets: Onsets, weights: np.ndarray, near: Candidate, start: np.ndarray, most: float
+) -> list[Candidate]:
+    """The local best fit there. Where damping or delay would be negative, those from the start with it held at 0.
+
+    None where its squares are more than ``most``: what is held leaves more.
+    """
     if near.found:
         free = _solve(onsets, weights, near.theta, ())
         if min(free.theta[1:3]) >= 0:
             return [free]
+        if free.squares > most:
+            return []
     ends = (_solve(onsets, weights, start, held) for held in ((1,), (2,), (1, 2)))
     return [end for end in ends if min(end.theta[1:3]) >= 0]
 

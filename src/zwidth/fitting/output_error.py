@@ -28,7 +28,8 @@ _GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
 # Devices with other parts are compared at this promised reduction.
 _CLOSELY = 2e-5
-# Promised reductions of the squares that end the search, tell the noise and excuse a corner; steps; how they are damped.
+# Promised reductions of the squares that end the search, and that tell the noise and excuse a corner; steps; how they
+# are damped.
 _ARRIVED, NEARLY, _STEPS = 1e-14, 1e-6, 100
 _EASY, _LIGHT, _STUBBORN = 1e-4, 1e-6, 1e12
 # A mass that slides back by less than this share of its way may do so for the noise alone.
@@ -41,6 +42,8 @@ _WITHIN = 3.0
 _BLIND, _ROUNDING = 1e7, 1e-13
 # Sums of residuals that noise alone exceeds so rarely are of something else.
 _CHANCE = 1e-3
+# Which numbers of theta stay as they start.
+_Held = tuple[int, ...]
 
 
 class ColumnsInverse(NamedTuple):
@@ -169,7 +172,8 @@ class FittedModel:
 def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: float) -> FittedModel:
     """The device of the least squares, with a constant force and friction."""
     model = Recordings(recordings)
-    best = _fit(model, _follow(model, _start(model, longest), longest), longest, resolution, (), NEARLY if resolution else _ARRIVED)
+    start = _follow(model, _start(model, longest), longest)
+    best = _fit(model, start, longest, resolution, (), NEARLY if resolution else _ARRIVED)
     if resolution:
         # At rest an encoder errs by the same all the time: that counts once.
         model = replace(model, noise=best.noise)
@@ -271,12 +275,7 @@ def follow_start(model: Recordings, start: np.ndarray, longest: float, steps: in
 
 
 def _fit(
-    model: Recordings,
-    start: np.ndarray,
-    longest: float,
-    resolution: float,
-    held: tuple[int, ...] = (),
-    arrived: float = _ARRIVED,
+    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: _Held = (), arrived: float = _ARRIVED
 ) -> FittedModel:
     """Least squares from a start, or at rest where that is as good.
 
@@ -298,12 +297,7 @@ def _fit(
 
 
 def settle(
-    model: Recordings,
-    start: np.ndarray,
-    longest: float,
-    resolution: float,
-    held: tuple[int, ...] = (),
-    arrived: float = _ARRIVED,
+    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: _Held = (), arrived: float = _ARRIVED
 ) -> FittedModel:
     """As `_refine`, with neither damping nor delay negative."""
     best = _refine(model, start, longest, held, arrived=arrived)
@@ -315,12 +309,7 @@ def settle(
 
 
 def _refine(
-    model: Recordings,
-    start: np.ndarray,
-    longest: float,
-    held: tuple[int, ...],
-    most: int = _STEPS,
-    arrived: float = _ARRIVED,
+    model: Recordings, start: np.ndarray, longest: float, held: _Held, most: int = _STEPS, arrived: float = _ARRIVED
 ) -> tuple[np.ndarray, float, bool]:
     """Levenberg and Marquardt's steps within bounds: theta, the sum of squares, and whether it is the least.
 

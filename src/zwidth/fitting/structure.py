@@ -39,10 +39,10 @@ _DOUBLE = 1e-5
 class StructuredRecordings(Recordings):
     """Several logs of one device with an amplifier of order ``lag`` and so many ``modes``.
 
-    theta is ``(g, delta, d)``, the amplifier's delay at low frequencies in periods (and its damping ratio), of each mode
-    the frequency in radians a period, the damping ratio and ``T^2/m``, then for each log x0 and v0, and two numbers of
-    how each mode was moving before; o and c come last. The delay ``2 zeta tau``, not tau, for a log tells its sum with d
-    far better than either: along a straight valley steps are long.
+    theta is ``(g, delta, d)``, the amplifier's delay at low frequencies in periods (and damping ratio), of each mode the
+    frequency in radians a period, the damping ratio and ``T^2/m``, then for each log x0 and v0, and two numbers of how
+    each mode was moving before; o and c come last. That delay is ``2 zeta tau`` of second order, for which tau stands
+    not: a log tells its sum with d far better than either, and along a straight valley steps are long.
     """
 
     lag: int = 0  # pyright: ignore[reportIncompatibleVariableOverride]  (0 of every rigid mass)
@@ -108,7 +108,7 @@ class StructuredRecordings(Recordings):
         return ModelledMotion(place, differentiate)
 
     def _find_poles(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of thetas along the first axis, poles on and above the real axis, weights, and which state of modes, or -1."""
+        """Of thetas by the first axis: poles on and above the real axis, weights, and which state of modes, or -1."""
         lag, modes = _read_lag(at, self.lag), at[self.parts][self.lag :]
         modes = modes.reshape(self.modes, 3, at.shape[1]).copy()
         modes[:, 2] /= at[0]
