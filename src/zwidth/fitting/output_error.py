@@ -213,10 +213,10 @@ def _start(model: Recordings, longest: float) -> list[np.ndarray]:
     ends = np.cumsum([log.position.size for log in early.logs])
     rows = np.concatenate([np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)])
 
-    def search() -> list[tuple[float, float, int]]:
+    def search(deltas: tuple[float, ...] = _DELTAS) -> list[tuple[float, float, int]]:
         """The sums of squares of dampings and delays, the least first."""
         found = []
-        for delta, some in product(_DELTAS, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
+        for delta, some in product(deltas, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
             columns = _answer(early, delta, 0.0, base)[rows - some[:, None]]
             rests = _combine(columns, model.measured)[1]
             found += [(float(rest), delta, d) for rest, d in zip(rests, some.tolist(), strict=True)]
@@ -236,9 +236,12 @@ def _start(model: Recordings, longest: float) -> list[np.ndarray]:
     firsts = [log.position[: 2 * _FIRST].reshape(2, -1).mean(1) for log in model.logs]
     base[model.speeds] = np.diff(firsts)[:, 0] / _FIRST / starts[0][0]
     base[-2] = starts[0][-2] / starts[0][0]
+    delta = apart[0][0]
     for friction in _FRICTIONS * model.largest:
         base[-1] = friction
-        starts.append(start(*search()[0][1:]))
+        # The more friction, the less damping is left to find.
+        _, delta, d = search(_DELTAS[: _DELTAS.index(delta) + 2])[0]
+        starts.append(start(delta, d))
     return starts
 
 

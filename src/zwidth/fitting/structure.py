@@ -39,10 +39,10 @@ _DOUBLE = 1e-5
 class StructuredRecordings(Recordings):
     """Several logs of one device with an amplifier of order ``lag`` and so many ``modes``.
 
-    theta is ``(g, delta, d)``, the amplifier's delay at low frequencies in periods (and damping ratio), of each mode the
-    frequency in radians a period, the damping ratio and ``T^2/m``, then for each log x0 and v0, and two numbers of how
-    each mode was moving before; o and c come last. That delay is ``2 zeta tau`` of second order, for which tau stands
-    not: a log tells its sum with d far better than either, and along a straight valley steps are long.
+    theta is ``(g, delta, d)``, the amplifier's delay at low frequencies in periods (and damping ratio), of each mode
+    the frequency in radians a period, the damping ratio and ``T^2/m``, then for each log x0 and v0, and two numbers of
+    how each mode was moving before; o and c come last. The delay of second order, ``2 zeta tau``, stands in place of
+    tau: a log tells its sum with d far better than either, and along a straight valley steps are long.
     """
 
     lag: int = 0  # pyright: ignore[reportIncompatibleVariableOverride]  (0 of every rigid mass)
