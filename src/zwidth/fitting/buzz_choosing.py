@@ -23,8 +23,8 @@ _BESIDE = 1e-6
 _KINDS = ((1, 0), (2, 0), (0, 1), (1, 1))
 # Few walls: what further numbers explain of noise more often than this is no evidence of them.
 _CHANCE = 0.003
-# Slopes promise squares at most so many times as large as what they lead to.
-_HOPELESS = 1.2
+# Slopes promise squares at most so many times as large as they lead to, and near an optimum no less than this share.
+_HOPELESS, _STUCK = 1.2, 0.5
 # Residuals that are rounding alone.
 _ROUNDING = 1e-9
 
@@ -114,13 +114,14 @@ def _try(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> FittedKind:
     for near, start in look_around(onsets, weights):
         most = _HOPELESS * (kind.equals[0].squares + AS_GOOD * scale) if kind.equals else np.inf
         known = any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found)
-        if near.found and (known or near.ahead > most):
+        # Where slopes promise much the search got stuck, and says nothing yet.
+        if near.found and (known or near.ahead > max(most, _STUCK * near.squares)):
             continue
         for fit in find_candidates(onsets, weights, near, start, most if parts else np.inf):
             found.append(fit)
             if not (fit.found and fit.squares < most and _at_edge(kind, fit)):
                 continue
-            if not (parts and is_blind(weigh(onsets.follow(fit.theta).slopes, weights))):
+            if not (parts and is_blind(weigh(onsets.follow(fit.theta).slopes(), weights))):
                 kind.equals.append(fit)
                 kind.equals.sort(key=lambda each: each.squares)
                 scale = 1.0 if known_noise else max(kind.equals[0].squares / freedom, EXACT**2)

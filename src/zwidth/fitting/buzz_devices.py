@@ -107,10 +107,8 @@ def _solve(
     from scipy.optimize import least_squares
 
     free = [k for k in range(onsets.unknowns) if k not in held]
-    theta = start.copy()
+    theta, lost = start.copy(), 0
     theta[list(held)] = 0.0
-
-    lost = 0
 
     @lru_cache(maxsize=1)  # The solver asks for values and slopes apart.
     @np.errstate(all="ignore")
@@ -132,9 +130,8 @@ def _solve(
     @np.errstate(all="ignore")
     def differentiate(values: np.ndarray) -> np.ndarray:
         _, _, walls, good = evaluate(tuple(values))
-        slopes = walls.slopes if walls else np.zeros((*good.shape, 2, onsets.unknowns))
-        slopes = np.where(good[:, None, None] & np.isfinite(slopes), slopes, 0.0)
-        return weigh(slopes, weights)[:, free]
+        slopes = walls.slopes() if walls else np.zeros((*good.shape, 2, onsets.unknowns))
+        return weigh(np.where(good[:, None, None] & np.isfinite(slopes), slopes, 0.0), weights)[:, free]
 
     names = tuple(_NAMES[k] for k in held)
     try:
@@ -152,6 +149,5 @@ def _solve(
     except _LostError:
         return Candidate(theta, np.inf, np.full((onsets.w.size, 2), np.nan), names, False)
     at, residuals, _, good = evaluate(tuple(found.x))
-    slopes = differentiate(found.x)
-    rest = residuals.ravel() - slopes @ (np.linalg.pinv(slopes) @ residuals.ravel())
+    rest = residuals.ravel() - found.jac @ (np.linalg.pinv(found.jac) @ residuals.ravel())
     return Candidate(at, float((residuals**2).sum()), -residuals, names, bool(good.all()), float(rest @ rest))

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -109,19 +109,13 @@ def _answer(plant: Any, at: CirclePoints) -> Any:
     return plant.a2 * at.z + plant.a1 + plant.a0 / at.z
 
 
-@dataclass(frozen=True)
-class Followed:
-    """kappa and w of walls, whether w was found, and the derivatives of their logarithms where somebody asks."""
+class Followed(NamedTuple):
+    """kappa and w of walls, whether w was found, and what differentiates their logarithms, (n, 2, unknowns)."""
 
     kappa: np.ndarray
     w: np.ndarray
     found: np.ndarray
-    differentiate: Callable[[], np.ndarray]
-
-    @cached_property
-    def slopes(self) -> np.ndarray:
-        """In theta, (n, 2, unknowns)."""
-        return self.differentiate()
+    slopes: Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True)
