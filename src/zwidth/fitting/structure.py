@@ -92,7 +92,8 @@ class StructuredRecordings(Recordings):
 
         def differentiate() -> np.ndarray:
             # Rows, and how their real parts count in the slopes. A delay moves E by -E' = -p E - F.
-            parts = [(log.pushes[0, log.skip - int(np.floor(d)) + now], -own[2] * weights.sum())]
+            moved = log.pushes[0, log.skip - int(np.floor(d)) + now]
+            parts: list[tuple[Any, Any]] = [(moved, -own[2] * weights.sum())]
             by_theta, slopes = self._differ_poles(theta)
             for pole, weight, by, slope in zip(poles, weights, by_theta, slopes, strict=True):
                 way = ways[pole]
