@@ -137,7 +137,7 @@ def fit_buzz(
     elif not equals:
         against = "the walls do not lie on the edge of this device's stable set: they began to buzz before or later"
     status = Status.NO_BOUNDARY if against else Status.OK
-    slopes = weigh(onsets.follow(best.theta).slopes, weights)
+    slopes = weigh(onsets.follow(best.theta).slopes(), weights)
     _refuse_blind(slopes, best.theta, table, bool(equals))
     information = slopes.T @ slopes / scale
     values, by_theta = in_si(best.theta, period, onsets.lag, onsets.modes)
@@ -249,7 +249,7 @@ def _further(
     if not edge.any():
         return None
     walls = replace(onsets, kappa=kappa[real][edge], rub=rub[real][edge], w=w[real][edge])
-    rows = walls.follow(theta).slopes
+    rows = walls.follow(theta).slopes()
     more = np.einsum("nki,k,nkj->nij", rows, precision, rows)
     after = np.linalg.solve(information + more, wanted[:, None])[..., 0] @ wanted
     best = int(np.argmin(after))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.buzz_devices import Candidate, find_candidates, is_blind, weigh
+from zwidth.fitting.buzz_devices import Candidate, find_candidates, is_blind, look_around, weigh
 from zwidth.fitting.buzzing import Onsets
 from zwidth.fitting.scenes import scene_of
 from zwidth.fitting.stiffness_estimate import in_si
@@ -23,6 +23,8 @@ _BESIDE = 1e-6
 _KINDS = ((1, 0), (2, 0), (0, 1), (1, 1))
 # Few walls: what further numbers explain of noise more often than this is no evidence of them.
 _CHANCE = 0.003
+# Slopes promise squares at most so many times as large as they lead to, and near an optimum no less than this share.
+_HOPELESS, _STUCK = 1.2, 0.5
 # Residuals that are rounding alone.
 _ROUNDING = 1e-9
 
@@ -105,21 +107,28 @@ def choose_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> tup
 def _try(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> FittedKind:
     """The best device of a kind, and all that fit as well."""
     nothing = Candidate(np.zeros(onsets.unknowns), np.inf, np.full((onsets.w.size, 2), np.nan), (), False)
-    found = find_candidates(onsets, weights) or [nothing]
     freedom = 2 * onsets.w.size - onsets.unknowns
-    kind = FittedKind(onsets, found[0], 1.0, [], known_noise)
-    scale = 1.0
-    for fit in found:
-        if not fit.found or (kind.equals and fit.squares - kind.equals[0].squares >= AS_GOOD * scale):
+    kind, found, scale = FittedKind(onsets, nothing, 1.0, [], known_noise), [], 1.0
+    # Parts are found where the walls tell their numbers; of a rigid device it is said which wall is missing.
+    parts = onsets.lag + onsets.modes > 0
+    for near, start in look_around(onsets, weights):
+        most = _HOPELESS * (kind.equals[0].squares + AS_GOOD * scale) if kind.equals else np.inf
+        known = any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found)
+        # Where slopes promise much the search got stuck, and says nothing yet.
+        if near.found and (known or near.ahead > max(most, _STUCK * near.squares)):
             continue
-        # Parts are found where the walls tell their numbers; of a rigid device it is said which wall is missing.
-        parts = onsets.lag + onsets.modes > 0
-        if _at_edge(kind, fit) and not (parts and is_blind(weigh(onsets.follow(fit.theta).slopes, weights))):
-            kind.equals.append(fit)
-            if not known_noise:
-                scale = max(kind.equals[0].squares / freedom, EXACT**2)
-    best = (kind.equals or found)[0]
-    return kind._replace(best=best, scale=1.0 if known_noise else max(best.squares / freedom, EXACT**2))
+        for fit in find_candidates(onsets, weights, near, start, most if parts else np.inf):
+            found.append(fit)
+            if not (fit.found and fit.squares < most and _at_edge(kind, fit)):
+                continue
+            if not (parts and is_blind(weigh(onsets.follow(fit.theta).slopes(), weights))):
+                kind.equals.append(fit)
+                kind.equals.sort(key=lambda each: each.squares)
+                scale = 1.0 if known_noise else max(kind.equals[0].squares / freedom, EXACT**2)
+    as_good = [fit for fit in kind.equals if fit.squares - kind.equals[0].squares < AS_GOOD * scale]
+    best = (as_good or sorted(found, key=lambda fit: (not fit.found, fit.squares)) or [nothing])[0]
+    scale = 1.0 if known_noise else max(best.squares / freedom, EXACT**2)
+    return kind._replace(best=best, scale=scale, equals=as_good)
 
 
 @np.errstate(all="ignore")  # Of parts that no device has, zeros overflow.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.buzzing import Onsets
+from zwidth.fitting.buzzing import Followed, Onsets
 
 # The dampings b T/m that are started from where nothing buzzes slowly, the number of cut-offs, and how many of the
 # dips.
@@ -25,13 +25,17 @@ _NAMES = ("mass", "damping", "delay", "cut-off")
 
 
 class Candidate(NamedTuple):
-    """A local best fit: theta, its sum of squares, residuals, what is held at 0, and whether all walls were found."""
+    """A local best fit: theta, its sum of squares, residuals, what is held at 0, and whether all walls were found.
+
+    Last, the sum of squares where its slopes lead: as much at an optimum, far less where the search got stuck.
+    """
 
     theta: np.ndarray
     squares: float
     residuals: np.ndarray
     held: tuple[str, ...]
     found: bool
+    ahead: float = np.inf
 
 
 class _LostError(Exception):
@@ -49,9 +53,8 @@ def is_blind(slopes: np.ndarray) -> bool:
     return not np.all(sizes > 0) or bool(np.linalg.cond(slopes / sizes) > _BLIND)
 
 
-def find_candidates(onsets: Onsets, weights: np.ndarray) -> list[Candidate]:
-    """Local best fits, the best first. Where damping or delay would be negative, it is held at 0."""
-    found: list[Candidate] = []
+def look_around(onsets: Onsets, weights: np.ndarray) -> list[tuple[Candidate, np.ndarray]]:
+    """Where a first look from each start leads, the best first, and the start."""
     # Half a turn over the delay, and some more for noise.
     longest = 1.2 * np.pi / float(onsets.w.max())
     parts = onsets.lag + onsets.modes > 0
@@ -59,22 +62,26 @@ def find_candidates(onsets: Onsets, weights: np.ndarray) -> list[Candidate]:
         starts = onsets.starts_beside(_DELTAS[::_EVERY], longest, _STARTS[0])
     else:
         starts = onsets.starts(_dampings(onsets), longest, _cutoffs(onsets), _STARTS[onsets.unknown_cutoff])
-    least = np.inf
-    for start in starts:
-        near = _solve(onsets, weights, start, (), _NEARLY)
-        least = min(least, near.squares)
-        if parts and not (near.found and near.squares <= _FAR * least):
-            continue
-        if near.found:
-            if any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found):
-                continue
-            free = _solve(onsets, weights, near.theta, ())
-            if min(free.theta[1:3]) >= 0:
-                found.append(free)
-                continue
-        ends = (_solve(onsets, weights, start, held) for held in ((1,), (2,), (1, 2)))
-        found += [end for end in ends if min(end.theta[1:3]) >= 0]
-    return sorted(found, key=lambda fit: (not fit.found, fit.squares))
+    near = [(_solve(onsets, weights, start, (), _NEARLY), start) for start in starts]
+    near = sorted(near, key=lambda each: each[0].squares)
+    return [each for each in near if not parts or (each[0].found and each[0].ahead <= _FAR * near[0][0].squares)]
+
+
+def find_candidates(
+    onsets: Onsets, weights: np.ndarray, near: Candidate, start: np.ndarray, most: float
+) -> list[Candidate]:
+    """The local best fit there. Where damping or delay would be negative, those from the start with it held at 0.
+
+    None where its squares are more than ``most``: what is held leaves more.
+    """
+    if near.found:
+        free = _solve(onsets, weights, near.theta, ())
+        if min(free.theta[1:3]) >= 0:
+            return [free]
+        if free.squares > most:
+            return []
+    ends = (_solve(onsets, weights, start, held) for held in ((1,), (2,), (1, 2)))
+    return [end for end in ends if min(end.theta[1:3]) >= 0]
 
 
 def _dampings(onsets: Onsets) -> np.ndarray:
@@ -100,40 +107,38 @@ def _solve(
     from scipy.optimize import least_squares
 
     free = [k for k in range(onsets.unknowns) if k not in held]
-    theta = start.copy()
+    theta, lost = start.copy(), 0
     theta[list(held)] = 0.0
 
-    lost = 0
-
-    possible = np.errstate(all="ignore")(onsets.is_possible)
-
     @lru_cache(maxsize=1)  # The solver asks for values and slopes apart.
-    def evaluate(values: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+    @np.errstate(all="ignore")
+    def evaluate(values: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, Followed | None, np.ndarray]:
         nonlocal lost
         at = theta.copy()
         at[free] = values
-        if possible(at):
-            with np.errstate(all="ignore"):
-                walls = onsets.follow(at)
-                ratios = np.stack([np.log(walls.kappa / onsets.kappa), np.log(walls.w / onsets.w)], -1)
-            good = walls.found & np.all(np.isfinite(ratios), -1) & np.all(np.isfinite(walls.slopes), (1, 2))
-        else:
-            good = np.zeros(onsets.w.shape, bool)
-            ratios, walls = 0.0, None
+        walls, ratios, good = None, 0.0, np.zeros(onsets.w.shape, bool)
+        if onsets.is_possible(at):
+            walls = onsets.follow(at)
+            ratios = np.stack([np.log(walls.kappa / onsets.kappa), np.log(walls.w / onsets.w)], -1)
+            good = walls.found & np.all(np.isfinite(ratios), -1)
         lost = 0 if good.all() else lost + 1
         if lost > _LOST:
             raise _LostError
         # Where no such wall is found, as wrong as can be, and flat.
-        ratios = np.where(good[:, None], ratios, 10.0)
-        slopes = np.where(good[:, None, None], walls.slopes if walls else 0.0, np.zeros((1, 2, onsets.unknowns)))
-        return at, ratios * weights, weigh(slopes, weights)[:, free], bool(good.all())
+        return at, np.where(good[:, None], ratios, 10.0) * weights, walls, good
+
+    @np.errstate(all="ignore")
+    def differentiate(values: np.ndarray) -> np.ndarray:
+        _, _, walls, good = evaluate(tuple(values))
+        slopes = walls.slopes() if walls else np.zeros((*good.shape, 2, onsets.unknowns))
+        return weigh(np.where(good[:, None, None] & np.isfinite(slopes), slopes, 0.0), weights)[:, free]
 
     names = tuple(_NAMES[k] for k in held)
     try:
         found = least_squares(
             lambda x: evaluate(tuple(x))[1].ravel(),
             theta[free],
-            lambda x: evaluate(tuple(x))[2],  # pyright: ignore[reportArgumentType]  (a function or a name)
+            differentiate,  # pyright: ignore[reportArgumentType]  (a function or a name)
             method="lm",
             x_scale="jac",
             xtol=tolerance,
@@ -144,4 +149,5 @@ def _solve(
     except _LostError:
         return Candidate(theta, np.inf, np.full((onsets.w.size, 2), np.nan), names, False)
     at, residuals, _, good = evaluate(tuple(found.x))
-    return Candidate(at, float((residuals**2).sum()), -residuals, names, good)
+    rest = residuals.ravel() - found.jac @ (np.linalg.pinv(found.jac) @ residuals.ravel())
+    return Candidate(at, float((residuals**2).sum()), -residuals, names, bool(good.all()), float(rest @ rest))

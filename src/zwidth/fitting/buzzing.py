@@ -17,7 +17,7 @@ late by d = n + f moves of ``E' = p E + F``, with zeta = z - 1:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -25,10 +25,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import CirclePoints, Jet, circle, lag_jet
+from zwidth.arrays.circle import CirclePoints, Jet, circle
 from zwidth.fitting.scenes import with_cutoff
 from zwidth.fitting.structure import LAGS, RATIOS, TURNS, list_poles
-from zwidth.loops.rigid.device import held_plant, split_delay
+from zwidth.loops.rigid.device import Plant, held_plant, split_delay
 from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.velocity import Estimate, Velocity
 
@@ -58,7 +58,6 @@ class NeededAnswer:
         """Of devices, described once for all frequencies."""
         self.whole, fraction = split_delay(np.asarray(d, float))
         self.delta, self.fraction = delta, fraction
-        self.plant = held_plant(delta, fraction)
         poles, residues = list_poles(delta, lag, modes)
         self.beside = len(poles) > 0
         if poles:
@@ -66,6 +65,11 @@ class NeededAnswer:
             poles, self.residues = np.where(both[: len(poles)] == 0, 1e-300, both[: len(poles)]), both[len(poles) :]
             self.turns, self.full = np.expm1(poles), np.expm1(poles) / poles
             self.late = np.expm1((1.0 - fraction) * poles) / poles
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The mass alone."""
+        return held_plant(self.delta, self.fraction)
 
     def jet(self, at: CirclePoints) -> Jet:
         """q and its derivative in w."""
@@ -80,14 +84,14 @@ class NeededAnswer:
         """The same of the mass alone."""
         plant, turn = self.plant, 1j * at.z
         total, below = _answer(plant, at), at.before + plant.em
-        q = -lag_jet(at, self.whole).value * at.before * below / total
+        q = -np.exp(1j * self.whole * at.w) * at.before * below / total
         slopes = turn / at.before + turn / below - 1j * (plant.a2 * at.z - plant.a0 / at.z) / total
         return Jet(q, q * (1j * self.whole + slopes))
 
     def add(self, at: CirclePoints) -> Jet:
         """What lag and modes add to the response, and its derivative in w."""
         above, below = at.before * self.late + self.full, at.before - self.turns
-        each = self.residues * (lag_jet(at, -self.whole - 1.0).value * above / below)
+        each = self.residues * (np.exp(-1j * (self.whole + 1.0) * at.w) * above / below)
         slopes = 1j * (at.z * (self.late / above - 1.0 / below) - self.whole - 1.0)
         return Jet(each.sum(0), (each * slopes).sum(0))
 
@@ -106,12 +110,12 @@ def _answer(plant: Any, at: CirclePoints) -> Any:
 
 
 class Followed(NamedTuple):
-    """kappa and w of walls, the derivatives of their logarithms in theta, (n, 2, unknowns), and whether w was found."""
+    """kappa and w of walls, whether w was found, and what differentiates their logarithms, (n, 2, unknowns)."""
 
     kappa: np.ndarray
     w: np.ndarray
-    slopes: np.ndarray
     found: np.ndarray
+    slopes: Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -191,26 +195,29 @@ class Onsets:
         at = circle(w)
         f, q = estimate.jet(at), answer.jet(at)
         kappa = (mass * q.value - self.rub * f.value).real
-        # kappa and w as theta moves: d kappa + e_w dw = m dq - rub dF with e_w = rub F' - m q'.
-        rigid = answer.rigid_jet(at).value if answer.beside else q.value
-        change = np.stack([q.value, *answer.moves(at, rigid)], -1)
-        if answer.beside:
-            # q = -1/G: what moves the mass alone counts by the square of its share.
-            change[:, 1:] *= (q.value / rigid)[:, None] ** 2
-            k = np.r_[1, 2, self._rigid : self.unknowns]
-            sides = theta[:, None, None, None] + _STEP * np.eye(theta.size)[:, k, None, None] * _SIDES[:, None]
-            more = np.einsum("kjn,j->nk", self.answer(sides).add(at).value, _WEIGHTS) / _STEP
-            more *= (q.value**2)[:, None]
-            change[:, 1:] += more[:, :2]
-            change = np.concatenate([change, more[:, 2:]], -1)
-        moved = mass * change
-        if self.unknown_cutoff:
-            sides = [self._estimate_at(theta + _STEP * k * np.eye(theta.size)[3]).jet(at).value for k in _SIDES]
-            moved = np.insert(moved, 3, -self.rub * (_WEIGHTS @ sides) / _STEP, -1)
-        by_w = (self.rub * f.slope - mass * q.slope)[:, None]
-        dw = moved.imag / by_w.imag
-        slopes = np.stack([(moved.real - by_w.real * dw) / kappa[:, None], dw / w[:, None]], 1)
-        return Followed(kappa, w, slopes, np.abs(step) <= _FOUND * w)
+
+        def differentiate() -> np.ndarray:
+            # kappa and w as theta moves: d kappa + e_w dw = m dq - rub dF with e_w = rub F' - m q'.
+            rigid = answer.rigid_jet(at).value if answer.beside else q.value
+            change = np.stack([q.value, *answer.moves(at, rigid)], -1)
+            if answer.beside:
+                # q = -1/G: what moves the mass alone counts by the square of its share.
+                change[:, 1:] *= (q.value / rigid)[:, None] ** 2
+                k = np.r_[1, 2, self._rigid : self.unknowns]
+                sides = theta[:, None, None, None] + _STEP * np.eye(theta.size)[:, k, None, None] * _SIDES[:, None]
+                more = np.einsum("kjn,j->nk", self.answer(sides).add(at).value, _WEIGHTS) / _STEP
+                more *= (q.value**2)[:, None]
+                change[:, 1:] += more[:, :2]
+                change = np.concatenate([change, more[:, 2:]], -1)
+            moved = mass * change
+            if self.unknown_cutoff:
+                sides = [self._estimate_at(theta + _STEP * k * np.eye(theta.size)[3]).jet(at).value for k in _SIDES]
+                moved = np.insert(moved, 3, -self.rub * (_WEIGHTS @ sides) / _STEP, -1)
+            by_w = (self.rub * f.slope - mass * q.slope)[:, None]
+            dw = moved.imag / by_w.imag
+            return np.stack([(moved.real - by_w.real * dw) / kappa[:, None], dw / w[:, None]], 1)
+
+        return Followed(kappa, w, np.abs(step) <= _FOUND * w, differentiate)
 
     def starts(self, deltas: np.ndarray, longest: float, cutoffs: np.ndarray, count: int) -> list[np.ndarray]:
         """Devices to start from: the lowest dips over damping, delay and cut-off, where the mass is in closed form.

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.hidden import HiddenPole, PoleBank, find_hidden, look_for_lags
-from zwidth.fitting.output_error import FittedModel, follow_start, settle
+from zwidth.fitting.hidden import HiddenPole, LagTest, PoleBank, find_hidden, look_for_lags
+from zwidth.fitting.output_error import NEARLY, FittedModel, follow_start, settle
 from zwidth.fitting.structure import StructuredRecordings
 
 # So many parts, lags and resonances, are added at most; so many positions of each log tell which one.
@@ -24,6 +24,8 @@ EXACT = 1e-9
 _BY_CHANCE = 5.99
 # Time constants that lags are started from, in periods; a second order's damping ratio.
 _LAGS, _RATIO = (0.3, 1.5), 0.7
+
+_Looked = tuple[FittedModel, HiddenPole | None, list[PoleBank], LagTest | None]
 
 
 class _Trial(NamedTuple):
@@ -40,31 +42,36 @@ class _Trial(NamedTuple):
         return self.misfit + self.theta.size * self.price
 
 
-def choose_structure(
-    best: FittedModel, longest: float, resolution: float
-) -> tuple[FittedModel, HiddenPole | None, list[PoleBank]]:
-    """Add what explains the residuals best as long as they show a pole; then, what they still show.
+def choose_structure(best: FittedModel, longest: float, resolution: float) -> _Looked:
+    """Add what explains the residuals best as long as they show a pole; then, what they still show, and what of lags.
 
     Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
     """
     way = max(float(np.ptp(log.position)) for log in best.model.logs)
     if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * way**2:
-        return best, None, []
-    pole, banks = find_hidden(best)
-    rigid, rival = (best, pole, banks), None
+        return best, None, [], None
+    rigid = best, pole, banks, lags = _look(best)
+    rival = None
     for _ in range(_MOST):
         # A lag has no size of its own, and so is seen where a pole of any size is not.
-        lags = pole is None and not best.model.lag and look_for_lags(best).toward.max() ** 2 > 2.0 * np.log(best.count)
-        if rival is not None or (pole is None and not lags):
+        late = lags is not None and lags.toward.max() ** 2 > 2.0 * np.log(best.count)
+        if rival is not None or (pole is None and not late):
             break
         richer, rival = _grow(best, banks, longest, resolution)
         if richer is None:
             break
-        best = richer
-        pole, banks = find_hidden(best)
+        best, pole, banks, lags = _look(richer)
+    if best is rigid[0] or not (rival or (pole is None and best.excess <= ALIKE)):
+        return rigid
+    best = settle(best.model, best.theta, longest, resolution)
     known = best.arrived and not best.inverse.open[: best.model.parts.stop].any()
-    explained = rival is not None or (pole is None and best.excess <= ALIKE)
-    return (best, rival or pole, banks) if explained and known else rigid
+    return (best, rival or pole, banks, lags) if known else rigid
+
+
+def _look(best: FittedModel) -> _Looked:
+    """What the residuals show; of lags where they show no pole and the device has none."""
+    pole, banks = find_hidden(best)
+    return best, pole, banks, None if pole or best.model.lag else look_for_lags(best)
 
 
 def _grow(
@@ -87,9 +94,9 @@ def _grow(
         tried.append(_Trial(model.measured.size * np.log(squares), np.log(model.measured.size), model, theta))
     likeliest = min(tried, key=lambda trial: trial.cost)
     model = replace(likeliest.model, logs=best.model.logs)
-    found = settle(model, likeliest.theta, longest, resolution)
+    found = settle(model, likeliest.theta, longest, resolution, (), NEARLY)
     if resolution:
-        found = settle(replace(model, noise=found.noise), found.theta, longest, resolution)
+        found = settle(replace(model, noise=found.noise), found.theta, longest, resolution, (), NEARLY)
     if best.lag_behind(found) <= (found.theta.size - best.theta.size) * np.log(best.count):
         return None, None
     for trial in tried:
@@ -110,9 +117,9 @@ def _start(best: FittedModel, banks: list[PoleBank]) -> Iterator[tuple[int, int,
             if late <= head[2] + 0.5:
                 start = [head[0], head[1], max(head[2] - late, 0.0)]
                 yield 1, modes, np.r_[start, late, ringing, speeds, states, theta[-2:]]
-                yield 2, modes, np.r_[start, late / (2.0 * _RATIO), _RATIO, ringing, speeds, states, theta[-2:]]
+                yield 2, modes, np.r_[start, late, _RATIO, ringing, speeds, states, theta[-2:]]
     elif lag == 1:
-        yield 2, modes, np.r_[head, theta[3] / (2.0 * _RATIO), _RATIO, ringing, speeds, states, theta[-2:]]
+        yield 2, modes, np.r_[head, theta[3], _RATIO, ringing, speeds, states, theta[-2:]]
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
     for ratio, frequency in _likeliest(banks):
         mode = [2.0 * np.pi * frequency, ratio, 0.0]

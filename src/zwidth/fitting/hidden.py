@@ -167,14 +167,14 @@ def look_for_lags(best: FittedModel) -> LagTest:
     return LagTest(lags, whole / error, left.T @ rest / whole / error, moved)
 
 
-def bound_lag(best: FittedModel, scene: Scene, reach: float) -> HiddenLag | None:
+def bound_lag(best: FittedModel, test: LagTest | None, scene: Scene, reach: float) -> HiddenLag | None:
     """The longest lag, a first-order one of the amplifier, with which the log goes as well; None where it shows all.
 
     The delay is less by the lag and has to remain.
     """
-    if best.model.lag:
+    if test is None:
         return None
-    test, period = look_for_lags(best), scene.timing.period
+    period = scene.timing.period
     may = (test.whole - test.toward <= reach) & (test.theta[1] >= 0) & (test.theta[2] >= 0)
     count = int(np.argmin(np.append(may, False)))
     if not count:

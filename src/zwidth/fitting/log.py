@@ -132,7 +132,7 @@ def fit_log(
     doubts = [doubt for log in logs for doubt in find_stretches(log)]
     step, odd = _find_step(resolution, logs)
     best = fit_model(recordings, longest, step)
-    best, pole, banks = choose_structure(best, longest, step)
+    best, pole, banks, lags = choose_structure(best, longest, step)
     theta = best.theta
     _refuse_unmoved(best, period)
     if best.inverse.open[:3].any():
@@ -172,7 +172,7 @@ def fit_log(
         return fit
     asked = best, stiffest.scene
     response, hidden = respond_as_fitted(*asked, banks), weigh_resonances(*asked, banks)
-    return replace(fit, response=response, hidden=hidden, lag=bound_lag(*asked, fit.reach))
+    return replace(fit, response=response, hidden=hidden, lag=bound_lag(best, lags, stiffest.scene, fit.reach))
 
 
 def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float) -> list[str]:

@@ -28,8 +28,9 @@ _GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
 # Devices with other parts are compared at this promised reduction.
 _CLOSELY = 2e-5
-# Promised reductions of the squares that end the search, and excuse a corner; steps; how they are damped.
-_ARRIVED, _NEARLY, _STEPS = 1e-14, 1e-6, 100
+# Promised reductions of the squares that end the search, and that tell the noise and excuse a corner; steps; how they
+# are damped.
+_ARRIVED, NEARLY, _STEPS = 1e-14, 1e-6, 100
 _EASY, _LIGHT, _STUBBORN = 1e-4, 1e-6, 1e12
 # A mass that slides back by less than this share of its way may do so for the noise alone.
 _BACK = 0.1
@@ -41,6 +42,8 @@ _WITHIN = 3.0
 _BLIND, _ROUNDING = 1e7, 1e-13
 # Sums of residuals that noise alone exceeds so rarely are of something else.
 _CHANCE = 1e-3
+# Which numbers of theta stay as they start.
+_Held = tuple[int, ...]
 
 
 class ColumnsInverse(NamedTuple):
@@ -169,7 +172,8 @@ class FittedModel:
 def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: float) -> FittedModel:
     """The device of the least squares, with a constant force and friction."""
     model = Recordings(recordings)
-    best = _fit(model, _follow(model, _start(model, longest), longest), longest, resolution)
+    start = _follow(model, _start(model, longest), longest)
+    best = _fit(model, start, longest, resolution, (), NEARLY if resolution else _ARRIVED)
     if resolution:
         # At rest an encoder errs by the same all the time: that counts once.
         model = replace(model, noise=best.noise)
@@ -209,10 +213,10 @@ def _start(model: Recordings, longest: float) -> list[np.ndarray]:
     ends = np.cumsum([log.position.size for log in early.logs])
     rows = np.concatenate([np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)])
 
-    def search() -> list[tuple[float, float, int]]:
+    def search(deltas: tuple[float, ...] = _DELTAS) -> list[tuple[float, float, int]]:
         """The sums of squares of dampings and delays, the least first."""
         found = []
-        for delta, some in product(_DELTAS, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
+        for delta, some in product(deltas, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
             columns = _answer(early, delta, 0.0, base)[rows - some[:, None]]
             rests = _combine(columns, model.measured)[1]
             found += [(float(rest), delta, d) for rest, d in zip(rests, some.tolist(), strict=True)]
@@ -232,9 +236,12 @@ def _start(model: Recordings, longest: float) -> list[np.ndarray]:
     firsts = [log.position[: 2 * _FIRST].reshape(2, -1).mean(1) for log in model.logs]
     base[model.speeds] = np.diff(firsts)[:, 0] / _FIRST / starts[0][0]
     base[-2] = starts[0][-2] / starts[0][0]
+    delta = apart[0][0]
     for friction in _FRICTIONS * model.largest:
         base[-1] = friction
-        starts.append(start(*search()[0][1:]))
+        # The more friction, the less damping is left to find.
+        _, delta, d = search(_DELTAS[: _DELTAS.index(delta) + 2])[0]
+        starts.append(start(delta, d))
     return starts
 
 
@@ -271,14 +278,14 @@ def follow_start(model: Recordings, start: np.ndarray, longest: float, steps: in
 
 
 def _fit(
-    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
+    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: _Held = (), arrived: float = _ARRIVED
 ) -> FittedModel:
     """Least squares from a start, or at rest where that is as good.
 
     First speeds that friction stops within the noise hardly move the positions. Beside such a speed the position's
     derivative is next to 0, and steps towards the best one hardly end.
     """
-    best = settle(model, start, longest, resolution, held)
+    best = settle(model, start, longest, resolution, held, arrived)
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.speeds]), best.theta
     # The way to the stop, v^2/(2 c) without damping and v/delta without friction.
     slid = speed**2 / (2.0 * friction + delta * speed)
@@ -286,31 +293,26 @@ def _fit(
     if idle.any():
         still = best.theta.copy()
         still[model.speeds[idle]] = 0.0
-        resting = settle(model, still, longest, resolution, held)
+        resting = settle(model, still, longest, resolution, held, arrived)
         if not best.arrived or resting.explains_as_well(best):
             return resting
     return best
 
 
 def settle(
-    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
+    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: _Held = (), arrived: float = _ARRIVED
 ) -> FittedModel:
     """As `_refine`, with neither damping nor delay negative."""
-    best = _refine(model, start, longest, held)
+    best = _refine(model, start, longest, held, arrived=arrived)
     while negative := tuple(k for k in (1, 2) if best[0][k] < 0):
         best[0][list(negative)] = 0.0
         held = (*held, *negative)
-        best = _refine(model, best[0], longest, held)
+        best = _refine(model, best[0], longest, held, arrived=arrived)
     return FittedModel(model, *best, resolution)
 
 
 def _refine(
-    model: Recordings,
-    start: np.ndarray,
-    longest: float,
-    held: tuple[int, ...],
-    most: int = _STEPS,
-    arrived: float = _ARRIVED,
+    model: Recordings, start: np.ndarray, longest: float, held: _Held, most: int = _STEPS, arrived: float = _ARRIVED
 ) -> tuple[np.ndarray, float, bool]:
     """Levenberg and Marquardt's steps within bounds: theta, the sum of squares, and whether it is the least.
 
@@ -358,7 +360,10 @@ def _refine(
             # No step in the direction of the slopes helps any more: a corner, or rounding.
             break
         theta, motion, rest, squares, before = trial, trial_motion, trial_rest, trial_squares, squares
-        damping = 0.0 if damping < _LIGHT else damping / 10.0
+        # Damped less where the slopes told the fall, more where it was less than half of that (Nielsen 1999).
+        told = (before - squares) / promised if promised > 0 else 0.0
+        less = max(0.1, 1.0 - (2.0 * told - 1.0) ** 3)
+        damping = 0.0 if damping < _LIGHT and less < 1.0 else less * damping
         if before - squares <= arrived * before and promised <= arrived * before:
             return theta, squares, True
-    return theta, squares, promised <= _NEARLY * squares
+    return theta, squares, promised <= NEARLY * squares

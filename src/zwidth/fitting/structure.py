@@ -29,6 +29,8 @@ from zwidth.scenes.scene import Scene
 _STEP = 1e-6
 # Time constants of amplifiers in periods, frequencies in radians a period, damping ratios.
 LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (5e-4, 4.0)
+# The delays at low frequencies of those of second order.
+_SLOW = 2.0 * RATIOS[0] * LAGS[0], 2.0 * LAGS[1]
 # A double pole has no partial fractions.
 _DOUBLE = 1e-5
 
@@ -37,9 +39,10 @@ _DOUBLE = 1e-5
 class StructuredRecordings(Recordings):
     """Several logs of one device with an amplifier of order ``lag`` and so many ``modes``.
 
-    theta is ``(g, delta, d)``, the amplifier's time constant in periods (and damping ratio), of each mode the frequency
-    in radians a period, the damping ratio and ``T^2/m``, then for each log x0 and v0, and two numbers of how each mode
-    was moving before; o and c come last.
+    theta is ``(g, delta, d)``, the amplifier's delay at low frequencies in periods (and damping ratio), of each mode
+    the frequency in radians a period, the damping ratio and ``T^2/m``, then for each log x0 and v0, and two numbers of
+    how each mode was moving before; o and c come last. The delay of second order, ``2 zeta tau``, stands in place of
+    tau: a log tells its sum with d far better than either, and along a straight valley steps are long.
     """
 
     lag: int = 0  # pyright: ignore[reportIncompatibleVariableOverride]  (0 of every rigid mass)
@@ -47,7 +50,7 @@ class StructuredRecordings(Recordings):
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         low, high = super().bounds()
-        ends = [LAGS, RATIOS][: self.lag] + self.modes * [TURNS, RATIOS, (-np.inf, np.inf)]
+        ends = [LAGS if self.lag == 1 else _SLOW, RATIOS][: self.lag] + self.modes * [TURNS, RATIOS, (-np.inf, np.inf)]
         low[self.parts], high[self.parts] = np.reshape(ends, (-1, 2)).T
         return low, high
 
@@ -66,9 +69,10 @@ class StructuredRecordings(Recordings):
         """What amplifier and modes add in one log to the mass whose force comes later."""
         log, (g, delta, d) = self.logs[which], theta[:3].tolist()
         own, now, place = np.eye(theta.size), np.arange(log.position.size), np.zeros(log.position.size)
-        poles, by_theta, weights, states = self._find_poles(theta)
+        poles, weights, states = self._find_poles(theta[:, None])
         first, ways, ringing, slides = self.parts.stop + 2 * (len(self.logs) + self.modes * which), {}, [], []
-        for pole, by, (weight, *_), k in zip(poles.tolist(), by_theta, weights, states, strict=True):
+        poles, weights = poles[:, 0].tolist(), weights[:, 0]
+        for own_pole, (pole, weight, k) in enumerate(zip(poles, weights, states, strict=True)):
             ways[pole] = _follow(log, pole, d)
             place += (weight * ways[pole].position).real
             if k >= 0:
@@ -76,7 +80,7 @@ class StructuredRecordings(Recordings):
                 free = own[first + k] - 1j * own[first + k + 1] if pole.imag else own[first + k]
                 motion, size = np.exp(pole * now), free @ theta
                 place += (motion * size).real
-                ringing += [(motion, free), (now * motion, size * by)]
+                ringing.append((own_pole, motion, free, size))
         if self.lag:
             late, by_late = _delay(theta, self.lag, log)
             turn = own[2] + by_late @ own[3 : 3 + self.lag]
@@ -88,10 +92,14 @@ class StructuredRecordings(Recordings):
 
         def differentiate() -> np.ndarray:
             # Rows, and how their real parts count in the slopes. A delay moves E by -E' = -p E - F.
-            parts = [(log.pushes[0, log.skip - int(np.floor(d)) + now], -own[2] * weights[:, 0].sum()), *ringing]
-            for pole, by, (weight, *slopes) in zip(poles.tolist(), by_theta, weights, strict=True):
+            moved = log.pushes[0, log.skip - int(np.floor(d)) + now]
+            parts: list[tuple[Any, Any]] = [(moved, -own[2] * weights.sum())]
+            by_theta, slopes = self._differ_poles(theta)
+            for pole, weight, by, slope in zip(poles, weights, by_theta, slopes, strict=True):
                 way = ways[pole]
-                parts += [(way.position, slopes - pole * weight * own[2]), (way.slopes, weight * by)]
+                parts += [(way.position, slope - pole * weight * own[2]), (way.slopes, weight * by)]
+            for k, motion, free, size in ringing:
+                parts += [(motion, free), (now * motion, size * by_theta[k])]
             for sign, by, speed, slide in slides:
                 parts += [(slide.position, sign / g * own[0]), (slide.slopes, sign * own[1])]
                 parts += [(speed[0] - speed, sign * by)]
@@ -100,32 +108,34 @@ class StructuredRecordings(Recordings):
 
         return ModelledMotion(place, differentiate)
 
-    def _find_poles(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Poles on and above the real axis, their slopes, weights and theirs, and which state of modes, -1 for none."""
+    def _find_poles(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of thetas by the first axis: poles on and above the real axis, weights, and which state of modes, or -1."""
+        lag, modes = _read_lag(at, self.lag), at[self.parts][self.lag :]
+        modes = modes.reshape(self.modes, 3, at.shape[1]).copy()
+        modes[:, 2] /= at[0]
+        poles, weights = (np.array(each) for each in list_poles(at[1], lag, modes))
+        states, height = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), np.imag(poles[:, 0])
+        # Of a pair half is followed, which counts twice.
+        weights = weights * at[0] * (1.0 + (height > 0))[:, None]
+        return poles[height >= 0], weights[height >= 0], states[height >= 0]
+
+    def _differ_poles(self, theta: np.ndarray) -> np.ndarray:
+        """The slopes of these poles, and of their weights."""
         moving = np.r_[0, 1, self.parts]
         steps, count = _STEP * np.abs(theta[moving]), moving.size
         steps[1], steps[4 + self.lag :: 3] = max(_STEP, steps[1]), steps[0]
         at = np.tile(theta[:, None], 1 + 2 * count)
         at[moving, 1 + np.arange(count)] += steps
         at[moving, 1 + count + np.arange(count)] -= steps
-        lag, modes = np.split(at[self.parts], [self.lag])
-        modes = modes.reshape(self.modes, 3, 1 + 2 * count)
-        modes[:, 2] /= at[0]
-        poles, weights = (np.array(each) for each in list_poles(at[1], lag, modes))
-        states, heights = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), np.imag(poles[:, :1])
-        # Of a pair half is followed, which counts twice.
-        weights *= at[0] * (1.0 + (heights > 0))
-        both = np.zeros((2, len(poles), 1 + theta.size), complex)
-        for each, values in zip(both, (poles, weights), strict=True):
-            each[:, 0] = values[:, 0]
-            each[:, 1 + moving] = (values[:, 1 : 1 + count] - values[:, 1 + count :]) / (2.0 * steps)
-        poles, weights = both[:, heights[:, 0] >= 0]
-        return poles[:, 0], poles[:, 1:], weights, states[heights[:, 0] >= 0]
+        both = np.array(self._find_poles(at)[:2])
+        by_theta = np.zeros((*both.shape[:2], theta.size), complex)
+        by_theta[..., moving] = (both[..., 1 : 1 + count] - both[..., 1 + count :]) / (2.0 * steps)
+        return by_theta
 
 
 def to_scene(model: Recordings, theta: np.ndarray, period: float, velocity: Velocity) -> Scene:
     """The scene of theta; its numbers go as `zwidth.fitting.scenes.name_numbers` names them."""
-    mass, (lag, modes) = period**2 / theta[0], np.split(theta[model.parts], [model.lag])
+    mass, lag, modes = period**2 / theta[0], _read_lag(theta, model.lag), theta[model.parts][model.lag :]
     late = lag * [period, 1.0][: model.lag]
     ringing = modes.reshape(-1, 3) * [0.5 / (np.pi * period), 1.0, period**-2]
     ringing[:, 2] = 1.0 / ringing[:, 2]
@@ -140,17 +150,23 @@ def derive_numbers(model: Recordings, theta: np.ndarray, period: float) -> tuple
     slopes = [[0.5 / (np.pi * period), 1.0, -((period / gain) ** 2)] for gain in gains.tolist()]
     by_theta = np.diag([-((period / g) ** 2), period / g, period, *[period, 1.0][: model.lag], *np.ravel(slopes)])
     by_theta[1, 0] = -delta * period / g**2
+    if model.lag == 2:
+        by_theta[3, 3:5] = 0.5 * period / theta[4], -0.5 * period * theta[3] / theta[4] ** 2
     return by_theta, np.array([2.0, 1.0, 1.0, *[1.0, 0.0][: model.lag], *model.modes * [-1.0, 0.0, 2.0]])
 
 
 def _delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.ndarray]:
     """By how much an amplifier delays slow forces, and its derivatives; no more than forces are known."""
-    if order == 2:
-        late, by = 2.0 * theta[3] * theta[4], 2.0 * theta[[4, 3]]
-    else:
-        late, by = theta[3:4].sum() if order else 0.0, np.ones(order)
+    late, by = theta[3:4].sum() if order else 0.0, np.eye(2)[0, :order]
     most = log.skip - 1.5 - theta[2]
     return (float(late), by) if late < most else (float(most), 0.0 * by)
+
+
+def _read_lag(theta: np.ndarray, order: int) -> np.ndarray:
+    """An amplifier's time constant and damping ratio, of thetas along the first axis."""
+    lag = theta[3 : 3 + order].copy()
+    lag[:1] /= 2.0 * lag[1] if order == 2 else 1.0
+    return lag
 
 
 def list_poles(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:

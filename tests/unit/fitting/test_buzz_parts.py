@@ -50,7 +50,7 @@ def test_walls_and_numbers_move_with_theta_as_their_derivatives_say(lag, modes):
         walls = onsets.follow(theta)
         return np.log(np.stack([walls.kappa, walls.w], 1))
 
-    slopes = onsets.follow(theta).slopes
+    slopes = onsets.follow(theta).slopes()
     np.testing.assert_allclose(slopes, differ(follow, theta), rtol=1e-6, atol=1e-8 * np.abs(slopes).max())
     values, by_theta = in_si(theta, PERIOD, lag, modes)
     found = differ(lambda theta: in_si(theta, PERIOD, lag, modes)[0], theta)

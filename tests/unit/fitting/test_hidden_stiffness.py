@@ -46,7 +46,7 @@ def play(modes, encoder, seed=0, count=2000):
 def test_what_a_resonance_makes_of_the_stiffest_wall_is_that_of_the_scene_with_it(monkeypatch):
     _, force, position = play((), 1e-4)
     best = fit_model((Recording(force, position[SKIP:], SKIP),), 20, 1e-4)
-    best, _, banks = choose_structure(best, 20, 1e-4)
+    best, _, banks, _ = choose_structure(best, 20, 1e-4)
     velocity = zwidth.BackwardDifference()
     scene = to_scene(best.model, best.theta, PERIOD, velocity)
     share, places = 0.05, [(0, 300), (0, 360), (1, 45), (2, 50)]

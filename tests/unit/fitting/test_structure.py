@@ -94,6 +94,6 @@ def test_no_part_is_found_in_a_log_of_a_rigid_device():
         force = 3 * np.repeat(rng.choice([-1.0, 1.0], 40), 25)
         read = rigid.play(force) + 1e-5 * rng.standard_normal(force.size)
         best = fit_model((Recording(force, read[SKIP:], SKIP),), 20, 0.0)
-        chosen, pole, banks = choose_structure(best, 20, 0.0)
+        chosen, pole, banks, _ = choose_structure(best, 20, 0.0)
         assert (chosen, pole) == (best, None)
         assert banks
