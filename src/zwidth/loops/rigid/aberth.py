@@ -127,17 +127,6 @@ def discs(z: RootsFirst, loop: Loop, degree: Degree, spring: bool) -> tuple[Radi
     return within, xp.all(disjoint, axis=0), xp.all(settled, axis=0)
 
 
-def replace_invalid(
-    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree
-) -> tuple[tuple[Reals, Reals, Reals, Reals], Reals]:
-    """Walls that can be computed, and what to add to the results of those that could not."""
-    xp = namespace(alpha, beta, delta, d)
-    ok = valid_wall(alpha, beta, delta, d)
-    alpha_in, beta_in, delta_in = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
-    inside = (alpha_in, beta_in, delta_in, xp.where(ok, d, float(degree.whole)))
-    return inside, nan_with_nan_slopes(ok, alpha, beta, delta, d)
-
-
 def with_zero(poles: Array, spring: bool) -> Array:
     """The pole 0 of walls without virtual damping, which is not computed."""
     xp = namespace(poles)
@@ -148,7 +137,8 @@ def aberth_kernel(
     alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool
 ) -> tuple[Roots, Radii, Array]:
     """All poles, how far each is off at most, and whether that is proved and no digit is missing."""
-    loop, spoiled = product_form(alpha, beta, delta, d, degree), replace_invalid(alpha, beta, delta, d, degree)[1]
+    loop = product_form(alpha, beta, delta, d, degree)
+    spoiled = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
     xp, steps = namespace(loop.c), _FIRST_STEPS + (degree.poles - spring) // 2
     z = repeat(steps, lambda z: _step(z, loop, degree, spring), _start(loop, degree, spring), xp)
     within, proved, settled = discs(z, loop, degree, spring)

@@ -9,9 +9,9 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, map_blocks, to_caller
-from zwidth.arrays.xp import is_traced, namespace, repeat
-from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, product_form, replace_invalid, split, with_zero
-from zwidth.loops.rigid.device import wall_status
+from zwidth.arrays.xp import is_traced, namespace, nan_with_nan_slopes, repeat
+from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, product_form, split, with_zero
+from zwidth.loops.rigid.device import valid_wall, wall_status
 from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
 from zwidth.loops.rigid.pole_step import Pair, join, square
 from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
@@ -51,7 +51,10 @@ def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degre
 
 
 def _matrices(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Matrices:
-    monic = coefficients(*replace_invalid(alpha, beta, delta, d, degree)[0], degree)
+    xp, ok = namespace(alpha, beta, delta, d), valid_wall(alpha, beta, delta, d)
+    # Of what is out of range any numbers: its poles are spoiled in the end.
+    alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
+    monic = coefficients(alpha, beta, delta, xp.where(ok, d, float(degree.whole)), degree)
     return companion(monic[..., :-1] if spring else monic)
 
 
@@ -68,7 +71,8 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
 def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Roots:
     """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
     xp = namespace(z, alpha)
-    loop, spoiled = product_form(alpha, beta, delta, d, degree), replace_invalid(alpha, beta, delta, d, degree)[1]
+    loop = product_form(alpha, beta, delta, d, degree)
+    spoiled = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
 
     def at(z: RootsFirst) -> tuple[Pair, Pair]:
         return evaluate(split(z), loop, degree, spring)
