@@ -14,6 +14,7 @@ from matplotlib.path import Path
 from zwidth.figures import style
 from zwidth.figures.motion import draw_positions
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select, stack
+from zwidth.words.formatting import round_safely
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -218,10 +219,12 @@ def draw_stable_set(
     beyond, most = 0.28 * max(1.0, 5.6 / wide), max(rows[names[0]], default=np.nan) * factors[0]
     for kind, label, *wall in zip(*(rows[name] for name in ("wall", "label", *names)), strict=True):
         wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
-        symbols = zip((r"\alpha", r"\beta") if normalized else "KB", wall, units, strict=True)
-        numbers = [f"${symbol} = {value:.3g}$ {unit}".rstrip() for symbol, value, unit in symbols]
-        text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""
         which = kind.split()[0]
+        # A wall to be set holds as it is read.
+        read = [round_safely(wall[0], "below") if which == "recommended" else wall[0], wall[1]]
+        symbols = zip((r"\alpha", r"\beta") if normalized else "KB", read, units, strict=True)
+        numbers = [f"${symbol} = {value:.4g}$ {unit}".rstrip() for symbol, value, unit in symbols]
+        text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""
         look = {"color": style.BLACK} if alone else {"color": colors[label]}
         look |= {"marker": markers[label]} if which == "stiffest" else {}
         room = np.inf if which == "stiffest" else 72.0 * (wide - _AROUND) * wall[0] / ((1.0 + beyond) * most)
