@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from zwidth.arrays.threads import run_in_threads
-from zwidth.arrays.xp import WIDE, is_jax, is_traced, store_once, tree_map
+from zwidth.arrays.xp import WIDE, is_jax, is_traced, known_options, store_once, tree_map
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
@@ -346,7 +346,7 @@ def compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Call
         count = _length(columns)
         return kernel(*(column[0] if column.size == 1 < count else column for column in columns), *static)
 
-    return jax.jit(whole, compiler_options=WIDE)
+    return jax.jit(whole, compiler_options=known_options(WIDE))
 
 
 def map_blocks(

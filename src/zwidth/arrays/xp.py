@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from functools import cache
 from math import factorial
 from typing import Any, TypeVar
 
@@ -176,7 +177,22 @@ Values = TypeVar("Values")
 
 # Registers twice as wide as what XLA takes by itself, where the processor has them; without effect elsewhere. Runs 1.2
 # times as fast for radii and 1.04 times for verdicts.
-WIDE = {"xla_cpu_prefer_vector_width": 512}
+WIDE = ("xla_cpu_prefer_vector_width", 512)
+
+
+@cache
+def known_options(*options: tuple[str, int]) -> dict[str, int]:
+    """Those of XLA's options that the installed XLA knows: releases drop some, and one of them would stop every run."""
+    import jax
+
+    def is_known(name: str, value: int) -> bool:
+        try:
+            jax.jit(abs, compiler_options={name: value}).lower(0.0).compile()
+        except jax.errors.JaxRuntimeError:
+            return False
+        return True
+
+    return {name: value for name, value in options if is_known(name, value)}
 
 
 def store_once(values: Values, witness: Array) -> Values:

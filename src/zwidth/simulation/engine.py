@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zwidth.arrays.xp import known_options
 from zwidth.simulation.lanes import Course, Given, Lanes, Options
 from zwidth.simulation.motion import BodyState, dot
 from zwidth.simulation.outlook import CYCLE
@@ -21,7 +22,7 @@ from zwidth.words.types import Array
 
 BLOCK = 128
 # XLA's older emitters of loops, in one piece: compiles in half of the time, and runs no slower.
-_PLAIN = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+_PLAIN = ("xla_cpu_use_fusion_emitters", False), ("xla_cpu_parallel_codegen_split_count", 1)
 
 
 class Extent(NamedTuple):
@@ -175,7 +176,7 @@ def compile_block(options: Options) -> Any:
     def block(lanes: Lanes, ends: Array, state: State, given: Inputs) -> tuple[State, Any]:
         return jax.lax.scan(partial(_period, lanes, options, ends), state, given)
 
-    return jax.jit(block, donate_argnums=2, compiler_options=_PLAIN)
+    return jax.jit(block, donate_argnums=2, compiler_options=known_options(*_PLAIN))
 
 
 def run_lanes(

@@ -13,7 +13,7 @@ import pytest
 
 from zwidth.arrays import evaluate as module
 from zwidth.arrays.evaluate import FEW, as_float64, broadcast, check_scalars, evaluate, evaluate_columns, map_blocks
-from zwidth.arrays.xp import is_jax, is_traced, namespace
+from zwidth.arrays.xp import is_jax, is_traced, known_options, namespace
 from zwidth.words.errors import InputError, PrecisionWarning
 
 ROUTES = ("auto", "numpy", "jax")
@@ -246,3 +246,9 @@ def test_a_module_that_is_still_being_imported_makes_no_arrays(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", types.ModuleType("jax"))
     assert not is_jax(object())
     assert not is_traced(object())
+
+
+def test_options_that_xla_does_not_know_are_left_out():
+    known = "xla_cpu_prefer_vector_width", 256
+    assert known_options(known, ("xla_option_of_no_release", 1)) == dict([known])
+    assert known_options(("xla_option_of_no_release", 1)) == {}
