@@ -90,17 +90,20 @@ class Plant(NamedTuple):
     gap: Array  # N(-1) = a2 - a1 + a0 without cancellation
 
 
-def held_plant(delta: Any, fraction: Any = None, functions: Functions = phi_functions, at: Any = None) -> Plant:
+def held_plant(
+    delta: Any, fraction: Any = None, functions: Functions = phi_functions, at: Any = None, at_t: Any = None
+) -> Plant:
     """Discretize for a delay whose fractional part is ``fraction``, in [0, 1), or None: N(z) = z (phi2 z + psi).
 
-    In any arithmetic whose phi-functions are given; ``at`` are these at delta, where somebody has them.
+    In any arithmetic whose phi-functions are given; ``at`` and ``at_t`` are these at delta and at delta (1 - fraction),
+    where somebody has them.
     """
     at = functions(delta) if at is None else at
     if fraction is None:
         return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
     f = fraction
     t = 1.0 - f
-    at_t, at_f = functions(delta * t), functions(delta * f)
+    at_t, at_f = functions(delta * t) if at_t is None else at_t, functions(delta * f)
     e_t = at_t.c
     a2 = t * t * at_t.phi2
     a1 = t * t * at_t.psi + t * f * e_t * at_f.phi1 + f * f * at_f.phi2 + t * f * at_t.phi1 * at_f.phi1
@@ -171,8 +174,8 @@ def device(delta: Array, d: Array, kind: DelayClasses = ANY, functions: Function
     delta, d = nan_unless(valid_device(delta, d), delta, d)
     whole, f = split_delay(d)
     at = functions(delta)
-    late = functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
-    plant = held_plant(delta, f if kind.fractional else None, functions, at)
+    late = functions(delta * (1.0 - f)) if kind.fractional else at
+    plant = held_plant(delta, f if kind.fractional else None, functions, at, late)
     # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1; 0 where N(-1) = 0.
     tilt = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
     return DeviceTerms(

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.roots import follow_root
-from zwidth.arrays.xp import along, apply_each, find_turn, frozen, namespace, repeat, store_once
+from zwidth.arrays.roots import follow_root, newton
+from zwidth.arrays.xp import along, apply_each, find_turn, frozen, namespace, store_once
 from zwidth.loops.rigid.crossover import Crossover, gain_crossover
 from zwidth.loops.rigid.device import DeviceTerms
 from zwidth.words.types import Array
@@ -36,10 +36,9 @@ def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tu
     each argument principal and continuous in w, so that the phase needs no unwrapping.
     """
     xp = namespace(w, alpha)
-    half = xp.sin(0.5 * w)
-    u, s = 2.0 * half * half, xp.sin(w)
+    half, cos_half = xp.sin(0.5 * w), xp.cos(0.5 * w)
+    u, s = 2.0 * half * half, 2.0 * half * cos_half
     wall_re, wall_im = alpha + beta * u, beta * s
-    cos_half = xp.cos(0.5 * w)
     m_re, m_im = 2.0 * (here.a2 + here.a0) * cos_half * cos_half - here.gap, (here.a2 - here.a0) * s
     top = (wall_re * wall_re + wall_im * wall_im) * (m_re * m_re + m_im * m_im)
     size = xp.sqrt(top / (2.0 * u * (here.em * here.em + 2.0 * here.c * u)))
@@ -57,43 +56,68 @@ def gain_frequency(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array,
 
 # For the samples of a point. Compiled they would take many seconds and then win nothing over NumPy.
 SAMPLES_WEIGHT = 8
-# Samples over the turns and over the decades below the crossover; how many dips are refined, by how many zooms.
-_TURN, _DECADES, _DIPS, _ZOOMS, _TRIALS = 100, 50, 5, 5, 13
+# Samples over the turns, and over the decades before and behind the crossover; dips that are followed, and how far.
+_TURN, _BEFORE, _BEHIND, _DIPS, _STEPS = 48, 32, 48, 5, 8
 
 
 def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:
-    """``|1 + L|^2`` at w in (0, pi]."""
-    size, phase = size_and_phase(w, alpha, beta, here)
-    half = namespace(phase).sin(0.5 * phase)
-    # L = -|L| e^(j phase)
-    return (1.0 - size) ** 2 + 4.0 * size * half * half
+    """``|1 + L|^2`` at w in (0, pi]; in the notation of `size_and_phase` ``L = -W M Z e^(-j (n + 1/2) w)/(2 h |Z|^2)``.
+
+    With h = sin(w/2), the functions of the sampled delay and of w/2 are all that is not arithmetic.
+    """
+    xp = namespace(w, alpha)
+    half = 0.5 * w
+    sine, cosine, lag = xp.sin(half), xp.cos(half), (2.0 * here.whole + 1.0) * half
+    u, s = 2.0 * sine * sine, 2.0 * sine * cosine
+    wall_re, wall_im = alpha + beta * u, beta * s
+    m_re, m_im = 2.0 * (here.a2 + here.a0) * cosine * cosine - here.gap, (here.a2 - here.a0) * s
+    re, im = wall_re * m_re - wall_im * m_im, wall_re * m_im + wall_im * m_re
+    rise = here.em - u
+    re, im = re * s - im * rise, re * rise + im * s
+    turn_re, turn_im = xp.cos(lag), xp.sin(lag)
+    size = 2.0 * sine * (here.em * here.em + 2.0 * here.c * u)
+    ahead, across = (re * turn_re + im * turn_im) / size, (im * turn_re - re * turn_im) / size
+    return (1.0 - ahead) ** 2 + across * across
+
+
+def _slope_and_bend(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
+    """Half the first and half the second derivative of `squared_distance`, by those of log L."""
+    xp = namespace(w, alpha)
+    sine, cosine, half_lag = xp.sin(0.5 * w), xp.cos(0.5 * w), here.whole + 0.5
+    u, s, c = 2.0 * sine * sine, 2.0 * sine * cosine, xp.cos(w)
+    z, lag = c + 1j * s, xp.cos(half_lag * w) - 1j * xp.sin(half_lag * w)
+    wall, wall_slope = alpha + beta * u + 1j * (beta * s), beta * (s + 1j * c)
+    total, moved = here.a2 + here.a0, here.a2 - here.a0
+    m = 2.0 * total * cosine * cosine - here.gap + 1j * (moved * s)
+    # The conjugate of Z, whose derivative is z.
+    pole = s + 1j * (u - here.em)
+    by_wall, by_m, by_pole = wall_slope / wall, (1j * moved * c - total * s) / m, z / pole
+    rate = by_wall + by_m - by_pole - 1j * half_lag - 0.5 * cosine / sine
+    bend = beta * xp.conj(z) / wall - by_wall**2 - (total * c + 1j * moved * s) / m - by_m**2
+    bend = bend - 1j * by_pole + by_pole**2 + 0.25 / (sine * sine)
+    loop = -wall * m * lag / (2.0 * sine * pole)
+    slope, back = rate * loop, xp.conj(1.0 + loop)
+    return xp.real(back * slope), xp.abs(slope) ** 2 + xp.real(back * (bend + rate * rate) * loop)
 
 
 def modulus(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
     """The least ``|1 + L|`` over (0, pi] and its w, for alpha > 0, elementwise."""
     xp = namespace(alpha, here.c)
     wall = alpha, beta, here
-    w = _lowest(*frozen(wall, xp), xp)
-    if xp is not np:
-        import jax
-
-        # The vertex of a parabola knows a flat minimum to fewer digits than its derivatives need.
-        w = store_once(w, alpha)
-        first, second = jax.jvp(lambda w: _slope(w, *frozen(wall, xp)), (w,), (xp.ones_like(w),))
-        w = store_once(w - xp.where(_is_dip(w, second), first / second, 0.0), w)
-        w = follow_root(_slope, w, _is_dip, *wall)
+    w = follow_root(_slope, _lowest(*frozen(wall, xp), xp), _is_dip, *wall, slope=_bend)
     return xp.sqrt(xp.maximum(squared_distance(w, *wall), 0.0)), w
 
 
-def _is_dip(w: Array, bend: Array, _: Any = None) -> Array:
-    return (w < np.pi) & (bend > 0)
-
-
 def _slope(w: Array, *wall: Any) -> Array:
-    """The derivative of the squared distance, in JAX."""
-    import jax
+    return _slope_and_bend(w, *wall)[0]
 
-    return jax.jvp(lambda w: squared_distance(w, *wall), (w,), (jax.numpy.ones_like(w),))[1]
+
+def _bend(w: Array, *wall: Any) -> Array:
+    return _slope_and_bend(w, *wall)[1]
+
+
+def _is_dip(w: Array, bend: Array, _: Array) -> Array:
+    return (w < np.pi) & (bend > 0)
 
 
 def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
@@ -105,59 +129,40 @@ def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
         w = xp.where(found.exists, find_angle(found), np.pi)
         return store_once(w, w)
 
-    def distance(w: Array) -> Array:
-        fields = DeviceTerms(*(field[..., None] for field in here))
-        return squared_distance(w, alpha[..., None], beta[..., None], fields)
-
     alpha, beta = xp.asarray(alpha), xp.asarray(beta)
     here = DeviceTerms(*(xp.asarray(field) for field in here))
-    # The distance at the crossover is at most 2; at the low end |L| is 3.
-    center, start = apply_each(at, [xp.ones_like(alpha), 3.0 * xp.ones_like(alpha)], xp)
+    wall = alpha[..., None], beta[..., None], DeviceTerms(*(field[..., None] for field in here))
+    center = at(xp.ones_like(alpha))
+    # With a share more: where the two bounds meet rounding has a say.
+    reached = 1.0001 * xp.sqrt(squared_distance(center, alpha, beta, here))
+    start, end = apply_each(at, [1.0 + reached, xp.maximum(1.0 - reached, 1e-9)], xp)
     # With room: the wall's own phase may rise by a quarter turn meanwhile.
     turn = 3.0 * np.pi / (here.whole + 0.5)
-    part = along(np.arange(1, _TURN + 1) / _TURN, center)
-    low, high = xp.maximum(center - turn, 0.0), xp.minimum(center + turn, np.pi)
-    turns = low[..., None] + (high - low)[..., None] * part
-    part = along((np.arange(_DECADES) + 0.5) / _DECADES, center)
-    start = xp.minimum(xp.maximum(start, low), center)
-    decades = start[..., None] * (center / start)[..., None] ** part
-    # Behind the crossover in equal steps of the logarithm as well.
-    beyond = center[..., None] * (high / center)[..., None] ** part
-    grid = xp.sort(xp.concatenate([turns, decades, beyond], axis=-1), axis=-1)
-    values = distance(grid)
-    return _refine_minimum(grid, values, distance, xp)
+    low = xp.minimum(xp.maximum(start, center - turn), center)
+    high = xp.maximum(xp.minimum(end, center + turn), center)
 
+    def spread(count: int, least: float = 0.5) -> Array:
+        return along((np.arange(count) + least) / count, center)
 
-def _refine_minimum(grid: Array, values: Array, distance: Any, xp: Any) -> Array:
-    """The lowest of the lowest dips, each zoomed in on."""
+    grid = [
+        low[..., None] + (high - low)[..., None] * spread(_TURN, 1.0),
+        low[..., None] * (center / low)[..., None] ** spread(_BEFORE),
+        center[..., None] * (high / center)[..., None] ** spread(_BEHIND),
+    ]
+    grid = xp.sort(xp.concatenate(grid, axis=-1), axis=-1)
+    values = squared_distance(grid, *wall)
     edge = xp.full_like(values[..., :1], np.inf)
     before, after = xp.concatenate([edge, values[..., :-1]], -1), xp.concatenate([values[..., 1:], edge], -1)
-    dips = xp.where((values <= before) & (values <= after), values, np.inf)
-    best = xp.argsort(dips, axis=-1)[..., :_DIPS]
-    last = grid.shape[-1] - 1
-    low = xp.take_along_axis(grid, xp.maximum(best - 1, 0), axis=-1)
-    high = xp.take_along_axis(grid, xp.minimum(best + 1, last), axis=-1)
-    part = along(np.arange(_TRIALS) / (_TRIALS - 1.0), low)
+    # A place that is there twice is one dip, whose zero may lie behind the second one.
+    dips = xp.where((values < before) & (values <= after), values, np.inf)
+    best = xp.argpartition(dips, _DIPS - 1, axis=-1)[..., :_DIPS]
 
-    def zoom(ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        trials = low[..., None] + (high - low)[..., None] * part
-        found = distance(trials.reshape(*grid.shape[:-1], _DIPS * _TRIALS)).reshape(trials.shape)
-        place = xp.argmin(found, axis=-1)[..., None]
-        low = xp.take_along_axis(trials, xp.maximum(place - 1, 0), axis=-1)[..., 0]
-        return low, xp.take_along_axis(trials, xp.minimum(place + 1, _TRIALS - 1), axis=-1)[..., 0]
+    def beside(steps: int) -> Array:
+        return xp.take_along_axis(grid, xp.clip(best + steps, 0, grid.shape[-1] - 1), axis=-1)
 
-    low, high = repeat(_ZOOMS, zoom, (low, high), xp)
-    # The vertex of a parabola: values alone know a minimum to half of the digits.
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    left, at, right = apply_each(distance, [low, middle, high], xp)
-    bend = left + right - 2.0 * at
-    vertex = middle + half * xp.where(bend > 0, 0.5 * (left - right) / xp.where(bend > 0, bend, 1.0), 0.0)
-    vertex = xp.minimum(xp.maximum(vertex, low), high)
+    middle = beside(0)
+    found = newton(lambda w: _slope_and_bend(w, *wall), beside(-2), beside(2), middle, _STEPS)[0]
     # At an end of the range the lowest point is the end itself.
-    ends = xp.stack([low, middle, high, vertex])
-    values = xp.stack([left, at, right, distance(vertex)])
-    best = xp.argmin(values, axis=0)[None]
-    point, value = xp.take_along_axis(ends, best, axis=0)[0], xp.take_along_axis(values, best, axis=0)[0]
-    lowest = xp.argmin(value, axis=-1)[..., None]
-    return xp.take_along_axis(point, lowest, axis=-1)[..., 0]
+    places = xp.concatenate([found, middle], axis=-1)
+    lowest = xp.argmin(squared_distance(places, *wall), axis=-1)[..., None]
+    return xp.take_along_axis(places, lowest, axis=-1)[..., 0]
