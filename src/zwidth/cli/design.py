@@ -126,15 +126,16 @@ def _tolerate(
     result = {name: value for name, value in asdict(found).items() if name not in ("drawn", "labels")}
     result |= {"seed": seed, "distribution": distribution, "shares": shares}
     percent = f"{100 * found.reliability:g} %"
+    borne, most = (with_unit(round_safely(end, "below"), "N/m") for end in (found.stiffness, found.stiffness_max))
     share = f"{plain(100 * found.stable)} % of {found.samples} devices drawn"
     known = f"{plain(100 * found.stable_low)} to {plain(100 * found.stable_high)} % of all, with 95 % confidence"
     lines = [
         row("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping)),
         row("stable", f"{share} ({known})"),
-        row(f"borne by {percent}", f"K up to {with_unit(found.stiffness, 'N/m')} at this B"),
+        row(f"borne by {percent}", f"K up to {borne} at this B"),
     ]
     if found.stiffness_max == found.stiffness_max:
-        lines.append(row("", f"K up to {with_unit(found.stiffness_max, 'N/m')}, each device with a B of its own"))
+        lines.append(row("", f"K up to {most}, each device with a B of its own"))
     return result, lines
 
 

@@ -23,7 +23,7 @@ from zwidth.cli.options import (
 )
 from zwidth.pages.words import row, tell
 from zwidth.words.errors import UnusableValueError
-from zwidth.words.formatting import name_wall, with_unit
+from zwidth.words.formatting import name_wall, round_safely, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.units import tell_kind
 
@@ -56,6 +56,8 @@ def _read_wall(text: str) -> HeardWall:
 
 
 _WALL = Parsed("WALL", _read_wall)
+# Steps down to a wall that is sure as it is written.
+_SOFTER = 50
 
 
 @cli.command()
@@ -220,7 +222,7 @@ def respond(
     words = f"{name_wall(*top[:2])}, by the curve that was measured" if top.status == 0 else "undecided"
     lines.append(row("K_max", words))
     given = safe.status == 0 and device.deviation is not None and not doubts
-    words = f"{name_wall(*safe[:2])}: stable for every response in the band" if given else "none is told"
+    words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none is told"
     lines.append(row("safe wall", words))
     lines += [row("a stiffer one" if k == 0 else "", text) for k, text in enumerate(said)]
     lines += [row("doubt", text) for text in doubts]
@@ -232,6 +234,17 @@ def respond(
     told = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
     told |= {"safe_wall": _plain(safe) if given else None, "undecided": said, "doubts": list(doubts)}
     tell(told, lines, as_json)
+
+
+def spell_safe_wall(scene: Any, wall: Any) -> str:
+    """A wall at the edge of what is sure, in few digits and as much softer as it takes to be sure as it is written."""
+    stiffness, damping = float(wall.stiffness), float(f"{float(wall.virtual_damping):.4g}")
+    for _ in range(_SOFTER):
+        stiffness = round_safely(stiffness, "below")
+        if scene.is_stable(stiffness, damping):
+            return name_wall(stiffness, damping)
+        stiffness *= 1.0 - 1e-4
+    return f"K = {float(wall.stiffness)!r} N/m, B = {float(wall.virtual_damping)!r} N s/m"
 
 
 def _compliance(deviation: Any) -> str:

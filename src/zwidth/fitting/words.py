@@ -14,7 +14,7 @@ from zwidth.fitting.fit_records import RivalDevice
 from zwidth.fitting.safe_wall import SafeWall, bears_resonances
 from zwidth.parts.paths import spell_estimate
 from zwidth.words import rotation
-from zwidth.words.formatting import plain, with_unit
+from zwidth.words.formatting import plain, round_safely, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.status import Status
 
@@ -185,7 +185,9 @@ def spell_rival(rival: RivalDevice, units: AxisUnits = LINEAR) -> str:
 
 
 def _spell_wall(wall: SafeWall | WallChoice, units: AxisUnits) -> str:
-    K, B = units.spell("stiffness", wall.stiffness), units.spell("damping", wall.virtual_damping)
+    # Rounded up it might no longer be what is said of it.
+    K = units.spell("stiffness", round_safely(wall.stiffness, "below"))
+    B = units.spell("damping", wall.virtual_damping)
     return f"K = {K}, B = {B}"
 
 

@@ -102,7 +102,10 @@ class LinearLoop:
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod, exact: tuple[np.ndarray, np.ndarray]
     ) -> Stability:
-        """Labels with status and method; ``exact`` are the walls in SI units, as "certified" takes them."""
+        """Labels with status and method; ``exact`` are the walls in SI units, as "certified" takes them.
+
+        All of them need only broadcast.
+        """
         # Device and delay were checked as the parts of the scene.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
@@ -115,11 +118,11 @@ class LinearLoop:
             used = Method.CERTIFIED
         elif method == "companion":
             with np.errstate(invalid="ignore"):
-                stable = log_size(poles_less_one(self.roots, alpha, beta)).max(-1) < 0
+                stable = log_size(poles_less_one(self.roots, *np.broadcast_arrays(alpha, beta))).max(-1) < 0
             used = Method.COMPANION
         else:
             stable, used = label_walls(self.boundary, alpha, beta), Method.CROSSOVER
-        return Stability(stable[()], status[()], np.full(alpha.shape, used, np.int32)[()])
+        return Stability(stable[()], status[()], np.full(stable.shape, used, np.int32)[()])
 
     def poles(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
         """All poles, along a new last axis."""

@@ -16,7 +16,7 @@ from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.device import Device
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.paths import find_parts
-from zwidth.words.formatting import plain, short, spell_stiffness, tell_apart, to_json, with_unit
+from zwidth.words.formatting import plain, round_safely, short, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
@@ -146,12 +146,15 @@ def _distance(value: float, intervals: Intervals, unit: str, name: str, other: s
     ranges = " and ".join(" to ".join(tell_apart(*ends, unit)) for ends in intervals)
     low, high = nearest_interval(intervals, value)
     if low < value < high:
-        moves = [f"fall by {with_unit(value - low, unit)}"] if isfinite(low) else []
-        moves += [f"rise by {with_unit(high - value, unit)}"] if isfinite(high) else []
+        ways = {"fall": value - low, "rise": high - value}
+        moves = [
+            f"{verb} by {with_unit(round_safely(way, 'below'), unit)}" for verb, way in ways.items() if isfinite(way)
+        ]
         moved = f"{name} may {' or '.join(moves)}"
     else:
         verb, step = ("rise", low - value) if value <= low else ("fall", value - high)
-        moved = f"{name} must {verb}{f' by {with_unit(step, unit)}' if step else ''}"
+        by = f" by {with_unit(round_safely(step, 'above'), unit)}" if step else ""
+        moved = f"{name} must {verb}{by}"
     return f"{moved}: stable from {ranges} (at this {other})"
 
 
@@ -179,9 +182,9 @@ def passivity_words(scene: Scene, verdict: Assessment) -> str:
     if abs(margin) <= _ROUNDED * dampings:
         return "only just, without any physical damping to spare"
     if verdict.passive:
-        return f"yes, with {with_unit(margin, 'N s/m')} of physical damping to spare"
+        return f"yes, with {with_unit(round_safely(margin, 'below'), 'N s/m')} of physical damping to spare"
     verb = "no" if scene.device.coupling is None else "not proved"
-    return f"{verb}, for want of {with_unit(-margin, 'N s/m')} of physical damping"
+    return f"{verb}, for want of {with_unit(round_safely(-margin, 'above'), 'N s/m')} of physical damping"
 
 
 def pole_lines(verdict: Assessment) -> list[str]:
@@ -219,7 +222,7 @@ def friction_lines(rule: FrictionRule) -> list[str]:
     if rule.stiffness is None:
         parts.append("both are needed for the rule")
     else:
-        known = with_unit(rule.stiffness, "N/m")
+        known = with_unit(round_safely(rule.stiffness, "below"), "N/m")
         parts.append(f"a spring alone is passive up to {known} (rigid, without delay; Abbott and Okamura 2005)")
     return [row("friction, resolution", ", ".join(parts))]
 

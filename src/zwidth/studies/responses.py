@@ -37,7 +37,7 @@ from zwidth.parts.checks import Span
 from zwidth.parts.device import Device
 from zwidth.scenes.recommendation import RANGES, Recommendation
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
-from zwidth.words.formatting import name_wall, plain, tell_apart, to_json, with_unit
+from zwidth.words.formatting import name_wall, plain, round_safely, tell_apart, to_json, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, Range
 
 
@@ -264,9 +264,10 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
         return "not known" if value is None else with_unit(value, unit) if unit else plain(value)
 
     def cells(row: dict[str, Any], mark: str = "") -> str:
-        units = {"stiffness": "N/m", "virtual_damping": "N s/m"}
-        spelled = [f"{mark}{spell(row[name], unit)}{mark}" for name, unit in units.items()]
-        return " | ".join([*spelled, spell(row["alpha"]), spell(row["beta"])])
+        # Of a wall to set a stiffness that is rounded up might no longer have what is wanted.
+        K, alpha = (round_safely(row[name], "below" if mark else "") for name in ("stiffness", "alpha"))
+        wall = spell(K, "N/m"), spell(row["virtual_damping"], "N s/m")
+        return " | ".join([*(f"{mark}{text}{mark}" for text in wall), spell(alpha), spell(row["beta"])])
 
     parts = [f"{name} = {value}" for name, value in found["device"].items() if name not in _BARE]
     by_mass = isinstance(scene.device, Device)
@@ -288,7 +289,7 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
         lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
         passive, missing = recommendation.spell_passive(), verdict.passivity_margin
         if verdict.passive is False:
-            passive += f", that would take {with_unit(-missing, 'N s/m')} more physical damping"
+            passive += f", that would take {with_unit(round_safely(-missing, 'above'), 'N s/m')} more physical damping"
         radius, how = best["spectral_radius"], ""
         if math.isnan(verdict.frequency):
             how = "by the measured curve" if scene.device.deviation is None else "for every response in the band"

@@ -21,7 +21,7 @@ from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.verdict import is_stable
 from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, header, plain, suggestion, with_unit
+from zwidth.words.formatting import describe, header, name_wall, plain, round_safely, suggestion, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.status import Status
 from zwidth.words.tables import read_columns, split_head
@@ -141,14 +141,13 @@ class WorkspaceStudy(ComputedStudy):
         if not known.any():
             raise InputError(f"poses: no pose of {file} has a K_max; the first, {notes[0]}")
         weakest = int(np.nanargmin(stiffness))
-        # Other poses are heavier or more damped, but not alike in both: the wall is tried on each.
-        wall = RECOMMENDED_SHARE * stiffness[weakest], virtual_damping[weakest]
+        # Other poses are heavier or more damped, but not alike in both: the wall as it is written is tried on each.
+        wall = round_safely(RECOMMENDED_SHARE * stiffness[weakest], "below"), float(f"{virtual_damping[weakest]:.4g}")
         bears = np.asarray(is_stable(wall[0] * self.period / rate, wall[1] / rate, delta, d))
-        ends = stiffness[weakest], np.nanmax(stiffness), wall[0]
-        low, high, set_to = (with_unit(float(each), "N/m") for each in ends)
+        low, high = (with_unit(float(each), "N/m") for each in (stiffness[weakest], np.nanmax(stiffness)))
         answer = (
             f"K_max from {low} at {spell_pose(weakest)} to {high}",
-            f"K = {set_to}, B = {with_unit(float(wall[1]), 'N s/m')}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
+            f"{name_wall(*wall)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
             f"stable in {np.count_nonzero(bears)} of {np.count_nonzero(known)} poses",
         )
         draw = partial(figures.draw_workspace, table, *names)

@@ -19,6 +19,7 @@ import numpy as np
 
 from zwidth.arrays.kernel_cache import mend_compilation_cache
 from zwidth.config.sweep import SweepStudy
+from zwidth.loops.rigid.device import wall_status
 from zwidth.scenes.scene import Scene
 from zwidth.sweep.files import content, hopeless
 from zwidth.sweep.grid import SceneBlock
@@ -251,12 +252,15 @@ def compute_scenes(
 def _compute_walls(
     scene: Scene, outputs: tuple[str, ...], stiffness: np.ndarray, virtual_damping: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The outputs of one device's walls, and where one of them is not known."""
+    """The outputs of one device's walls, and their status."""
     found: dict[str, np.ndarray] = {}
-    unknown = np.zeros((stiffness.size, virtual_damping.size), bool)
+    alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
+    status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
     if "stable" in outputs:
-        # With a row a damping its intervals serve all of its walls.
-        found["stable"] = np.asarray(scene.is_stable(stiffness.T, virtual_damping.T)).T
+        # With a row a damping its intervals serve all of its walls. A measured response leaves some of them undecided.
+        labels = scene.loop.decide(alpha.T, beta.T, "auto", (stiffness.T, virtual_damping.T))
+        found["stable"], status = np.asarray(labels.stable).T, np.asarray(labels.status).T
+    unknown = np.zeros(status.shape, bool)
     if "spectral_radius" in outputs:
         found["spectral_radius"] = radius = np.asarray(scene.spectral_radius(stiffness, virtual_damping))
         unknown |= np.isnan(radius)
@@ -264,4 +268,4 @@ def _compute_walls(
         margin = np.asarray(scene.passivity_margin(stiffness, virtual_damping))
         found["passive"] = margin > 0
         unknown |= np.isnan(margin)
-    return found, np.where(unknown, Status.NOT_CONVERGED, Status.OK)
+    return found, np.where(unknown & (status == Status.OK), Status.NOT_CONVERGED, status)

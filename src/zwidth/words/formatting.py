@@ -73,10 +73,10 @@ ENOUGH = {"above": "or more", "below": "or less"}
 
 
 def round_safely(value: float, enough: str, digits: int = 4) -> float:
-    """A positive number to few digits, rounded to the side on which there is enough."""
-    if not (0 < value < math.inf and enough in ENOUGH):
+    """A number to few digits, rounded to the side on which there is enough."""
+    if not (value and math.isfinite(value) and enough in ENOUGH):
         return value
-    step = 10.0 ** (math.floor(math.log10(value)) + 1 - digits)
+    step = 10.0 ** (math.floor(math.log10(abs(value))) + 1 - digits)
     # A value that has so few digits stays, whatever the rounding of the quotient.
     steps = math.ceil(value / step - 1e-9) if enough == "above" else math.floor(value / step + 1e-9)
     return steps * step
@@ -89,13 +89,16 @@ def spell_stiffness(value: float) -> str:
 
 
 def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
-    """Two ends, with a unit or plain, with as many digits as it takes to tell different ones apart."""
+    """Two ends with a unit or plain, rounded into what lies between, with as many digits as it takes to leave some."""
 
     def spell(end: float, digits: int) -> str:
         return with_unit(end, unit, digits) if unit else plain(end, digits)
 
-    texts = [(spell(low, digits), spell(high, digits)) for digits in range(4, 18)]
-    return next((pair for pair in texts if pair[0] != pair[1]), texts[0])
+    for digits in range(4, 18):
+        ends = round_safely(low, "above", digits), round_safely(high, "below", digits)
+        if ends[0] < ends[1]:
+            return spell(ends[0], digits), spell(ends[1], digits)
+    return spell(low, 4), spell(high, 4)
 
 
 def header(name: str, unit: str) -> str:

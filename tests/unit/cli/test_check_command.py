@@ -280,7 +280,7 @@ def test_nothing_on_an_undamped_device_is_just_passive():
 @pytest.mark.parametrize(
     "parts, words",
     [
-        (["--velocity-cutoff", "100 Hz"], "yes, with 8.479 N s/m of physical damping to spare"),
+        (["--velocity-cutoff", "100 Hz"], "yes, with 8.478 N s/m of physical damping to spare"),
         (["--coupling-mass", "50 g", "--coupling-stiffness", "20 kN/m"], "not proved, for want of"),
         (
             ["--coupling-mass", "50 g", "--coupling-stiffness", "20 kN/m", "--coupling-sensor", "tip"],

@@ -1,6 +1,7 @@
 """What the studies compute, against the library's own functions and pole counts."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from zwidth.config.scenes import PhysicalScene
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.loops.rigid.poles import radius_by_companion
+from zwidth.parts.checks import read_texts
 from zwidth.studies.boundary import BoundaryStudy, MapStudy, outline, stable_intervals
 from zwidth.studies.outcome import csv_text
 from zwidth.studies.responses import RecommendStudy, StepStudy
@@ -195,6 +197,21 @@ def test_a_recommendation_is_a_share_of_the_stiffest_wall():
     assert best["virtual_damping"] == pytest.approx(1e2 * float(ridge.beta), rel=1e-12)
     assert best["stable"] is True
     assert "| **recommended, 60 % of it** |" in outcome.documents["recommendation.md"]
+
+
+@pytest.mark.parametrize("mass", np.linspace(0.05, 0.5, 6).tolist())
+def test_a_recommendation_is_written_no_stiffer_than_it_is(mass):
+    """Rounded to the nearest, half of all walls would miss what is wanted of them."""
+    device = {"mass": mass, "damping": "10 N s/m", "period": "1 ms", "delay": "1 periods"}
+    study = RecommendStudy.model_validate({"kind": "recommend", "name": "r", "device": device, "phase_margin": 30})
+    outcome = study.compute(None, alone=True)
+    row = re.search(r"\*\*recommended.*", outcome.documents["recommendation.md"])
+    assert row is not None
+    _, stiffness, _, alpha, *_ = (cell.strip(" *") for cell in row.group().split("|"))
+    best = json.loads(outcome.documents["recommendation.json"])["recommended"]
+    written = read_texts("stiffness", stiffness, "N/m"), float(alpha)
+    for number, exact in zip(written, (best["stiffness"], best["alpha"]), strict=True):
+        assert (1 - 1e-3) * exact < number <= exact * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("fraction", [0.3, 0.45, 0.6, 0.7, 0.85])

@@ -57,6 +57,16 @@ def test_the_wall_is_tried_in_every_pose(tmp_path, capsys):
     assert bears == [True, False]
 
 
+def test_the_wall_is_written_no_stiffer_than_it_is(tmp_path, capsys):
+    """Three quarters of the K_max of its weakest pose are 75.057 kN/m."""
+    top = zwidth.Scene(zwidth.Device(0.1, 1.0), zwidth.Timing(1e-3)).max_stiffness()
+    scale = 75_057.0 / (0.75 * float(top.stiffness))
+    poses = f"a,b,mass,damping\n0,0,{0.1 * scale!r},{scale!r}\n1,0,{0.2 * scale!r},{2 * scale!r}\n"
+    study = STUDY.replace("shoulder", "a").replace("elbow", "b").replace("1 periods", "0 s")
+    assert main_of("run", write(tmp_path, study, poses), "--out", tmp_path / "out") == 0
+    assert "K = 75.05 kN/m, " in capsys.readouterr().out
+
+
 def test_the_scene_gives_period_and_delay(tmp_path):
     scene = "scene: {mass: 1 kg, period: 2 ms, delay: 1 ms}\n"
     study: Any

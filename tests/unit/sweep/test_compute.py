@@ -72,3 +72,18 @@ def test_what_is_not_proved_says_so():
     assert found["status"].ravel().tolist() == [Status.OK, Status.NOT_CONVERGED]
     # A larger error is proved: the value is kept.
     np.testing.assert_allclose(found["spectral_radius"].ravel()[1], exact_radius(alpha, beta, delta, 0.0), rtol=1e-3)
+
+
+def test_points_where_the_model_is_not_computed_say_so():
+    """The reference: `zwidth.decide_stability`, whose labels there are False with OUT_OF_RANGE, not unstable."""
+    axes = {"alpha": [0.1, 1e61], "beta": [0.1, 1e61], "delta": [1.0, 1e13], "d": [0, 0.5]}
+    outputs = ("stable", "passive", "spectral_radius", "gain_margin")
+    grid = Grid(sweep_of(study(axes=axes, outputs=outputs)))
+    block = grid.block(all_of(grid))
+    told = zwidth.decide_stability(
+        block.alpha[:, :, None], block.beta[:, None, :], block.delta[:, None, None], block.d[:, None, None]
+    )
+    assert set(told.status.ravel().tolist()) == {Status.OK, Status.OUT_OF_RANGE}
+    for output in outputs:
+        found = compute("wall", (output,), block, 1e-9)
+        np.testing.assert_array_equal(found["status"], told.status, err_msg=output)

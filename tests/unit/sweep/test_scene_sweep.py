@@ -261,3 +261,31 @@ def test_devices_given_as_a_whole_are_swept(tmp_path):
 def test_a_device_given_as_a_whole_holds_its_mass(axis):
     with pytest.raises(ValueError, match="beside a device given as a whole"):
         config_of(study("s", {"period": 1e-3, axis: [1.0, 2.0]}, ("stiffness_max",), device="1 / 0.1 10 0"))
+
+
+def test_walls_that_a_measured_response_leaves_open_are_undecided(tmp_path):
+    """They are not stable for every response in the band, and not unstable for every one either."""
+    lines = np.geomspace(1.0, 450.0, 300)
+    response = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3)).frequency_response(1.0, 0.0, lines)
+    device = zwidth.MeasuredDevice(lines, response, 0.1 * np.abs(response))
+    device.save(tmp_path / "response.csv")
+    config = config_of(study("s", {"period": 1e-3, **WALLS}, ("stable",), device=str(tmp_path / "response.csv")))
+    assert zwidth.run(config, out=tmp_path / "run").ok
+    found = open_dataset(tmp_path / "run")
+    told = zwidth.Scene(device, zwidth.Timing(1e-3)).decide_stability(STIFFNESS[:, None], VIRTUAL)
+    assert set(told.status.ravel().tolist()) == {Status.OK, Status.UNDECIDED}
+    np.testing.assert_array_equal(found.stable, told.stable)
+    np.testing.assert_array_equal(found.status, told.status)
+
+
+def test_walls_of_devices_with_parts_that_are_out_of_range_say_so(tmp_path):
+    device = {"mass": 1e-30, "damping": 1e-30, "period": 1e3}
+    scene = zwidth.Scene(zwidth.Device(1e-30, 1e-30), zwidth.Timing(1e3), velocity=zwidth.LowPass(cutoff=1e-4))
+    # alpha = K T^2/m is 1e66.
+    stiffness, told = [1e-20, 1e30], [Status.OK, Status.OUT_OF_RANGE]
+    assert scene.decide_stability(stiffness, 0.0).status.tolist() == told
+    for output in ("stable", "spectral_radius", "passive"):
+        axes = {**device, "stiffness": stiffness}
+        config = config_of(study("s", axes, (output,), velocity={"kind": "low_pass", "cutoff": 1e-4}))
+        assert zwidth.run(config, out=tmp_path, overwrite=True).ok
+        assert open_dataset(tmp_path).status.values.tolist() == told

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from zwidth.words.formatting import plain, tell_apart, with_unit
+from zwidth.words.formatting import plain, round_safely, tell_apart, with_unit
 
 
 @pytest.mark.parametrize(
@@ -54,10 +54,27 @@ def test_digits_are_those_asked_for():
     assert (plain(2 / 3, 2), with_unit(2 / 3, "s", 2), with_unit(996.0, "s", 2)) == ("0.67", "670 ms", "1.0 ks")
 
 
-def test_two_ends_that_differ_read_differently():
-    assert tell_apart(10.5953e3, 10.5961e3, "N/m") == ("10.595 kN/m", "10.596 kN/m")
+def test_two_ends_that_differ_read_differently_and_lie_inside():
+    assert tell_apart(-3.45678, 19844.99, "N/m") == ("-3.456 N/m", "19.84 kN/m")
+    assert tell_apart(1.23411, 1.23499) == ("1.2342", "1.2349")
+    assert tell_apart(10.5953e3, 10.5971e3, "N/m") == ("10.596 kN/m", "10.597 kN/m")
     assert tell_apart(1.0, 2.0) == ("1.000", "2.000")
     assert tell_apart(3.0, 3.0, "N/m") == ("3.000 N/m", "3.000 N/m")
     assert tell_apart(-float("inf"), 1.0, "N/m") == ("-infinite", "1.000 N/m")
     low, high = tell_apart(1.0, 1.0 + 2.3e-16)
     assert low != high
+
+
+@pytest.mark.parametrize(
+    ("value", "enough", "rounded"),
+    [(1.23456, "above", 1.235), (1.23456, "below", 1.234), (-1.23456, "above", -1.234), (-1.23456, "below", -1.235)],
+)
+def test_a_number_is_rounded_to_the_side_on_which_there_is_enough(value, enough, rounded):
+    assert round_safely(value, enough) == pytest.approx(rounded, rel=1e-12)
+    assert round_safely(rounded, enough) == pytest.approx(rounded, rel=1e-12)
+
+
+def test_what_has_no_digits_stays():
+    assert round_safely(0.0, "above") == 0.0
+    assert round_safely(float("inf"), "below") == float("inf")
+    assert round_safely(1.23456, "") == 1.23456

@@ -101,6 +101,8 @@ def margins_kernel(
     spoiled = nan_with_nan_slopes(ok, alpha, beta, delta, d)
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
+    # A damping whose inverse is infinite moves no margin.
+    delta = xp.where((delta > 0) & (delta < float(xp.finfo(delta.dtype).tiny)), 0.0, delta)
     here = store_once(device(delta, d), delta)
     w, phase, crosses = gain_frequency(alpha, beta, here)
     stable = store_once(stable_at(*frozen((alpha, beta, here), xp), ANY), delta)

@@ -177,6 +177,8 @@ def alpha_max(
         twice. alpha's first derivatives are continuous, also where the corner takes over (d = 0:
         delta = 3.65936162742...) and at whole d > 0; its second ones and the first ones of beta and omega jump there,
         and at a whole d are those from the right. A fractional power has a corner at d = 0 only, with -inf in d.
+        For strong damping the second one in delta falls like delta^-3, below the rounding of what it is the difference
+        of, 1e-15 (d = 0) to 1e-12 (d = 500) of alpha/delta^2: at delta = 1e6 none of its digits are sure.
 
         Float64 when called directly. Inside a transformation, `jax.grad` included, JAX's own precision holds: float32
         unless ``jax.config.update("jax_enable_x64", True)`` was called, which a `zwidth.PrecisionWarning` says once.

@@ -21,7 +21,7 @@ from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import MotionKind
-from zwidth.words.formatting import plain
+from zwidth.words.formatting import plain, round_safely, tell_apart
 
 Curve = tuple[np.ndarray, np.ndarray]
 Range = tuple[float, float]
@@ -252,10 +252,10 @@ def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
 
 def normalized_lines(verdict: Assessment) -> list[str]:
     """The verdict on a normalized wall, whose units are the period and the mass."""
-    span = f"{plain(verdict.virtual_damping_lower)} to {plain(verdict.virtual_damping_upper)}"
+    span = " to ".join(tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper))
     rows = {
         "verdict": f"{word_of(verdict)}, spectral radius {verdict.spectral_radius:.6f}",
-        "stable alpha": f"up to {plain(verdict.stiffness_limit)} at this beta",
+        "stable alpha": f"up to {plain(round_safely(verdict.stiffness_limit, 'below'))} at this beta",
         "stable beta": f"{span} at this alpha",
         "passive": f"{'yes' if verdict.passive else 'no'}, margin {plain(verdict.passivity_margin)} of delta",
         "stiffest stable wall": f"alpha_max = {plain(verdict.alpha_max)} at beta = {plain(verdict.beta_at_max)}",

@@ -22,7 +22,8 @@ from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.files import write_whole
 from zwidth.sweep.store import SUFFIX, Store
 from zwidth.words.errors import StoreError
-from zwidth.words.quantities import OUTPUTS, VARIABLES
+from zwidth.words.quantities import OUTPUTS, STATUS_OF, VARIABLES
+from zwidth.words.status import Status
 
 if TYPE_CHECKING:
     import xarray
@@ -180,7 +181,11 @@ def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[st
     for name in (name for name in OUTPUTS if name in data and name != "kind"):
         axes = choose_axes(data, name)
         if len(axes) == 2 and "device" not in axes:
-            yield _draw(data[name], name, (axes[0], axes[1]), edges or (lambda part: {}))
+            values = data[name]
+            if OUTPUTS[name].dtype == "bool":
+                # A wall that nothing is known of is not one that is not stable.
+                values = values.astype(np.float32).where(data[STATUS_OF[OUTPUTS[name].family]] == Status.OK)
+            yield _draw(values, name, (axes[0], axes[1]), edges or (lambda part: {}))
 
 
 def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edges) -> str:
@@ -193,7 +198,8 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
     most = {dim: along if dim in (x, y) else _OTHERS for dim in map(str, values.dims)}
     thin = values.isel({dim: pick_evenly(values.sizes[dim], count) for dim, count in most.items()})
     thin = thin.transpose(*others, y, x).load()
-    numbers, sizes = thin.values.astype(np.float32), [thin.sizes[dim] for dim in others]
+    with np.errstate(over="ignore"):
+        numbers, sizes = thin.values.astype(np.float32), [thin.sizes[dim] for dim in others]
     finite = numbers[np.isfinite(numbers)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     steep = output.look in ("logarithmic", "steep") and low > 0
@@ -208,7 +214,8 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
         "y": _axis(thin, y),
         "others": [_axis(thin, dim) for dim in others],
         "edges": [_trace(thin.isel(dict(zip(others, place, strict=True))), x, edges) for place in np.ndindex(*sizes)],
-        "values": _encode(np.where(np.isfinite(numbers), numbers, np.nan)),
+        # What is too large for single precision is not infinite.
+        "values": _encode(np.where(np.isfinite(numbers) | np.isinf(thin.values), numbers, np.nan)),
     }
     words = f"{output.long_name}, over {_words(x)} (across) and {_words(y)} (up)"
     sliders = "".join(

@@ -33,7 +33,7 @@
       const image = painter.createImageData(columns, rows), start = offset();
       for (let row = 0; row < rows; row++) for (let column = 0; column < columns; column++) {
         const value = values[start + row * columns + column], k = 4 * ((rows - 1 - row) * columns + column);
-        const rgb = Number.isNaN(value) ? [138, 138, 138] : color(share(value));
+        const rgb = Number.isFinite(value) ? color(share(value)) : [138, 138, 138];
         image.data.set([...rgb, 255], k);
       }
       painter.putImageData(image, 0, 0);
@@ -120,7 +120,7 @@
     function tell() {
       draw();
       const value = values[offset() + at.row * columns + at.column];
-      const words = data.truth ? (value ? data.name : `not ${data.name}`) : Number.isNaN(value) ? "not known" : spell(value);
+      const words = Number.isNaN(value) ? "not known" : !Number.isFinite(value) ? "infinite" : data.truth ? (value ? data.name : `not ${data.name}`) : spell(value);
       const known = (axis, k) => `${axis.name} = ${spell(axis.values[k])} ${axis.unit}`.trim();
       readout.textContent = `${known(data.x, at.column)}, ${known(data.y, at.row)}: ${words} ${data.truth ? "" : data.unit}`;
     }

@@ -243,6 +243,14 @@ def test_what_is_returned_for_walls_without_margins():
         zwidth.margins(1e70, 0.4, 0.1, 1)
 
 
+@pytest.mark.parametrize("delta", [5e-324, 1e-310, 5e-309, 2.3e-308, 1e-300])
+def test_a_damping_next_to_none_moves_no_margin(delta):
+    """Its inverse is infinite or nearly so; stable walls of an undamped device have the margins of one without any."""
+    walls = 1e-3, 1e-2, np.array([0.0, delta])[:, None], np.array([0.0, 0.5, 1.0, 3.0])
+    none, least = (np.array([field[k] for field in zwidth.margins(*walls)]) for k in (0, 1))
+    np.testing.assert_allclose(least, none, rtol=1e-12)
+
+
 def test_the_longest_delays():
     wall = (1e-7, 0.05, 0.1)
     short, long = zwidth.margins(*wall, 1.0), zwidth.margins(*wall, 9_001.0)

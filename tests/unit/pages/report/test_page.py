@@ -145,3 +145,20 @@ def test_labelled_devices_are_sliders_by_name(tmp_path):
     text = zwidth.write_report(tmp_path / "out").read_text(encoding="utf-8")
     slices = [json.loads(found) for found in re.findall(r'<script type="application/json">(.*?)</script>', text)]
     assert [other["values"] for other in slices[0]["others"]] == [["=one", "two"]]
+
+
+def test_of_walls_without_an_answer_a_slice_says_none(tmp_path):
+    """Beyond the range of the model no wall is called unstable; a settling time without end is infinite."""
+    axes = {"alpha": [0.1, 0.9, 1e61], "beta": [0.1, 0.2], "delta": 0.1, "d": 1}
+    outputs = ["stable", "settling_time"]
+    study = {"kind": "sweep", "name": "s", "axes": axes, "outputs": outputs}
+    zwidth.run({"version": 1, "name": "far", "studies": [study]}, out=tmp_path / "run")
+    text = zwidth.write_report(tmp_path / "run").read_text(encoding="utf-8")
+    for block in re.findall(r'<script type="application/json">(.*?)</script>', text, re.DOTALL):
+        content = json.loads(block)
+        values = np.frombuffer(base64.b64decode(content["values"]), "<f4").reshape(2, 3)
+        values = values if content["x"]["values"] == axes["alpha"] else values.reshape(3, 2).T
+        assert np.isnan(values[:, 2]).all()
+        expected = [1.0, 0.0] if content["name"] == "stable" else [values[0, 0], np.inf]
+        np.testing.assert_array_equal(values[0, :2], expected)
+    assert len(re.findall(r'<script type="application/json">', text)) == 2
