@@ -67,7 +67,6 @@ _WALL = Parsed("WALL", _read_wall)
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
-@click.option("--unknown-cutoff", is_flag=True, help="Find the velocity's cut-off, too; needs --buzz at B > 0.")
 @figure_option
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run`.")
 @json_option
@@ -76,7 +75,6 @@ def fit(
     walls: tuple[Any, ...],
     period: float | None,
     noise: float | None,
-    unknown_cutoff: bool,
     velocity: Any,
     figure: Path | None,
     as_yaml: bool,
@@ -109,13 +107,11 @@ def fit(
             raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
         units = ROTARY if kinds == {True} else LINEAR
         points = tuple(BuzzPoint(*wall.point) for wall in walls)
-        found = fit_buzz(points, period=period, velocity=velocity, noise=noise, unknown_cutoff=unknown_cutoff)
+        found = fit_buzz(points, period=period, velocity=velocity, noise=noise)
         source = f"{len(walls)} buzzing walls"
     else:
         if noise is not None:
             raise click.UsageError("--noise belongs to --buzz; the noise of a log is found from it")
-        if unknown_cutoff:
-            raise click.UsageError("--unknown-cutoff belongs to --buzz; no velocity is estimated in a log")
         if of_logs["time"] is not None and period is not None:
             raise click.UsageError("give one of --time, --period and --rate")
         from zwidth.fitting.columns import fit_motions

@@ -9,8 +9,6 @@ import numpy as np
 
 from zwidth.fitting.buzz_devices import Candidate, find_candidates, is_blind, look_around, weigh
 from zwidth.fitting.buzzing import Onsets
-from zwidth.fitting.scenes import scene_of
-from zwidth.fitting.stiffness_estimate import in_si
 from zwidth.scenes.scene import Scene
 
 # Another device is as good where the sum of squares in units of the noise rises by less.
@@ -75,19 +73,17 @@ class FittedKind(NamedTuple):
 
     def scene(self, theta: np.ndarray) -> Scene:
         """The loop of one of its devices."""
-        onsets = self.onsets
-        values, _ = in_si(theta, onsets.period, onsets.lag, onsets.modes)
-        return scene_of(values, onsets.period, onsets.velocity, onsets.lag, onsets.modes)
+        return self.onsets.normalize(theta).to_scene(self.onsets.period, self.onsets.velocity)
 
 
 def choose_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> tuple[FittedKind, list[FittedKind]]:
     """The likeliest kind of device, and others that are about as likely where it is no rigid one.
 
-    Parts are looked for where they could explain more than chance does, beside a known cut-off alone.
+    Parts are looked for where they could explain more than chance does.
     """
     rigid = chosen = _try(onsets, weights, known_noise)
     tried = [rigid]
-    for lag, modes in () if onsets.unknown_cutoff else _KINDS:
+    for lag, modes in _KINDS:
         richer = replace(onsets, lag=lag, modes=modes)
         more = richer.unknowns - chosen.onsets.unknowns
         if chosen.freedom <= more:

@@ -9,10 +9,10 @@ import numpy as np
 
 from zwidth.fitting.buzzing import Followed, Onsets
 
-# The dampings b T/m that are started from where nothing buzzes slowly, the number of cut-offs, and how many of the
-# dips.
+# The dampings b T/m that are started from where nothing buzzes slowly, how many of the dips, and every which damping
+# beside parts.
 _DELTAS = np.geomspace(1e-4, 30.0, 45)
-_CUTOFFS, _STARTS, _EVERY = 16, (6, 12), 4
+_STARTS, _EVERY = 6, 4
 # Beyond this condition number some direction is not seen at all.
 _BLIND = 1e6
 # Tolerances of a first look and of the end, and the evaluations they may take.
@@ -21,7 +21,7 @@ _NEARLY, _ARRIVED, _MOST_STEPS = 1e-4, 1e-12, (100, 40)
 _FAR = 100.0
 # After so many devices in a row without such walls there is no way back.
 _LOST = 8
-_NAMES = ("mass", "damping", "delay", "cut-off")
+_NAMES = ("mass", "damping", "delay")
 
 
 class Candidate(NamedTuple):
@@ -59,9 +59,9 @@ def look_around(onsets: Onsets, weights: np.ndarray) -> list[tuple[Candidate, np
     longest = 1.2 * np.pi / float(onsets.w.max())
     parts = onsets.lag + onsets.modes > 0
     if parts:
-        starts = onsets.starts_beside(_DELTAS[::_EVERY], longest, _STARTS[0])
+        starts = onsets.starts_beside(_DELTAS[::_EVERY], longest, _STARTS)
     else:
-        starts = onsets.starts(_dampings(onsets), longest, _cutoffs(onsets), _STARTS[onsets.unknown_cutoff])
+        starts = onsets.starts(_dampings(onsets), longest, _STARTS)
     near = [(_solve(onsets, weights, start, (), _NEARLY), start) for start in starts]
     near = sorted(near, key=lambda each: each[0].squares)
     return [each for each in near if not parts or (each[0].found and each[0].ahead <= _FAR * near[0][0].squares)]
@@ -89,16 +89,6 @@ def _dampings(onsets: Onsets) -> np.ndarray:
     ratio = _DELTAS[1] / _DELTAS[0]
     more = np.ceil(np.log(_DELTAS[0] / (0.1 * float(onsets.w.min()) ** 2)) / np.log(ratio))
     return np.concatenate([[0.0], _DELTAS[0] * ratio ** np.arange(-more, 0.0), _DELTAS])
-
-
-def _cutoffs(onsets: Onsets) -> np.ndarray:
-    """Places to look for a cut-off at: from a tenth of what was heard on, and the one given."""
-    if not onsets.unknown_cutoff:
-        return np.ones(1)
-    low, high = onsets.cutoffs
-    places = np.geomspace(min(100 * low, 0.1 * high), 0.98 * high, _CUTOFFS)
-    given = getattr(onsets.velocity, "cutoff", None)
-    return places if given is None else np.sort(np.append(places, np.clip(given, *places[[0, -1]])))
 
 
 def _solve(

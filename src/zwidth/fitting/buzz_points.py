@@ -30,7 +30,7 @@ class BuzzPoint(NamedTuple):
 
 
 def read_points(
-    points: Iterable[Any], period: float, copies_count_once: bool, unknown_cutoff: bool
+    points: Iterable[Any], period: float, copies_count_once: bool
 ) -> tuple[np.ndarray, list[str]]:
     """The walls as an array, and doubts; an impossible one is refused, and so are walls that cannot tell a device."""
     if not isinstance(points, Iterable) or isinstance(points, str | dict):
@@ -63,21 +63,13 @@ def read_points(
     table = np.array(rows)
     # A force over a velocity: the dampings that matter are of this size.
     unit = table[0, 0] / (2 * np.pi * table[0, 2])
-    near = _SAME * max(unit, np.abs(table[:, 1]).max())
-    if np.ptp(table[:, 1]) <= near:
+    if np.ptp(table[:, 1]) <= _SAME * max(unit, np.abs(table[:, 1]).max()):
         count = (
             "one wall gives two equations for" if len(table) == 1 else f"{len(table)} walls of one damping cannot tell"
         )
         raise InputError(
             f"points: {count} the three unknowns m, b and t_d; what is missing is a wall of another damping: raise K "
             f"at B = {with_unit(table[0, 1] + 0.4 * unit, 'N s/m', 2)}, say, until it buzzes"
-        )
-    damped = table[np.abs(table[:, 1]) > near, 1]
-    if unknown_cutoff and (len(table) < 3 or np.ptp(damped) <= near):
-        raise InputError(
-            f"points: {len(table)} walls, {damped.size} of them with B > 0, cannot tell m, b, t_d and the cut-off; "
-            "three are needed, at two dampings B > 0; what is missing is a wall of another damping: raise K at "
-            f"B = {with_unit(table[:, 1].max() + 0.4 * unit, 'N s/m', 2)}, say, until it buzzes"
         )
     return table, doubts
 

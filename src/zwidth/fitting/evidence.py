@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.buzz import BuzzPoint
-from zwidth.fitting.device_fit import DeviceFit, reach_of
-from zwidth.fitting.safe_wall import draw_devices
+from zwidth.fitting.device_estimate import reach_of
+from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.words import LINEAR, AxisUnits, choose_wall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import header
@@ -77,7 +77,7 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
     damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
     own = fit.estimates[None]
     low = high = np.full(damping.size, np.nan)
-    drawn = draw_devices(fit, min(_DRAWS, fit.scene.loop.draws), 0)
+    drawn = fit.draw(min(_DRAWS, fit.scene.loop.draws))
     if drawn is not None:
         low, high = np.quantile(_limit_rows(fit, drawn, damping), [0.025, 0.975], axis=0)
     return {

@@ -18,7 +18,7 @@ from zwidth.arrays.circle import circle
 from zwidth.fitting.device_rows import DeviceRows
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
-from zwidth.fitting.structure import StructuredRecordings, to_scene
+from zwidth.fitting.structure import Recordings
 from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
 from zwidth.parts.actuator import Actuator
 from zwidth.parts.measured import MeasuredDevice
@@ -152,7 +152,7 @@ def look_for_lags(best: FittedModel) -> LagTest:
     best = _glimpse(best)
     lags = np.geomspace(_SHORTEST, max(_LONGEST, min(_LONGEST_LAG, best.theta[2])), _LAGS)
     # Of the mass alone: what resonances add turns hardly.
-    (g, delta, d), model = best.theta[:3], StructuredRecordings(best.model.logs, lag=1)
+    (g, delta, d), model = best.theta[:3], Recordings(best.model.logs, lag=1)
     thetas = [np.pad([g, delta, d - lag, lag], (0, model.size - 4)) for lag in lags]
     columns = [[model.add_parts(theta, k).position for k in range(len(model.logs))] for theta in thetas]
     columns = best.model.weigh(np.stack([np.concatenate(column) for column in columns], -1))
@@ -181,7 +181,8 @@ def bound_lag(best: FittedModel, test: LagTest | None, scene: Scene, reach: floa
         return None
     lag = float(test.lag[count - 1] * period)
     # What a lag moves of resonances is small, and may be more than there is.
-    there = to_scene(best.model, np.clip(test.theta[:, count - 1], *best.model.bounds()), period, scene.velocity)
+    theta = np.clip(test.theta[:, count - 1], *best.model.bounds())
+    there = best.model.to_scene(theta, period, scene.velocity)
     there = replace(there, device=replace(there.device, actuator=Actuator(time_constant=lag)))
     return HiddenLag(lag, float(there.timing.delay), float(there.max_stiffness().stiffness))
 
@@ -261,7 +262,7 @@ def _respond(best: FittedModel, scene: Scene, lines: np.ndarray) -> tuple[np.nda
     for k in range(best.model.parts.stop):
         theta = best.theta.copy()
         theta[k] += (step := _STEP * max(abs(best.theta[k]), 1e-3 if k in (1, 2) else 0.0))
-        there = to_scene(best.model, theta, period, scene.velocity)
+        there = best.model.to_scene(theta, period, scene.velocity)
         columns.append((there.frequency_response(1.0, 0.0, frequency) - response) / step)
     return response, np.stack(columns, -1)
 

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.device_fit import DeviceFit
-from zwidth.fitting.fit_records import RivalDevice
+from zwidth.fitting.device_fit import DeviceFit, RivalDevice
 from zwidth.fitting.safe_wall import SafeWall, bears_resonances
 from zwidth.parts.paths import spell_estimate
 from zwidth.words import rotation
@@ -22,7 +21,6 @@ SYMBOLS = {
     "mass": "m",
     "damping": "b",
     "delay": "t_d",
-    "cutoff": "f_c",
     "friction": "F_c",
     "stiffness_max": "K_max",
 }
@@ -53,7 +51,6 @@ class AxisUnits(NamedTuple):
             **self._asdict(),
             "delay": "s",
             "time_constant": "s",
-            "cutoff": "Hz",
             "frequency": "Hz",
             "friction": self.force,
             "offset": self.force,
@@ -103,8 +100,7 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
         count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
         rows.append(("of it", f"{count:,} of {total:,} samples, the first ones; more would only narrow the errors"))
     beside = [name for name in fit.numbers if name.startswith(("actuator", "modes"))]
-    names = ("mass", "damping", "delay", *(["cutoff"] if "cutoff" in fit.errors else []), *beside, "stiffness_max")
-    for name in names:
+    for name in ("mass", "damping", "delay", *beside, "stiffness_max"):
         symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS.get(name) or _name_part(name, len(fit.modes))
         known = math.isfinite(fit.value_of(name))
         rows.append((symbol, f"{_spell(fit, name, units)} ({_between(fit, name, units)})" if known else "open"))
@@ -178,7 +174,6 @@ def list_doubts(fit: DeviceFit, units: AxisUnits) -> list[str]:
 def spell_rival(rival: RivalDevice, units: AxisUnits = LINEAR) -> str:
     """Its numbers in a line."""
     parts = {SYMBOLS[name]: units.spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
-    parts |= {} if rival.cutoff is None else {SYMBOLS["cutoff"]: units.spell("cutoff", rival.cutoff)}
     parts |= {_name_part(name, 1).strip(): units.spell(name, value) for name, value in (rival.parts or {}).items()}
     parts[SYMBOLS["stiffness_max"]] = units.spell("stiffness", rival.stiffness_max)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
@@ -251,7 +246,7 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
         lines += [f"    {'-' if j == 0 else ' '} {part}" for j, part in enumerate(parts)]
     for key, section in spell_estimate(fit.velocity, every=True).items():
         inside = ", ".join(f"{name}: {json.dumps(value).strip(chr(34))}" for name, value in section.items())
-        lines.append(f"  {key}: {{{inside}}} # {'its cut-off fitted' if 'cutoff' in fit.errors else 'as given'}")
+        lines.append(f"  {key}: {{{inside}}} # as given")
     if fit.is_doubted:
         lines += [f"studies: [] # {NO_WALL}"]
     else:
