@@ -4,28 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.arrays.circle import circle
-from zwidth.fitting.buzz_choosing import AS_GOOD, EXACT, FittedKind, choose_device, find_edges
-from zwidth.fitting.buzz_devices import Candidate, is_blind, weigh
-from zwidth.fitting.buzz_points import BuzzPoint as BuzzPoint
-from zwidth.fitting.buzz_points import read_noise, read_points
+from zwidth.fitting.buzz_search import (
+    AS_GOOD,
+    EXACT,
+    Candidate,
+    FittedKind,
+    choose_device,
+    find_edges,
+    is_blind,
+    weigh,
+)
 from zwidth.fitting.buzzing import Onsets
 from zwidth.fitting.device_estimate import differentiate, find_stiffest, name_numbers
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FurtherExperiment, RivalDevice
 from zwidth.fitting.words import spell_rival
-from zwidth.parts.checks import check_number
+from zwidth.parts.checks import check_number, read_texts
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import plain
+from zwidth.words.formatting import plain, with_unit
 from zwidth.words.status import Status
 
 # Worse by chance of 1e-4, or than this share where the noise is unknown, the points contradict each other.
 _CHANCE, _ROUGH = 1e-4, 0.1
 _ANGLES = 240
+# Dampings closer than this are one experiment.
+_SAME = 1e-6
+
+
+class BuzzPoint(NamedTuple):
+    """A wall at the onset of buzzing.
+
+    Args:
+        stiffness: K in N/m, raised at this damping until the wall buzzes.
+        virtual_damping: B in N s/m.
+        frequency: heard or measured, in Hz.
+    """
+
+    stiffness: float
+    virtual_damping: float
+    frequency: float
 
 
 def fit_buzz(
@@ -90,8 +112,8 @@ def fit_buzz(
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
         raise InputError(f"velocity: got {velocity!r}; give an estimate, as zwidth.LowPass(cutoff=100)")
-    share = read_noise(noise)
-    table, doubts = read_points(points, period, share is None)
+    share = _read_noise(noise)
+    table, doubts = _read_points(points, period, share is None)
     kappa, rub, w = (table * [period**2, period, 2 * np.pi * period]).T
     onsets = Onsets(kappa, rub, w, velocity, period)
     weights = 1.0 / np.array(share or (1.0, 1.0))
@@ -163,6 +185,61 @@ def fit_buzz(
         damping_tried=damping,
         stiffness_tried=stiffness,
     )
+
+
+def _read_points(points: Iterable[Any], period: float, copies_count_once: bool) -> tuple[np.ndarray, list[str]]:
+    """The walls as an array, and doubts; an impossible one is refused, and so are walls that cannot tell a device."""
+    if not isinstance(points, Iterable) or isinstance(points, str | dict):
+        raise InputError(f"points: got {points!r}; give walls, each (K in N/m, B in N s/m, f in Hz)")
+    rows = []
+    for k, point in enumerate(points):
+        try:
+            row = [float(read_texts(f"points[{k}]", *each)) for each in zip(point, ("N/m", "N s/m", "Hz"), strict=True)]
+        except (TypeError, ValueError):
+            row = []
+        if len(row) != 3 or not np.all(np.isfinite(row)):
+            raise InputError(f"points[{k}]: got {point!r}; give K in N/m, B in N s/m and f in Hz, as (6e3, 0, 37.6)")
+        if not row[0] > 0:
+            raise InputError(f"points[{k}].stiffness: got {row[0]:g} N/m; it must be greater than 0 to buzz")
+        if not 0 < row[2] < 0.5 / period:
+            raise InputError(
+                f"points[{k}].frequency: got {row[2]:g} Hz; it must be greater than 0 and less than half the sampling "
+                f"rate, {plain(0.5 / period)} Hz: check the frequency, or the period"
+            )
+        rows.append(row)
+    if not rows:
+        raise InputError("points: got none; raise K at B = 0 until the wall buzzes, and again at another B")
+    doubts = []
+    if copies_count_once and len(kept := list(dict.fromkeys(map(tuple, rows)))) < len(rows):
+        doubts.append(
+            f"{len(rows) - len(kept)} of the walls repeat others to the last digit and count once; give the noise if "
+            "they were measured again"
+        )
+        rows = kept
+    table = np.array(rows)
+    # A force over a velocity: the dampings that matter are of this size.
+    unit = table[0, 0] / (2 * np.pi * table[0, 2])
+    if np.ptp(table[:, 1]) <= _SAME * max(unit, np.abs(table[:, 1]).max()):
+        count = (
+            "one wall gives two equations for" if len(table) == 1 else f"{len(table)} walls of one damping cannot tell"
+        )
+        raise InputError(
+            f"points: {count} the three unknowns m, b and t_d; what is missing is a wall of another damping: raise K "
+            f"at B = {with_unit(table[0, 1] + 0.4 * unit, 'N s/m', 2)}, say, until it buzzes"
+        )
+    return table, doubts
+
+
+def _read_noise(noise: Any) -> tuple[float, float] | None:
+    if noise is None:
+        return None
+    try:
+        pair = np.broadcast_to(np.asarray(noise, float), (2,))
+    except ValueError:
+        pair = np.zeros(2)
+    if not np.all((pair > 0) & (pair < 1)):
+        raise InputError(f"noise: got {noise!r}; give the relative noise of K and f, as 0.02, or (0.03, 0.01)")
+    return float(pair[0]), float(pair[1])
 
 
 def _describe_rival(kind: FittedKind, theta: np.ndarray) -> RivalDevice:

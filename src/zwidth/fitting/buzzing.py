@@ -7,28 +7,22 @@ With z = e^(jw), w = 2 pi f T, a pole pair is on the circle exactly where
 two real equations a wall, whatever G is. At a known B they determine w and K (docs/theory/scenes.md). A device is
 looked for as ``theta = (ln m, delta, d)``, then the logarithms of an amplifier's time constant in periods and damping
 ratio, and of each mode those of its frequency in radians a period and its damping ratio, and ``m/m_i``.
-
-The lag and the modes add to the response of the mass a sum over their poles p of ``r h(p; z)``, what a force held and
-late by d = n + f moves of ``E' = p E + F``, with zeta = z - 1:
-
-    h = (zeta (e^((1 - f) p) - 1) + e^p - 1)/(p (zeta + 1 - e^p) z^(n + 1))
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import CirclePoints, Jet, circle
+from zwidth.arrays.circle import circle
 from zwidth.fitting.device_estimate import DimensionlessDevice
-from zwidth.fitting.structure import LAGS, RATIOS, TURNS, list_poles
-from zwidth.loops.rigid.device import Plant, held_plant, split_delay
-from zwidth.loops.rigid.ridge import plant_slopes
+from zwidth.fitting.required_wall import RequiredWall
+from zwidth.fitting.structure import LAGS, RATIOS, TURNS
 from zwidth.parts.velocity import Estimate, Velocity
 
 # Newton's steps towards w, the longest of them as a share of w, the last one's share (it squares), and the share
@@ -40,68 +34,6 @@ _STEP, _SIDES, _WEIGHTS = 1e-3, np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0,
 # how far apart the logarithms of starts lie.
 _LAGS: list[list[tuple[float, ...]]] = [[()], [(0.3,), (1.0,), (3.0,)], [(0.3, 0.7), (1.0, 0.7), (3.0, 0.7)]]
 _RATIOS, _DELAYS, _FREQUENCIES, _ALIKE = (0.01, 0.05, 0.3), 16, 24, 0.3
-
-
-class NeededAnswer:
-    """``q = -1/G`` of devices, arrays that broadcast with the points asked for.
-
-    Of a rigid one ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``; ``lag`` is an amplifier's time constant in periods
-    and, of second order, its damping ratio; ``modes`` are frequencies in radians a period, damping ratios, ``m/m_i``.
-    """
-
-    def __init__(self, delta: Any, d: Any, lag: Sequence[Any] = (), modes: Sequence[Sequence[Any]] = ()) -> None:
-        """Of devices, described once for all frequencies."""
-        self.whole, fraction = split_delay(np.asarray(d, float))
-        self.delta, self.fraction = delta, fraction
-        poles, residues = list_poles(delta, lag, modes)
-        self.beside = len(poles) > 0
-        if poles:
-            both = np.array(np.broadcast_arrays(fraction + np.zeros(1), *poles, *residues)[1:], complex)
-            poles, self.residues = np.where(both[: len(poles)] == 0, 1e-300, both[: len(poles)]), both[len(poles) :]
-            self.turns, self.full = np.expm1(poles), np.expm1(poles) / poles
-            self.late = np.expm1((1.0 - fraction) * poles) / poles
-
-    @cached_property
-    def plant(self) -> Plant:
-        """The mass alone."""
-        return held_plant(self.delta, self.fraction)
-
-    def jet(self, at: CirclePoints) -> Jet:
-        """q and its derivative in w."""
-        rigid = self.rigid_jet(at)
-        if not self.beside:
-            return rigid
-        more = self.add(at)
-        share = 1.0 / (1.0 - rigid.value * more.value)
-        return Jet(rigid.value * share, share**2 * (rigid.slope + rigid.value**2 * more.slope))
-
-    def rigid_jet(self, at: CirclePoints) -> Jet:
-        """The same of the mass alone."""
-        plant, turn = self.plant, 1j * at.z
-        total, below = _answer(plant, at), at.before + plant.em
-        q = -np.exp(1j * self.whole * at.w) * at.before * below / total
-        slopes = turn / at.before + turn / below - 1j * (plant.a2 * at.z - plant.a0 / at.z) / total
-        return Jet(q, q * (1j * self.whole + slopes))
-
-    def add(self, at: CirclePoints) -> Jet:
-        """What lag and modes add to the response, and its derivative in w."""
-        above, below = at.before * self.late + self.full, at.before - self.turns
-        each = self.residues * (np.exp(-1j * (self.whole + 1.0) * at.w) * above / below)
-        slopes = 1j * (at.z * (self.late / above - 1.0 / below) - self.whole - 1.0)
-        return Jet(each.sum(0), (each * slopes).sum(0))
-
-    def moves(self, at: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The derivatives in delta and d of q, that of the rigid device alone."""
-        by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
-        total = _answer(self.plant, at)
-        return (
-            q * (by_delta.em / (at.before + self.plant.em) - _answer(by_delta, at) / total),
-            -q * _answer(by_fraction, at) / total,
-        )
-
-
-def _answer(plant: Any, at: CirclePoints) -> Any:
-    return plant.a2 * at.z + plant.a1 + plant.a0 / at.z
 
 
 class Followed(NamedTuple):
@@ -155,9 +87,9 @@ class Onsets:
         """The device of theta."""
         return DimensionlessDevice(np.exp(theta[0]), *theta[1:3], *map(list, self._read(theta)))
 
-    def answer(self, theta: np.ndarray) -> NeededAnswer:
+    def answer(self, theta: np.ndarray) -> RequiredWall:
         """What devices need, one or several along further axes of theta."""
-        return NeededAnswer(*self.normalize(theta)[1:])
+        return RequiredWall(*self.normalize(theta)[1:])
 
     def follow(self, theta: np.ndarray) -> Followed:
         """The walls of theta at these dampings, w nearest to the measured ones."""
@@ -206,7 +138,7 @@ class Onsets:
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
         at = circle(self.w)
-        q = NeededAnswer(deltas[:, None, None], delays[:, None]).jet(at).value
+        q = RequiredWall(deltas[:, None, None], delays[:, None]).jet(at).value
         away = np.log((self.kappa + self.rub * self._estimate.jet(at).value) / q)
         log_mass = away.real.mean(-1)
         cost = (away.imag**2).sum(-1) + ((away.real - log_mass[..., None]) ** 2).sum(-1)
@@ -226,9 +158,9 @@ class Onsets:
         found: list[tuple[float, np.ndarray]] = []
         for lag, ratio in product(_LAGS[self.lag], _RATIOS[: None if self.modes else 1]):
             grid = deltas[:, None, None, None], delays[:, None, None]
-            mass = -1.0 / NeededAnswer(*grid, lag).jet(at).value / wanted
+            mass = -1.0 / RequiredWall(*grid, lag).jet(at).value / wanted
             ringing = [(frequencies[:, None], ratio, 1.0)][: self.modes]
-            mode = -1.0 / NeededAnswer(*grid, lag, ringing).jet(at).value / wanted - mass
+            mode = -1.0 / RequiredWall(*grid, lag, ringing).jet(at).value / wanted - mass
             (aa, bb, ab), (a, b) = (
                 [(one * other.conj()).real.sum(-1) for one, other in ((mass, mass), (mode, mode), (mass, mode))],
                 [each.real.sum(-1) for each in (mass, mode)],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from zwidth.parts.mode import Mode
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
+from zwidth.words.rotation import is_rotary
 
 # Of the upper ends of intervals of 95 %.
 UPPER = 0.975
@@ -37,8 +38,8 @@ class DimensionlessDevice(NamedTuple):
     mass: Any
     delta: Any
     d: Any
-    lag: Sequence[Any] | np.ndarray = ()
-    modes: Sequence[Any] | np.ndarray = ()
+    lag: Any = ()
+    modes: Any = ()
 
     def to_numbers(self, period: Any) -> np.ndarray:
         """Its numbers in SI units, as `name_numbers` names them."""
@@ -63,18 +64,21 @@ class DimensionlessDevice(NamedTuple):
 
 
 def scene_of(values: Iterable[float], period: float, velocity: Velocity, lag: int = 0) -> Scene:
-    """The loop of a device by the numbers that `name_numbers` names; ``lag`` is an amplifier's order."""
+    """The loop of a device by the numbers that `name_numbers` names; ``lag`` is an amplifier's order.
+
+    The device is of the kind in question, linear or rotary.
+    """
     mass, damping, delay, *beside = map(float, values)
     constant, *ratio = beside[:lag] or [None]
     actuator = Actuator(None, constant, lag, *ratio) if lag else None
     modes = [Mode(*beside[k : k + 3]) for k in range(lag, len(beside), 3)]
-    device = Device(mass, damping, actuator=actuator, modes=modes)
+    device = Device(mass, damping, actuator=actuator, modes=modes, rotary=is_rotary())
     return Scene(device, Timing(period=period, delay=delay), velocity=velocity)
 
 
 def differentiate(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
     """The derivatives of a smooth formula, a column each, by complex steps: exact to rounding (Squire, Trapp 1998)."""
-    return np.stack([function(values + 1j * _TINY * unit).imag / _TINY for unit in np.eye(values.size)], -1)
+    return np.stack([np.imag(function(values + 1j * _TINY * unit)) / _TINY for unit in np.eye(values.size)], -1)
 
 
 def name_numbers(scene: Scene) -> tuple[str, ...]:

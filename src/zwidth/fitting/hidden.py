@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from zwidth.arrays.circle import circle
-from zwidth.fitting.device_rows import DeviceRows
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
+from zwidth.fitting.required_wall import DeviceRows
 from zwidth.fitting.structure import Recordings
 from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
 from zwidth.parts.actuator import Actuator

@@ -20,6 +20,7 @@ from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE
+from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
@@ -118,8 +119,19 @@ def fit_log(
         >>> print(f"{fit.mass * 1e3:.1f} g, {fit.damping:.2f} N s/m")
         100.0 g, 2.00 N s/m
     """
-    velocity = BackwardDifference() if velocity is None else velocity
-    logs, period, wavers = read_logs(time, position, force, resample)
+    with use_kind(rotary):
+        return _fit(
+            *read_logs(time, position, force, resample),
+            BackwardDifference() if velocity is None else velocity,
+            max_delay,
+            resolution,
+        )
+
+
+def _fit(
+    logs: tuple[Log, ...], period: float, wavers: float, velocity: Velocity, max_delay: Any, resolution: Any
+) -> DeviceFit:
+    """The same of logs that are read, whose period has the relative standard error ``wavers``."""
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
     recordings = tuple(log.recording(skip, k).begin(_MOST // len(logs)) for k, log in enumerate(logs))
@@ -140,7 +152,7 @@ def fit_log(
     covariance = by_theta @ best.covariance[known, known] @ by_theta.T + np.outer(late, late)
     freedom = max(1, best.count - theta.size)
     unexplained = _find_unexplained(best, pole, period) if banks else []
-    doubts = odd + doubts + _doubt(scene, np.sqrt(np.diag(covariance)), best, logs, rotary) + unexplained
+    doubts = odd + doubts + _doubt(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     # The device that bears K_max is another one then.
     status = Status.UNDECIDED if status == Status.OK and unexplained else status
@@ -237,17 +249,17 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
         )
 
 
-def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Log, ...], rotary: bool) -> list[str]:
+def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Log, ...]) -> list[str]:
     mass, damping, delay = scene.device.mass, scene.device.damping, scene.timing.delay
     doubts, residuals = [], best.residuals
-    if not rotary and not _LIGHTEST <= mass <= _HEAVIEST:
+    if not is_rotary() and not _LIGHTEST <= mass <= _HEAVIEST:
         light = "the position may be in mm, or the force in kN"
         slip = light if mass < _LIGHTEST else "the force may be in mN, or the time in ms"
         doubts.append(f"a mass of {with_unit(mass, 'kg')} is far from any device; {slip}: m, N and s are meant")
     way, push = max(float(np.ptp(log.position)) for log in logs), best.model.largest
-    if not rotary and way > _FARTHEST:
+    if not is_rotary() and way > _FARTHEST:
         doubts.append(f"a way of {with_unit(way, 'm')} is far from any device; the position may be in mm: m is meant")
-    if not rotary and push > _STRONGEST:
+    if not is_rotary() and push > _STRONGEST:
         doubts.append(f"a force of {with_unit(push, 'N')} is far from any device; it may be in mN: N is meant")
     if errors[0] > VAGUE * mass:
         doubts.append(MASS_OPEN)

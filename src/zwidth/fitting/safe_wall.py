@@ -5,7 +5,7 @@ and columns of the stable set are intervals (docs/theory/one-lobe.md), so that a
 bear are counted from the ends of their columns, and K is halved between what they bear and what they do not.
 
 With a velocity filter, an amplifier or resonances rows are looked for on a grid of frequencies
-(`zwidth.fitting.device_rows`); eigenvalues then judge the wall on every device.
+(`zwidth.fitting.required_wall`); eigenvalues then judge the wall on every device.
 
 A log bounds resonances as well: how large one may be and not show. The fitted response with that radius decides walls
 as a measured one does (docs/theory/measured.md), and a wall counts that it decides too.
@@ -18,9 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import circle
-from zwidth.fitting.buzzing import NeededAnswer
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
-from zwidth.fitting.device_rows import DeviceRows, find_highest
+from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
 from zwidth.loops.linear.state_space import delayed_device, open_loop
 from zwidth.loops.rigid.device import device_status
 from zwidth.loops.variants import RigidVariants
@@ -186,7 +185,7 @@ class _SearchedDevices:
         at = circle(w)
         with np.errstate(all="ignore"):
             velocity = scene.velocity.estimate(period).jet(at).value.reshape(-1, w.shape[-1]) / period
-            needed = NeededAnswer(*devices[1:]).jet(at).value * (rate / period)[:, None]
+            needed = RequiredWall(*devices[1:]).jet(at).value * (rate / period)[:, None]
             # At z = -1 both are real.
             needed[:, -1], velocity[:, -1] = np.real(needed[:, -1]), np.real(velocity[:, -1])
             self.rows = DeviceRows(needed, velocity)

@@ -13,7 +13,6 @@ frequencies, -A'(0), which is the same but for the bends of the force within a t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +21,7 @@ import numpy as np
 from zwidth.fitting.device_estimate import DimensionlessDevice
 from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.fitting.moving import ModelledMotion, Recording, recur
+from zwidth.fitting.required_wall import list_poles
 from zwidth.loops.rigid.device import phi_functions
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
@@ -32,8 +32,6 @@ _STEP = 1e-6
 LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (5e-4, 4.0)
 # The delays at low frequencies of those of second order.
 _SLOW = 2.0 * RATIOS[0] * LAGS[0], 2.0 * LAGS[1]
-# A double pole has no partial fractions.
-_DOUBLE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ class Recordings:
     def normalize(self, theta: np.ndarray, period: Any) -> DimensionlessDevice:
         """The device of theta."""
         modes = theta[self.parts][self.lag :].reshape(-1, 3) / [1.0, 1.0, theta[0]]
-        return DimensionlessDevice(period**2 / theta[0], *theta[1:3], _read_lag(theta, self.lag), modes)
+        return DimensionlessDevice(period**2 / theta[0], theta[1], theta[2], _read_lag(theta, self.lag), modes)
 
     def to_scene(self, theta: np.ndarray, period: float, velocity: Velocity) -> Scene:
         """The scene of theta."""
@@ -219,41 +217,6 @@ def _read_lag(theta: np.ndarray, order: int) -> np.ndarray:
     lag = theta[3 : 3 + order].copy()
     lag[:1] /= 2.0 * lag[1] if order == 2 else 1.0
     return lag
-
-
-def list_poles(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
-    """Poles and residues of ``A(s) (1/(s (s + delta)) + sum of modes)`` but for ``1/(s (s + delta))``.
-
-    Those of the amplifier, -delta behind one, and two of each mode: frequency, damping ratio and ``m/m_i``.
-    """
-    late, gains = (list(each) for each in amplify(lag))
-    poles, weights = list(late), [gain / pole / (pole + delta) for pole, gain in zip(late, gains, strict=True)]
-    if late:
-        poles, weights = [*poles, -delta + 0j], [*weights, -sum(weights)]
-    for turns, ratio, share in modes:
-        own = find_roots(turns, ratio)
-        for k, (pole, gain) in enumerate(zip(late, gains, strict=True)):
-            weights[k] = weights[k] + share * gain / (pole - own[0]) / (pole - own[1])
-        for pole, other in (own, own[::-1]):
-            poles.append(pole)
-            behind = sum(gain / (pole - each) for each, gain in zip(late, gains, strict=True)) if late else 1.0
-            weights.append(share * behind / (pole - other))
-    return poles, weights
-
-
-def amplify(lag: Sequence[Any] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poles and residues of A, along the first axis, by its time constant and damping ratio; none without them."""
-    if len(lag) == 0:
-        return np.zeros(0), np.zeros(0)
-    poles = find_roots(1.0 / lag[0], lag[1]) if len(lag) == 2 else np.array([-1.0 / lag[0] + 0j])
-    return poles, np.prod(-poles, 0) / (poles - poles[::-1] if len(lag) == 2 else np.ones_like(poles))
-
-
-def find_roots(w: Any, ratio: Any) -> np.ndarray:
-    """Of ``s^2 + 2 zeta w s + w^2``, along the first axis; a double one is parted a little."""
-    inside = ratio**2 - 1.0
-    root = np.sqrt(np.where(np.abs(inside) > _DOUBLE, inside, _DOUBLE) + 0j)
-    return np.array([w * (-ratio + root), w * (-ratio - root)])
 
 
 def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:

@@ -8,10 +8,10 @@ from measured_devices import PERIOD, TrueDevice
 
 import zwidth
 from zwidth.fitting.choosing import choose_structure
-from zwidth.fitting.device_rows import DeviceRows
 from zwidth.fitting.hidden import HiddenResonances, weigh_resonances
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import fit_model
+from zwidth.fitting.required_wall import DeviceRows
 from zwidth.fitting.structure import Recordings
 
 SKIP, DELAY = 22, 1.3e-3
