@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.hidden import HiddenPole, LagTest, PoleBank, find_hidden, look_for_lags
+from zwidth.fitting.hidden import HiddenPole, LagTest, PoleBank, find_hidden, list_likeliest, look_for_lags
 from zwidth.fitting.output_error import NEARLY, FittedModel, follow_start, settle
 from zwidth.fitting.structure import Recordings
 
@@ -24,6 +25,8 @@ EXACT = 1e-9
 _BY_CHANCE = 5.99
 # Time constants that lags are started from, in periods; a second order's damping ratio.
 _LAGS, _RATIO = (0.3, 1.5), 0.7
+# So many resonances are started from, their frequencies so far apart.
+_PARTED, _APART = 2, float(np.exp(0.2))
 
 _Looked = tuple[FittedModel, HiddenPole | None, list[PoleBank], LagTest | None]
 
@@ -119,26 +122,7 @@ def _start(best: FittedModel, banks: list[PoleBank]) -> Iterator[tuple[int, int,
     elif lag == 1:
         yield 2, modes, np.r_[head, theta[3], _RATIO, ringing, speeds, states, theta[-2:]]
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
-    for ratio, frequency in _likeliest(banks):
+    ringing_banks = [bank for bank in banks if bank.ratio < 1.0]
+    for _, frequency, ratio in islice(list_likeliest(ringing_banks, _APART), _PARTED):
         mode = [2.0 * np.pi * frequency, ratio, 0.0]
         yield lag, modes + 1, np.r_[head, theta[3 : 3 + lag], ringing, mode, speeds, states, theta[-2:]]
-
-
-def _likeliest(banks: list[PoleBank]) -> Iterator[tuple[float, float]]:
-    """Damping ratios and frequencies of the ringing poles that explain most."""
-    found = sorted(
-        (
-            (e, f, bank.ratio)
-            for bank in banks
-            if bank.ratio < 1.0
-            for e, f in zip(bank.explained, bank.frequency, strict=True)
-        ),
-        reverse=True,
-    )
-    kept: list[float] = []
-    for _, frequency, ratio in sorted(found, reverse=True):
-        if all(abs(np.log(frequency / other)) > 0.2 for other in kept):
-            kept.append(frequency)
-            yield ratio, frequency
-        if len(kept) == 2:
-            return

@@ -20,7 +20,7 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
-from zwidth.loops.linear.state_space import delayed_device, open_loop
+from zwidth.loops.linear.state_space import StateSpace, delayed_device, estimate_matrices, in_series
 from zwidth.loops.rigid.device import device_status
 from zwidth.loops.variants import RigidVariants
 from zwidth.parts.velocity import BackwardDifference
@@ -215,7 +215,8 @@ class _SearchedDevices:
 def _bears(scene: Scene, stiffness: float, virtual_damping: float) -> bool:
     alpha, beta = scene.normalize_walls(stiffness * np.array(_SOFTER), virtual_damping)
     chain = scene.loop.chain
-    loop, device = open_loop(chain, 0.0, float(beta)), delayed_device(chain)
+    estimate, device = estimate_matrices(chain.estimate), delayed_device(chain)
+    loop = in_series(StateSpace(estimate.A, estimate.B, float(beta) * estimate.C, float(beta) * estimate.D), device)
     closed = np.repeat((loop.A - loop.B @ loop.C)[None], alpha.size, 0)
     size = device.A.shape[0]
     closed[:, -size:, -size:] -= alpha[:, None, None] * device.B @ device.C
