@@ -76,12 +76,9 @@ def fit_buzz(
             to the last digit then counts once.
 
     Returns:
-        DeviceFit: ``mass``, ``damping``, ``delay``, ``actuator``, ``modes``, their ``errors`` and ``covariance``;
-        ``stiffness_max`` with ``stiffness_error``; ``intervals``, 95 %, that of K_max down to what buzzed at the
-        largest B where K_max has more; ``residuals``; ``doubts``; ``next``, the experiment that narrows K_max most, or
-        tells the device from one of another kind; ``status``: UNDECIDED where another device fits as well (those are
-        ``rivals``), NO_BOUNDARY where the walls do not lie on the edge of its stable set or contradict each other;
-        K_max is NaN then, see `zwidth.DeviceFit`.
+        DeviceFit: the interval of K_max reaches down to what buzzed at the largest B where K_max has more; ``status``:
+        UNDECIDED where another device fits as well (those are ``rivals``), NO_BOUNDARY where the walls do not lie on
+        the edge of its stable set or contradict each other; K_max is NaN then, see `zwidth.DeviceFit`.
 
     Raises:
         InputError: a number is impossible, or an experiment is missing, which the message names.

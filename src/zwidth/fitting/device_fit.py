@@ -197,7 +197,7 @@ class DeviceFit(DeviceEstimate):
         """What ``errors`` names: an attribute of the fit, or a parameter of a part by its path."""
         return float(self.scene.parameters()[name] if "." in name else getattr(self, name))
 
-    @property
+    @cached_property
     def intervals(self) -> dict[str, ErrorBar]:
         """95 % intervals by name: of what ``errors`` has, and of "stiffness_max", with ``hidden`` and up to ``lag``.
 

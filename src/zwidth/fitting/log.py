@@ -79,14 +79,10 @@ def fit_log(
             damping in N m s/rad, and so on.
 
     Returns:
-        DeviceFit: ``mass``, ``damping``, ``delay``, their ``errors`` and ``covariance``; ``friction`` and ``offset``,
-        whose errors are NaN where the log leaves open how much is of which, as of a mass that slides one way only;
-        ``stiffness_max`` with ``stiffness_error``; ``intervals``, 95 %; ``noise`` of the position in m; ``residuals``
-        and ``motions``; ``doubts``, as of a unit or of residuals that are no noise: then there is no safe wall;
-        ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED, UNDECIDED where the residuals
-        are no noise: then K_max is NaN; ``response``, with the radius by which a resonance may move it that the log
-        does not show: what bounds the safe wall; ``actuator`` and ``modes`` where the log asks for them; ``lag``, the
-        longest that it does not tell from a delay: the interval of K_max reaches to it.
+        DeviceFit: the errors of ``friction`` and ``offset`` are NaN where the log leaves open how much is of which, as
+        of a mass that slides one way only; ``doubts`` as of a unit or of residuals that are no noise: then there is no
+        safe wall; ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED, UNDECIDED where the
+        residuals are no noise: then K_max is NaN; ``response`` bounds the safe wall.
 
     Raises:
         InputError: times are uneven, the force or the position never changes, the device runs away from its force, most

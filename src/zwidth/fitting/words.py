@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
-from zwidth.fitting.safe_wall import SafeWall, bears_resonances
+from zwidth.fitting.safe_wall import bears_resonances
 from zwidth.parts.paths import spell_estimate
-from zwidth.words.formatting import plain, with_unit
+from zwidth.words.formatting import name_wall, plain, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 from zwidth.words.status import Status
@@ -104,15 +103,18 @@ def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     if any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
         count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
         rows.append(("of it", f"{count:,} of {total:,} samples, the first ones; more would only narrow the errors"))
-    beside = [name for name in fit.numbers if name.startswith(("actuator", "modes"))]
-    for name in ("mass", "damping", "delay", *beside, "stiffness_max"):
+    for name in (*fit.numbers, "stiffness_max"):
         symbol = "J" if name == "mass" and is_rotary() else SYMBOLS.get(name) or _name_part(name, len(fit.modes))
         known = math.isfinite(fit.value_of(name))
         rows.append((symbol, f"{_spell(fit, name)} ({_between(fit, name)})" if known else "open"))
     if math.isfinite(fit.virtual_damping):
         B, error = (spell("damping", value) for value in (fit.virtual_damping, fit.virtual_damping_error))
         rows.append(("at B", f"{B} (standard error {error})"))
-    rows += _explain_parts(fit)
+    for name, label in (("friction", "friction"), ("offset", "constant force")):
+        if name in fit.errors:
+            known = math.isfinite(fit.errors[name])
+            bar = _between(fit, name) if known else "open: this log does not tell friction from a constant force"
+            rows.append((label, f"{_spell(fit, name)} ({bar})"))
     if isinstance(fit.noise, tuple):
         rows.append(("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in fit.noise)))
     else:
@@ -127,11 +129,11 @@ def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     safe, wall = fit.safe_wall(), choose_wall(fit)
     if safe.status == Status.OK and safe.stiffness > 0:
         borne = "stable on 99 % of the devices that these records allow"
-        rows.append(("safe wall", f"{_spell_wall(safe)}: {borne}"))
+        rows.append(("safe wall", f"{name_wall(*safe[:2])}: {borne}"))
     if fit.is_doubted:
         rows.append(("no wall", NO_WALL))
     if wall is not None:
-        rows.append(("set", f"{_spell_wall(wall)}: {wall.why}"))
+        rows.append(("set", f"{name_wall(*wall[:2])}: {wall.why}"))
     rows += [("doubt", doubt) for doubt in fit.doubts]
     if not fit.is_doubted and (rigid := choose_wall(fit, rigid=True)) not in (None, wall):
         at = "" if math.isnan(safe.resonance) else f" near {with_unit(safe.resonance, 'Hz', 3)}"
@@ -139,7 +141,7 @@ def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
         if fit.damping_tried is not None:
             hidden = f"a resonance may make other walls unstable, K_max too, and not show in these: {_TRY_MORE}"
         alone = "if nothing hides" if fit.is_structured else "if it is rigid"
-        rows += [("not seen", hidden), (alone, f"{_spell_wall(rigid)}: {rigid.why}")]
+        rows += [("not seen", hidden), (alone, f"{name_wall(*rigid[:2])}: {rigid.why}")]
     if fit.next is not None:
         step = fit.next
         B, K = spell("damping", step.virtual_damping, 3), spell("stiffness", step.stiffness, 3)
@@ -153,11 +155,11 @@ def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
 
 def _name_part(name: str, count: int) -> str:
     """The label of a number of the amplifier or of one of so many resonances."""
-    part, *place, number = name.split(".")
-    if number in ("time_constant", "frequency"):
-        return (
-            "amplifier's lag" if part == "actuator" else f"resonance {int(place[0]) + 1 if count > 1 else ''}".rstrip()
-        )
+    _, *place, number = name.split(".")
+    if number == "time_constant":
+        return "amplifier's lag"
+    if number == "frequency":
+        return f"resonance {int(place[0]) + 1}" if count > 1 else "resonance"
     return f"  its {number.replace('_', ' ')}"
 
 
@@ -177,11 +179,6 @@ def spell_rival(rival: RivalDevice) -> str:
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 
 
-def _spell_wall(wall: SafeWall | WallChoice) -> str:
-    K, B = spell("stiffness", wall.stiffness), spell("damping", wall.virtual_damping)
-    return f"K = {K}, B = {B}"
-
-
 def _spell(fit: DeviceFit, name: str) -> str:
     """A value with so many digits that its interval shows."""
     return spell(name, fit.value_of(name), _count_digits(fit, name))
@@ -198,15 +195,6 @@ def _count_digits(fit: DeviceFit, name: str) -> int:
     value, bar = abs(fit.value_of(name)), fit.intervals[name]
     known = value / (bar.high - bar.low) if bar.high > bar.low else 1.0
     return min(max(4, 2 + math.ceil(math.log10(known))), 9) if known > 0 and math.isfinite(known) else 4
-
-
-def _explain_parts(fit: DeviceFit) -> Iterable[tuple[str, str]]:
-    """Friction and constant force of a log."""
-    for part, label in (("friction", "friction"), ("offset", "constant force")):
-        if part in fit.errors:
-            known = math.isfinite(fit.errors[part])
-            bar = _between(fit, part) if known else "open: this log does not tell friction from a constant force"
-            yield label, f"{_spell(fit, part)} ({bar})"
 
 
 def _write(fit: DeviceFit, name: str) -> str:
@@ -252,7 +240,7 @@ def write_scene(fit: DeviceFit, source: str) -> list[str]:
             alone = "these parts alone" if fit.is_structured else "a rigid device"
             lines += [
                 f"# As of {alone}. A resonance that the log does not show may make walls unstable,",
-                f"# if they are stiffer than {_spell_wall(safe)}: {_SEE_MORE}.",
+                f"# if they are stiffer than {name_wall(*safe[:2])}: {_SEE_MORE}.",
             ]
         lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
     if fit.friction and math.isfinite(fit.errors["friction"]):
