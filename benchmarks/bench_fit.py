@@ -24,7 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import zwidth
-from zwidth.fitting.moving import Recording, Recordings
+from zwidth.fitting.moving import Recording
+from zwidth.fitting.structure import Recordings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 

@@ -5,12 +5,12 @@ from .figures import plot as plot
 from .fitting.buzz import BuzzPoint as BuzzPoint
 from .fitting.buzz import fit_buzz as fit_buzz
 from .fitting.device_fit import DeviceFit as DeviceFit
+from .fitting.device_fit import ErrorBar as ErrorBar
+from .fitting.device_fit import FittedMotion as FittedMotion
+from .fitting.device_fit import FurtherExperiment as FurtherExperiment
+from .fitting.device_fit import RivalDevice as RivalDevice
 from .fitting.excite import Excitation as Excitation
 from .fitting.excite import excite as excite
-from .fitting.fit_records import ErrorBar as ErrorBar
-from .fitting.fit_records import FittedMotion as FittedMotion
-from .fitting.fit_records import FurtherExperiment as FurtherExperiment
-from .fitting.fit_records import RivalDevice as RivalDevice
 from .fitting.log import fit_log as fit_log
 from .fitting.respond import ResponseEstimate as ResponseEstimate
 from .fitting.respond import respond as respond

@@ -25,6 +25,7 @@ from zwidth.pages.words import row, tell
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import name_wall, round_safely, with_unit
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.rotation import use_kind
 from zwidth.words.units import tell_kind
 
 # A letter, "=", and all up to the next letter with "=".
@@ -69,7 +70,6 @@ _SOFTER = 50
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
-@click.option("--unknown-cutoff", is_flag=True, help="Find the velocity's cut-off, too; needs --buzz at B > 0.")
 @figure_option
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run`.")
 @json_option
@@ -78,7 +78,6 @@ def fit(
     walls: tuple[Any, ...],
     period: float | None,
     noise: float | None,
-    unknown_cutoff: bool,
     velocity: Any,
     figure: Path | None,
     as_yaml: bool,
@@ -91,13 +90,13 @@ def fit(
     heard. With LOG.csv: from its free motion under a force that a computer commanded, friction included; several logs
     are of one device and have the same columns. Units stand in headers, as 'encoder [counts]', or behind a colon.
     """
-    from zwidth.fitting.words import LINEAR, ROTARY, describe_fit, write_scene
+    from zwidth.fitting.words import describe_fit, list_units, write_scene
 
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if as_json and as_yaml:
         raise click.UsageError("give one of --json and --yaml")
-    units, points = LINEAR, ()
+    points = ()
     if walls:
         for name, value in of_logs.items():
             if value:
@@ -109,22 +108,19 @@ def fit(
         kinds = {wall.rotary for wall in walls} - {None}
         if len(kinds) > 1:
             raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
-        units = ROTARY if kinds == {True} else LINEAR
         points = tuple(BuzzPoint(*wall.point) for wall in walls)
-        found = fit_buzz(points, period=period, velocity=velocity, noise=noise, unknown_cutoff=unknown_cutoff)
+        with use_kind(kinds == {True}):
+            found = fit_buzz(points, period=period, velocity=velocity, noise=noise)
         source = f"{len(walls)} buzzing walls"
     else:
         if noise is not None:
             raise click.UsageError("--noise belongs to --buzz; the noise of a log is found from it")
-        if unknown_cutoff:
-            raise click.UsageError("--unknown-cutoff belongs to --buzz; no velocity is estimated in a log")
         if of_logs["time"] is not None and period is not None:
             raise click.UsageError("give one of --time, --period and --rate")
         from zwidth.fitting.columns import fit_motions
 
         options = {name: of_logs.pop(name) for name in ("max_delay", "resample")}
         motions = read_logs(logs, period, **of_logs)
-        units = ROTARY if motions[0].rotary else LINEAR
         found = fit_motions(motions, period=period, velocity=velocity, **options)
         source = " and ".join(log.name for log in logs)
     wrote = []
@@ -132,13 +128,13 @@ def fit(
         from zwidth.figures import draw_device_fit
         from zwidth.fitting.evidence import gather_evidence
 
-        evidence: dict[str, Any] = gather_evidence(found, source, points, units)
+        evidence: dict[str, Any] = gather_evidence(found, source, points)
         wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
     if as_yaml:
-        click.echo("\n".join(write_scene(found, source, units)))
+        click.echo("\n".join(write_scene(found, source)))
         return
-    lines = () if as_json else describe_fit(found, source, units)
-    tell({**found.as_dict(), "units": units._asdict()}, [*(row(*each) for each in lines), *wrote], as_json)
+    lines = () if as_json else describe_fit(found, source)
+    tell({**found.as_dict(), "units": list_units(found)}, [*(row(*each) for each in lines), *wrote], as_json)
 
 
 _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)

@@ -4,35 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.arrays.circle import circle
-from zwidth.fitting.buzz_choosing import AS_GOOD, EXACT, FittedKind, choose_device, find_edges
-from zwidth.fitting.buzz_devices import Candidate, is_blind, weigh
-from zwidth.fitting.buzz_points import BuzzPoint as BuzzPoint
-from zwidth.fitting.buzz_points import read_noise, read_points
-from zwidth.fitting.buzzing import Onsets
-from zwidth.fitting.device_fit import (
-    BEYOND,
-    MASS_OPEN,
-    VAGUE,
-    DeviceFit,
+from zwidth.fitting.buzz_search import (
+    AS_GOOD,
+    EXACT,
+    Candidate,
+    FittedKind,
+    choose_device,
+    find_edges,
+    is_blind,
+    weigh,
 )
-from zwidth.fitting.fit_records import FurtherExperiment, RivalDevice
-from zwidth.fitting.scenes import name_numbers
-from zwidth.fitting.stiffness_estimate import StiffnessEstimate, in_si
+from zwidth.fitting.buzzing import Onsets
+from zwidth.fitting.device_estimate import differentiate, find_stiffest, name_numbers
+from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FurtherExperiment, RivalDevice
 from zwidth.fitting.words import spell_rival
-from zwidth.parts.checks import check_number
-from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity
+from zwidth.parts.checks import check_number, read_texts
+from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import plain
+from zwidth.words.formatting import plain, with_unit
 from zwidth.words.status import Status
 
 # Worse by chance of 1e-4, or than this share where the noise is unknown, the points contradict each other.
 _CHANCE, _ROUGH = 1e-4, 0.1
 _ANGLES = 240
+# Dampings closer than this are one experiment.
+_SAME = 1e-6
+
+
+class BuzzPoint(NamedTuple):
+    """A wall at the onset of buzzing.
+
+    Args:
+        stiffness: K in N/m, raised at this damping until the wall buzzes.
+        virtual_damping: B in N s/m.
+        frequency: heard or measured, in Hz.
+    """
+
+    stiffness: float
+    virtual_damping: float
+    frequency: float
 
 
 def fit_buzz(
@@ -41,7 +56,6 @@ def fit_buzz(
     period: Any,
     velocity: Velocity | None = None,
     noise: float | tuple[float, float] | None = None,
-    unknown_cutoff: bool = False,
 ) -> DeviceFit:
     """Find mass, damping and delay from walls at the onset of buzzing, and a lag or a resonance where they ask for it.
 
@@ -60,31 +74,23 @@ def fit_buzz(
         noise: relative standard deviation of K and f, one number or one for each. Left out, it is taken to be equal
             for both and is estimated from the residuals, which two or three walls hardly determine; a wall given twice
             to the last digit then counts once.
-        unknown_cutoff: whether the cut-off of ``velocity``, a `zwidth.LowPass` or `zwidth.Butterworth`, is a fourth
-            unknown, and the one given only a place to look at. It asks for three walls or more, at two dampings B > 0
-            at least: a wall of B = 0 says nothing about the filter. Lags and resonances are not looked for then.
 
     Returns:
-        DeviceFit: ``mass``, ``damping``, ``delay``, ``actuator``, ``modes``, their ``errors`` and ``covariance``;
-        ``stiffness_max`` with ``stiffness_error``; ``intervals``, 95 %, that of K_max down to what buzzed at the
-        largest B where K_max has more; ``residuals``; ``doubts``; ``next``, the experiment that narrows K_max most, or
-        tells the device from one of another kind; ``status``: UNDECIDED where another device fits as well (those are
-        ``rivals``), NO_BOUNDARY where the walls do not lie on the edge of its stable set or contradict each other;
-        K_max is NaN then, see `zwidth.DeviceFit`.
+        DeviceFit: the interval of K_max reaches down to what buzzed at the largest B where K_max has more; ``status``:
+        UNDECIDED where another device fits as well (those are ``rivals``), NO_BOUNDARY where the walls do not lie on
+        the edge of its stable set or contradict each other; K_max is NaN then, see `zwidth.DeviceFit`.
 
     Raises:
         InputError: a number is impossible, or an experiment is missing, which the message names.
 
     Numerics:
-        Levenberg and Marquardt (SciPy's: three unknowns, nothing to compile) from the dips over damping and delay, and
-        over cut-offs; exact walls give the device back to about 1e-12. Errors are linear in the noise. With 2 % of K
+        Levenberg and Marquardt (SciPy's: three unknowns, nothing to compile) from the dips over damping and delay;
+        exact walls give the device back to about 1e-12. Errors are linear in the noise. With 2 % of K
         and f and four walls of 800 random rigid devices, 9 % of the fits were UNDECIDED, 3 % refused, and 2 of them
         found a part; of the others, the intervals of m, b, t_d and K_max held the true value on 93.7, 94.4, 94.6 and
         94.4 %, and that of K_max on 96 % of 50 more whose K_max spreads by 20 % more or less than its gradient says. Of
         200 others with a lag, a resonance or both, most of five walls, 11 % were doubted; of the rest the interval of
-        K_max held it on 96.6 %, and every safe wall was stable. With an unknown cut-off and five walls of 305 rigid
-        devices (7 % UNDECIDED, 1 % refused), those of m, b, t_d, cut-off and K_max did on 95.7, 95.7, 96.1, 96.8 and
-        98.2 %. Looking for parts takes a few seconds.
+        K_max held it on 96.6 %, and every safe wall was stable. Looking for parts takes a few seconds.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V (the boundary). Boggs, Rogers 1990 (errors in both coordinates).
@@ -103,21 +109,10 @@ def fit_buzz(
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
         raise InputError(f"velocity: got {velocity!r}; give an estimate, as zwidth.LowPass(cutoff=100)")
-    if unknown_cutoff and not isinstance(velocity, LowPass | Butterworth):
-        raise InputError(
-            f"velocity: got {velocity!r}, which has no cut-off; give the kind of filter with a guess, as "
-            "zwidth.LowPass(cutoff=100), or leave unknown_cutoff out"
-        )
-    share = read_noise(noise)
-    table, doubts = read_points(points, period, share is None, unknown_cutoff)
-    onsets = Onsets(
-        table[:, 0] * period**2,
-        table[:, 1] * period,
-        2 * np.pi * table[:, 2] * period,
-        velocity,
-        period,
-        unknown_cutoff,
-    )
+    share = _read_noise(noise)
+    table, doubts = _read_points(points, period, share is None)
+    kappa, rub, w = (table * [period**2, period, 2 * np.pi * period]).T
+    onsets = Onsets(kappa, rub, w, velocity, period)
     weights = 1.0 / np.array(share or (1.0, 1.0))
     chosen, others = choose_device(onsets, weights, share is not None)
     onsets, best, scale, equals, _ = chosen
@@ -140,10 +135,10 @@ def fit_buzz(
     slopes = weigh(onsets.follow(best.theta).slopes(), weights)
     _refuse_blind(slopes, best.theta, table, bool(equals))
     information = slopes.T @ slopes / scale
-    values, by_theta = in_si(best.theta, period, onsets.lag, onsets.modes)
-    stiffest = StiffnessEstimate.at(chosen.scene(best.theta), unknown_cutoff)
+    scene = chosen.scene(best.theta)
+    by_theta = differentiate(lambda theta: onsets.normalize(theta).to_numbers(period), best.theta)
+    stiffest, slope = find_stiffest(scene)
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
-    gradient = stiffest.gradient @ by_theta
     rivals: list[tuple[FittedKind, np.ndarray]] = []
     apart = [best.theta]
     for other in equals[1:] if status == Status.OK else ():
@@ -151,10 +146,10 @@ def fit_buzz(
         if all((away := other.theta - one) @ information @ away > AS_GOOD for one in apart):
             apart.append(other.theta)
             rivals.append((chosen, other.theta))
-    error = float(np.sqrt(stiffest.gradient @ covariance @ stiffest.gradient))
+    error = float(np.sqrt(slope @ covariance @ slope))
     for kind in others if status == Status.OK else ():
         # Devices of other kinds whose K_max is the same say nothing else of walls.
-        if abs(float(kind.scene(kind.best.theta).max_stiffness().stiffness) - stiffest.value) > error:
+        if abs(float(kind.scene(kind.best.theta).max_stiffness().stiffness) - stiffest) > error:
             rivals.append((kind, kind.best.theta))
     told = tuple(_describe_rival(*rival) for rival in rivals)
     if rivals:
@@ -163,38 +158,92 @@ def fit_buzz(
     if against:
         doubts.append(against)
     else:
-        if covariance[0, 0] > (VAGUE * values[0]) ** 2:
+        if covariance[0, 0] > (VAGUE * scene.device.mass) ** 2:
             doubts.append(MASS_OPEN)
-        if unknown_cutoff and covariance[3, 3] > (VAGUE * values[3]) ** 2:
-            doubts.append("the cut-off is hardly determined: its standard error is more than half of it")
         if best.squares > EXACT:
             doubts += [
                 f"the {name} is 0 at best: a negative one would fit better"
                 for name in best.held
                 if name != "delay" or _delay_beyond(slopes, best) < -BEYOND * np.sqrt(scale)
             ]
-    further = _further(chosen, stiffest.value, information, gradient, weights**2 / scale, rivals)
-    found = stiffest.conclude(
+    further = _further(chosen, stiffest, information, slope @ by_theta, weights**2 / scale, rivals)
+    stiffness, damping, _ = table[np.argmax(table[:, 1])].tolist()
+    return DeviceFit.conclude(
+        scene,
+        (stiffest, slope),
         covariance,
         noise=share or (float(np.sqrt(scale)), float(np.sqrt(scale))),
         residuals=best.residuals / np.sqrt(scale),
         doubts=doubts,
         status=status,
         freedom=None if share else chosen.freedom,
-        further=None if status == Status.NO_BOUNDARY else further,
+        next=None if status == Status.NO_BOUNDARY else further,
         rivals=told,
+        damping_tried=damping,
+        stiffness_tried=stiffness,
     )
-    stiffness, damping, _ = table[np.argmax(table[:, 1])].tolist()
-    return replace(found, damping_tried=damping, stiffness_tried=stiffness)
+
+
+def _read_points(points: Iterable[Any], period: float, copies_count_once: bool) -> tuple[np.ndarray, list[str]]:
+    """The walls as an array, and doubts; an impossible one is refused, and so are walls that cannot tell a device."""
+    if not isinstance(points, Iterable) or isinstance(points, str | dict):
+        raise InputError(f"points: got {points!r}; give walls, each (K in N/m, B in N s/m, f in Hz)")
+    rows = []
+    for k, point in enumerate(points):
+        try:
+            row = [float(read_texts(f"points[{k}]", *each)) for each in zip(point, ("N/m", "N s/m", "Hz"), strict=True)]
+        except (TypeError, ValueError):
+            row = []
+        if len(row) != 3 or not np.all(np.isfinite(row)):
+            raise InputError(f"points[{k}]: got {point!r}; give K in N/m, B in N s/m and f in Hz, as (6e3, 0, 37.6)")
+        if not row[0] > 0:
+            raise InputError(f"points[{k}].stiffness: got {row[0]:g} N/m; it must be greater than 0 to buzz")
+        if not 0 < row[2] < 0.5 / period:
+            raise InputError(
+                f"points[{k}].frequency: got {row[2]:g} Hz; it must be greater than 0 and less than half the sampling "
+                f"rate, {plain(0.5 / period)} Hz: check the frequency, or the period"
+            )
+        rows.append(row)
+    if not rows:
+        raise InputError("points: got none; raise K at B = 0 until the wall buzzes, and again at another B")
+    doubts = []
+    if copies_count_once and len(kept := list(dict.fromkeys(map(tuple, rows)))) < len(rows):
+        doubts.append(
+            f"{len(rows) - len(kept)} of the walls repeat others to the last digit and count once; give the noise if "
+            "they were measured again"
+        )
+        rows = kept
+    table = np.array(rows)
+    # A force over a velocity: the dampings that matter are of this size.
+    unit = table[0, 0] / (2 * np.pi * table[0, 2])
+    if np.ptp(table[:, 1]) <= _SAME * max(unit, np.abs(table[:, 1]).max()):
+        count = (
+            "one wall gives two equations for" if len(table) == 1 else f"{len(table)} walls of one damping cannot tell"
+        )
+        raise InputError(
+            f"points: {count} the three unknowns m, b and t_d; what is missing is a wall of another damping: raise K "
+            f"at B = {with_unit(table[0, 1] + 0.4 * unit, 'N s/m', 2)}, say, until it buzzes"
+        )
+    return table, doubts
+
+
+def _read_noise(noise: Any) -> tuple[float, float] | None:
+    if noise is None:
+        return None
+    try:
+        pair = np.broadcast_to(np.asarray(noise, float), (2,))
+    except ValueError:
+        pair = np.zeros(2)
+    if not np.all((pair > 0) & (pair < 1)):
+        raise InputError(f"noise: got {noise!r}; give the relative noise of K and f, as 0.02, or (0.03, 0.01)")
+    return float(pair[0]), float(pair[1])
 
 
 def _describe_rival(kind: FittedKind, theta: np.ndarray) -> RivalDevice:
     scene = kind.scene(theta)
-    names = name_numbers(scene, kind.onsets.unknown_cutoff)
-    own = {name: scene.parameters()[name] for name in names}
-    cutoff, parts = own.pop("velocity.cutoff", None), dict(list(own.items())[3:])
+    parts = {name: scene.parameters()[name] for name in name_numbers(scene)[3:]}
     stiffness = float(scene.max_stiffness().stiffness)
-    return RivalDevice(scene.mass, scene.damping, scene.timing.delay, stiffness, cutoff, parts or None)
+    return RivalDevice(scene.mass, scene.damping, scene.timing.delay, stiffness, parts or None)
 
 
 def _delay_beyond(slopes: np.ndarray, best: Candidate) -> float:
@@ -211,9 +260,8 @@ def _refuse_blind(slopes: np.ndarray, theta: np.ndarray, table: np.ndarray, on_e
                 "points: no device has these walls on the edge of its stable set; check K, B, f and the period, and at "
                 "each B raise K from far below until the wall begins to buzz"
             )
-        names = "m, b and t_d" if theta.size == 3 else "m, b, t_d and the cut-off"
         raise InputError(
-            f"points: walls of B = {dampings} N s/m cannot tell {names} apart"
+            f"points: walls of B = {dampings} N s/m cannot tell m, b and t_d apart"
             + (f", the mass hardly counts beside the damping (b T/m = {plain(theta[1], 2)})" if theta[1] > 3 else "")
             + "; what is missing is a wall of a damping farther away"
         )

@@ -5,31 +5,24 @@ With z = e^(jw), w = 2 pi f T, a pole pair is on the circle exactly where
     K T^2 + B T F(z) = m q(z),     q = -1/G,
 
 two real equations a wall, whatever G is. At a known B they determine w and K (docs/theory/scenes.md). A device is
-looked for as ``theta = (ln m, delta, d)``, then ``ln cutoff`` where the velocity's cut-off is unknown, the logarithms
-of an amplifier's time constant in periods and damping ratio, and of each mode those of its frequency in radians a
-period and its damping ratio, and ``m/m_i``.
-
-The lag and the modes add to the response of the mass a sum over their poles p of ``r h(p; z)``, what a force held and
-late by d = n + f moves of ``E' = p E + F``, with zeta = z - 1:
-
-    h = (zeta (e^((1 - f) p) - 1) + e^p - 1)/(p (zeta + 1 - e^p) z^(n + 1))
+looked for as ``theta = (ln m, delta, d)``, then the logarithms of an amplifier's time constant in periods and damping
+ratio, and of each mode those of its frequency in radians a period and its damping ratio, and ``m/m_i``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import CirclePoints, Jet, circle
-from zwidth.fitting.scenes import with_cutoff
-from zwidth.fitting.structure import LAGS, RATIOS, TURNS, list_poles
-from zwidth.loops.rigid.device import Plant, held_plant, split_delay
-from zwidth.loops.rigid.ridge import plant_slopes
+from zwidth.arrays.circle import circle
+from zwidth.fitting.device_estimate import DimensionlessDevice
+from zwidth.fitting.required_wall import RequiredWall
+from zwidth.fitting.structure import LAGS, RATIOS, TURNS
 from zwidth.parts.velocity import Estimate, Velocity
 
 # Newton's steps towards w, the longest of them as a share of w, the last one's share (it squares), and the share
@@ -37,76 +30,10 @@ from zwidth.parts.velocity import Estimate, Velocity
 _STEPS, _LONGEST, _ARRIVED, _FOUND = 25, 0.15, 1e-9, 1e-6
 # The step of differences of fourth order, and their weights.
 _STEP, _SIDES, _WEIGHTS = 1e-3, np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
-# No cut-off is looked for above this share of half the sampling rate, or below this one of the lowest frequency heard,
-# where a filter makes of the damper a spring.
-_HIGHEST, _LOWEST = 0.99, 1e-3
-
 # Starts of lags of each order, in periods, and of damping ratios; how many delays and frequencies are looked at, and
 # how far apart the logarithms of starts lie.
 _LAGS: list[list[tuple[float, ...]]] = [[()], [(0.3,), (1.0,), (3.0,)], [(0.3, 0.7), (1.0, 0.7), (3.0, 0.7)]]
 _RATIOS, _DELAYS, _FREQUENCIES, _ALIKE = (0.01, 0.05, 0.3), 16, 24, 0.3
-
-
-class NeededAnswer:
-    """``q = -1/G`` of devices, arrays that broadcast with the points asked for.
-
-    Of a rigid one ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``; ``lag`` is an amplifier's time constant in periods
-    and, of second order, its damping ratio; ``modes`` are frequencies in radians a period, damping ratios, ``m/m_i``.
-    """
-
-    def __init__(self, delta: Any, d: Any, lag: Sequence[Any] = (), modes: Sequence[Sequence[Any]] = ()) -> None:
-        """Of devices, described once for all frequencies."""
-        self.whole, fraction = split_delay(np.asarray(d, float))
-        self.delta, self.fraction = delta, fraction
-        poles, residues = list_poles(delta, lag, modes)
-        self.beside = len(poles) > 0
-        if poles:
-            both = np.array(np.broadcast_arrays(fraction + np.zeros(1), *poles, *residues)[1:], complex)
-            poles, self.residues = np.where(both[: len(poles)] == 0, 1e-300, both[: len(poles)]), both[len(poles) :]
-            self.turns, self.full = np.expm1(poles), np.expm1(poles) / poles
-            self.late = np.expm1((1.0 - fraction) * poles) / poles
-
-    @cached_property
-    def plant(self) -> Plant:
-        """The mass alone."""
-        return held_plant(self.delta, self.fraction)
-
-    def jet(self, at: CirclePoints) -> Jet:
-        """q and its derivative in w."""
-        rigid = self.rigid_jet(at)
-        if not self.beside:
-            return rigid
-        more = self.add(at)
-        share = 1.0 / (1.0 - rigid.value * more.value)
-        return Jet(rigid.value * share, share**2 * (rigid.slope + rigid.value**2 * more.slope))
-
-    def rigid_jet(self, at: CirclePoints) -> Jet:
-        """The same of the mass alone."""
-        plant, turn = self.plant, 1j * at.z
-        total, below = _answer(plant, at), at.before + plant.em
-        q = -np.exp(1j * self.whole * at.w) * at.before * below / total
-        slopes = turn / at.before + turn / below - 1j * (plant.a2 * at.z - plant.a0 / at.z) / total
-        return Jet(q, q * (1j * self.whole + slopes))
-
-    def add(self, at: CirclePoints) -> Jet:
-        """What lag and modes add to the response, and its derivative in w."""
-        above, below = at.before * self.late + self.full, at.before - self.turns
-        each = self.residues * (np.exp(-1j * (self.whole + 1.0) * at.w) * above / below)
-        slopes = 1j * (at.z * (self.late / above - 1.0 / below) - self.whole - 1.0)
-        return Jet(each.sum(0), (each * slopes).sum(0))
-
-    def moves(self, at: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The derivatives in delta and d of q, that of the rigid device alone."""
-        by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
-        total = _answer(self.plant, at)
-        return (
-            q * (by_delta.em / (at.before + self.plant.em) - _answer(by_delta, at) / total),
-            -q * _answer(by_fraction, at) / total,
-        )
-
-
-def _answer(plant: Any, at: CirclePoints) -> Any:
-    return plant.a2 * at.z + plant.a1 + plant.a0 / at.z
 
 
 class Followed(NamedTuple):
@@ -130,7 +57,6 @@ class Onsets:
     w: np.ndarray
     velocity: Velocity
     period: float
-    unknown_cutoff: bool = False
     lag: int = 0
     modes: int = 0
 
@@ -141,47 +67,33 @@ class Onsets:
     @property
     def unknowns(self) -> int:
         """How many numbers are looked for."""
-        return self._rigid + self.lag + 3 * self.modes
-
-    @property
-    def _rigid(self) -> int:
-        """Those before lag and modes."""
-        return 4 if self.unknown_cutoff else 3
-
-    @property
-    def cutoffs(self) -> tuple[float, float]:
-        """The lowest and the highest that are looked for, in Hz."""
-        coded = getattr(self.velocity, "coded_period", None) or self.period
-        return _LOWEST * float(self.w.min()) / (2 * np.pi * self.period), _HIGHEST * 0.5 / coded
-
-    def _estimate_at(self, theta: np.ndarray) -> Estimate:
-        if not self.unknown_cutoff:
-            return self._estimate
-        return with_cutoff(self.velocity, float(np.exp(theta[3]))).estimate(self.period)
+        return 3 + self.lag + 3 * self.modes
 
     def is_possible(self, theta: np.ndarray) -> bool:
-        """Whether a filter of this cut-off, and such parts, are looked for."""
+        """Whether such parts are looked for."""
         ends = [LAGS, RATIOS][: self.lag] + self.modes * [TURNS, RATIOS, (0.0, np.inf)]
         low, high = np.reshape(ends, (-1, 2)).T
         parts = np.abs(np.concatenate([np.ravel(part) for part in self._read(theta)]))
-        cutoff = not self.unknown_cutoff or np.log(self.cutoffs[0]) < theta[3] < np.log(self.cutoffs[1])
-        return bool(cutoff and np.all((low < parts) & (parts < high)))
+        return bool(np.all((low < parts) & (parts < high)))
 
     def _read(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The numbers of the amplifier, and of each mode; of thetas along the first axis."""
-        lag, modes = np.split(theta[self._rigid :], [self.lag])
+        lag, modes = np.split(theta[3:], [self.lag])
         modes = modes.reshape(self.modes, 3, *theta.shape[1:]).copy()
         modes[:, :2] = np.exp(modes[:, :2])
         return np.exp(lag), modes
 
-    def answer(self, theta: np.ndarray) -> NeededAnswer:
+    def normalize(self, theta: np.ndarray) -> DimensionlessDevice:
+        """The device of theta."""
+        return DimensionlessDevice(np.exp(theta[0]), *theta[1:3], *map(list, self._read(theta)))
+
+    def answer(self, theta: np.ndarray) -> RequiredWall:
         """What devices need, one or several along further axes of theta."""
-        return NeededAnswer(theta[1], theta[2], *map(list, self._read(theta)))
+        return RequiredWall(*self.normalize(theta)[1:])
 
     def follow(self, theta: np.ndarray) -> Followed:
         """The walls of theta at these dampings, w nearest to the measured ones."""
-        mass, answer, estimate = np.exp(theta[0]), self.answer(theta), self._estimate_at(theta)
-        w = self.w
+        mass, answer, estimate, w = np.exp(theta[0]), self.answer(theta), self._estimate, self.w
         step = np.full(w.shape, np.inf)
         for _ in range(_STEPS):
             at = circle(w)
@@ -203,45 +115,36 @@ class Onsets:
             if answer.beside:
                 # q = -1/G: what moves the mass alone counts by the square of its share.
                 change[:, 1:] *= (q.value / rigid)[:, None] ** 2
-                k = np.r_[1, 2, self._rigid : self.unknowns]
+                k = np.r_[1, 2, 3 : self.unknowns]
                 sides = theta[:, None, None, None] + _STEP * np.eye(theta.size)[:, k, None, None] * _SIDES[:, None]
                 more = np.einsum("kjn,j->nk", self.answer(sides).add(at).value, _WEIGHTS) / _STEP
                 more *= (q.value**2)[:, None]
                 change[:, 1:] += more[:, :2]
                 change = np.concatenate([change, more[:, 2:]], -1)
             moved = mass * change
-            if self.unknown_cutoff:
-                sides = [self._estimate_at(theta + _STEP * k * np.eye(theta.size)[3]).jet(at).value for k in _SIDES]
-                moved = np.insert(moved, 3, -self.rub * (_WEIGHTS @ sides) / _STEP, -1)
             by_w = (self.rub * f.slope - mass * q.slope)[:, None]
             dw = moved.imag / by_w.imag
             return np.stack([(moved.real - by_w.real * dw) / kappa[:, None], dw / w[:, None]], 1)
 
         return Followed(kappa, w, np.abs(step) <= _FOUND * w, differentiate)
 
-    def starts(self, deltas: np.ndarray, longest: float, cutoffs: np.ndarray, count: int) -> list[np.ndarray]:
-        """Devices to start from: the lowest dips over damping, delay and cut-off, where the mass is in closed form.
+    def starts(self, deltas: np.ndarray, longest: float, count: int) -> list[np.ndarray]:
+        """Devices to start from: the lowest dips over damping and delay, where the mass is in closed form.
 
         By phases and by magnitudes, of which the mean is the mass. No stable wall turns its phase by more than half a
-        turn over its delay. ``cutoffs`` are not looked at where the cut-off is known.
+        turn over its delay.
         """
+        from scipy.ndimage import minimum_filter
+
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
         at = circle(self.w)
-        q = NeededAnswer(deltas[:, None, None], delays[:, None]).jet(at).value
-        filters = [with_cutoff(self.velocity, cutoff) for cutoff in cutoffs] if self.unknown_cutoff else [self.velocity]
-        f = np.stack([one.estimate(self.period).jet(at).value for one in filters])
-        away = np.log((self.kappa + self.rub * f)[:, None, None] / q)
+        q = RequiredWall(deltas[:, None, None], delays[:, None]).jet(at).value
+        away = np.log((self.kappa + self.rub * self._estimate.jet(at).value) / q)
         log_mass = away.real.mean(-1)
         cost = (away.imag**2).sum(-1) + ((away.real - log_mass[..., None]) ** 2).sum(-1)
-        walled = np.pad(cost, 1, constant_values=np.inf)
-        lowest = np.ones(cost.shape, bool)
-        for shifts in product((0, 1, 2), repeat=3):
-            around = tuple(slice(by, by + size) for by, size in zip(shifts, cost.shape, strict=True))
-            lowest &= cost <= walled[around]
-        dips = sorted(np.argwhere(lowest).tolist(), key=lambda place: cost[tuple(place)])[:count]
-        return [
-            np.array([log_mass[c, i, j], deltas[i], delays[j], np.log(cutoffs[c])][: self.unknowns]) for c, i, j in dips
-        ]
+        lowest = np.argwhere(cost == minimum_filter(cost, 3, mode="constant", cval=np.inf))
+        dips = sorted(lowest.tolist(), key=lambda place: cost[tuple(place)])[:count]
+        return [np.array([log_mass[i, j], deltas[i], delays[j]]) for i, j in dips]
 
     def starts_beside(self, deltas: np.ndarray, longest: float, count: int) -> list[np.ndarray]:
         """Devices with lag and modes to start from: the lowest dips over their time constants and frequencies.
@@ -255,9 +158,9 @@ class Onsets:
         found: list[tuple[float, np.ndarray]] = []
         for lag, ratio in product(_LAGS[self.lag], _RATIOS[: None if self.modes else 1]):
             grid = deltas[:, None, None, None], delays[:, None, None]
-            mass = -1.0 / NeededAnswer(*grid, lag).jet(at).value / wanted
+            mass = -1.0 / RequiredWall(*grid, lag).jet(at).value / wanted
             ringing = [(frequencies[:, None], ratio, 1.0)][: self.modes]
-            mode = -1.0 / NeededAnswer(*grid, lag, ringing).jet(at).value / wanted - mass
+            mode = -1.0 / RequiredWall(*grid, lag, ringing).jet(at).value / wanted - mass
             (aa, bb, ab), (a, b) = (
                 [(one * other.conj()).real.sum(-1) for one, other in ((mass, mass), (mode, mode), (mass, mode))],
                 [each.real.sum(-1) for each in (mass, mode)],

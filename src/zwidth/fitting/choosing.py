@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.hidden import HiddenPole, LagTest, PoleBank, find_hidden, look_for_lags
+from zwidth.fitting.hidden import HiddenPole, LagTest, PoleBank, find_hidden, list_likeliest, look_for_lags
 from zwidth.fitting.output_error import NEARLY, FittedModel, follow_start, settle
-from zwidth.fitting.structure import StructuredRecordings
+from zwidth.fitting.structure import Recordings
 
 # So many parts, lags and resonances, are added at most; so many positions of each log tell which one.
 _MOST, _TOLD = 4, 2500
@@ -24,6 +25,8 @@ EXACT = 1e-9
 _BY_CHANCE = 5.99
 # Time constants that lags are started from, in periods; a second order's damping ratio.
 _LAGS, _RATIO = (0.3, 1.5), 0.7
+# So many resonances are started from, their frequencies so far apart.
+_PARTED, _APART = 2, float(np.exp(0.2))
 
 _Looked = tuple[FittedModel, HiddenPole | None, list[PoleBank], LagTest | None]
 
@@ -33,7 +36,7 @@ class _Trial(NamedTuple):
 
     misfit: float
     price: float
-    model: StructuredRecordings
+    model: Recordings
     theta: np.ndarray
 
     @property
@@ -42,7 +45,7 @@ class _Trial(NamedTuple):
         return self.misfit + self.theta.size * self.price
 
 
-def choose_structure(best: FittedModel, longest: float, resolution: float) -> _Looked:
+def choose_structure(best: FittedModel) -> _Looked:
     """Add what explains the residuals best as long as they show a pole; then, what they still show, and what of lags.
 
     Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
@@ -57,13 +60,13 @@ def choose_structure(best: FittedModel, longest: float, resolution: float) -> _L
         late = lags is not None and lags.toward.max() ** 2 > 2.0 * np.log(best.count)
         if rival is not None or (pole is None and not late):
             break
-        richer, rival = _grow(best, banks, longest, resolution)
+        richer, rival = _grow(best, banks)
         if richer is None:
             break
         best, pole, banks, lags = _look(richer)
     if best is rigid[0] or not (rival or (pole is None and best.excess <= ALIKE)):
         return rigid
-    best = settle(best.model, best.theta, longest, resolution)
+    best = settle(best.model, best.theta)
     known = best.arrived and not best.inverse.open[: best.model.parts.stop].any()
     return (best, rival or pole, banks, lags) if known else rigid
 
@@ -74,29 +77,27 @@ def _look(best: FittedModel) -> _Looked:
     return best, pole, banks, None if pole or best.model.lag else look_for_lags(best)
 
 
-def _grow(
-    best: FittedModel, banks: list[PoleBank], longest: float, resolution: float
-) -> tuple[FittedModel | None, HiddenPole | None]:
+def _grow(best: FittedModel, banks: list[PoleBank]) -> tuple[FittedModel | None, HiddenPole | None]:
     """The likeliest device with one part more, None where none is as likely as without; and what else it may be.
 
     A resonance that a log hardly shows looks like a lag, which has fewer numbers, but quite another K_max. So a lag is
     doubted where the further numbers of a resonance explain more than chance does.
     """
-    begun: dict[tuple[int, int], tuple[float, StructuredRecordings, np.ndarray]] = {}
+    begun: dict[tuple[int, int], tuple[float, Recordings, np.ndarray]] = {}
     for lag, modes, start in _start(best, banks):
-        model = StructuredRecordings(best.model.logs, None, lag, modes).begin(_TOLD)
-        theta, squares = follow_start(model, start, longest, _BEGUN)
+        model = replace(best.model, lag=lag, modes=modes).begin(_TOLD)
+        theta, squares = follow_start(model, start, _BEGUN)
         if squares < begun.get((lag, modes), (np.inf,))[0]:
             begun[lag, modes] = squares, model, theta
     tried = []
     for _, model, start in begun.values():
-        theta, squares = follow_start(model, start, longest, _COMPARED)
+        theta, squares = follow_start(model, start, _COMPARED)
         tried.append(_Trial(model.measured.size * np.log(squares), np.log(model.measured.size), model, theta))
     likeliest = min(tried, key=lambda trial: trial.cost)
     model = replace(likeliest.model, logs=best.model.logs)
-    found = settle(model, likeliest.theta, longest, resolution, (), NEARLY)
-    if resolution:
-        found = settle(replace(model, noise=found.noise), found.theta, longest, resolution, (), NEARLY)
+    found = settle(model, likeliest.theta, (), NEARLY)
+    if model.resolution:
+        found = settle(replace(model, noise=found.noise), found.theta, (), NEARLY)
     if best.lag_behind(found) <= (found.theta.size - best.theta.size) * np.log(best.count):
         return None, None
     for trial in tried:
@@ -121,26 +122,7 @@ def _start(best: FittedModel, banks: list[PoleBank]) -> Iterator[tuple[int, int,
     elif lag == 1:
         yield 2, modes, np.r_[head, theta[3], _RATIO, ringing, speeds, states, theta[-2:]]
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
-    for ratio, frequency in _likeliest(banks):
+    ringing_banks = [bank for bank in banks if bank.ratio < 1.0]
+    for _, frequency, ratio in islice(list_likeliest(ringing_banks, _APART), _PARTED):
         mode = [2.0 * np.pi * frequency, ratio, 0.0]
         yield lag, modes + 1, np.r_[head, theta[3 : 3 + lag], ringing, mode, speeds, states, theta[-2:]]
-
-
-def _likeliest(banks: list[PoleBank]) -> Iterator[tuple[float, float]]:
-    """Damping ratios and frequencies of the ringing poles that explain most."""
-    found = sorted(
-        (
-            (e, f, bank.ratio)
-            for bank in banks
-            if bank.ratio < 1.0
-            for e, f in zip(bank.explained, bank.frequency, strict=True)
-        ),
-        reverse=True,
-    )
-    kept: list[float] = []
-    for _, frequency, ratio in sorted(found, reverse=True):
-        if all(abs(np.log(frequency / other)) > 0.2 for other in kept):
-            kept.append(frequency)
-            yield ratio, frequency
-        if len(kept) == 2:
-            return

@@ -110,10 +110,11 @@ def read_log(
     constant = 1.0
     if given["force"] in _AMPERES:
         constant, units["force"] = _read_constant(motor_constant, given["force"])
-    units = {name: _read_unit(name, unit) for name, unit in units.items()}
-    rotary, step = _pair_units(units, resolution)
-    factors = {name: 1.0 if unit in COUNTS else _factor(name, unit) for name, unit in units.items()}
-    if units["position"] in COUNTS:
+    read = {name: _read_unit(name, unit) for name, unit in units.items()}
+    factors = {name: size for name, (size, _) in read.items()}
+    dimensions = {name: dimension for name, (_, dimension) in read.items()}
+    rotary, step = dimensions["force"] is TORQUE, _check_pairs(units, dimensions, resolution)
+    if dimensions["position"] is None:
         if step is None:
             raise InputError(
                 "position: it is in counts; give the resolution, as 0.03 mm or 0.09 deg for a count of the encoder"
@@ -161,8 +162,7 @@ def _compare_period(file: str | Path, table: NamedColumns, period: float) -> Non
     if len(found) != 1:
         return
     try:
-        factor = _factor("time", _read_unit("time", found[0][1]))
-        time = factor * table.numbers([found[0][0]])[0]
+        time = _read_unit("time", found[0][1])[0] * table.numbers([found[0][0]])[0]
     except InputError:
         # The period may be given for the times' sake.
         return
@@ -215,52 +215,38 @@ def _listing(heads: Any) -> str:
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
 
 
-def _read_unit(name: str, unit: str) -> str:
-    """A unit that exists, or "" for the SI unit."""
-    if not unit:
-        return ""
+def _read_unit(name: str, unit: str) -> tuple[float, Dimension | None]:
+    """What one of a unit is in SI units, the base unit of a linear axis without one; its dimension, None of counts."""
     if name == "position" and unit.lower() in COUNTS:
-        return COUNTS[0]
-    if all(dimension.in_base("1", 0, unit) is None for dimension in _DIMENSIONS[name]):
-        known = [each for dimension in _DIMENSIONS[name] for each in dimension.units]
-        known += [COUNTS[0]] if name == "position" else []
+        return 1.0, None
+    for dimension in _DIMENSIONS[name]:
+        size = dimension.in_base("1", 0, unit) if unit else 1.0
+        if size is not None:
+            return size, dimension
+    known = [each for dimension in _DIMENSIONS[name] for each in dimension.units]
+    known += [COUNTS[0]] if name == "position" else []
+    raise InputError(
+        f"{name}: got the unit {unit!r}; allowed are {', '.join(known)}; "
+        + suggestion(unit, known, "write COLUMN:unit with one of them")
+    )
+
+
+def _check_pairs(units: Mapping[str, str], dimensions: Mapping[str, Dimension | None], resolution: Any) -> float | None:
+    """The encoder's step in its SI unit; `InputError` where it, or the position, is of another axis than the force."""
+    turns = dimensions["force"] is TORQUE
+    force = f"a {'torque' if turns else 'force'} in {units['force'] or 'N (no unit is given)'}"
+    step, angular = (None, None) if resolution is None else read_step(resolution)
+    if angular is not None and angular != turns:
         raise InputError(
-            f"{name}: got the unit {unit!r}; allowed are {', '.join(known)}; "
-            + suggestion(unit, known, "write COLUMN:unit with one of them")
+            f"resolution: got {describe(resolution)} with {force}; "
+            + ("an angle belongs to a torque, as in N m" if angular else "a length belongs to a force, as in N")
         )
-    return unit
-
-
-def _factor(name: str, unit: str) -> float:
-    """What one of the unit is in SI units."""
-    return next((size for each in _DIMENSIONS[name] if (size := each.in_base("1", 0, unit)) is not None), 1.0)
-
-
-def _pair_units(units: Mapping[str, str], resolution: Any) -> tuple[bool, float | None]:
-    """Whether the axis is rotary, and the encoder's step in its unit."""
-    turns = units["force"] != "" and TORQUE.in_base("1", 0, units["force"]) is not None
-    step = None
-    if resolution is not None:
-        step, angular = read_step(resolution)
-        if angular is not None and angular != turns:
-            raise InputError(
-                f"resolution: got {describe(resolution)} with {_force_words(units['force'])}; "
-                + ("an angle belongs to a torque, as in N m" if angular else "a length belongs to a force, as in N")
-            )
-    if units["position"] not in COUNTS:
-        angular = units["position"] != "" and ANGLE.in_base("1", 0, units["position"]) is not None
-        if angular != turns:
-            place = f"a position in {units['position'] or 'm (no unit is given)'}"
-            raise InputError(
-                f"position, force: got {place} with {_force_words(units['force'])}; a length goes with a force, an "
-                "angle with a torque: say the units, as COLUMN:deg and COLUMN:mN m"
-            )
-    return turns, step
-
-
-def _force_words(unit: str) -> str:
-    torque = unit != "" and TORQUE.in_base("1", 0, unit) is not None
-    return f"a {'torque' if torque else 'force'} in {unit or 'N (no unit is given)'}"
+    if dimensions["position"] not in (None, ANGLE if turns else LENGTH):
+        raise InputError(
+            f"position, force: got a position in {units['position'] or 'm (no unit is given)'} with {force}; a length "
+            "goes with a force, an angle with a torque: say the units, as COLUMN:deg and COLUMN:mN m"
+        )
+    return step
 
 
 def read_step(resolution: Any) -> tuple[float, bool | None]:

@@ -2,43 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.fit_records import ErrorBar, FittedMotion, FurtherExperiment, RivalDevice
-from zwidth.fitting.scenes import name_numbers, scene_of
-from zwidth.parts.actuator import Actuator
-from zwidth.parts.measured import MeasuredDevice
-from zwidth.parts.mode import Mode
-from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import Velocity
+from zwidth.fitting.device_estimate import RELIABILITY, UPPER, DeviceEstimate, name_numbers
+from zwidth.fitting.hidden import HiddenLag, HiddenResonances
+from zwidth.fitting.safe_wall import SafeWall, find_safe_wall
 from zwidth.scenes.scene import Scene
-from zwidth.words.formatting import to_json
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import to_json, with_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
-if TYPE_CHECKING:
-    from zwidth.fitting.hidden import HiddenLag, HiddenResonances
-    from zwidth.fitting.safe_wall import SafeWall
-
-NAMES = ("mass", "damping", "delay")
-# Of the upper ends of intervals of 95 %.
-_UPPER = 0.975
 # Standard errors within which everything lies.
 _FAR = 1e3
-# Of standard errors, for differences.
-_STEP = 0.1
 # A standard error beyond this share leaves a value open.
 VAGUE = 0.5
 # Standard errors below 0 that nobody takes for a delay of 0 anymore; half of a true 0's errors go below.
 BEYOND = 3.0
-# Of the usual safe wall.
-_RELIABILITY = 0.99
+# Sampling periods of loops, in s: outside a unit is suspected.
+_QUICKEST, _SLOWEST = 5e-6, 0.02
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of it"
+
+
+class ErrorBar(NamedTuple):
+    """An interval that holds the true value with 95 % confidence."""
+
+    low: float
+    high: float
+
+
+class FurtherExperiment(NamedTuple):
+    """Raise K at this damping until the wall buzzes: N s/m, the N/m and Hz expected, and K_max's error afterwards.
+
+    That error is NaN where K_max is.
+    """
+
+    virtual_damping: float
+    stiffness: float
+    frequency: float
+    error_afterwards: float
+
+
+class FittedMotion(NamedTuple):
+    """One log beside its fit, a number a sample: times in s, forces in N, positions in m.
+
+    ``modelled`` is NaN at the first samples, whose past forces are unknown, and behind the first 200,000.
+    """
+
+    time: np.ndarray
+    force: np.ndarray
+    position: np.ndarray
+    modelled: np.ndarray
+
+
+class RivalDevice(NamedTuple):
+    """Another device that fits as well: kg, N s/m, s, its K_max in N/m.
+
+    ``parts`` are the numbers of its amplifier and its resonance by their paths, None of a rigid one.
+    """
+
+    mass: float
+    damping: float
+    delay: float
+    stiffness_max: float
+    parts: dict[str, float] | None = None
 
 
 @shown(
@@ -51,16 +83,16 @@ MASS_OPEN = "the mass is hardly determined: its standard error is more than half
     stiffness_error="N/m",
     friction="N",
 )
-@dataclass(frozen=True)
-class DeviceFit:
+@dataclass(frozen=True, kw_only=True)
+class DeviceFit(DeviceEstimate):
     """A device found from records of it.
 
     Attributes:
         mass, damping, delay: estimates in kg, N s/m, s.
         actuator, modes: the amplifier's lag and the resonances that the records ask for, a `zwidth.Actuator` or None
             and `zwidth.Mode`; the sensor of a positive modal mass is at the motor, of a negative one beyond a node.
-        errors: standard errors of the three, by name, of "cutoff" where that was unknown, and of the parts by their
-            paths, as "actuator.time_constant" and "modes.0.frequency".
+        errors: standard errors of the three, by name, and of the parts by their paths, as "actuator.time_constant" and
+            "modes.0.frequency".
         covariance: of ``numbers``, in that order, SI units.
         stiffness_max: K_max in N/m of the estimated device, `zwidth.Scene.max_stiffness`; NaN where the status is not
             OK, unless it is UNDECIDED and the rivals have the same within the error.
@@ -78,7 +110,7 @@ class DeviceFit:
         friction: Coulomb friction in N, of a log; its error in ``errors``, NaN where the log leaves it open.
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
         motions: of a log, each with its fit, a `zwidth.FittedMotion`.
-        period, velocity: of the loop; the velocity with the cut-off found where that was unknown.
+        scene, period, velocity: the estimated device in its loop, a `zwidth.Scene`.
         response: of a log, a `zwidth.MeasuredDevice`: the response of the estimated device, with the radius by which a
             resonance of a damping ratio of 0.005 or more may move it and not show in the log. None of buzzing walls, of
             a log without noise, and under a doubt of what the fit leaves.
@@ -93,38 +125,53 @@ class DeviceFit:
         freedom: degrees of freedom that the noise was estimated with; None where it is known.
     """
 
-    mass: float
-    damping: float
-    delay: float
     errors: dict[str, float]
-    covariance: np.ndarray
     stiffness_max: float
     stiffness_error: float
-    noise: float | tuple[float, float]
     residuals: np.ndarray
     doubts: tuple[str, ...]
     status: int
-    next: FurtherExperiment | None
-    offset: float
-    friction: float
-    resolution: float
-    motions: tuple[FittedMotion, ...]
-    period: float
-    velocity: Velocity
-    freedom: int | None = None
+    next: FurtherExperiment | None = None
+    offset: float = 0.0
+    friction: float = 0.0
+    resolution: float = 0.0
+    motions: tuple[FittedMotion, ...] = ()
     rivals: tuple[RivalDevice, ...] = ()
-    response: MeasuredDevice | None = None
-    actuator: Actuator | None = None
-    modes: tuple[Mode, ...] = ()
     lag: HiddenLag | None = None
     hidden: HiddenResonances | None = None
-    damping_tried: float | None = None
-    stiffness_tried: float | None = None
 
-    @property
-    def numbers(self) -> tuple[str, ...]:
-        """Paths of what was fitted, in the order of the covariance: mass, damping, delay, and what more there is."""
-        return name_numbers(self.scene, "cutoff" in self.errors)
+    @classmethod
+    def conclude(
+        cls,
+        scene: Scene,
+        stiffest: tuple[float, np.ndarray],
+        covariance: np.ndarray,
+        *,
+        doubts: Iterable[str],
+        status: int,
+        rivals: tuple[RivalDevice, ...] = (),
+        next: FurtherExperiment | None = None,
+        errors: dict[str, float] | None = None,
+        **records: Any,
+    ) -> DeviceFit:
+        """A fit of a scene, its K_max with the gradient in what was fitted, and the covariance of that."""
+        value, gradient = stiffest
+        error = float(np.sqrt(gradient @ covariance @ gradient))
+        agreed = bool(rivals) and all(abs(one.stiffness_max - value) <= error for one in rivals)
+        known = 1.0 if status == Status.OK or (status == Status.UNDECIDED and agreed) else np.nan
+        own = dict(zip(name_numbers(scene), np.sqrt(np.diag(covariance)).tolist(), strict=True))
+        return cls(
+            scene=scene,
+            covariance=covariance,
+            errors=own | (errors or {}),
+            stiffness_max=known * value,
+            stiffness_error=known * error,
+            doubts=(*doubts, *_doubt_period(scene.timing.period)),
+            status=int(status),
+            rivals=rivals,
+            next=next and next._replace(error_afterwards=known * next.error_afterwards),
+            **records,
+        )
 
     @property
     def is_doubted(self) -> bool:
@@ -133,58 +180,6 @@ class DeviceFit:
         What a record shows beyond the model moved K_max up to 2.8 times, and most often where something was doubted.
         """
         return self.status != Status.OK or bool(self.doubts)
-
-    @property
-    def reach(self) -> float:
-        """How many standard errors the intervals reach."""
-        return reach_of(self.freedom)
-
-    @property
-    def cutoff(self) -> float | None:
-        """Of the velocity estimate, in Hz; None where it has none."""
-        return getattr(self.velocity, "cutoff", None)
-
-    @cached_property
-    def scene(self) -> Scene:
-        """The estimated device with its timing and velocity estimate."""
-        scene = scene_of((self.mass, self.damping, self.delay), self.period, self.velocity)
-        return replace(scene, device=replace(scene.device, actuator=self.actuator, modes=self.modes))
-
-    @cached_property
-    def responding(self) -> Scene | None:
-        """The same loop with the response in place of the device: what holds for every resonance within its radius.
-
-        Of a device with an amplifier or resonances, the radius has what their numbers may be, too.
-        """
-        return self.respond(_RELIABILITY, True)
-
-    def respond(self, reliability: float, hidden: bool) -> Scene | None:
-        """The loop of the response; within its radius are so many devices that the log allows, and what it may hide.
-
-        None without a response, and where the numbers are too open for a radius.
-        """
-        from scipy.special import fdtri
-
-        known = self.response
-        if known is None:
-            return None
-        radius = known.deviation if hidden else 0.0 * known.deviation
-        if self.is_structured:
-            changes = self.differ(lambda scene: scene.frequency_response(1.0, 0.0, known.frequency))
-            # The longer axis of the ellipse in which the response lies with the numbers.
-            square, across = np.sum(np.abs(changes) ** 2, 0), np.abs(np.sum(changes**2, 0))
-            count = len(self.numbers)
-            reach = count * fdtri(count, self.freedom, reliability)
-            radius = radius + np.sqrt(0.5 * (square + across) * reach)
-        if not np.all(np.isfinite(radius)):
-            return None
-        device = MeasuredDevice(known.frequency, known.response, radius)
-        return Scene(device, Timing(self.period), velocity=self.velocity)
-
-    @property
-    def is_structured(self) -> bool:
-        """Whether it is more than a rigid mass: by an amplifier, or by resonances."""
-        return self.actuator is not None or bool(self.modes)
 
     @cached_property
     def virtual_damping(self) -> float:
@@ -198,38 +193,11 @@ class DeviceFit:
             return np.nan
         return float(np.sqrt(np.sum(self.differ(lambda scene: scene.max_stiffness().virtual_damping) ** 2)))
 
-    def differ(self, ask: Callable[[Scene], Any]) -> np.ndarray:
-        """By how much an answer changes along each axis of the covariance, one standard deviation far: a row each."""
-        values, errors = self.estimates, np.sqrt(np.diag(self.covariance))
-        scales = np.where(errors > 0, errors, 1.0)
-        sizes, axes = np.linalg.eigh(self.covariance / np.outer(scales, scales))
-        middle, rows = ask(self.scene), []
-        for size, axis in zip(sizes, axes.T, strict=True):
-            step = _STEP * np.sqrt(max(size, 0.0)) * axis * scales
-            # Where damping or delay would be negative, to one side.
-            sides = [side for side in (-1.0, 1.0) if np.all((values + side * step) * np.where(values < 0, -1, 1) >= 0)]
-            ends = [ask(self.vary(values + side * step)) for side in sides]
-            if len(sides) == 1:
-                sides, ends = [0.0, *sides], [middle, *ends]
-            change = (ends[-1] - ends[0]) / (_STEP * (sides[-1] - sides[0])) if sides else np.nan * middle
-            rows.append(change)
-        return np.array(rows)
-
     def value_of(self, name: str) -> float:
         """What ``errors`` names: an attribute of the fit, or a parameter of a part by its path."""
         return float(self.scene.parameters()[name] if "." in name else getattr(self, name))
 
     @cached_property
-    def estimates(self) -> np.ndarray:
-        """The values of ``numbers``."""
-        own = self.scene.parameters()
-        return np.array([own[name] for name in self.numbers])
-
-    def vary(self, values: Iterable[float]) -> Scene:
-        """The scene with other values of ``numbers``."""
-        return self.scene.replace(**dict(zip(self.numbers, map(float, values), strict=True)))
-
-    @property
     def intervals(self) -> dict[str, ErrorBar]:
         """95 % intervals by name: of what ``errors`` has, and of "stiffness_max", with ``hidden`` and up to ``lag``.
 
@@ -248,17 +216,12 @@ class DeviceFit:
             bars["stiffness_max"] = ErrorBar(min(bar.low, self.stiffness_max), max(bar.high, self.stiffness_max))
         if self.damping_tried is not None and self.virtual_damping > self.damping_tried:
             # Beyond the dampings tried K_max is what the model says; it is at least what buzzed there.
-            bar, tried = bars["stiffness_max"], self.bear_tried(_UPPER)
+            bar, tried = bars["stiffness_max"], self.bear_tried(UPPER)
             bars["stiffness_max"] = ErrorBar(min(bar.low, tried), bar.high)
         if self.lag is not None:
             bar, more = bars["stiffness_max"], self.lag.stiffness_max - self.stiffness_max
             bars["stiffness_max"] = ErrorBar(bar.low, bar.high + max(more, 0.0))
         return bars
-
-    def bear_tried(self, confidence: float) -> float:
-        """What the K that buzzed at the largest damping tried is at least, by its noise."""
-        noise = self.noise[0] if isinstance(self.noise, tuple) else 0.0
-        return max(0.0, (self.stiffness_tried or 0.0) * (1.0 - reach_of(self.freedom, confidence) * noise))
 
     def _average(self, odds: float, ratios: np.ndarray) -> ErrorBar:
         """The interval of K_max over the device without a hidden resonance and those with one."""
@@ -273,14 +236,12 @@ class DeviceFit:
             return float(weights @ stdtr(self.freedom, (stiffness - middles) / self.stiffness_error)) - share
 
         low, high = (
-            float(brentq(exceed, -far, far, args=(0.5 + side * (_UPPER - 0.5),)))  # pyright: ignore[reportArgumentType]  (a number unless asked)
+            float(brentq(exceed, -far, far, args=(0.5 + side * (UPPER - 0.5),)))  # pyright: ignore[reportArgumentType]  (a number unless asked)
             for side in (-1.0, 1.0)
         )
         return ErrorBar(max(0.0, low), high)
 
-    def safe_wall(
-        self, reliability: float = 0.99, *, samples: int | None = None, seed: int = 0, rigid: bool = False
-    ) -> SafeWall:
+    def safe_wall(self, reliability: float = RELIABILITY, *, rigid: bool = False) -> SafeWall:
         """Find the stiffest wall that nearly all devices bear that the records allow.
 
         Devices are drawn around the estimate; K is the largest for which there is one B that this share of them bears,
@@ -290,9 +251,6 @@ class DeviceFit:
 
         Args:
             reliability: the share, between 0.5 and 1.
-            samples: how many devices are drawn, 100 to 100,000; left out, 8,000, 1,000 with a velocity filter, or 400
-                with an amplifier or resonances.
-            seed: of the draws; equal seeds give equal walls.
             rigid: whether the device is known to be a rigid mass. Many have resonances of 50 to 300 Hz; a wall that one
                 makes unstable may be far softer than the stiffest one of the mass.
 
@@ -304,11 +262,12 @@ class DeviceFit:
             and B with it, where no wall is borne by so many.
 
         Raises:
-            InputError: a share, a number of samples or a seed that there cannot be.
+            InputError: a share that there cannot be.
 
         Numerics:
-            ln m, b, t_d (and 1/cutoff) normal with the fit's covariance, or Student's t where the noise was estimated;
-            draws of negative ones are drawn again. A rigid device: rows and columns in closed form, K to 0.1 %, in
+            8,000 devices, 1,000 with a velocity filter, or 400 with an amplifier or resonances: ln m, b, t_d normal
+            with the fit's covariance, or Student's t where the noise was estimated; draws of negative ones are drawn
+            again, and equal fits give equal walls. A rigid device: rows and columns in closed form, K to 0.1 %, in
             about 0.1 s; of 20,000 other devices of 69 fits each, 98.5 to 99.2 % bore it, and of 2 % more stiffness at
             most 91.4 % at any B. With a filter, and of walls with an amplifier or a resonance: boundaries on a grid of
             frequencies, judged by eigenvalues, in some seconds. Hidden resonances, one at a time with damping ratios
@@ -326,21 +285,24 @@ class DeviceFit:
             >>> print(f"{wall.stiffness / 1e3:.1f} of {fit.stiffness_max / 1e3:.1f} kN/m")
             18.8 of 19.9 kN/m
         """
-        from zwidth.fitting.safe_wall import find_safe_wall
-
-        asked = (reliability, samples, seed, rigid)
-        return self._usual_safe_wall if asked == (0.99, None, 0, False) else find_safe_wall(self, *asked)
+        if isinstance(reliability, bool | str) or not 0.5 <= reliability < 1:
+            raise InputError(f"reliability: got {reliability!r}; a share from 0.5 to below 1 is needed, as 0.99")
+        asked = reliability, rigid
+        if asked not in self._safe_walls:
+            open_status = self.status if self.status != Status.OK else int(Status.UNDECIDED)
+            none = SafeWall(np.nan, np.nan, np.nan, open_status)
+            self._safe_walls[asked] = none if self.is_doubted else find_safe_wall(self, *asked)
+        return self._safe_walls[asked]
 
     @cached_property
-    def _usual_safe_wall(self) -> SafeWall:
-        from zwidth.fitting.safe_wall import find_safe_wall
-
-        return find_safe_wall(self, 0.99, None, 0, False)
+    def _safe_walls(self) -> dict[tuple[float, bool], SafeWall]:
+        """Those that were asked for."""
+        return {}
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON; None for what is NaN."""
         numbers = {
-            **{name.removeprefix("velocity."): value for name, value in zip(self.numbers, self.estimates, strict=True)},
+            **dict(zip(self.numbers, self.estimates.tolist(), strict=True)),
             "stiffness_max": self.stiffness_max,
             "virtual_damping": self.virtual_damping,
             "errors": self.errors
@@ -366,8 +328,10 @@ def _may_be_negative(name: str) -> bool:
     return name == "offset" or (name.startswith("modes") and name.endswith("mass"))
 
 
-def reach_of(freedom: int | None, upper: float = _UPPER) -> float:
-    """Standard errors to a side: of a known noise, or of one estimated with so many degrees of freedom."""
-    from scipy.special import ndtri, stdtrit
-
-    return float(ndtri(upper) if freedom is None else stdtrit(freedom, upper))
+def _doubt_period(period: float) -> list[str]:
+    if _QUICKEST <= period <= _SLOWEST:
+        return []
+    slip = "in ms or us" if period > _SLOWEST else "in s"
+    return [
+        f"a sampling period of {with_unit(period, 's')} is far from any loop; the time may be {slip}: check its unit"
+    ]

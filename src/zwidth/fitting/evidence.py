@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.buzz import BuzzPoint
-from zwidth.fitting.device_fit import DeviceFit, reach_of
-from zwidth.fitting.safe_wall import draw_devices
-from zwidth.fitting.words import LINEAR, AxisUnits, choose_wall
+from zwidth.fitting.device_estimate import reach_of
+from zwidth.fitting.device_fit import DeviceFit
+from zwidth.fitting.words import choose_wall, unit_of
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import header
+from zwidth.words.rotation import in_own_units
 
 # Devices drawn around the estimate, dampings of the boundary, and how far beyond its end.
 _DRAWS, _ROWS, _BEYOND = 1000, 121, 1.1
@@ -20,32 +21,31 @@ _DRAWS, _ROWS, _BEYOND = 1000, 121, 1.1
 _LAGS, _SHARE = 60, 0.25
 
 
-def gather_evidence(
-    fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = (), units: AxisUnits = LINEAR
-) -> dict[str, dict[str, Any]]:
+@in_own_units
+def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = ()) -> dict[str, dict[str, Any]]:
     """Every table of a fit, as `zwidth.figures.draw_device_fit` takes them."""
     found: dict[str, dict[str, Any]] = {}
-    for name, table in (("boundary", trace_boundary(fit, units)), ("walls", tabulate_walls(fit, points, units))):
+    for name, table in (("boundary", trace_boundary(fit)), ("walls", tabulate_walls(fit, points))):
         rows = next(iter(table.values())).size
         found[name] = {"fitted_to": np.full(rows, source), **table}
     if fit.motions:
-        found |= {"motion": tabulate_motions(fit, units), "correlation": correlate_residuals(fit)}
+        found |= {"motion": tabulate_motions(fit), "correlation": correlate_residuals(fit)}
     return found
 
 
-def tabulate_motions(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.ndarray]:
+@in_own_units
+def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
     """Every sample of the logs: measured, modelled, and what is left."""
     logs = [np.full(motion.time.size, k, int) for k, motion in enumerate(fit.motions, start=1)]
     columns = {name: np.concatenate([getattr(motion, name) for motion in fit.motions])
                for name in ("time", "force", "position", "modelled")}  # fmt: skip
-    length = units.position
     return {
         "log": np.concatenate(logs),
         header("time", "s"): columns["time"],
-        header("force", units.force): columns["force"],
-        header("position", length): columns["position"],
-        header("modelled", length): columns["modelled"],
-        header("residual", length): columns["position"] - columns["modelled"],
+        header("force", unit_of("force")): columns["force"],
+        header("position", unit_of("position")): columns["position"],
+        header("modelled", unit_of("position")): columns["modelled"],
+        header("residual", unit_of("position")): columns["position"] - columns["modelled"],
     }
 
 
@@ -64,7 +64,8 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
     }
 
 
-def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.ndarray]:
+@in_own_units
+def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
     """The stiffest stable wall at each damping B >= 0, and between which stiffnesses it lies with 95 %.
 
     The band is pointwise: the quantiles of devices drawn around the estimate, by a fixed seed; NaN where the records
@@ -77,14 +78,14 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
     damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
     own = fit.estimates[None]
     low = high = np.full(damping.size, np.nan)
-    drawn = draw_devices(fit, min(_DRAWS, fit.scene.loop.draws), 0)
+    drawn = fit.draw(min(_DRAWS, fit.scene.loop.draws))
     if drawn is not None:
         low, high = np.quantile(_limit_rows(fit, drawn, damping), [0.025, 0.975], axis=0)
     return {
-        header("virtual_damping", units.damping): damping,
-        header("stiffness", units.stiffness): _limit_rows(fit, own, damping)[0],
-        header("stiffness_low", units.stiffness): low,
-        header("stiffness_high", units.stiffness): high,
+        header("virtual_damping", unit_of("damping")): damping,
+        header("stiffness", unit_of("stiffness")): _limit_rows(fit, own, damping)[0],
+        header("stiffness_low", unit_of("stiffness")): low,
+        header("stiffness_high", unit_of("stiffness")): high,
     }
 
 
@@ -93,9 +94,8 @@ def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.
     return fit.scene.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).row_ends(damping)
 
 
-def tabulate_walls(
-    fit: DeviceFit, points: Sequence[BuzzPoint] = (), units: AxisUnits = LINEAR
-) -> dict[str, np.ndarray]:
+@in_own_units
+def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str, np.ndarray]:
     """The stiffest wall, the one to set, and walls that buzzed: their errors, frequencies, and distances from the fit.
 
     Distances are in units of the noise, stiffness and frequency apart.
@@ -107,7 +107,8 @@ def tabulate_walls(
     for each, rest in zip(points, fit.residuals if points else (), strict=True):
         rows.append(("buzzing", each.stiffness, each.virtual_damping, share * each.stiffness, each.frequency, *rest))
     kinds, *numbers = zip(*rows, strict=True)
-    heads = (("stiffness", units.stiffness), ("virtual_damping", units.damping), ("stiffness_error", units.stiffness))
-    names = [header(*head) for head in (*heads, ("frequency", "Hz"))] + ["stiffness_residual", "frequency_residual"]
+    stiffness, damping = unit_of("stiffness"), unit_of("damping")
+    heads = {"stiffness": stiffness, "virtual_damping": damping, "stiffness_error": stiffness, "frequency": "Hz"}
+    names = [*(header(*head) for head in heads.items()), "stiffness_residual", "frequency_residual"]
     columns = {name: np.array(part, float) for name, part in zip(names, numbers, strict=True)}
     return {"kind": np.array(kinds), **columns}

@@ -8,17 +8,19 @@ in the device nevertheless: how large, at most, is the radius in which the true 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from zwidth.arrays.circle import circle
-from zwidth.fitting.device_rows import DeviceRows
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
-from zwidth.fitting.structure import StructuredRecordings, to_scene
+from zwidth.fitting.required_wall import DeviceRows, RequiredWall
+from zwidth.fitting.structure import Recordings
 from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
 from zwidth.parts.actuator import Actuator
 from zwidth.parts.measured import MeasuredDevice
@@ -90,12 +92,7 @@ class PoleBank:
     @property
     def rates(self) -> npt.NDArray[np.complex128]:
         """Poles of the continuous device, in periods."""
-        return self.rates_of(self.ratio, self.frequency)
-
-    @staticmethod
-    def rates_of(ratio: float, frequency: np.ndarray) -> npt.NDArray[np.complex128]:
-        """Those of a damping ratio."""
-        return np.asarray(2.0 * np.pi * frequency * complex(-ratio, np.sqrt(1.0 - ratio**2)), np.complex128)
+        return _rates_of(self.ratio, self.frequency)
 
     def bound_modes(self) -> np.ndarray:
         """How much more than the whole mass a mode of each pole may move, at most."""
@@ -116,14 +113,10 @@ def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
     rest = rest - basis @ (basis.T @ rest)
     noise = best.variance * best.excess
     banks = [_test(best, basis, rest, ratio, noise) for ratio in _APART]
-    tried: list[float] = []
     total, chance = float(rest @ rest), 2.0 * np.log(best.count)
-    found = [(e, f, bank.ratio) for bank in banks for e, f in zip(bank.explained * noise, bank.frequency, strict=True)]
-    for explained, frequency, ratio in sorted(found, reverse=True):
-        if any(max(frequency / other, other / frequency) < _ELSEWHERE for other in tried):
-            continue
-        tried.append(frequency)
-        cleared = _filter_forces(best, ratio, PoleBank.rates_of(ratio, np.array([frequency])))[..., 0].T
+    for share, frequency, ratio in islice(list_likeliest(banks, _ELSEWHERE), _TRIED):
+        explained = share * noise
+        cleared = _filter_forces(best, ratio, _rates_of(ratio, np.array([frequency])))[..., 0].T
         cleared, _ = np.linalg.qr(cleared - basis @ (basis.T @ cleared))
         along = cleared.T @ rest
         # In squares of standard errors, of errors as kindred as the encoder's and as the sums of neighbors are.
@@ -132,9 +125,17 @@ def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
         white = best.count * np.log(total / (total - explained)) if explained < total else np.inf
         if min(known, white) > along.size * chance:
             return HiddenPole(float(frequency), ratio < 1.0), banks
-        if len(tried) == _TRIED:
-            break
     return None, banks
+
+
+def list_likeliest(banks: list[PoleBank], apart: float) -> Iterator[tuple[float, float, float]]:
+    """What each pole explains, its frequency and damping ratio, the likeliest first, frequencies so far apart."""
+    found = [(e, f, bank.ratio) for bank in banks for e, f in zip(bank.explained, bank.frequency, strict=True)]
+    told: list[float] = []
+    for explained, frequency, ratio in sorted(found, reverse=True):
+        if all(max(frequency / other, other / frequency) >= apart for other in told):
+            told.append(frequency)
+            yield explained, frequency, ratio
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def look_for_lags(best: FittedModel) -> LagTest:
     best = _glimpse(best)
     lags = np.geomspace(_SHORTEST, max(_LONGEST, min(_LONGEST_LAG, best.theta[2])), _LAGS)
     # Of the mass alone: what resonances add turns hardly.
-    (g, delta, d), model = best.theta[:3], StructuredRecordings(best.model.logs, lag=1)
+    (g, delta, d), model = best.theta[:3], Recordings(best.model.logs, lag=1)
     thetas = [np.pad([g, delta, d - lag, lag], (0, model.size - 4)) for lag in lags]
     columns = [[model.add_parts(theta, k).position for k in range(len(model.logs))] for theta in thetas]
     columns = best.model.weigh(np.stack([np.concatenate(column) for column in columns], -1))
@@ -181,7 +182,8 @@ def bound_lag(best: FittedModel, test: LagTest | None, scene: Scene, reach: floa
         return None
     lag = float(test.lag[count - 1] * period)
     # What a lag moves of resonances is small, and may be more than there is.
-    there = to_scene(best.model, np.clip(test.theta[:, count - 1], *best.model.bounds()), period, scene.velocity)
+    theta = np.clip(test.theta[:, count - 1], *best.model.bounds())
+    there = best.model.to_scene(theta, period, scene.velocity)
     there = replace(there, device=replace(there.device, actuator=Actuator(time_constant=lag)))
     return HiddenLag(lag, float(there.timing.delay), float(there.max_stiffness().stiffness))
 
@@ -192,7 +194,7 @@ def respond_as_fitted(best: FittedModel, scene: Scene, banks: list[PoleBank]) ->
     What such a resonance moves the other numbers by, they have been found with.
     """
     lines = np.unique(np.concatenate([_lay_lines(scene, _TURN), banks[0].frequency]))
-    response, slopes = _respond(best, scene, lines)
+    response, slopes = _respond(best, scene.timing.period, lines)
     radius = np.zeros(lines.size)
     for bank in banks[:_RINGING]:
         moved = _add_modes(best, lines, bank.rates[:, None]) - bank.absorbed[: best.model.parts.stop].T @ slopes.T
@@ -213,7 +215,7 @@ def weigh_resonances(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> 
     all_lines = _lay_lines(scene, _LITTLE)[None], np.clip(beside, _FIRST, _HIGHEST)
     responses, count = [], len(which)
     for lines in all_lines:
-        response, slopes = _respond(best, scene, lines)
+        response, slopes = _respond(best, period, lines)
         responses.append(response + share * (_add_modes(best, lines, rates) - (slopes @ absorbed)[..., 0]))
     lines = np.concatenate([np.broadcast_to(all_lines[0], (count, all_lines[0].size)), all_lines[1]], -1)
     order = np.argsort(lines, -1)
@@ -253,17 +255,18 @@ def _draw_modes(banks: list[PoleBank]) -> tuple[float, np.ndarray, np.ndarray]:
     return float(reached[-1]), drawn // shares.size, shares[drawn % shares.size]
 
 
-def _respond(best: FittedModel, scene: Scene, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _respond(best: FittedModel, period: float, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The response at lines, and its derivatives in the first numbers of theta, along the last axis."""
-    period, columns = scene.timing.period, []
-    frequency = lines / period
-    response = scene.frequency_response(1.0, 0.0, frequency)
-    for k in range(best.model.parts.stop):
-        theta = best.theta.copy()
-        theta[k] += (step := _STEP * max(abs(best.theta[k]), 1e-3 if k in (1, 2) else 0.0))
-        there = to_scene(best.model, theta, period, scene.velocity)
-        columns.append((there.frequency_response(1.0, 0.0, frequency) - response) / step)
-    return response, np.stack(columns, -1)
+    at = circle(2.0 * np.pi * lines.ravel())
+
+    def answer(theta: np.ndarray) -> np.ndarray:
+        device = best.model.normalize(theta, period)
+        return (-(period**2) / device.mass / RequiredWall(*device[1:]).jet(at).value).reshape(lines.shape)
+
+    count, response = best.model.parts.stop, answer(best.theta)
+    steps = _STEP * np.maximum(np.abs(best.theta[:count]), [1e-3 if k in (1, 2) else 0.0 for k in range(count)])
+    moved = [answer(best.theta + step * unit) for step, unit in zip(steps, np.eye(count, best.theta.size), strict=True)]
+    return response, (np.stack(moved, -1) - response[..., None]) / steps
 
 
 def _glimpse(best: FittedModel) -> FittedModel:
@@ -305,6 +308,11 @@ def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, 
         bank.kindred[part] = np.sqrt(np.maximum(errors / size**2 / noise, 1.0))
         bank.absorbed[:, part] = numbers @ (np.sum(shares * mode[:, None], 0) - last_shares * late[part])
     return bank
+
+
+def _rates_of(ratio: float, frequency: np.ndarray) -> npt.NDArray[np.complex128]:
+    """Poles of a damping ratio."""
+    return np.asarray(2.0 * np.pi * frequency * complex(-ratio, np.sqrt(1.0 - ratio**2)), np.complex128)
 
 
 def _filter_forces(best: FittedModel, ratio: float, rates: np.ndarray) -> np.ndarray:

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from zwidth.fitting.choosing import ALIKE, EXACT, choose_structure
-from zwidth.fitting.device_fit import (
-    BEYOND,
-    MASS_OPEN,
-    VAGUE,
-    DeviceFit,
-    FittedMotion,
-)
+from zwidth.fitting.device_estimate import differentiate, find_stiffest, reach_of
+from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FittedMotion
 from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted, weigh_resonances
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
-from zwidth.fitting.stiffness_estimate import StiffnessEstimate
-from zwidth.fitting.structure import derive_numbers, to_scene
+from zwidth.fitting.structure import Recordings
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity
+from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE
+from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
@@ -84,14 +79,10 @@ def fit_log(
             damping in N m s/rad, and so on.
 
     Returns:
-        DeviceFit: ``mass``, ``damping``, ``delay``, their ``errors`` and ``covariance``; ``friction`` and ``offset``,
-        whose errors are NaN where the log leaves open how much is of which, as of a mass that slides one way only;
-        ``stiffness_max`` with ``stiffness_error``; ``intervals``, 95 %; ``noise`` of the position in m; ``residuals``
-        and ``motions``; ``doubts``, as of a unit or of residuals that are no noise: then there is no safe wall;
-        ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED, UNDECIDED where the residuals
-        are no noise: then K_max is NaN; ``response``, with the radius by which a resonance may move it that the log
-        does not show: what bounds the safe wall; ``actuator`` and ``modes`` where the log asks for them; ``lag``, the
-        longest that it does not tell from a delay: the interval of K_max reaches to it.
+        DeviceFit: the errors of ``friction`` and ``offset`` are NaN where the log leaves open how much is of which, as
+        of a mass that slides one way only; ``doubts`` as of a unit or of residuals that are no noise: then there is no
+        safe wall; ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED, UNDECIDED where the
+        residuals are no noise: then K_max is NaN; ``response`` bounds the safe wall.
 
     Raises:
         InputError: times are uneven, the force or the position never changes, the device runs away from its force, most
@@ -124,31 +115,40 @@ def fit_log(
         >>> print(f"{fit.mass * 1e3:.1f} g, {fit.damping:.2f} N s/m")
         100.0 g, 2.00 N s/m
     """
-    velocity = BackwardDifference() if velocity is None else velocity
-    logs, period, wavers = read_logs(time, position, force, resample)
+    with use_kind(rotary):
+        return _fit(
+            *read_logs(time, position, force, resample),
+            BackwardDifference() if velocity is None else velocity,
+            max_delay,
+            resolution,
+        )
+
+
+def _fit(
+    logs: tuple[Log, ...], period: float, wavers: float, velocity: Velocity, max_delay: Any, resolution: Any
+) -> DeviceFit:
+    """The same of logs that are read, whose period has the relative standard error ``wavers``."""
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
     recordings = tuple(log.recording(skip, k).begin(_MOST // len(logs)) for k, log in enumerate(logs))
     doubts = [doubt for log in logs for doubt in find_stretches(log)]
     step, odd = _find_step(resolution, logs)
-    best = fit_model(recordings, longest, step)
-    best, pole, banks, lags = choose_structure(best, longest, step)
-    theta = best.theta
+    best, pole, banks, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
+    model, theta = best.model, best.theta
     _refuse_unmoved(best, period)
     if best.inverse.open[:3].any():
         raise InputError(
             "force: mass, damping and delay cannot be told apart by this log; record longer, with a force that changes "
             "its sign at different times, as steps to and fro"
         )
-    by_theta, power = derive_numbers(best.model, theta, period)
-    stiffest = StiffnessEstimate.at(to_scene(best.model, theta, period, velocity))
-    own = stiffest.scene.parameters()
-    values = np.array([own[name] for name in stiffest.numbers])
-    by_period, known = wavers * values * power, slice(0, values.size)
-    covariance = by_theta @ best.covariance[known, known] @ by_theta.T + np.outer(by_period, by_period)
+    scene, known = model.to_scene(theta, period, velocity), slice(0, model.parts.stop)
+    by_theta = differentiate(lambda theta: model.normalize(theta, period).to_numbers(period), theta)[:, known]
+    (by_period,) = differentiate(lambda time: model.normalize(theta, time[0]).to_numbers(time[0]), np.array([period])).T
+    late = wavers * period * by_period
+    covariance = by_theta @ best.covariance[known, known] @ by_theta.T + np.outer(late, late)
     freedom = max(1, best.count - theta.size)
     unexplained = _find_unexplained(best, pole, period) if banks else []
-    doubts = odd + doubts + _doubt(values, np.sqrt(np.diag(covariance)), best, logs, rotary) + unexplained
+    doubts = odd + doubts + _doubt(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     # The device that bears K_max is another one then.
     status = Status.UNDECIDED if status == Status.OK and unexplained else status
@@ -158,21 +158,26 @@ def fit_log(
             f"the delay ends the range looked in, {with_unit(longest * period, 's')}; give a longer max_delay"
         )
     motions, (offset, friction) = _place(best, logs, skip, period), (_in_newton(best, k) for k in (-2, -1))
-    fit = stiffest.conclude(
+    shown: dict[str, Any] = {}
+    if banks and not unexplained:
+        shown = {"response": respond_as_fitted(best, scene, banks), "hidden": weigh_resonances(best, scene, banks)}
+        shown |= {"lag": bound_lag(best, lags, scene, reach_of(freedom))}
+    return DeviceFit.conclude(
+        scene,
+        find_stiffest(scene),
         covariance,
+        errors={"offset": offset[1], "friction": friction[1]},
+        offset=offset[0],
+        friction=friction[0],
+        resolution=step,
+        motions=motions,
         noise=float(np.sqrt(best.variance)),
         residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
         doubts=doubts,
         status=status,
         freedom=freedom,
+        **shown,
     )
-    errors = fit.errors | {"offset": offset[1], "friction": friction[1]}
-    fit = replace(fit, errors=errors, offset=offset[0], friction=friction[0], resolution=step, motions=motions)
-    if unexplained or not banks:
-        return fit
-    asked = best, stiffest.scene
-    response, hidden = respond_as_fitted(*asked, banks), weigh_resonances(*asked, banks)
-    return replace(fit, response=response, hidden=hidden, lag=bound_lag(best, lags, stiffest.scene, fit.reach))
 
 
 def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float) -> list[str]:
@@ -240,17 +245,17 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
         )
 
 
-def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tuple[Log, ...], rotary: bool) -> list[str]:
-    mass, damping, delay = values[:3]
+def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Log, ...]) -> list[str]:
+    mass, damping, delay = scene.device.mass, scene.device.damping, scene.timing.delay
     doubts, residuals = [], best.residuals
-    if not rotary and not _LIGHTEST <= mass <= _HEAVIEST:
+    if not is_rotary() and not _LIGHTEST <= mass <= _HEAVIEST:
         light = "the position may be in mm, or the force in kN"
         slip = light if mass < _LIGHTEST else "the force may be in mN, or the time in ms"
         doubts.append(f"a mass of {with_unit(mass, 'kg')} is far from any device; {slip}: m, N and s are meant")
     way, push = max(float(np.ptp(log.position)) for log in logs), best.model.largest
-    if not rotary and way > _FARTHEST:
+    if not is_rotary() and way > _FARTHEST:
         doubts.append(f"a way of {with_unit(way, 'm')} is far from any device; the position may be in mm: m is meant")
-    if not rotary and push > _STRONGEST:
+    if not is_rotary() and push > _STRONGEST:
         doubts.append(f"a force of {with_unit(push, 'N')} is far from any device; it may be in mN: N is meant")
     if errors[0] > VAGUE * mass:
         doubts.append(MASS_OPEN)

@@ -14,14 +14,13 @@ compiled recursions, for JAX would compile for seconds for a log's length.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from math import expm1, log1p
-from typing import ClassVar, NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.loops.rigid.device import PhiFunctions, phi_functions, split_delay
 
 
@@ -218,74 +217,3 @@ def recur(factor: np.ndarray | complex, added: np.ndarray, begin: float | np.nda
     band[1, :-1] = np.negative(later)
     solve = ztbtrs if right.dtype == complex else dtbtrs
     return solve(band, right, uplo="L", diag="U", overwrite_b=1)[0].reshape(right.shape)
-
-
-@dataclass(frozen=True)
-class Recordings:
-    """Several logs of one device; theta is ``(g, delta, d)``, for each log x0 and v0, then o and c."""
-
-    logs: tuple[Recording, ...]
-    noise: MeasurementNoise | None = None
-
-    def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Columns over samples, as `MeasurementNoise.weigh` where the noise is known."""
-        return columns if self.noise is None else self.noise.weigh(columns)
-
-    def begin(self, count: int) -> Self:
-        """Of each log so many first positions."""
-        return replace(self, logs=tuple(log.begin(count) for log in self.logs), noise=None)
-
-    @property
-    def measured(self) -> np.ndarray:
-        """All positions that count."""
-        return np.concatenate([log.position for log in self.logs])
-
-    def split(self, column: np.ndarray) -> list[np.ndarray]:
-        """What of a column over samples belongs to each log."""
-        return np.split(column, np.cumsum([log.position.size for log in self.logs])[:-1])
-
-    @property
-    def size(self) -> int:
-        """How many numbers theta has."""
-        return self.parts.stop + 2 + 2 * (1 + self.modes) * len(self.logs)
-
-    # Of the amplifier the order, and how many modes: none beside a rigid mass.
-    lag: ClassVar[int] = 0
-    modes: ClassVar[int] = 0
-
-    @property
-    def parts(self) -> slice:
-        """Where in theta the numbers of amplifier and modes are."""
-        return slice(3, 3 + self.lag + 3 * self.modes)
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """The least and the largest that each number of theta may be."""
-        return np.full(self.size, -np.inf), np.full(self.size, np.inf)
-
-    @property
-    def speeds(self) -> np.ndarray:
-        """Where in theta the first speeds are."""
-        return self.parts.stop + 1 + 2 * np.arange(len(self.logs))
-
-    @property
-    def largest(self) -> float:
-        """The largest force commanded."""
-        return max(float(np.abs(log.force).max()) for log in self.logs)
-
-    def follow(self, theta: np.ndarray) -> ModelledMotion:
-        """The motion of theta in all logs."""
-        each = [self.follow_log(theta, k) for k in range(len(self.logs))]
-        place = np.concatenate([motion.position for motion in each])
-        return ModelledMotion(place, lambda: np.concatenate([motion.slopes for motion in each]))
-
-    def follow_log(self, theta: np.ndarray, which: int, later: float = 0.0) -> ModelledMotion:
-        """The motion in one of them, of a rigid mass whose force comes later."""
-        speed = self.speeds[which]
-        into = np.array([0, 1, 2, speed - 1, speed, -2, -1])
-        moved = self.logs[which].move(*(theta[into] + later * np.eye(7)[2]).tolist())
-        return ModelledMotion(moved.position, lambda: moved.slopes @ np.eye(theta.size)[into])
-
-    def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and their derivatives in theta."""
-        motion = self.follow(theta)
-        return motion.position, motion.slopes

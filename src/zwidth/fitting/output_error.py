@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.fitting.encoder import MeasurementNoise
-from zwidth.fitting.moving import ModelledMotion, Recording, Recordings
+from zwidth.fitting.moving import ModelledMotion, Recording
+from zwidth.fitting.structure import Recordings
 
 # Dampings b T/m and frictions as shares of the largest force that are started from; the least friction that is looked
 # for, for at 0 its slope is not seen.
@@ -67,7 +68,6 @@ class FittedModel:
     theta: np.ndarray
     squares: float
     arrived: bool
-    resolution: float
     rivals: tuple[FittedModel, ...] = ()
 
     @property
@@ -93,7 +93,8 @@ class FittedModel:
     @cached_property
     def noise(self) -> MeasurementNoise:
         """That of its positions; at rest, x0 takes up an encoder's error, and the residuals show less than there is."""
-        return MeasurementNoise(self.moved[0], max(self.variance, self.resolution**2 / 12.0), self.resolution)
+        step = self.model.resolution
+        return MeasurementNoise(self.moved[0], max(self.variance, step**2 / 12.0), step)
 
     @cached_property
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
@@ -169,15 +170,14 @@ class FittedModel:
         return whole
 
 
-def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: float) -> FittedModel:
+def fit_model(model: Recordings) -> FittedModel:
     """The device of the least squares, with a constant force and friction."""
-    model = Recordings(recordings)
-    start = _follow(model, _start(model, longest), longest)
-    best = _fit(model, start, longest, resolution, (), NEARLY if resolution else _ARRIVED)
-    if resolution:
+    start = _follow(model, _start(model))
+    best = _fit(model, start, (), NEARLY if model.resolution else _ARRIVED)
+    if model.resolution:
         # At rest an encoder errs by the same all the time: that counts once.
         model = replace(model, noise=best.noise)
-        best = _fit(model, best.theta, longest, resolution)
+        best = _fit(model, best.theta)
     # Of a mass that slides one way only, and rests before or after, how much is of which stays open: one of them is
     # none. Beside that device others fit that slide back a little within the noise.
     steps = np.diff(best.moved[0])
@@ -186,27 +186,27 @@ def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: flo
         g, pull = best.theta[0], best.theta[-2] - way * best.theta[-1]
         parts, none = ((pull, LEAST * abs(g) * model.largest), -1) if way * pull > 0 else ((0.0, -way * pull), -2)
         start = np.append(best.theta[:-2], parts)
-        rival = _fit(model, start, longest, resolution, (none,))
+        rival = _fit(model, start, (none,))
         if rival.inverse.open[-2:].all() and rival.explains_as_well(best):
             return rival
     # Without friction nothing rests: beyond that corner the squares may rise less than the slopes say.
     if best.theta[-1] ** 2 < _CLOSE_BY * best.covariance[-1, -1]:
         none = best.theta - np.nan_to_num(best.covariance[:, -1]) * best.theta[-1] / best.covariance[-1, -1]
         none[-1] = LEAST * abs(none[0]) * model.largest
-        gliding = settle(model, none, longest, resolution, (-1,))
+        gliding = settle(model, none, (-1,))
         if best.explains_as_well(gliding):
             return replace(best, rivals=(gliding,))
         return replace(gliding, rivals=(best,))
     return best
 
 
-def _start(model: Recordings, longest: float) -> list[np.ndarray]:
+def _start(model: Recordings) -> list[np.ndarray]:
     """The best without friction, and for every friction the best of a grid over damping and delay; by the beginnings.
 
     All else is linear there, for all speeds grow with g. One motion serves all delays: begun so much earlier.
     """
     model = model.begin(_GLIMPSE)
-    base, most = np.zeros(model.size), int(longest)
+    base, most = np.zeros(model.size), int(model.longest)
     early = Recordings(
         tuple(Recording(log.force, np.zeros(log.position.size + most), log.skip - most) for log in model.logs)
     )
@@ -230,7 +230,7 @@ def _start(model: Recordings, longest: float) -> list[np.ndarray]:
     for _, delta, d in search():
         if all(abs(d - other) > _APART or delta != of for of, other in apart):
             apart.append((delta, d))
-    glides = [_refine(model, start(*one), longest, (-1,), arrived=_NEAR) for one in apart[:_STARTS]]
+    glides = [_refine(model, start(*one), (-1,), arrived=_NEAR) for one in apart[:_STARTS]]
     starts = [min(glides, key=lambda found: found[1])[0]]
     # From there on with the speeds and the constant force that were found.
     firsts = [log.position[: 2 * _FIRST].reshape(2, -1).mean(1) for log in model.logs]
@@ -263,29 +263,27 @@ def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.nd
     return values / sizes[..., 0, :], np.sum(rest**2, -1)
 
 
-def _follow(model: Recordings, starts: list[np.ndarray], longest: float) -> np.ndarray:
+def _follow(model: Recordings, starts: list[np.ndarray]) -> np.ndarray:
     """The best start, followed through ever longer beginnings: few turns and rests make hardly a false optimum."""
     for count, kept in _ROUNDS:
         part = model.begin(count)
-        found = [_refine(part, start, longest, (), _FOLLOWED, _NEAR) for start in starts]
+        found = [_refine(part, start, (), _FOLLOWED, _NEAR) for start in starts]
         starts = [theta for theta, *_ in sorted(found, key=lambda found: found[1])[:kept]]
     return starts[0]
 
 
-def follow_start(model: Recordings, start: np.ndarray, longest: float, steps: int) -> tuple[np.ndarray, float]:
+def follow_start(model: Recordings, start: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
     """Some steps from a start, as close as devices are compared by: theta and the sum of squares."""
-    return _refine(model, start, longest, (), steps, _CLOSELY)[:2]
+    return _refine(model, start, (), steps, _CLOSELY)[:2]
 
 
-def _fit(
-    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: _Held = (), arrived: float = _ARRIVED
-) -> FittedModel:
+def _fit(model: Recordings, start: np.ndarray, held: _Held = (), arrived: float = _ARRIVED) -> FittedModel:
     """Least squares from a start, or at rest where that is as good.
 
     First speeds that friction stops within the noise hardly move the positions. Beside such a speed the position's
     derivative is next to 0, and steps towards the best one hardly end.
     """
-    best = settle(model, start, longest, resolution, held, arrived)
+    best = settle(model, start, held, arrived)
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.speeds]), best.theta
     # The way to the stop, v^2/(2 c) without damping and v/delta without friction.
     slid = speed**2 / (2.0 * friction + delta * speed)
@@ -293,35 +291,30 @@ def _fit(
     if idle.any():
         still = best.theta.copy()
         still[model.speeds[idle]] = 0.0
-        resting = settle(model, still, longest, resolution, held, arrived)
+        resting = settle(model, still, held, arrived)
         if not best.arrived or resting.explains_as_well(best):
             return resting
     return best
 
 
-def settle(
-    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: _Held = (), arrived: float = _ARRIVED
-) -> FittedModel:
+def settle(model: Recordings, start: np.ndarray, held: _Held = (), arrived: float = _ARRIVED) -> FittedModel:
     """As `_refine`, with neither damping nor delay negative."""
-    best = _refine(model, start, longest, held, arrived=arrived)
+    best = _refine(model, start, held, arrived=arrived)
     while negative := tuple(k for k in (1, 2) if best[0][k] < 0):
         best[0][list(negative)] = 0.0
         held = (*held, *negative)
-        best = _refine(model, best[0], longest, held, arrived=arrived)
-    return FittedModel(model, *best, resolution)
+        best = _refine(model, best[0], held, arrived=arrived)
+    return FittedModel(model, *best)
 
 
 def _refine(
-    model: Recordings, start: np.ndarray, longest: float, held: _Held, most: int = _STEPS, arrived: float = _ARRIVED
+    model: Recordings, start: np.ndarray, held: _Held, most: int = _STEPS, arrived: float = _ARRIVED
 ) -> tuple[np.ndarray, float, bool]:
     """Levenberg and Marquardt's steps within bounds: theta, the sum of squares, and whether it is the least.
 
     What is ``held`` stays as it starts.
     """
-    count = max(log.force.size for log in model.logs)
     low, high = model.bounds()
-    # A little beyond 0 the model goes on, so that an optimum at 0 is no corner.
-    low[1], low[2], high[1], high[2] = -5.0 / count, -1.0, 50.0, longest
     low[-1] = LEAST * abs(start[0]) * model.largest
     low[list(held)] = high[list(held)] = start[list(held)]
     theta, measured, damping = np.clip(start, low, high), model.measured, _EASY

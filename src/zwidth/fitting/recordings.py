@@ -149,10 +149,11 @@ def find_stretches(log: Log) -> list[str]:
     return doubts
 
 
+def find_runs(marked: np.ndarray) -> np.ndarray:
+    """First and one past the last of each run of marked samples, a row each."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]]))).reshape(-1, 2)
+
+
 def _longest_run(marked: np.ndarray) -> tuple[int, int]:
-    """First and one past the last of the longest run of marked samples."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
-    if not ends.size:
-        return 0, 0
-    k = int(np.argmax(ends[1::2] - ends[::2]))
-    return int(ends[2 * k]), int(ends[2 * k + 1])
+    first, last = max(find_runs(marked).tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
+    return first, last

@@ -15,7 +15,7 @@ import numpy as np
 
 from zwidth.fitting.columns import LoggedMotion
 from zwidth.fitting.encoder import find_resolution
-from zwidth.fitting.recordings import Log, read_logs
+from zwidth.fitting.recordings import Log, find_runs, read_logs
 from zwidth.loops.measured.loop import MeasuredLoop
 from zwidth.parts.checks import check_number
 from zwidth.parts.measured import MeasuredDevice
@@ -159,22 +159,20 @@ def _find_period(force: np.ndarray) -> int | None:
     lags = lags[lags >= _SHORTEST]
     tall = np.sort(lags[np.argsort(-alike[lags])][:20])
     for lag in tall.tolist():
-        if sum(last - first for first, last in _find_runs(force, lag)) > _REPEATED * force.size:
+        if sum(last - first for first, last in _find_repeats(force, lag)) > _REPEATED * force.size:
             return lag
     return None
 
 
-def _find_runs(force: np.ndarray, count: int) -> list[tuple[int, int]]:
+def _find_repeats(force: np.ndarray, count: int) -> list[tuple[int, int]]:
     """First and one past the last sample of each stretch of two periods of so many samples or more."""
-    same = np.concatenate([[False], np.abs(force[count:] - force[:-count]) <= _SAME * np.ptp(force), [False]])
-    edges = np.flatnonzero(np.diff(same.astype(np.int8)))
-    ends = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-    return [(first, last + count) for first, last in ends if last - first >= count]
+    runs = find_runs(np.abs(force[count:] - force[:-count]) <= _SAME * np.ptp(force)).tolist()
+    return [(first, last + count) for first, last in runs if last - first >= count]
 
 
 def _split(log: Log, count: int, trusted: bool) -> list[tuple[np.ndarray, np.ndarray]]:
     """Stretches of two periods or more that repeat one force, as force and position, shape (periods, count)."""
-    runs = _find_runs(log.force, count)
+    runs = _find_repeats(log.force, count)
     if trusted and not runs and log.force.size >= 2 * count:
         # A loop that holds the device adds to the force: it repeats on average only.
         runs = [(0, log.force.size)]
@@ -190,11 +188,9 @@ def _without_drift(position: np.ndarray) -> np.ndarray:
     """Periods of a position without the parabola that carries each into the next one."""
     count = position.shape[1]
     steps = np.diff(position[-3:], axis=0).ravel()
-    at = np.arange(steps.size) - 0.5 * (steps.size - 1)
-    slope = float(at @ steps) / float(at @ at)
+    slope, start = np.polyfit(np.arange(steps.size), steps, 1).tolist()
     # Of a t + b t^2 a period makes a P + b (2 t P + P^2).
     bend = 0.5 * slope / count
-    start = float(steps.mean()) - slope * 0.5 * (steps.size - 1)
     rise = (start - bend * count**2) / count
     t = np.arange(position.size) - (position.size - min(3, position.shape[0]) * count)
     return position - (rise * t + bend * t**2).reshape(position.shape)
@@ -232,10 +228,9 @@ def _average_periods(
 
 def _smooth(values: np.ndarray, reach: int) -> np.ndarray:
     """Means over lines to both sides, fewer at the ends."""
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    k = np.arange(values.size)
-    low, high = np.maximum(k - reach, 0), np.minimum(k + reach + 1, values.size)
-    return (sums[high] - sums[low]) / (high - low)
+    near = np.ones(2 * reach + 1)
+    total, count = (np.convolve(each, near)[reach : reach + values.size] for each in (values, np.ones(values.size)))
+    return total / count
 
 
 def _average_pieces(logs: tuple[Log, ...], period: float, doubts: list[str]) -> ResponseEstimate:

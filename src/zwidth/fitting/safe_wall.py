@@ -5,7 +5,7 @@ and columns of the stable set are intervals (docs/theory/one-lobe.md), so that a
 bear are counted from the ends of their columns, and K is halved between what they bear and what they do not.
 
 With a velocity filter, an amplifier or resonances rows are looked for on a grid of frequencies
-(`zwidth.fitting.device_rows`); eigenvalues then judge the wall on every device.
+(`zwidth.fitting.required_wall`); eigenvalues then judge the wall on every device.
 
 A log bounds resonances as well: how large one may be and not show. The fitted response with that radius decides walls
 as a measured one does (docs/theory/measured.md), and a wall counts that it decides too.
@@ -13,35 +13,25 @@ as a measured one does (docs/theory/measured.md), and a wall counts that it deci
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zwidth.arrays.circle import circle
-from zwidth.fitting.buzzing import NeededAnswer
-from zwidth.fitting.device_rows import DeviceRows, find_highest
-from zwidth.loops.linear.state_space import delayed_device, open_loop
+from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
+from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
+from zwidth.loops.linear.state_space import StateSpace, delayed_device, estimate_matrices, in_series
 from zwidth.loops.rigid.device import device_status
 from zwidth.loops.variants import RigidVariants
-from zwidth.parts.checks import check_whole
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.tolerances import borne_by
-from zwidth.words.errors import InputError
 from zwidth.words.quantities import SI_RANGE
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
-if TYPE_CHECKING:
-    from zwidth.fitting.device_fit import DeviceFit
-
-_SAMPLES, _MOST_SAMPLES = 8000, 100_000
-# How many draws a kind of device takes, times the loop's own number: to find a wall, and only to confirm one.
-_FOUND, _CONFIRMED = 5, 2
-# Rounds of draws; where most are impossible, the estimate says nothing.
-_ROUNDS = 50
-# In parts of the sampling rate.
-_HIGHEST = 0.499
+# How many devices are drawn at the most, and times the loop's own number: to find a wall, and only to confirm one.
+_SAMPLES, _FOUND, _CONFIRMED = 8000, 5, 2
 # K is known to this share, and is 0 where it is less than that share of what each device bears at its best B.
 _CLOSE, _NOTHING = 1e-3, 1e-4
 # Below the edge of the device that binds.
@@ -70,19 +60,16 @@ class SafeWall(NamedTuple):
     resonance: float = np.nan
 
 
-def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed: int, rigid: bool) -> SafeWall:
+_UNDECIDED = SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+
+
+def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> SafeWall:
     """See `zwidth.DeviceFit.safe_wall`."""
-    if isinstance(reliability, bool | str) or not 0.5 <= reliability < 1:
-        raise InputError(f"reliability: got {reliability!r}; a share from 0.5 to below 1 is needed, as 0.99")
-    scene = fit.scene
-    usual = (_CONFIRMED if fit.is_structured else _FOUND) * scene.loop.draws
-    count = min(_SAMPLES, usual) if samples is None else check_whole("samples", samples, 100, _MOST_SAMPLES)
-    seed = check_whole("seed", seed, 0, 2**63 - 1)
-    if fit.is_doubted:
-        return SafeWall(np.nan, np.nan, np.nan, fit.status if fit.status != Status.OK else int(Status.UNDECIDED))
-    drawn = draw_devices(fit, count, seed)
+    scene, usual = fit.scene, _CONFIRMED if fit.is_structured else _FOUND
+    count = min(_SAMPLES, usual * scene.loop.draws)
+    drawn = fit.draw(count)
     if drawn is None:
-        return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+        return _UNDECIDED
     if fit.is_structured and fit.damping_tried is None:
         return _bear_response(fit, reliability, rigid, drawn)
     searched = fit.is_structured or scene.velocity != BackwardDifference()
@@ -103,26 +90,26 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
     stiffness *= 1.0 - _BELOW
     share = devices.share(stiffness, virtual_damping)
     if share < reliability - max(_ASTRAY, 1.0 / count):
-        return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+        return _UNDECIDED
     return SafeWall(stiffness, virtual_damping, share, int(Status.OK), resonance)
 
 
-def _bear_response(fit: DeviceFit, reliability: float, rigid: bool, drawn: np.ndarray) -> SafeWall:
+def _bear_response(fit: DeviceEstimate, reliability: float, rigid: bool, drawn: np.ndarray) -> SafeWall:
     """The stiffest wall of the response of a device that is more than rigid, with what its numbers may be as radius."""
     scene = fit.respond(reliability, not rigid)
     if scene is None:
-        return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+        return _UNDECIDED
     top = scene.max_stiffness(negative_damping=False)
     if top.status != Status.OK:
         return SafeWall(0.0, 0.0, 1.0, int(Status.OK), float(top.frequency))
     wall = float(top.stiffness), float(top.virtual_damping)
     share = float(np.mean([_bears(fit.vary(values), *wall) for values in drawn]))
     if share < reliability - 1.0 / np.sqrt(len(drawn)):
-        return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+        return _UNDECIDED
     return SafeWall(*wall, share, int(Status.OK), np.nan if rigid else float(top.frequency))
 
 
-def bears_resonances(fit: DeviceFit, stiffness: float, virtual_damping: float) -> bool:
+def bears_resonances(fit: DeviceEstimate, stiffness: float, virtual_damping: float) -> bool:
     """Whether a wall and the softer ones of its damping bear every resonance that the records do not show."""
     if fit.damping_tried is not None and virtual_damping > fit.damping_tried:
         return False
@@ -131,48 +118,6 @@ def bears_resonances(fit: DeviceFit, stiffness: float, virtual_damping: float) -
         return True
     alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
     return scene.loop.holds_softly(float(alpha), float(beta))
-
-
-def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:
-    """What `DeviceFit.numbers` has of possible devices around the estimate, a row each; None if few are possible.
-
-    The mass is drawn by its logarithm, for what walls and logs tell of it is a share; of a filter its time constant is,
-    and of a mode what it moves.
-    """
-    values, names = fit.estimates, fit.numbers
-    if not np.all(np.isfinite(fit.covariance)):
-        return None
-    # By their reciprocals, those of which a mass may change its sign.
-    inverse = np.array([name == "velocity.cutoff" or (name[0] == "m" and name.endswith(".mass")) for name in names])
-    signed = inverse & np.array([name != "velocity.cutoff" for name in names])
-    center, slopes = values.copy(), np.ones(values.size)
-    center[inverse], slopes[inverse] = 1.0 / values[inverse], -1.0 / values[inverse] ** 2
-    center[0], slopes[0] = np.log(fit.mass), 1.0 / fit.mass
-    covariance = fit.covariance * np.outer(slopes, slopes)
-    # Of very different units: by correlations. What is known exactly has none.
-    errors = np.sqrt(np.diag(covariance))
-    errors = np.where(errors > 0, errors, 1.0)
-    sizes, sides = np.linalg.eigh(covariance / np.outer(errors, errors))
-    root = errors[:, None] * sides * np.sqrt(np.maximum(sizes, 0.0))
-    generator = np.random.default_rng(seed)
-    coded = getattr(fit.velocity, "coded_period", None) or fit.period
-    kept = np.zeros((0, values.size))
-    for _ in range(_ROUNDS):
-        spread = generator.standard_normal((count, values.size))
-        if fit.freedom is not None:
-            spread /= np.sqrt(generator.chisquare(fit.freedom, count) / fit.freedom)[:, None]
-        some = center + spread @ root.T
-        some = some[np.all((some >= 0) | signed | (np.arange(values.size) == 0), 1)]
-        with np.errstate(over="ignore", divide="ignore"):
-            some[:, 0] = np.exp(some[:, 0])
-            some[:, inverse] = 1.0 / some[:, inverse]
-            # Faster filters than half the sampling rate do nothing.
-            filters = inverse & ~signed
-            some[:, filters] = np.minimum(some[:, filters], _HIGHEST / coded)
-        kept = np.concatenate([kept, some])
-        if len(kept) >= count:
-            return kept[:count]
-    return None
 
 
 class _RigidDevices:
@@ -221,7 +166,7 @@ class _RigidDevices:
 class _SearchedDevices:
     """Devices with a filter or parts, by their boundaries on a grid of frequencies; only B >= 0 counts."""
 
-    def __init__(self, drawn: np.ndarray, fit: DeviceFit) -> None:
+    def __init__(self, drawn: np.ndarray, fit: DeviceEstimate) -> None:
         period, scene = fit.period, fit.scene
         with np.errstate(all="ignore"):
             rate, d = drawn[:, 0] / period, drawn[:, 2] / period
@@ -233,17 +178,14 @@ class _SearchedDevices:
         self.scenes = [fit.vary(values) for values in drawn]
         even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max(initial=0.0)))[1:]
         w = np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even])
-        lag, modes = _read_parts(drawn, fit)
-        if modes:
-            beside = [np.clip(turns * (1.0 + ratio * _BESIDE), _SLOWEST, np.pi) for turns, ratio, _ in modes]
+        devices = DimensionlessDevice.of_numbers(drawn.T[..., None], period, fit.lag_order)
+        if devices.modes:
+            beside = [np.clip(turns * (1.0 + ratio * _BESIDE), _SLOWEST, np.pi) for turns, ratio, _ in devices.modes]
             w = np.sort(np.concatenate([np.broadcast_to(w, (len(drawn), w.size)), *beside], -1), -1)
         at = circle(w)
-        some = self.scenes if "cutoff" in fit.errors else [scene]
         with np.errstate(all="ignore"):
-            velocity = np.array([one.velocity.estimate(period).jet(at).value for one in some]) / period
-            velocity = velocity.reshape(-1, w.shape[-1])
-            answer = NeededAnswer((drawn[:, 1] / rate)[:, None], d[:, None], lag, modes)
-            needed = answer.jet(at).value * (rate / period)[:, None]
+            velocity = scene.velocity.estimate(period).jet(at).value.reshape(-1, w.shape[-1]) / period
+            needed = RequiredWall(*devices[1:]).jet(at).value * (rate / period)[:, None]
             # At z = -1 both are real.
             needed[:, -1], velocity[:, -1] = np.real(needed[:, -1]), np.real(velocity[:, -1])
             self.rows = DeviceRows(needed, velocity)
@@ -270,22 +212,11 @@ class _SearchedDevices:
         return borne_by(np.concatenate([limits, self.others]), reliability)
 
 
-def _read_parts(drawn: np.ndarray, fit: DeviceFit) -> tuple[list[np.ndarray], list[tuple[np.ndarray, ...]]]:
-    """Lag and modes of drawn devices as `NeededAnswer` has them, each number a column."""
-    columns = {name: values[:, None] for name, values in zip(fit.numbers, drawn.T, strict=True)}
-    units = {"actuator.time_constant": 1.0 / fit.period, "actuator.damping_ratio": 1.0}
-    lag = [columns[name] * unit for name, unit in units.items() if name in columns]
-    modes = []
-    for k in range(len(fit.modes)):
-        hertz, ratio, mass = (columns[f"modes.{k}.{name}"] for name in ("frequency", "damping_ratio", "mass"))
-        modes.append((2.0 * np.pi * fit.period * hertz, ratio, columns["mass"] / mass))
-    return lag, modes
-
-
 def _bears(scene: Scene, stiffness: float, virtual_damping: float) -> bool:
     alpha, beta = scene.normalize_walls(stiffness * np.array(_SOFTER), virtual_damping)
     chain = scene.loop.chain
-    loop, device = open_loop(chain, 0.0, float(beta)), delayed_device(chain)
+    estimate, device = estimate_matrices(chain.estimate), delayed_device(chain)
+    loop = in_series(StateSpace(estimate.A, estimate.B, float(beta) * estimate.C, float(beta) * estimate.D), device)
     closed = np.repeat((loop.A - loop.B @ loop.C)[None], alpha.size, 0)
     size = device.A.shape[0]
     closed[:, -size:, -size:] -= alpha[:, None, None] * device.B @ device.C

@@ -13,14 +13,15 @@ frequencies, -A'(0), which is the same but for the bends of the force within a t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from zwidth.fitting.moving import ModelledMotion, Recording, Recordings, recur
-from zwidth.fitting.scenes import scene_of
+from zwidth.fitting.device_estimate import DimensionlessDevice
+from zwidth.fitting.encoder import MeasurementNoise
+from zwidth.fitting.moving import ModelledMotion, Recording, recur
+from zwidth.fitting.required_wall import list_poles
 from zwidth.loops.rigid.device import phi_functions
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
@@ -31,39 +32,110 @@ _STEP = 1e-6
 LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (5e-4, 4.0)
 # The delays at low frequencies of those of second order.
 _SLOW = 2.0 * RATIOS[0] * LAGS[0], 2.0 * LAGS[1]
-# A double pole has no partial fractions.
-_DOUBLE = 1e-5
 
 
 @dataclass(frozen=True)
-class StructuredRecordings(Recordings):
-    """Several logs of one device with an amplifier of order ``lag`` and so many ``modes``.
+class Recordings:
+    """Several logs of one device with an amplifier of order ``lag``, 0 for none, and so many ``modes``.
 
     theta is ``(g, delta, d)``, the amplifier's delay at low frequencies in periods (and damping ratio), of each mode
     the frequency in radians a period, the damping ratio and ``T^2/m``, then for each log x0 and v0, and two numbers of
     how each mode was moving before; o and c come last. The delay of second order, ``2 zeta tau``, stands in place of
     tau: a log tells its sum with d far better than either, and along a straight valley steps are long.
+
+    ``longest`` is the longest delay that is looked for, in periods, ``resolution`` the encoder's step, 0 for none.
     """
 
-    lag: int = 0  # pyright: ignore[reportIncompatibleVariableOverride]  (0 of every rigid mass)
-    modes: int = 0  # pyright: ignore[reportIncompatibleVariableOverride]
+    logs: tuple[Recording, ...]
+    noise: MeasurementNoise | None = None
+    lag: int = 0
+    modes: int = 0
+    longest: float = 20.0
+    resolution: float = 0.0
+
+    def weigh(self, columns: np.ndarray) -> np.ndarray:
+        """Columns over samples, as `MeasurementNoise.weigh` where the noise is known."""
+        return columns if self.noise is None else self.noise.weigh(columns)
+
+    def begin(self, count: int) -> Recordings:
+        """Of each log so many first positions."""
+        return replace(self, logs=tuple(log.begin(count) for log in self.logs), noise=None)
+
+    @property
+    def measured(self) -> np.ndarray:
+        """All positions that count."""
+        return np.concatenate([log.position for log in self.logs])
+
+    def split(self, column: np.ndarray) -> list[np.ndarray]:
+        """What of a column over samples belongs to each log."""
+        return np.split(column, np.cumsum([log.position.size for log in self.logs])[:-1])
+
+    @property
+    def size(self) -> int:
+        """How many numbers theta has."""
+        return self.parts.stop + 2 + 2 * (1 + self.modes) * len(self.logs)
+
+    @property
+    def parts(self) -> slice:
+        """Where in theta the numbers of amplifier and modes are."""
+        return slice(3, 3 + self.lag + 3 * self.modes)
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """Where in theta the first speeds are."""
+        return self.parts.stop + 1 + 2 * np.arange(len(self.logs))
+
+    @property
+    def largest(self) -> float:
+        """The largest force commanded."""
+        return max(float(np.abs(log.force).max()) for log in self.logs)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        low, high = super().bounds()
+        """The least and the largest that each number of theta may be."""
+        low, high = np.full((2, self.size), [[-np.inf], [np.inf]])
         ends = [LAGS if self.lag == 1 else _SLOW, RATIOS][: self.lag] + self.modes * [TURNS, RATIOS, (-np.inf, np.inf)]
         low[self.parts], high[self.parts] = np.reshape(ends, (-1, 2)).T
+        # A little beyond 0 the model goes on, so that an optimum at 0 is no corner.
+        count = max(log.force.size for log in self.logs)
+        low[1:3], high[1:3] = (-5.0 / count, -1.0), (50.0, self.longest)
         return low, high
 
-    def follow_log(self, theta: np.ndarray, which: int, later: float = 0.0) -> ModelledMotion:
+    def normalize(self, theta: np.ndarray, period: Any) -> DimensionlessDevice:
+        """The device of theta."""
+        modes = theta[self.parts][self.lag :].reshape(-1, 3) / [1.0, 1.0, theta[0]]
+        return DimensionlessDevice(period**2 / theta[0], theta[1], theta[2], _read_lag(theta, self.lag), modes)
+
+    def to_scene(self, theta: np.ndarray, period: float, velocity: Velocity) -> Scene:
+        """The scene of theta."""
+        return self.normalize(theta, period).to_scene(period, velocity)
+
+    def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and their derivatives in theta."""
+        motion = self.follow(theta)
+        return motion.position, motion.slopes
+
+    def follow(self, theta: np.ndarray) -> ModelledMotion:
+        """The motion of theta in all logs."""
+        each = [self.follow_log(theta, k) for k in range(len(self.logs))]
+        place = np.concatenate([motion.position for motion in each])
+        return ModelledMotion(place, lambda: np.concatenate([motion.slopes for motion in each]))
+
+    def follow_log(self, theta: np.ndarray, which: int) -> ModelledMotion:
+        """The motion in one of them."""
         late, by_late = _delay(theta, self.lag, self.logs[which])
-        rigid, beside = super().follow_log(theta, which, later + late), self.add_parts(theta, which)
+        speed = self.speeds[which]
+        into = np.array([0, 1, 2, speed - 1, speed, -2, -1])
+        rigid = self.logs[which].move(*(theta[into] + late * np.eye(7)[2]).tolist())
+        beside = self.add_parts(theta, which) if self.lag or self.modes else None
 
         def differentiate() -> np.ndarray:
-            slopes = rigid.slopes + beside.slopes
-            slopes[:, 3 : 3 + self.lag] += np.outer(rigid.slopes[:, 2], by_late)
+            slopes = rigid.slopes @ np.eye(theta.size)[into]
+            if beside is not None:
+                slopes += beside.slopes
+                slopes[:, 3 : 3 + self.lag] += np.outer(rigid.slopes[:, 2], by_late)
             return slopes
 
-        return ModelledMotion(rigid.position + beside.position, differentiate)
+        return ModelledMotion(rigid.position if beside is None else rigid.position + beside.position, differentiate)
 
     def add_parts(self, theta: np.ndarray, which: int) -> ModelledMotion:
         """What amplifier and modes add in one log to the mass whose force comes later."""
@@ -133,28 +205,6 @@ class StructuredRecordings(Recordings):
         return by_theta
 
 
-def to_scene(model: Recordings, theta: np.ndarray, period: float, velocity: Velocity) -> Scene:
-    """The scene of theta; its numbers go as `zwidth.fitting.scenes.name_numbers` names them."""
-    mass, lag, modes = period**2 / theta[0], _read_lag(theta, model.lag), theta[model.parts][model.lag :]
-    late = lag * [period, 1.0][: model.lag]
-    ringing = modes.reshape(-1, 3) * [0.5 / (np.pi * period), 1.0, period**-2]
-    ringing[:, 2] = 1.0 / ringing[:, 2]
-    values = [mass, theta[1] * mass / period, theta[2] * period, *late, *ringing.ravel()]
-    return scene_of(values, period, velocity, model.lag, model.modes)
-
-
-def derive_numbers(model: Recordings, theta: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """The derivatives of the scene's numbers in the first ones of theta; and what power of the period each is."""
-    g, delta = theta[:2]
-    gains = theta[model.parts][model.lag + 2 :: 3]
-    slopes = [[0.5 / (np.pi * period), 1.0, -((period / gain) ** 2)] for gain in gains.tolist()]
-    by_theta = np.diag([-((period / g) ** 2), period / g, period, *[period, 1.0][: model.lag], *np.ravel(slopes)])
-    by_theta[1, 0] = -delta * period / g**2
-    if model.lag == 2:
-        by_theta[3, 3:5] = 0.5 * period / theta[4], -0.5 * period * theta[3] / theta[4] ** 2
-    return by_theta, np.array([2.0, 1.0, 1.0, *[1.0, 0.0][: model.lag], *model.modes * [-1.0, 0.0, 2.0]])
-
-
 def _delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.ndarray]:
     """By how much an amplifier delays slow forces, and its derivatives; no more than forces are known."""
     late, by = theta[3:4].sum() if order else 0.0, np.eye(2)[0, :order]
@@ -167,41 +217,6 @@ def _read_lag(theta: np.ndarray, order: int) -> np.ndarray:
     lag = theta[3 : 3 + order].copy()
     lag[:1] /= 2.0 * lag[1] if order == 2 else 1.0
     return lag
-
-
-def list_poles(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
-    """Poles and residues of ``A(s) (1/(s (s + delta)) + sum of modes)`` but for ``1/(s (s + delta))``.
-
-    Those of the amplifier, -delta behind one, and two of each mode: frequency, damping ratio and ``m/m_i``.
-    """
-    late, gains = (list(each) for each in amplify(lag))
-    poles, weights = list(late), [gain / pole / (pole + delta) for pole, gain in zip(late, gains, strict=True)]
-    if late:
-        poles, weights = [*poles, -delta + 0j], [*weights, -sum(weights)]
-    for turns, ratio, share in modes:
-        own = find_roots(turns, ratio)
-        for k, (pole, gain) in enumerate(zip(late, gains, strict=True)):
-            weights[k] = weights[k] + share * gain / (pole - own[0]) / (pole - own[1])
-        for pole, other in (own, own[::-1]):
-            poles.append(pole)
-            behind = sum(gain / (pole - each) for each, gain in zip(late, gains, strict=True)) if late else 1.0
-            weights.append(share * behind / (pole - other))
-    return poles, weights
-
-
-def amplify(lag: Sequence[Any] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poles and residues of A, along the first axis, by its time constant and damping ratio; none without them."""
-    if len(lag) == 0:
-        return np.zeros(0), np.zeros(0)
-    poles = find_roots(1.0 / lag[0], lag[1]) if len(lag) == 2 else np.array([-1.0 / lag[0] + 0j])
-    return poles, np.prod(-poles, 0) / (poles - poles[::-1] if len(lag) == 2 else np.ones_like(poles))
-
-
-def find_roots(w: Any, ratio: Any) -> np.ndarray:
-    """Of ``s^2 + 2 zeta w s + w^2``, along the first axis; a double one is parted a little."""
-    inside = ratio**2 - 1.0
-    root = np.sqrt(np.where(np.abs(inside) > _DOUBLE, inside, _DOUBLE) + 0j)
-    return np.array([w * (-ratio + root), w * (-ratio - root)])
 
 
 def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:

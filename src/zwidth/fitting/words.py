@@ -4,27 +4,39 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.device_fit import DeviceFit
-from zwidth.fitting.fit_records import RivalDevice
+from zwidth.fitting.device_fit import DeviceFit, RivalDevice
 from zwidth.fitting.safe_wall import SafeWall, bears_resonances
 from zwidth.parts.paths import spell_estimate
-from zwidth.words import rotation
-from zwidth.words.formatting import plain, round_safely, with_unit
+from zwidth.words.formatting import name_wall, plain, round_safely, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
+from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 from zwidth.words.status import Status
 
 SYMBOLS = {
     "mass": "m",
     "damping": "b",
     "delay": "t_d",
-    "cutoff": "f_c",
     "friction": "F_c",
     "stiffness_max": "K_max",
+}
+# SI units of a linear device.
+_UNITS = {
+    "mass": "kg",
+    "damping": "N s/m",
+    "delay": "s",
+    "stiffness": "N/m",
+    "stiffness_max": "N/m",
+    "friction": "N",
+    "offset": "N",
+    "force": "N",
+    "position": "m",
+    "resolution": "m",
+    "time_constant": "s",
+    "frequency": "Hz",
 }
 # What a status says of a fit; the doubts say more.
 _TROUBLES = {
@@ -38,33 +50,21 @@ _TRY_MORE = "try walls of more damping"
 NO_WALL = "under a doubt no safe wall is given, and none to set; do what it says, and record again"
 
 
-class AxisUnits(NamedTuple):
-    """SI units of an axis."""
-
-    mass: str
-    damping: str
-    stiffness: str
-    force: str
-    position: str
-
-    def spell(self, name: str, value: float, digits: int = 4) -> str:
-        """A value of a fit for people."""
-        units = {
-            **self._asdict(),
-            "delay": "s",
-            "time_constant": "s",
-            "cutoff": "Hz",
-            "frequency": "Hz",
-            "friction": self.force,
-            "offset": self.force,
-            "stiffness_max": self.stiffness,
-        }
-        unit = units.get(name.rpartition(".")[2], "")
-        return with_unit(value, unit, digits) if unit else plain(value, digits)
+def unit_of(name: str) -> str:
+    """The SI unit of a value of a fit, "" where it has none."""
+    return own_unit(_UNITS.get(name.rpartition(".")[2], ""))
 
 
-LINEAR = AxisUnits("kg", "N s/m", "N/m", "N", "m")
-ROTARY = AxisUnits(*(rotation.ROTARY[unit] for unit in LINEAR))
+@in_own_units
+def list_units(fit: DeviceFit) -> dict[str, str]:
+    """Those of a fit, by the name of what has them."""
+    return {name: unit_of(name) for name in ("mass", "damping", "stiffness", "force", "position")}
+
+
+def spell(name: str, value: float, digits: int = 4) -> str:
+    """A value of a fit for people."""
+    unit = _UNITS.get(name.rpartition(".")[2], "")
+    return with_unit(value, unit, digits) if unit else plain(value, digits)
 
 
 class WallChoice(NamedTuple):
@@ -93,7 +93,8 @@ def choose_wall(fit: DeviceFit, rigid: bool = False) -> WallChoice | None:
     return WallChoice(RECOMMENDED_SHARE * safe.stiffness, safe.virtual_damping, share)
 
 
-def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[tuple[str, str]]:
+@in_own_units
+def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     """Each line's label and its text, what is wrong first."""
     rows = []
     if fit.status != Status.OK:
@@ -102,47 +103,49 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     if any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
         count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
         rows.append(("of it", f"{count:,} of {total:,} samples, the first ones; more would only narrow the errors"))
-    beside = [name for name in fit.numbers if name.startswith(("actuator", "modes"))]
-    names = ("mass", "damping", "delay", *(["cutoff"] if "cutoff" in fit.errors else []), *beside, "stiffness_max")
-    for name in names:
-        symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS.get(name) or _name_part(name, len(fit.modes))
+    for name in (*fit.numbers, "stiffness_max"):
+        symbol = "J" if name == "mass" and is_rotary() else SYMBOLS.get(name) or _name_part(name, len(fit.modes))
         known = math.isfinite(fit.value_of(name))
-        rows.append((symbol, f"{_spell(fit, name, units)} ({_between(fit, name, units)})" if known else "open"))
+        rows.append((symbol, f"{_spell(fit, name)} ({_between(fit, name)})" if known else "open"))
     if math.isfinite(fit.virtual_damping):
-        B, error = (units.spell("damping", value) for value in (fit.virtual_damping, fit.virtual_damping_error))
+        B, error = (spell("damping", value) for value in (fit.virtual_damping, fit.virtual_damping_error))
         rows.append(("at B", f"{B} (standard error {error})"))
-    rows += _explain_parts(fit, units)
+    for name, label in (("friction", "friction"), ("offset", "constant force")):
+        if name in fit.errors:
+            known = math.isfinite(fit.errors[name])
+            bar = _between(fit, name) if known else "open: this log does not tell friction from a constant force"
+            rows.append((label, f"{_spell(fit, name)} ({bar})"))
     if isinstance(fit.noise, tuple):
         rows.append(("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in fit.noise)))
     else:
-        rows.append(("position noise", units.spell("position", fit.noise, 3)))
+        rows.append(("position noise", spell("position", fit.noise, 3)))
         if fit.resolution:
-            rows.append(("step of the encoder", units.spell("position", fit.resolution, 3)))
-    rows += [("or as well", spell_rival(rival, units)) for rival in fit.rivals]
+            rows.append(("step of the encoder", spell("position", fit.resolution, 3)))
+    rows += [("or as well", spell_rival(rival)) for rival in fit.rivals]
     if fit.lag is not None:
         names = ("time_constant", "delay", "stiffness_max")
-        lag, delay, K = (units.spell(name, value, 3) for name, value in zip(names, fit.lag, strict=True))
+        lag, delay, K = (spell(name, value, 3) for name, value in zip(names, fit.lag, strict=True))
         rows.append(("or as well", f"an amplifier's lag of up to {lag}, with t_d = {delay} and K_max = {K}"))
     safe, wall = fit.safe_wall(), choose_wall(fit)
     if safe.status == Status.OK and safe.stiffness > 0:
         borne = "stable on 99 % of the devices that these records allow"
-        rows.append(("safe wall", f"{_spell_wall(safe, units)}: {borne}"))
+        rows.append(("safe wall", f"{_spell_wall(safe)}: {borne}"))
     if fit.is_doubted:
         rows.append(("no wall", NO_WALL))
     if wall is not None:
-        rows.append(("set", f"{_spell_wall(wall, units)}: {wall.why}"))
-    rows += [("doubt", doubt) for doubt in list_doubts(fit, units)]
+        rows.append(("set", f"{_spell_wall(wall)}: {wall.why}"))
+    rows += [("doubt", doubt) for doubt in fit.doubts]
     if not fit.is_doubted and (rigid := choose_wall(fit, rigid=True)) not in (None, wall):
         at = "" if math.isnan(safe.resonance) else f" near {with_unit(safe.resonance, 'Hz', 3)}"
         hidden = f"a resonance{at} may make stiffer walls unstable, K_max too, and not show in this log: {_SEE_MORE}"
         if fit.damping_tried is not None:
             hidden = f"a resonance may make other walls unstable, K_max too, and not show in these: {_TRY_MORE}"
         alone = "if nothing hides" if fit.is_structured else "if it is rigid"
-        rows += [("not seen", hidden), (alone, f"{_spell_wall(rigid, units)}: {rigid.why}")]
+        rows += [("not seen", hidden), (alone, f"{_spell_wall(rigid)}: {rigid.why}")]
     if fit.next is not None:
         step = fit.next
-        B, K = units.spell("damping", step.virtual_damping, 3), units.spell("stiffness", step.stiffness, 3)
-        errors = [units.spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards)]
+        B, K = spell("damping", step.virtual_damping, 3), spell("stiffness", step.stiffness, 3)
+        errors = [spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards)]
         text = f"K at B = {B}, near {K} and {with_unit(step.frequency, 'Hz', 3)}"
         if math.isfinite(fit.stiffness_error + step.error_afterwards):
             text += f": K_max's standard error falls from {' to '.join(errors)}"
@@ -152,11 +155,11 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
 
 def _name_part(name: str, count: int) -> str:
     """The label of a number of the amplifier or of one of so many resonances."""
-    part, *place, number = name.split(".")
-    if number in ("time_constant", "frequency"):
-        return (
-            "amplifier's lag" if part == "actuator" else f"resonance {int(place[0]) + 1 if count > 1 else ''}".rstrip()
-        )
+    _, *place, number = name.split(".")
+    if number == "time_constant":
+        return "amplifier's lag"
+    if number == "frequency":
+        return f"resonance {int(place[0]) + 1}" if count > 1 else "resonance"
     return f"  its {number.replace('_', ' ')}"
 
 
@@ -168,38 +171,28 @@ def name_trouble(fit: DeviceFit) -> str:
     return "" if status == Status.OK else _TROUBLES.get(status, status.message)
 
 
-def list_doubts(fit: DeviceFit, units: AxisUnits) -> list[str]:
-    """The doubts of a fit in the units of its axis."""
-    if units is not ROTARY:
-        return list(fit.doubts)
-    return [doubt.replace("N s/m", ROTARY.damping).replace("N/m", ROTARY.stiffness) for doubt in fit.doubts]
-
-
-def spell_rival(rival: RivalDevice, units: AxisUnits = LINEAR) -> str:
+def spell_rival(rival: RivalDevice) -> str:
     """Its numbers in a line."""
-    parts = {SYMBOLS[name]: units.spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
-    parts |= {} if rival.cutoff is None else {SYMBOLS["cutoff"]: units.spell("cutoff", rival.cutoff)}
-    parts |= {_name_part(name, 1).strip(): units.spell(name, value) for name, value in (rival.parts or {}).items()}
-    parts[SYMBOLS["stiffness_max"]] = units.spell("stiffness", rival.stiffness_max)
+    parts = {SYMBOLS[name]: spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
+    parts |= {_name_part(name, 1).strip(): spell(name, value) for name, value in (rival.parts or {}).items()}
+    parts[SYMBOLS["stiffness_max"]] = spell("stiffness", rival.stiffness_max)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 
 
-def _spell_wall(wall: SafeWall | WallChoice, units: AxisUnits) -> str:
+def _spell_wall(wall: SafeWall | WallChoice) -> str:
     # Rounded up it might no longer be what is said of it.
-    K = units.spell("stiffness", round_safely(wall.stiffness, "below"))
-    B = units.spell("damping", wall.virtual_damping)
-    return f"K = {K}, B = {B}"
+    return name_wall(round_safely(wall.stiffness, "below"), wall.virtual_damping)
 
 
-def _spell(fit: DeviceFit, name: str, units: AxisUnits) -> str:
+def _spell(fit: DeviceFit, name: str) -> str:
     """A value with so many digits that its interval shows."""
-    return units.spell(name, fit.value_of(name), _count_digits(fit, name))
+    return spell(name, fit.value_of(name), _count_digits(fit, name))
 
 
-def _between(fit: DeviceFit, name: str, units: AxisUnits) -> str:
+def _between(fit: DeviceFit, name: str) -> str:
     if not math.isfinite(sum(fit.intervals[name])):
         return "open"
-    low, high = (units.spell(name, end, _count_digits(fit, name)) for end in fit.intervals[name])
+    low, high = (spell(name, end, _count_digits(fit, name)) for end in fit.intervals[name])
     return f"95 % between {low} and {high}"
 
 
@@ -207,15 +200,6 @@ def _count_digits(fit: DeviceFit, name: str) -> int:
     value, bar = abs(fit.value_of(name)), fit.intervals[name]
     known = value / (bar.high - bar.low) if bar.high > bar.low else 1.0
     return min(max(4, 2 + math.ceil(math.log10(known))), 9) if known > 0 and math.isfinite(known) else 4
-
-
-def _explain_parts(fit: DeviceFit, units: AxisUnits) -> Iterable[tuple[str, str]]:
-    """Friction and constant force of a log."""
-    for part, label in (("friction", "friction"), ("offset", "constant force")):
-        if part in fit.errors:
-            known = math.isfinite(fit.errors[part])
-            bar = _between(fit, part, units) if known else "open: this log does not tell friction from a constant force"
-            yield label, f"{_spell(fit, part, units)} ({bar})"
 
 
 def _write(fit: DeviceFit, name: str) -> str:
@@ -227,33 +211,32 @@ def _write(fit: DeviceFit, name: str) -> str:
     return repr(float(f"{value:.{min(max(digits, 4), 12)}g}"))
 
 
-def _write_part(fit: DeviceFit, name: str, units: AxisUnits) -> str:
-    """A number of an amplifier or a resonance."""
-    key = name.rpartition(".")[2]
-    unit = {"time_constant": " s", "frequency": " Hz", "mass": f" {units.mass}"}.get(key, "")
-    return f"{key}: {_write(fit, name)}{unit} # fitted, {_between(fit, name, units)}"
+def _write_part(fit: DeviceFit, name: str) -> str:
+    """A number of a section of the scene."""
+    text = f"{name.rpartition('.')[2]}: {_write(fit, name)} {unit_of(name)}".rstrip()
+    return f"{text} # fitted, {_between(fit, name)}"
 
 
-def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[str]:
+@in_own_units
+def write_scene(fit: DeviceFit, source: str) -> list[str]:
     """A configuration for `zwidth run` in which every number says where it is from."""
-    lines = [f"# Fitted to {source}: {_between(fit, 'stiffness_max', units)} for K_max."]
+    lines = [f"# Fitted to {source}: {_between(fit, 'stiffness_max')} for K_max."]
     if fit.status != Status.OK:
         lines.append(f"# {Status(fit.status).name}: do not rely on these numbers: {name_trouble(fit)}.")
-    lines += [f"# Doubt: {doubt}" for doubt in list_doubts(fit, units)]
+    lines += [f"# Doubt: {doubt}" for doubt in fit.doubts]
     lines += ["version: 1", "name: fitted_device", "scene:"]
-    for key, unit in (("mass", units.mass), ("damping", units.damping), ("delay", "s")):
-        lines.append(f"  {key}: {_write(fit, key)} {unit} # fitted, {_between(fit, key, units)}")
+    lines += [f"  {_write_part(fit, key)}" for key in fit.numbers[:3]]
     lines.append(f"  period: {fit.period!r} s # as given")
     if fit.actuator is not None:
         lines += ["  actuator:", f"    order: {fit.actuator.order} # fitted"]
-        lines += [f"    {_write_part(fit, name, units)}" for name in fit.numbers if name.startswith("actuator")]
+        lines += [f"    {_write_part(fit, name)}" for name in fit.numbers if name.startswith("actuator")]
     lines += ["  modes:"] if fit.modes else []
     for k in range(len(fit.modes)):
-        parts = [_write_part(fit, name, units) for name in fit.numbers if name.startswith(f"modes.{k}.")]
+        parts = [_write_part(fit, name) for name in fit.numbers if name.startswith(f"modes.{k}.")]
         lines += [f"    {'-' if j == 0 else ' '} {part}" for j, part in enumerate(parts)]
     for key, section in spell_estimate(fit.velocity, every=True).items():
         inside = ", ".join(f"{name}: {json.dumps(value).strip(chr(34))}" for name, value in section.items())
-        lines.append(f"  {key}: {{{inside}}} # {'its cut-off fitted' if 'cutoff' in fit.errors else 'as given'}")
+        lines.append(f"  {key}: {{{inside}}} # as given")
     if fit.is_doubted:
         lines += [f"studies: [] # {NO_WALL}"]
     else:
@@ -262,13 +245,13 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
             alone = "these parts alone" if fit.is_structured else "a rigid device"
             lines += [
                 f"# As of {alone}. A resonance that the log does not show may make walls unstable,",
-                f"# if they are stiffer than {_spell_wall(safe, units)}: {_SEE_MORE}.",
+                f"# if they are stiffer than {_spell_wall(safe)}: {_SEE_MORE}.",
             ]
         lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
     if fit.friction and math.isfinite(fit.errors["friction"]):
-        friction = f"{_write(fit, 'friction')} {units.force}, {_between(fit, 'friction', units)}"
+        friction = f"{_write(fit, 'friction')} {unit_of('friction')}, {_between(fit, 'friction')}"
         lines.append(f"# For studies of kind simulate: coulomb: {friction}.")
     if fit.resolution:
         resolution = float(f"{fit.resolution:.12g}")
-        lines.append(f"# For studies of kind simulate: resolution: {resolution!r} {units.position}.")
+        lines.append(f"# For studies of kind simulate: resolution: {resolution!r} {unit_of('position')}.")
     return lines

@@ -25,12 +25,13 @@ from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.evidence import gather_evidence
-from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
+from zwidth.fitting.words import describe_fit, unit_of, write_scene
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, plain, with_unit
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.rotation import in_own_units
 from zwidth.words.status import Status
 
 # Times of a log and the period may differ so much, as a share.
@@ -225,10 +226,6 @@ class FitStudy(ComputedStudy):
             yield ("buzz",), problem(what, "m, b and t_d need two", remedy, on_key=True)
 
     @property
-    def units(self) -> AxisUnits:
-        return ROTARY if any(motion.rotary for motion in self._motions) else LINEAR
-
-    @property
     def extent(self) -> str:
         parts = [f"{len(self.log)} log{'' if len(self.log) == 1 else 's'}"] if self.log else []
         return " and ".join(parts + ([f"{len(self.buzz)} walls that buzzed"] if self.buzz else []))
@@ -238,18 +235,18 @@ class FitStudy(ComputedStudy):
         return sum(motion.position.size for motion in self._motions) + len(self.buzz or ())
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        fits, units = self._fit(), self.units
-        gathered = [gather_evidence(each.fit, each.source, each.points, units) for each in fits]
+        fits = self._fit()
+        gathered = [gather_evidence(each.fit, each.source, each.points) for each in fits]
         below = {name: stack([tables[name] for tables in gathered]) for name in ("boundary", "walls")}
         evidence = {**gathered[0], **below}
         documents = {f"{self.name}_{name}.csv": csv_text(table) for name, table in evidence.items()}
         for each in fits:
             middle = f"_{each.name}" if len(fits) > 1 else ""
-            text = "\n".join(write_scene(each.fit, each.source, units))
+            text = "\n".join(write_scene(each.fit, each.source))
             documents[f"{self.name}{middle}_scene.yaml"] = text + "\n"
         answers, notes = [], []
         for each in fits:
-            rows = describe_fit(each.fit, each.source, units)
+            rows = describe_fit(each.fit, each.source)
             said = dict(rows)
             trouble = [f"{label}: {text}" for label, text in rows[:1] if each.fit.status != Status.OK]
             labels = [label for label in _DEVICE if label in said and (label != "friction" or each.fit.friction)]
@@ -262,7 +259,7 @@ class FitStudy(ComputedStudy):
         step = next((each.fit.resolution for each in fits if each.fit.motions), 0.0)
         draw = partial(figures.draw_device_fit, **evidence, step=step)
         return Outcome(
-            table=stack([_tabulate(each, units) for each in fits]),
+            table=stack([_tabulate(each.fit, each.source) for each in fits]),
             figures={"": draw},
             documents=documents,
             answer=tuple(answers),
@@ -292,20 +289,17 @@ _DEVICE = ("m", "J", "b", "t_d", "friction")
 _LABELS = ("m", "J", "b", "t_d", "K_max", "set", "no wall", "fitted to")
 
 
-def _tabulate(each: _Fitted, units: AxisUnits) -> dict[str, Any]:
+@in_own_units
+def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
     """One row: every number with its standard error and its 95 % interval."""
-    fit = each.fit
-    row: dict[str, Any] = {"fitted_to": each.source, "status": Status(fit.status).name}
-    of = {"mass": units.mass, "damping": units.damping, "delay": "s", "stiffness_max": units.stiffness}
-    of_part = {"time_constant": "s", "frequency": "Hz", "damping_ratio": "", "mass": units.mass}
-    of |= {name: of_part[name.rpartition(".")[2]] for name in fit.numbers if name.startswith(("actuator", "modes"))}
-    of |= {name: units.force for name in ("friction", "offset") if name in fit.errors}
+    row: dict[str, Any] = {"fitted_to": source, "status": Status(fit.status).name}
     errors = fit.errors | {"stiffness_max": fit.stiffness_error}
-    for name, unit in of.items():
+    of_log = [name for name in ("friction", "offset") if name in errors]
+    for name in (*fit.numbers[:3], "stiffness_max", *fit.numbers[3:], *of_log):
         ends = fit.intervals[name]
         numbers = {"": fit.value_of(name), "_error": errors[name], "_low": ends.low, "_high": ends.high}
-        row |= {header(name + end, unit): value for end, value in numbers.items()}
-    return row | {header("offset", units.force): fit.offset, header("resolution", units.position): fit.resolution}
+        row |= {header(name + end, unit_of(name)): value for end, value in numbers.items()}
+    return row | {header(name, unit_of(name)): getattr(fit, name) for name in ("offset", "resolution")}
 
 
 def _compare(one: DeviceFit, other: DeviceFit) -> str:

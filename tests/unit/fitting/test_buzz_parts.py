@@ -7,8 +7,7 @@ from measured_devices import OTHERS, PERIOD, OtherDevice, TrueDevice
 import zwidth
 from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import Onsets
-from zwidth.fitting.scenes import name_numbers, scene_of
-from zwidth.fitting.stiffness_estimate import in_si
+from zwidth.fitting.device_estimate import differentiate, name_numbers, scene_of
 from zwidth.fitting.words import choose_wall, describe_fit, write_scene
 from zwidth.words.status import Status
 
@@ -35,7 +34,7 @@ def differ(function, theta):
 @pytest.mark.parametrize("lag, modes", KINDS)
 def test_what_is_needed_is_that_of_the_sampled_device(lag, modes):
     onsets, theta = lay_out(lag, modes)
-    scene = scene_of(in_si(theta, PERIOD, lag, modes)[0], PERIOD, VELOCITY, lag, modes)
+    scene = onsets.normalize(theta).to_scene(PERIOD, VELOCITY)
     at = circle(np.array([1e-3, 0.05, 0.3, 0.72, 1.9, 3.0]))
     found, wanted = onsets.answer(theta).jet(at), scene.loop.roots.required_wall(at)
     np.testing.assert_allclose(found.value, wanted.value, rtol=1e-12)
@@ -52,10 +51,13 @@ def test_walls_and_numbers_move_with_theta_as_their_derivatives_say(lag, modes):
 
     slopes = onsets.follow(theta).slopes()
     np.testing.assert_allclose(slopes, differ(follow, theta), rtol=1e-6, atol=1e-8 * np.abs(slopes).max())
-    values, by_theta = in_si(theta, PERIOD, lag, modes)
-    found = differ(lambda theta: in_si(theta, PERIOD, lag, modes)[0], theta)
+
+    def to_numbers(theta):
+        return onsets.normalize(theta).to_numbers(PERIOD)
+
+    values, by_theta, found = to_numbers(theta), differentiate(to_numbers, theta), differ(to_numbers, theta)
     np.testing.assert_allclose(by_theta, found, rtol=1e-7, atol=1e-7 * np.abs(values).max())
-    scene = scene_of(values, PERIOD, VELOCITY, lag, modes)
+    scene = scene_of(values, PERIOD, VELOCITY, lag)
     own = scene.parameters()
     np.testing.assert_allclose([own[name] for name in name_numbers(scene)], values, rtol=1e-15)
 
@@ -149,7 +151,7 @@ def test_a_lag_and_a_resonance_that_explain_walls_alike_leave_no_wall_to_set():
     assert "resonance = 65.6" in dict(describe_fit(fit, "walls"))["or as well"]
     # The wall to measure next is one that the two do not have alike.
     values = [rival.mass, rival.damping, rival.delay, *rival.parts.values()]
-    other = scene_of(values, PERIOD, VELOCITY, 0, 1)
+    other = scene_of(values, PERIOD, VELOCITY)
     assert float(other.max_stiffness().stiffness) == pytest.approx(rival.stiffness_max, rel=1e-9)
     assert fit.next is not None
     assert fit.actuator is not None

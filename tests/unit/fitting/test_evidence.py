@@ -9,7 +9,6 @@ import zwidth
 from zwidth import figures
 from zwidth.fitting.buzz import BuzzPoint
 from zwidth.fitting.evidence import correlate_residuals, gather_evidence, trace_boundary
-from zwidth.fitting.safe_wall import draw_devices
 from zwidth.fitting.words import choose_wall, describe_fit, write_scene
 
 HEARD = tuple(BuzzPoint(*wall) for wall in ((6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)))
@@ -112,7 +111,7 @@ def test_the_wall_to_set_is_softer_where_k_max_is_hardly_known(heard):
 
 
 def test_the_error_of_the_best_damping_is_that_of_devices_drawn(heard):
-    drawn = draw_devices(replace(heard, covariance=0.01 * heard.covariance), 3000, 1)
+    drawn = replace(heard, covariance=0.01 * heard.covariance).draw(3000)
     assert drawn is not None
     rate = drawn[:, 0] / 1e-3
     best = rate * zwidth.alpha_max(drawn[:, 1] / rate, drawn[:, 2] / 1e-3).beta

@@ -8,11 +8,11 @@ from measured_devices import PERIOD, TrueDevice
 
 import zwidth
 from zwidth.fitting.choosing import choose_structure
-from zwidth.fitting.device_rows import DeviceRows
 from zwidth.fitting.hidden import HiddenResonances, weigh_resonances
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import fit_model
-from zwidth.fitting.structure import to_scene
+from zwidth.fitting.required_wall import DeviceRows
+from zwidth.fitting.structure import Recordings
 
 SKIP, DELAY = 22, 1.3e-3
 SCENES = {
@@ -45,10 +45,10 @@ def play(modes, encoder, seed=0, count=2000):
 
 def test_what_a_resonance_makes_of_the_stiffest_wall_is_that_of_the_scene_with_it(monkeypatch):
     _, force, position = play((), 1e-4)
-    best = fit_model((Recording(force, position[SKIP:], SKIP),), 20, 1e-4)
-    best, _, banks, _ = choose_structure(best, 20, 1e-4)
+    best = fit_model(Recordings((Recording(force, position[SKIP:], SKIP),), resolution=1e-4))
+    best, _, banks, _ = choose_structure(best)
     velocity = zwidth.BackwardDifference()
-    scene = to_scene(best.model, best.theta, PERIOD, velocity)
+    scene = best.model.to_scene(best.theta, PERIOD, velocity)
     share, places = 0.05, [(0, 300), (0, 360), (1, 45), (2, 50)]
     ends = np.cumsum([0, *(bank.frequency.size for bank in banks)])
     rows = np.array([ends[k] + j for k, j in places])
@@ -58,9 +58,8 @@ def test_what_a_resonance_makes_of_the_stiffest_wall_is_that_of_the_scene_with_i
     ratios = found.stiffness_max
     for ratio, (k, j) in zip(ratios, places, strict=True):
         # The other numbers move as the log asks with such a resonance in it.
-        moved = to_scene(
-            best.model, best.theta - share * np.append(banks[k].absorbed[:3, j], np.zeros(4)), PERIOD, velocity
-        )
+        theta = best.theta - share * np.append(banks[k].absorbed[:3, j], np.zeros(4))
+        moved = best.model.to_scene(theta, PERIOD, velocity)
         mode = zwidth.Mode(banks[k].frequency[j] / PERIOD, banks[k].ratio, scene.device.mass / share)
         there = replace(moved, device=replace(moved.device, modes=(mode,)))
         exact = there.max_stiffness(negative_damping=False).stiffness / scene.max_stiffness().stiffness

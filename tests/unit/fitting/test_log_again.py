@@ -8,8 +8,9 @@ import tolerances
 from scipy.optimize import least_squares
 
 import zwidth
-from zwidth.fitting.moving import Recording, Recordings
+from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import FittedModel
+from zwidth.fitting.structure import Recordings
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -98,9 +99,9 @@ def test_errors_know_the_encoder_where_residuals_hide_it(share):
     # At rest the start takes up what the encoder errs: so little is left that its waves alone exceed it.
     force = push_to_and_fro(np.random.default_rng(2), 200)
     theta = np.array([PERIOD**2 / 0.075, PERIOD * 0.6 / 0.075, 2.3, 0.0, 0.0, 0.0, 1e-16])
-    model = Recordings((Recording(force, np.zeros(178), SKIP),))
+    model = Recordings((Recording(force, np.zeros(178), SKIP),), resolution=STEP)
     squares = [part * (178 - 7) * STEP**2 / 12 for part in (share, 1.0)]
-    few, usual = (np.diag(FittedModel(model, theta, size, True, STEP).covariance) for size in squares)
+    few, usual = (np.diag(FittedModel(model, theta, size, True).covariance) for size in squares)
     np.testing.assert_allclose(few, usual, rtol=1e-9)
 
 

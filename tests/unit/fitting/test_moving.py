@@ -5,7 +5,8 @@ import pytest
 import tolerances
 
 import zwidth
-from zwidth.fitting.moving import Recording, Recordings
+from zwidth.fitting.moving import Recording
+from zwidth.fitting.structure import Recordings
 
 EXACT = tolerances.FIT_EXACT.float64
 PERIOD, FINER, SKIP = 1e-3, 20, 6

@@ -7,8 +7,9 @@ import pytest
 
 import bench_fit
 import zwidth
-from zwidth.fitting.moving import Recording, Recordings
+from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import FittedModel
+from zwidth.fitting.structure import Recordings
 from zwidth.words.status import Status
 
 SKIP = bench_fit.SKIP
@@ -91,11 +92,11 @@ def test_a_rival_is_as_many_errors_away_as_its_squares_say(lag, expected):
     noisy = model.predict(theta)[0] + 1e-6 * random.standard_normal(400)
     model = Recordings((Recording(force, noisy, SKIP),))
     squares = float(np.sum((noisy - model.predict(theta)[0]) ** 2))
-    alone = FittedModel(model, theta, squares, True, 0.0)
+    alone = FittedModel(model, theta, squares, True)
     # By slopes it is 50 errors away in each of two numbers.
     away = np.zeros(7)
     away[[1, 6]] = 50.0 * np.sqrt(np.diag(alone.covariance)[[1, 6]])
-    rival = FittedModel(model, theta + away, squares * np.exp(lag / 400), True, 0.0)
+    rival = FittedModel(model, theta + away, squares * np.exp(lag / 400), True)
     widened = replace(alone, rivals=(rival,)).covariance
     if expected is None:
         np.testing.assert_array_equal(widened, alone.covariance)
