@@ -5,7 +5,7 @@ The number of steps is fixed, so that no point of a batch waits for another, and
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -198,11 +198,22 @@ def follow_root(
     return follow(frozen(root, xp), *known)
 
 
-def integrate(function: Callable[[Array], Array], low: Array, high: Array, nodes: int) -> Array:
-    """The integral of a function of points along a new last axis."""
-    xp = namespace(low)
-    node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(nodes))
-    width = high - low
-    points = low[..., None] + width[..., None] * (0.5 * (node + 1.0))
+def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes: Sequence[int]) -> Array:
+    """The integral of a function of points along a new last axis, piece by piece between edges.
+
+    All points of all pieces are asked for at once, so that the function is compiled once.
+    """
+    xp = namespace(*edges)
+    points, rules = [], []
+    for low, high, count in zip(edges[:-1], edges[1:], nodes, strict=True):
+        node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(count))
+        width = high - low
+        points.append(low[..., None] + width[..., None] * (0.5 * (node + 1.0)))
+        rules.append((width, weight))
     # Of no width: the values are finite and do not matter.
-    return 0.5 * width * xp.sum(function(points) * weight, axis=-1)
+    values = function(xp.concatenate(points, axis=-1))
+    total, start = 0.0, 0
+    for (width, weight), count in zip(rules, nodes, strict=True):
+        total = total + 0.5 * width * xp.sum(values[..., start : start + count] * weight, axis=-1)
+        start += count
+    return total
