@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import along, frozen, namespace, repeat
+from zwidth.arrays.xp import along, frozen, namespace, push_moving, repeat
 from zwidth.words.types import Array
 
 Function = Callable[[Array], Array]
@@ -187,14 +187,14 @@ def follow_root(
     def follow(root: Array, *known: Any) -> Array:
         return root
 
-    @follow.defjvp
-    def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
         x, known = follow(*primals), primals[1:]
-        value, change = jax.jvp(lambda *known: function(x, *known), known, tangents[1:])
+        value, change = push_moving(lambda *known: function(x, *known), known, tangents[1:])
         rate = (slope or differentiate)(x, *known)
         taken = usable(*frozen((x, rate, value / xp.where(rate == 0, 1.0, rate)), xp))
         return x, xp.where(taken, -change / xp.where(taken, rate, 1.0), 0.0)
 
+    follow.defjvp(rule, symbolic_zeros=True)
     return follow(frozen(root, xp), *known)
 
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward
+from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward, push_moving
 from zwidth.loops.rigid.device import (
     ANY,
     GAP,
@@ -125,7 +125,6 @@ def _jax_ridge() -> Any:
 
     function = jax.custom_jvp(solve, nondiff_argnums=(3, 4))
 
-    @function.defjvp
     def rule(delay_model: str, kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
         # s moves by this rule again: hence right to any order.
         ridge = function(*primals, delay_model, kind)
@@ -133,8 +132,9 @@ def _jax_ridge() -> Any:
         def moving(plant: Plant, lag: Array) -> Ridge:
             return Ridge(*follow(ridge.s, plant, lag, delay_model, kind), ridge.last)
 
-        return ridge, jax.jvp(moving, primals[:2], tangents[:2])[1]
+        return ridge, push_moving(moving, primals[:2], tangents[:2])[1]
 
+    function.defjvp(rule, symbolic_zeros=True)
     return function
 
 
