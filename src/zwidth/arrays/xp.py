@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from functools import cache
 from math import factorial
 from typing import Any, TypeVar
 
@@ -140,6 +141,23 @@ def epsilon(value: Any) -> float:
 
 def horner(x: Any, coefficients: Sequence[Any]) -> Any:
     """A polynomial, lowest power first, by Horner's rule."""
+    if is_jax(x) and all(isinstance(coefficient, float) for coefficient in coefficients):
+        return _polynomial(tuple(coefficients))(x)
+    return _horner(x, coefficients)
+
+
+@cache
+def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
+    """A fixed polynomial for JAX, which reads it once; its slope is a polynomial too, however many derivatives ask."""
+    import jax
+
+    function = jax.custom_jvp(jax.jit(lambda x: _horner(x, coefficients)))
+    slope = tuple(k * coefficient for k, coefficient in enumerate(coefficients))[1:] or (0.0,)
+    function.defjvp(lambda x, change: (function(*x), _polynomial(slope)(*x) * change[0]))
+    return function
+
+
+def _horner(x: Any, coefficients: Sequence[Any]) -> Any:
     total = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
         total = total * x + coefficient
