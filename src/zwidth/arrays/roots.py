@@ -6,6 +6,7 @@ The number of steps is fixed, so that no point of a batch waits for another, and
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import gcd
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -201,19 +202,27 @@ def follow_root(
 def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes: Sequence[int]) -> Array:
     """The integral of a function of points along a new last axis, piece by piece between edges.
 
-    All points of all pieces are asked for at once, so that the function is compiled once.
+    JAX takes equally many points at a time: the function is compiled once, and its arrays stay in caches.
     """
     xp = namespace(*edges)
-    points, rules = [], []
+    points, weights = [], []
     for low, high, count in zip(edges[:-1], edges[1:], nodes, strict=True):
         node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(count))
-        width = high - low
-        points.append(low[..., None] + width[..., None] * (0.5 * (node + 1.0)))
-        rules.append((width, weight))
-    # Of no width: the values are finite and do not matter.
-    values = function(xp.concatenate(points, axis=-1))
-    total, start = 0.0, 0
-    for (width, weight), count in zip(rules, nodes, strict=True):
-        total = total + 0.5 * width * xp.sum(values[..., start : start + count] * weight, axis=-1)
-        start += count
-    return total
+        width = (high - low)[..., None]
+        points.append(low[..., None] + width * (0.5 * (node + 1.0)))
+        weights.append(0.5 * width * weight)
+
+    def add_up(place: Array, weight: Array) -> Array:
+        # Of no width: the values are finite and do not matter.
+        return xp.sum(function(place) * weight, axis=-1)
+
+    if xp is np or len(nodes) == 1:
+        return sum(map(add_up, points, weights))
+    from jax.lax import map as map_in_turn
+
+    together = gcd(*nodes)
+    parts = [
+        xp.stack([part[..., k : k + together] for part in of for k in range(0, part.shape[-1], together)])
+        for of in (points, weights)
+    ]
+    return xp.sum(map_in_turn(lambda part: add_up(*part), tuple(parts)), axis=0)
