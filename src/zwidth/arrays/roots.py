@@ -205,24 +205,22 @@ def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes:
     JAX takes equally many points at a time: the function is compiled once, and its arrays stay in caches.
     """
     xp = namespace(*edges)
-    points, weights = [], []
+    pieces, together = [], gcd(*nodes)
     for low, high, count in zip(edges[:-1], edges[1:], nodes, strict=True):
         node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(count))
-        width = (high - low)[..., None]
-        points.append(low[..., None] + width * (0.5 * (node + 1.0)))
-        weights.append(0.5 * width * weight)
+        width = high - low
+        points = low[..., None] + width[..., None] * (0.5 * (node + 1.0))
+        size = count if xp is np else together
+        cuts = [slice(k, k + size) for k in range(0, count, size)]
+        pieces += [(points[..., cut], 0.0 * low[..., None] + weight[..., cut], 0.5 * width) for cut in cuts]
 
-    def add_up(place: Array, weight: Array) -> Array:
+    def add_up(piece: tuple[Array, Array, Array]) -> Array:
+        points, weight, half = piece
         # Of no width: the values are finite and do not matter.
-        return xp.sum(function(place) * weight, axis=-1)
+        return half * xp.sum(function(points) * weight, axis=-1)
 
-    if xp is np or len(nodes) == 1:
-        return sum(map(add_up, points, weights))
+    if xp is np or len(pieces) == 1:
+        return sum(map(add_up, pieces))
     from jax.lax import map as map_in_turn
 
-    together = gcd(*nodes)
-    parts = [
-        xp.stack([part[..., k : k + together] for part in of for k in range(0, part.shape[-1], together)])
-        for of in (points, weights)
-    ]
-    return xp.sum(map_in_turn(lambda part: add_up(*part), tuple(parts)), axis=0)
+    return xp.sum(map_in_turn(add_up, tuple(map(xp.stack, zip(*pieces, strict=True)))), axis=0)
