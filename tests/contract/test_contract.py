@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
-from compiling import QUICKLY
 from mpmath import mpf
 
 import oracles
 import zwidth
 from contract.cases import CASES, OTHERS
-from contract.traced import ROWS, ask, batch, compiled, fixed_of, has_gradient, in_float64
+from contract.traced import ROWS, ask, batch, compiled, family_of, fixed_of, has_gradient, in_float32, in_float64
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import Status
 
@@ -275,12 +274,7 @@ def test_without_x64_float32_is_computed_in_and_the_statuses_agree(case):
     columns, _ = batch(case, beyond=False)
     columns = [np.float32(column) for column in columns]
     direct = directly(case, [np.float64(column) for column in columns])
-
-    def function(*values):
-        return case.leaves(case.call(**dict(zip(case.free, values, strict=True)), **fixed_of(case)))
-
-    result = jax.jit(function, compiler_options=QUICKLY)(*map(jnp.asarray, columns))
-    for name, value in result.items():
+    for name, value in in_float32(family_of(case.name))[case.name].items():
         assert value.dtype in (jnp.float32, jnp.complex64, jnp.bool_, jnp.int32), name
         if value.dtype.kind in "fc":
             np.testing.assert_allclose(value, direct[name], rtol=case.single, atol=case.single, err_msg=name)

@@ -39,21 +39,51 @@ def fixed_of(case):
     return {name: case.arguments[name][0] for name in case.concrete}
 
 
-@cache
+# Of one kernel: compiled together, what they share is compiled once.
+FAMILIES = [("spectral_radius", "decay_rate"), ("passivity_margin", "is_passive")]
+
+
+def family_of(name):
+    return next((names for names in FAMILIES if name in names), (name,))
+
+
+def leaves_at(case, point):
+    return case.leaves(case.call(**dict(zip(case.free, point, strict=True)), **fixed_of(case)))
+
+
 def compiled(case_name):
     """The case inside jit, vmap and grad at once, where it has a gradient, in float64: what comes out for its batch."""
-    case = next(case for case in CASES if case.name == case_name)
+    return lambda columns: compiled_family(family_of(case_name))(columns)[case_name]
 
+
+@cache
+def compiled_family(names):
+    cases = [next(case for case in CASES if case.name == name) for name in names]
+    return jax.jit(
+        jax.vmap(lambda point: {case.name: with_gradient(case)(point) for case in cases}), compiler_options=QUICKLY
+    )
+
+
+def with_gradient(case):
     def values(point):
-        leaves = case.leaves(case.call(**dict(zip(case.free, point, strict=True)), **fixed_of(case)))
+        leaves = leaves_at(case, point)
         # Of one point: complex numbers and lists of numbers are added up, and so are many results, for a sweep back
         # from each of them compiles for long.
         real = {name: v for name, v in leaves.items() if v.dtype.kind in "fc"}
         sums = {name: jnp.sum(jnp.abs(v)) if v.ndim or v.dtype.kind == "c" else v for name, v in real.items()}
         return (sums if len(sums) <= 3 else {"all": sum(map(jnp.abs, sums.values()))}), leaves
 
-    function = jax.jacrev(values, has_aux=True) if has_gradient(case) else lambda point: values(point)[1]
-    return jax.jit(jax.vmap(function), compiler_options=QUICKLY)
+    return jax.jacrev(values, has_aux=True) if has_gradient(case) else lambda point: values(point)[1]
+
+
+@cache
+def in_float32(names):
+    """The leaves of each case of a family at `batch` without what is beyond."""
+    cases = [next(case for case in CASES if case.name == name) for name in names]
+    columns = [jnp.asarray(np.float32(column)) for column in batch(cases[0], beyond=False)[0]]
+    return jax.jit(lambda *point: {case.name: leaves_at(case, point) for case in cases}, compiler_options=QUICKLY)(
+        *columns
+    )
 
 
 @cache

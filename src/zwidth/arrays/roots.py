@@ -5,12 +5,13 @@ The number of steps is fixed, so that no point of a batch waits for another, and
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from math import gcd
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import along, frozen, namespace, repeat
+from zwidth.arrays.xp import along, frozen, namespace, push_moving, repeat
 from zwidth.words.types import Array
 
 Function = Callable[[Array], Array]
@@ -187,22 +188,39 @@ def follow_root(
     def follow(root: Array, *known: Any) -> Array:
         return root
 
-    @follow.defjvp
-    def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
         x, known = follow(*primals), primals[1:]
-        value, change = jax.jvp(lambda *known: function(x, *known), known, tangents[1:])
+        value, change = push_moving(lambda *known: function(x, *known), known, tangents[1:])
         rate = (slope or differentiate)(x, *known)
         taken = usable(*frozen((x, rate, value / xp.where(rate == 0, 1.0, rate)), xp))
         return x, xp.where(taken, -change / xp.where(taken, rate, 1.0), 0.0)
 
+    follow.defjvp(rule, symbolic_zeros=True)
     return follow(frozen(root, xp), *known)
 
 
-def integrate(function: Callable[[Array], Array], low: Array, high: Array, nodes: int) -> Array:
-    """The integral of a function of points along a new last axis."""
-    xp = namespace(low)
-    node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(nodes))
-    width = high - low
-    points = low[..., None] + width[..., None] * (0.5 * (node + 1.0))
-    # Of no width: the values are finite and do not matter.
-    return 0.5 * width * xp.sum(function(points) * weight, axis=-1)
+def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes: Sequence[int]) -> Array:
+    """The integral of a function of points along a new last axis, piece by piece between edges.
+
+    JAX takes equally many points at a time: the function is compiled once, and its arrays stay in caches.
+    """
+    xp = namespace(*edges)
+    pieces, together = [], gcd(*nodes)
+    for low, high, count in zip(edges[:-1], edges[1:], nodes, strict=True):
+        node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(count))
+        width = high - low
+        points = low[..., None] + width[..., None] * (0.5 * (node + 1.0))
+        size = count if xp is np else together
+        cuts = [slice(k, k + size) for k in range(0, count, size)]
+        pieces += [(points[..., cut], 0.0 * low[..., None] + weight[..., cut], 0.5 * width) for cut in cuts]
+
+    def add_up(piece: tuple[Array, Array, Array]) -> Array:
+        points, weight, half = piece
+        # Of no width: the values are finite and do not matter.
+        return half * xp.sum(function(points) * weight, axis=-1)
+
+    if xp is np or len(pieces) == 1:
+        return sum(map(add_up, pieces))
+    from jax.lax import map as map_in_turn
+
+    return xp.sum(map_in_turn(add_up, tuple(map(xp.stack, zip(*pieces, strict=True)))), axis=0)

@@ -114,6 +114,21 @@ def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes:
     return tree_map(lambda result: np.imag(result) / _STEP, function(*moved))
 
 
+def push_moving(function: Callable[..., Any], values: tuple[Any, ...], changes: tuple[Any, ...]) -> tuple[Any, Any]:
+    """`jax.jvp` in a rule of ``symbolic_zeros``: what does not move costs nothing."""
+    import jax
+
+    leaves, tree = jax.tree.flatten(values)
+    sides = jax.tree.leaves(changes)
+    moving = [k for k, side in enumerate(sides) if not isinstance(side, jax.custom_derivatives.SymbolicZero)]
+
+    def of_moving(*moved: Any) -> Any:
+        known = dict(zip(moving, moved, strict=True))
+        return function(*tree.unflatten([known.get(k, leaf) for k, leaf in enumerate(leaves)]))
+
+    return jax.jvp(of_moving, tuple(leaves[k] for k in moving), tuple(sides[k] for k in moving))
+
+
 def along(values: np.ndarray, like: Any) -> Any:
     """Values along a new last axis behind those of ``like``, and of its type."""
     return namespace(like).asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))
@@ -126,6 +141,23 @@ def epsilon(value: Any) -> float:
 
 def horner(x: Any, coefficients: Sequence[Any]) -> Any:
     """A polynomial, lowest power first, by Horner's rule."""
+    if is_jax(x) and all(isinstance(coefficient, float) for coefficient in coefficients):
+        return _polynomial(tuple(coefficients))(x)
+    return _horner(x, coefficients)
+
+
+@cache
+def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
+    """A fixed polynomial for JAX, which reads it once; its slope is a polynomial too, however many derivatives ask."""
+    import jax
+
+    function = jax.custom_jvp(jax.jit(lambda x: _horner(x, coefficients)))
+    slope = tuple(k * coefficient for k, coefficient in enumerate(coefficients))[1:] or (0.0,)
+    function.defjvp(lambda x, change: (function(*x), _polynomial(slope)(*x) * change[0]))
+    return function
+
+
+def _horner(x: Any, coefficients: Sequence[Any]) -> Any:
     total = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
         total = total * x + coefficient

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import check_scalars, evaluate
+from zwidth.arrays.evaluate import check_scalars, compile_traced, evaluate
 from zwidth.arrays.xp import namespace
 from zwidth.loops.normalization import Normalized, normalize, quantity_status
 from zwidth.loops.rigid.device import DelayClasses, classify_delays
@@ -140,7 +140,11 @@ def sensitivities(
 
 def _sensitivities_kernel(mass, damping, period, delay, delta, d, delay_model, kind) -> Sensitivities:
     xp = namespace(mass, delta, d)
-    found = slopes_kernel(delta, d, delay_model, kind)
+    if xp is np:
+        found = slopes_kernel(delta, d, delay_model, kind)
+    else:
+        # Its slopes are found once, in delta and d, and not once more for each quantity.
+        found = compile_traced(slopes_kernel, (delay_model, kind))(delta, d)
     # An array's entry beyond the range of its quantity is NaN in delta or d; the quantities tell why.
     given = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
     status = xp.where(given == Status.OK, found.point.status, given).astype(np.int32)

@@ -323,5 +323,5 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
 
     # From a corner back to alpha = 0 along alpha + 2 beta = const.
     last = xp.where(curve.to_corner, wall(end, curve).alpha, 0.0)
-    under_lobe = integrate(rise, 0.0 * end, end, _LOBE_NODES)
+    under_lobe = integrate(rise, (0.0 * end, end), (_LOBE_NODES,))
     return under_lobe + 0.25 * last * last + nan_with_nan_slopes(valid_device(delta, d), delta, d)

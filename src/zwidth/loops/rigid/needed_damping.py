@@ -172,7 +172,7 @@ def needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClasses = ANY
     a_in, beta_in = xp.where(inside, a, 0.0), xp.where(inside, beta, 1.0)
     f_in = xp.where(inside, delay.f, 0.5)
     delay_in = Delay(f_in, delay.k, 4.0 * f_in * (1.0 - f_in))
-    u = frozen(peak(a_in, beta_in, delay_in, xp.where(inside, rise, 1.0)), xp)
+    u = peak(*frozen((a_in, beta_in, delay_in, xp.where(inside, rise, 1.0)), xp))
     here = condition(u, a_in, beta_in, delay_in)
     # One more step, as its effect on the height: with it the second derivatives are right too.
     curvature = frozen(xp.where(here.bend < 0, here.bend * here.root / here.needed, -1.0), xp)

@@ -278,7 +278,7 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
     safe_d = xp.where(ok, d, 1.0)
     unit = 1.0 / (safe_d + 0.5)
     # Where the kinks lie does not matter to the first order.
-    first, last = (xp.arctan(t * frozen(unit, xp)) for t in frozen(directions(safe_d), xp))
+    first, last = (xp.arctan(t * frozen(unit, xp)) for t in directions(frozen(safe_d, xp)))
     end = 0.5 * np.pi + 0.0 * safe_d
 
     def share(theta: Array) -> Array:
@@ -286,6 +286,5 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
         alpha = xp.maximum(xp.cos(theta), 0.0) * unit[..., None]
         return needed_damping(alpha, xp.sin(theta), safe_d[..., None] + 0.0 * theta) ** -2
 
-    edges = (-end, first, last, end)
-    parts = [integrate(share, edges[i], edges[i + 1], nodes) for i, nodes in enumerate(_PASSIVE_NODES)]
-    return 0.5 * delta * delta * unit * (parts[0] + parts[1] + parts[2]) + nan_with_nan_slopes(ok, delta, d)
+    inverse_squares = integrate(share, (-end, first, last, end), _PASSIVE_NODES)
+    return 0.5 * delta * delta * unit * inverse_squares + nan_with_nan_slopes(ok, delta, d)

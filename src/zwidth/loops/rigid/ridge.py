@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward
+from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward, push_moving, store_once
 from zwidth.loops.rigid.device import (
     ANY,
     GAP,
@@ -125,7 +125,6 @@ def _jax_ridge() -> Any:
 
     function = jax.custom_jvp(solve, nondiff_argnums=(3, 4))
 
-    @function.defjvp
     def rule(delay_model: str, kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
         # s moves by this rule again: hence right to any order.
         ridge = function(*primals, delay_model, kind)
@@ -133,8 +132,9 @@ def _jax_ridge() -> Any:
         def moving(plant: Plant, lag: Array) -> Ridge:
             return Ridge(*follow(ridge.s, plant, lag, delay_model, kind), ridge.last)
 
-        return ridge, jax.jvp(moving, primals[:2], tangents[:2])[1]
+        return ridge, push_moving(moving, primals[:2], tangents[:2])[1]
 
+    function.defjvp(rule, symbolic_zeros=True)
     return function
 
 
@@ -238,7 +238,7 @@ def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses =
     def move(change: Plant) -> Array:
         return push_forward(lambda plant: wall(at, expand_curve(plant))[0], (plant,), (change,), xp)
 
-    by_delta, by_d = map(move, plant_slopes(delta, f))
+    by_delta, by_d = map(move, store_once(plant_slopes(delta, f), ridge.s))
     if delay_model == "fractional_power":
         by_d = -8.0 * at.y * at.half * at.per_sin * (ridge.beta + 0.5 * ridge.alpha)
         by_d = xp.where(ridge.s >= 1.0, -np.inf, by_d)
@@ -283,7 +283,7 @@ def _solve_ridge(
         plant = held_plant(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
     else:
         plant = held_plant(delta)
-    ridge = differentiable_ridge(plant, whole, start, delay_model, kind)
+    ridge = store_once(differentiable_ridge(plant, whole, start, delay_model, kind), delta)
     return ridge, status, plant, whole, (delta, f)
 
 
