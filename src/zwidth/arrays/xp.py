@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, reduce
 from math import factorial
 from typing import Any, TypeVar
 
@@ -141,9 +141,13 @@ def epsilon(value: Any) -> float:
 
 def horner(x: Any, coefficients: Sequence[Any]) -> Any:
     """A polynomial, lowest power first, by Horner's rule."""
-    if is_jax(x) and all(isinstance(coefficient, float) for coefficient in coefficients):
+    # Asked in this order for the sake of single walls.
+    if not isinstance(x, _HOST_TYPES) and is_jax(x) and all(isinstance(each, float) for each in coefficients):
         return _polynomial(tuple(coefficients))(x)
-    return _horner(x, coefficients)
+    total = coefficients[-1]
+    for coefficient in reversed(coefficients[:-1]):
+        total = total * x + coefficient
+    return total
 
 
 @cache
@@ -151,17 +155,12 @@ def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
     """A fixed polynomial for JAX, which reads it once; its slope is a polynomial too, however many derivatives ask."""
     import jax
 
-    function = jax.custom_jvp(jax.jit(lambda x: _horner(x, coefficients)))
-    slope = tuple(k * coefficient for k, coefficient in enumerate(coefficients))[1:] or (0.0,)
+    if len(coefficients) == 1:
+        return lambda x: jax.numpy.full_like(x, *coefficients)
+    function = jax.custom_jvp(jax.jit(lambda x: reduce(lambda total, each: total * x + each, reversed(coefficients))))
+    slope = tuple(k * coefficient for k, coefficient in enumerate(coefficients))[1:]
     function.defjvp(lambda x, change: (function(*x), _polynomial(slope)(*x) * change[0]))
     return function
-
-
-def _horner(x: Any, coefficients: Sequence[Any]) -> Any:
-    total = coefficients[-1]
-    for coefficient in reversed(coefficients[:-1]):
-        total = total * x + coefficient
-    return total
 
 
 def roots(*values: Any) -> tuple[Any, ...]:
