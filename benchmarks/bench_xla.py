@@ -115,7 +115,7 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     def top(a: Any, b: Any) -> Any:
         return ridge.ridge_kernel(a, b, "held", ANY)
 
-    wide = xp.WIDE
+    wide = xp.known_options(xp.WIDE)
     yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
     yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
     few = (delta[:8192], d[:8192])
