@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from zwidth.words.formatting import with_unit
+from zwidth.words.formatting import round_safely, with_unit
 from zwidth.words.rotation import in_own_units, is_rotary, wrap_methods
 from zwidth.words.status import Status
 
@@ -129,7 +129,9 @@ def _spell_number(value: Any, unit: Unit) -> str:
     if unit in _BARE or not (value == 0 or 1e-12 < abs(value) < 1e12):
         # A zero has no sign.
         return f"{float(value) + 0.0:.6g} {'' if unit == '1' else unit}".strip()
-    number, _, rest = with_unit(float(value), unit, 6).partition(" ")
+    # Most stiffnesses are the largest of which something holds.
+    value = round_safely(float(value), "below" if unit == "N/m" else "", 6)
+    number, _, rest = with_unit(value, unit, 6).partition(" ")
     return f"{float(number):.6g} {rest}"
 
 

@@ -1,5 +1,6 @@
 """Results at the prompt and in notebooks: short, with units and names, and every NaN explained."""
 
+import re
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -117,6 +118,13 @@ def test_poles_are_a_table_of_poles():
 )
 def test_values_in_words(value, unit, text):
     assert spell_value(value, unit) == text
+
+
+def test_the_largest_stiffness_is_not_shown_larger():
+    wall = SCENE.max_stiffness()
+    for stiffness in 19876.5432 * np.geomspace(1.0, 10.0, 40):
+        shown = re.search(r"stiffness=([0-9.]+) kN/m", repr(wall._replace(stiffness=stiffness))).group(1)
+        assert 0 <= stiffness - 1e3 * float(shown) <= 1e-5 * stiffness
 
 
 def test_what_jax_traces_is_shown_as_it_is():
