@@ -136,7 +136,7 @@ CASES = [
         {"alpha": [0.3, 0.1, 0.05]},
     ),
     of_devices("alpha_max", zwidth.alpha_max),
-    of_devices("stable_area", zwidth.stable_area, derivatives=1),
+    of_devices("stable_area", zwidth.stable_area),
     of_devices("passive_area", zwidth.passive_area, single=1e-5),
     Case(
         "stiffness_slope", zwidth.stiffness_slope, {"d": [0.0, 1.0, 2.5]}, {"d": -1.0}, {"d": 1e6}, domain="d 0 to 1e5"

@@ -1,8 +1,10 @@
 """Areas against the outlined region, a Monte Carlo count of poles, and Colgate's triangle."""
 
+import jax
 import mpmath as mp
 import numpy as np
 import pytest
+from compiling import QUICKLY
 from mpmath import mpf
 
 import oracles
@@ -79,6 +81,22 @@ def test_the_passive_area_lies_between_two_polygons():
 def test_passive_walls_are_fewer_than_stable_ones():
     delta, d = np.array(POINTS).T
     assert np.all(passive_area(delta, d) < stable_area(delta, d))
+
+
+def test_second_derivatives_of_the_stable_area(x64):
+    # Ends at alpha = 0 and at a corner, below one period and beyond; not at whole delays, which have kinks.
+    points, step = (
+        np.array([(0.0, 0.2), (0.3, 0.5), (3.0, 0.9), (40.0, 0.2), (0.1, 1.3), (20.0, 2.6), (2.0, 50.25)]),
+        1e-5,
+    )
+    slopes = jax.vmap(jax.grad(lambda point: stable_area(*point)))
+    bends = jax.jit(jax.vmap(jax.jacfwd(jax.grad(lambda point: stable_area(*point)))), compiler_options=QUICKLY)(points)
+    slopes = jax.jit(slopes, compiler_options=QUICKLY)
+    for k, side in enumerate(np.eye(2)):
+        up, down = points + step * side, np.maximum(points - step * side, 0.0)
+        change = (np.asarray(slopes(up)) - np.asarray(slopes(down))) / (up - down)[:, k : k + 1]
+        # At delta = 0 the difference is to one side.
+        np.testing.assert_allclose(np.asarray(bends)[:, k], change, rtol=1e-4, atol=1e-6)
 
 
 def test_bad_points_are_nan():

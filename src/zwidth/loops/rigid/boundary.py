@@ -295,9 +295,8 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
         Array of the broadcast shape; NaN out of range.
 
     Numerics:
-        Gauss-Legendre quadrature of the closed form, about 1e-13. Traceable, with first derivatives: the area does
-        not change to first order when the ends of the lobe move, so they count as fixed; second derivatives are not
-        right.
+        Gauss-Legendre quadrature of the closed form, about 1e-13. Traceable, with first and second derivatives; at
+        whole d those in d are from the right.
 
     References:
         Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, section V.
@@ -314,6 +313,10 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
     curve = lobe(delta, d, "held", kind)
     end = frozen(curve.end, xp)
+    if xp is not np:
+        # It moves as the zero of alpha does, which the second derivatives of the area ask for; a corner stays.
+        at = wall(end, curve)
+        end = end - xp.where(curve.to_corner, 0.0, at.alpha / frozen(xp.where(curve.to_corner, 1.0, at.d_alpha), xp))
     # For many places of each lobe.
     at_places = tree_map(lambda value: None if value is None else value[..., None], curve)
 
