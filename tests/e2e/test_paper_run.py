@@ -154,7 +154,8 @@ def test_the_recommendation_is_the_library_s_in_si_units(phantom):
     assert 0.0 < best["settling_time"] < 0.1
     text = (phantom.folder / "recommendation.md").read_text(encoding="utf-8")
     assert "19.86 kN/m" in text
-    assert "14.90 kN/m" in text
+    # Rounded down: 14.90 would be stiffer.
+    assert "14.89 kN/m" in text
 
 
 def test_the_phantom_run_makes_every_file(phantom):

@@ -135,7 +135,8 @@ def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
     center = at(xp.ones_like(alpha))
     # With a share more: where the two bounds meet rounding has a say.
     reached = 1.0001 * xp.sqrt(squared_distance(center, alpha, beta, here))
-    start, end = apply_each(at, [1.0 + reached, xp.maximum(1.0 - reached, 1e-9)], xp)
+    start, end = apply_each(at, [1.0 + reached, xp.where(reached < 1.0, 1.0 - reached, 1.0)], xp)
+    end = xp.where(reached < 1.0, end, np.pi)
     # With room: the wall's own phase may rise by a quarter turn meanwhile.
     turn = 3.0 * np.pi / (here.whole + 0.5)
     low = xp.minimum(xp.maximum(start, center - turn), center)

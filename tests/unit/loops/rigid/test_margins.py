@@ -191,6 +191,13 @@ def test_the_modulus_margin_of_long_delay_and_strong_damping():
     assert found.modulus_margin == pytest.approx(0.0002142985, abs=1e-10)
 
 
+def test_the_modulus_margin_of_a_wall_that_is_next_to_nothing():
+    # Least where L is negative, far behind the crossover.
+    found = zwidth.margins(1e-8, 0.49993896484375, 1e12, 1.0)
+    assert 0.999 < found.modulus_margin < 1.0
+    assert found.modulus_frequency == pytest.approx(0.5 * np.pi, abs=0.01)
+
+
 def test_no_frequency_comes_closer():
     random = np.random.default_rng(6)
     for _ in range(400):
