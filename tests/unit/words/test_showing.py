@@ -1,6 +1,5 @@
 """Results at the prompt and in notebooks: short, with units and names, and every NaN explained."""
 
-import re
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -123,7 +122,7 @@ def test_values_in_words(value, unit, text):
 def test_the_largest_stiffness_is_not_shown_larger():
     wall = SCENE.max_stiffness()
     for stiffness in 19876.5432 * np.geomspace(1.0, 10.0, 40):
-        shown = re.search(r"stiffness=([0-9.]+) kN/m", repr(wall._replace(stiffness=stiffness))).group(1)
+        shown = repr(wall._replace(stiffness=stiffness)).partition("stiffness=")[2].partition(" kN/m")[0]
         assert 0 <= stiffness - 1e3 * float(shown) <= 1e-5 * stiffness
 
 
