@@ -141,8 +141,7 @@ def epsilon(value: Any) -> float:
 
 def horner(x: Any, coefficients: Sequence[Any]) -> Any:
     """A polynomial, lowest power first, by Horner's rule."""
-    # Asked in this order for the sake of single walls.
-    if not isinstance(x, _HOST_TYPES) and is_jax(x) and all(isinstance(each, float) for each in coefficients):
+    if is_jax(x) and all(isinstance(each, float) for each in coefficients):
         return _polynomial(tuple(coefficients))(x)
     total = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):

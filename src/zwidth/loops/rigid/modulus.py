@@ -36,14 +36,20 @@ def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tu
     each argument principal and continuous in w, so that the phase needs no unwrapping.
     """
     xp = namespace(w, alpha)
-    half, cos_half = xp.sin(0.5 * w), xp.cos(0.5 * w)
-    u, s = 2.0 * half * half, 2.0 * half * cos_half
-    wall_re, wall_im = alpha + beta * u, beta * s
-    m_re, m_im = 2.0 * (here.a2 + here.a0) * cos_half * cos_half - here.gap, (here.a2 - here.a0) * s
+    _, _, u, s, (wall_re, wall_im), (m_re, m_im) = _factors(w, alpha, beta, here)
     top = (wall_re * wall_re + wall_im * wall_im) * (m_re * m_re + m_im * m_im)
     size = xp.sqrt(top / (2.0 * u * (here.em * here.em + 2.0 * here.c * u)))
     phase = xp.arctan2(wall_im, wall_re) + xp.arctan2(m_im, m_re) + xp.arctan2(here.em - u, s)
     return size, phase - (here.whole + 0.5) * w
+
+
+def _factors(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Any, ...]:
+    """sin and cos of w/2, u, s, and the parts of W and of M."""
+    xp = namespace(w, alpha)
+    sine, cosine = xp.sin(0.5 * w), xp.cos(0.5 * w)
+    u, s = 2.0 * sine * sine, 2.0 * sine * cosine
+    m_re = 2.0 * (here.a2 + here.a0) * cosine * cosine - here.gap
+    return sine, cosine, u, s, (alpha + beta * u, beta * s), (m_re, (here.a2 - here.a0) * s)
 
 
 def gain_frequency(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array, Array]:
@@ -66,11 +72,8 @@ def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> 
     With h = sin(w/2), the functions of the sampled delay and of w/2 are all that is not arithmetic.
     """
     xp = namespace(w, alpha)
-    half = 0.5 * w
-    sine, cosine, lag = xp.sin(half), xp.cos(half), (2.0 * here.whole + 1.0) * half
-    u, s = 2.0 * sine * sine, 2.0 * sine * cosine
-    wall_re, wall_im = alpha + beta * u, beta * s
-    m_re, m_im = 2.0 * (here.a2 + here.a0) * cosine * cosine - here.gap, (here.a2 - here.a0) * s
+    lag = (2.0 * here.whole + 1.0) * (0.5 * w)
+    sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = _factors(w, alpha, beta, here)
     re, im = wall_re * m_re - wall_im * m_im, wall_re * m_im + wall_im * m_re
     rise = here.em - u
     re, im = re * s - im * rise, re * rise + im * s
@@ -83,12 +86,11 @@ def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> 
 def _slope_and_bend(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
     """Half the first and half the second derivative of `squared_distance`, by those of log L."""
     xp = namespace(w, alpha)
-    sine, cosine, half_lag = xp.sin(0.5 * w), xp.cos(0.5 * w), here.whole + 0.5
-    u, s, c = 2.0 * sine * sine, 2.0 * sine * cosine, xp.cos(w)
+    half_lag, c = here.whole + 0.5, xp.cos(w)
+    sine, cosine, u, s, wall, m = _factors(w, alpha, beta, here)
     z, lag = c + 1j * s, xp.cos(half_lag * w) - 1j * xp.sin(half_lag * w)
-    wall, wall_slope = alpha + beta * u + 1j * (beta * s), beta * (s + 1j * c)
+    wall, m, wall_slope = wall[0] + 1j * wall[1], m[0] + 1j * m[1], beta * (s + 1j * c)
     total, moved = here.a2 + here.a0, here.a2 - here.a0
-    m = 2.0 * total * cosine * cosine - here.gap + 1j * (moved * s)
     # The conjugate of Z, whose derivative is z.
     pole = s + 1j * (u - here.em)
     by_wall, by_m, by_pole = wall_slope / wall, (1j * moved * c - total * s) / m, z / pole
