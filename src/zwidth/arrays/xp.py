@@ -141,7 +141,8 @@ def epsilon(value: Any) -> float:
 
 def horner(x: Any, coefficients: Sequence[Any]) -> Any:
     """A polynomial, lowest power first, by Horner's rule."""
-    if is_jax(x) and all(isinstance(each, float) for each in coefficients):
+    # The type is asked here first: a single wall passes here often, and each time would be one call more.
+    if not isinstance(x, _HOST_TYPES) and is_jax(x) and all(isinstance(each, float) for each in coefficients):
         return _polynomial(tuple(coefficients))(x)
     total = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
