@@ -16,6 +16,8 @@ from zwidth.words.quantities import NOT_COMPUTED, OF_PARTS, OUTPUTS, STATUS_OF, 
 if TYPE_CHECKING:
     import xarray
 
+# The color of a panel where it shows nothing.
+MISSING = "#D9D9D9"
 # As many values as one panel, or one of several, resolves; of a finer grid every n-th is drawn.
 _RESOLVED, _RESOLVED_BY_MANY = 1000, 500
 # A grid of more panels than this says nothing on a page: evenly spaced values stand for all.
@@ -175,6 +177,14 @@ def scale_axis(ax: Axes, which: str, values: Any) -> None:
         style.use_logarithmic(ax, which, values, _FEW_DECADES)
     if low < high:
         getattr(ax, f"set_{which}lim")(low, high)
+
+
+def draw_cells(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, **look: Any) -> Any:
+    """A cell round each point of (y, x); the frame, whose axes are scaled, cuts those at the ends in half."""
+    limits = ax.get_xlim(), ax.get_ylim()
+    image = ax.pcolormesh(find_edges(x), find_edges(y), values, shading="flat", rasterized=True, **look)
+    ax.set(xlim=limits[0], ylim=limits[1])
+    return image
 
 
 def label_contours(

@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 
 from zwidth.figures import grid, stable_set, style
 from zwidth.figures.alpha_beta import SHADES
-from zwidth.figures.grid import label_contours
+from zwidth.figures.grid import MISSING, label_contours
 from zwidth.figures.table import Table
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, Output
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 # Gives the outlines of the "stable" and the "passive" walls of a panel, in its units and stiffness first.
 Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, stable_set.Outlines]]"
 
-_MISSING = "#D9D9D9"
 # Numbers whose contour is the boundary of the stable walls, smoother than that of truth values.
 SMOOTH = ("margin", "spectral_radius")
 _SMOOTH = {"stable": SMOOTH, "passive": ("passivity_margin",)}
@@ -138,7 +137,7 @@ def _draw_panel(
 ) -> Any:
     x, y = (part[dim].values for dim in reversed(part[name].dims))
     output = OUTPUTS[name]
-    ax.set_facecolor(_MISSING)
+    ax.set_facecolor(MISSING)
     for which, values in (("x", x), ("y", y)):
         grid.scale_axis(ax, which, values)
     if output.look == "truth":
@@ -155,12 +154,8 @@ def _draw_panel(
 
 
 def _draw_cells(ax: Axes, part: xarray.Dataset, values: Any, **look: Any) -> Any:
-    """A cell round each point; the frame cuts those at the ends in half."""
-    limits = ax.get_xlim(), ax.get_ylim()
-    y, x = (grid.find_edges(part[dim].values) for dim in next(iter(part.data_vars.values())).dims)
-    image = ax.pcolormesh(x, y, values, shading="flat", rasterized=True, **look)
-    ax.set(xlim=limits[0], ylim=limits[1])
-    return image
+    y, x = (part[dim].values for dim in next(iter(part.data_vars.values())).dims)
+    return grid.draw_cells(ax, x, y, values, **look)
 
 
 def _find_peak(part: xarray.Dataset) -> list[float] | None:
@@ -321,9 +316,9 @@ def _explain(axes: np.ndarray, parts: list[xarray.Dataset], name: str, image: An
         what = "passive" if name == "passivity_margin" else "stable"
         handles.append(style.line(f"edge of what is {what}", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):
-        handles.append(Patch(facecolor=_MISSING, label="unstable"))
+        handles.append(Patch(facecolor=MISSING, label="unstable"))
     elif any(part[name].isnull().any() for part in parts):
-        handles.append(Patch(facecolor=_MISSING, label="not computed"))
+        handles.append(Patch(facecolor=MISSING, label="not computed"))
     if any("kind" in part and (part["kind"] == 1).mean() > _SEEN for part in parts):
         handles.append(Patch(facecolor="white", hatch="////", edgecolor="#606060", linewidth=0, label="corner optimum"))
     if any(_find_peak(part) is not None for part in parts):

@@ -24,6 +24,7 @@ from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.words.errors import InputError
 from zwidth.words.rotation import use_kind
+from zwidth.words.status import note_failures
 
 AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 
@@ -230,8 +231,8 @@ class _Run:
             entry = self.record.entry(study.name)
             faults = self.record.faults(study.name)
             if entry is not None and entry["state"] == "done" and not faults:
-                files, answer = (tuple(entry.get(name, ())) for name in ("files", "answer"))
-                self.results.append(StudyResult(study.name, event.kind, "kept", files=files, answer=answer))
+                kept = {name: tuple(entry.get(name, ())) for name in ("files", "notes", "answer")}
+                self.results.append(StudyResult(study.name, event.kind, "kept", **kept))
                 self.tell(replace(event, result=self.results[-1]))
                 continue
             self.repaired += [f"{study.name}: {fault}" for fault in faults if entry and entry["state"] == "done"]
@@ -306,13 +307,16 @@ class _Run:
             sweep = sweeps.results[study.name]
             self.repaired += sweep.repaired
             # A shard that ends last finds the others' chunks done as well.
-            state = "failed" if sweep.failed else "open" if Store(sweep.store).missing() else "done"
+            store = Store(sweep.store)
+            state = "failed" if sweep.failed else "open" if store.missing() else "done"
+            notes = _note_failures(store) if state == "done" else ()
             error = next(iter(sweep.failed.values()), sweeps.lost)
             seconds = time.perf_counter() - clock
             if not self.hopeless:
-                self.record.note({**self._spell_sweep(study, state), "seconds": round(seconds, 3), "error": error})
+                ended = {"seconds": round(seconds, 3), "notes": [*notes], "error": error}
+                self.record.note({**self._spell_sweep(study, state), **ended})
             files = (sweep.store.name,)
-            result = StudyResult(study.name, "sweep", state, seconds, files, error=error, sweep=sweep)
+            result = StudyResult(study.name, "sweep", state, seconds, files, notes, error=error, sweep=sweep)
             self.results.append(result)
             self.tell(StudyEvent(number[study.name], self.total, study.name, "sweep", result))
 
@@ -336,6 +340,11 @@ def _list_inputs(config: Config, names: dict[str, str]) -> dict[str, dict[str, A
             if study.reads_scene and config.scene is not None:
                 found[study.name]["scene"] = _spell(config.scene)
     return found
+
+
+def _note_failures(store: Store) -> tuple[str, ...]:
+    counts = store.count_statuses().items()
+    return tuple(note for family, each in counts for note in note_failures(each, f"{family}s"))
 
 
 def _spell(model: Any) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.figures.stable_set import Outlines, tabulate_sets
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
+from zwidth.loops.rigid.device import valid_device, wall_status
 from zwidth.loops.rigid.passivity import is_passive
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import is_stable
@@ -34,6 +35,7 @@ from zwidth.studies.outcome import (
 )
 from zwidth.studies.ridge import find_edges, needed_models, passive_intervals, passive_outlines, ridge_table
 from zwidth.words.quantities import WALL_RANGE
+from zwidth.words.status import Status, note_failures
 from zwidth.words.types import DelayModel
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
@@ -287,21 +289,30 @@ class MapStudy(ComputedStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         alpha, beta, delta, d = (axis.values() for axis in (self.alpha, self.beta, self.delta, self.d))
         share = share_of_device(self.delta, self.d, scene)
-        outputs = {name: np.empty(tuple(self.sizes.values()), dtype=_TYPES[name]) for name in self.outputs}
+        shape = tuple(self.sizes.values())
+        outputs = {name: np.empty(shape, dtype=_TYPES[name]) for name in self.outputs}
+        status = np.full(shape, Status.OK, np.uint8)
         # One plane at a time: the columns that broadcasting lays out are several times as large as the results.
         for delta_index, d_index in np.ndindex(delta.size, d.size):
             place = (slice(None), slice(None), delta_index, d_index)
+            # As arrays: a device that is out of range has a status, and does not end the study.
+            walls = alpha[:, None], beta[None, :]
+            device = delta[delta_index, None, None], d[d_index, None, None]
             for name in outputs:
-                damping = float(delta[delta_index]) * (share if name == "passive" else 1.0)
-                found = _FUNCTIONS[name](alpha[:, None], beta[None, :], damping, float(d[d_index]))
-                outputs[name][place] = np.asarray(found)
-        arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}
+                damping = device[0] * (share if name == "passive" else 1.0)
+                outputs[name][place] = np.asarray(_FUNCTIONS[name](*walls, damping, device[1]))
+                if outputs[name].dtype == np.float64:
+                    status[place][np.isnan(outputs[name][place])] = Status.NOT_CONVERGED
+            told = wall_status(*walls, *device)
+            np.copyto(status[place], told, where=told != Status.OK, casting="unsafe")
+        arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs, "status": status}
         arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()
 
         def find_edge(name: str, delta: float, d: float) -> Outlines | None:
-            return find_edges(delta * (share if name == "passive" else 1.0), d).get(name)
+            known = valid_device(np.float64(delta), np.float64(d))
+            return find_edges(delta * (share if name == "passive" else 1.0), d).get(name) if known else None
 
         draw = partial(figures.draw_map, arrays)
         drawn = {f"_{name}": partial(draw, name, edges=partial(find_edge, name)) for name in names}
-        return Outcome(arrays=arrays, figures=drawn)
+        return Outcome(arrays=arrays, figures=drawn, notes=note_failures(np.bincount(status.ravel())))

@@ -156,6 +156,18 @@ class Store:
         sums = np.array([checksum(file) for file in files], dtype="<u4")
         write_whole(self.flag(task), sums.tobytes())
 
+    def count_statuses(self) -> dict[str, np.ndarray]:
+        """How many points of each family have each status; those of damaged chunks are not counted."""
+        counts = {family.family: np.zeros(NOT_COMPUTED, int) for family in self.plan.families}
+        for task in self.plan.tasks():
+            family, name = self.plan.family(task.family), STATUS_OF[task.family]
+            file = self.files(task)[family.variables.index(name)]
+            if self.is_done(task) and checksum(file) == self.checksums(task).get(name):
+                with silence_zarr():
+                    status = np.asarray(self._arrays[name][family.place(task.index) or ...])
+                counts[task.family] += np.bincount(status.ravel(), minlength=NOT_COMPUTED)
+        return counts
+
     def forget(self, task: Task) -> None:
         """Take back that a chunk is done."""
         remove_quietly(self.flag(task))

@@ -5,6 +5,7 @@ Traced code cannot raise, and one bad point must not spoil a batch: it gets NaN 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import IntEnum
 
 
@@ -24,6 +25,16 @@ class Status(IntEnum):
     def message(self) -> str:
         """One sentence: the cause, then the remedy."""
         return _MESSAGES[self]
+
+
+def note_failures(counts: Iterable[int], of: str = "points") -> tuple[str, ...]:
+    """A note of how many of a result's points, counted by their status, are not OK, and why; none where all are."""
+    ok, *others = counts
+    failed = [(count, Status(code).name.lower().replace("_", " ")) for code, count in enumerate(others, 1) if count]
+    if not failed:
+        return ()
+    why = ", ".join(f"{count:,} {name}" for count, name in failed)
+    return (f"{sum(others):,} of {ok + sum(others):,} {of} have no answer: {why}",)
 
 
 class Method(IntEnum):

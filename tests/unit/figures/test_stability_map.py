@@ -25,6 +25,26 @@ def test_the_outline_is_drawn_where_the_cells_agree():
         assert not exact(ax)
 
 
+def test_axes_in_equal_ratios_are_logarithmic_and_points_without_an_answer_are_gray():
+    status = np.zeros((30, 30, 1, 1), int)
+    status[0] = 7
+    (ax,) = figures.draw_map(
+        {**fine(), "alpha": np.geomspace(1e-3, 1.0, 30), "delta": np.array([0.1]), "status": status}, "stable"
+    )
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "linear")
+    drawn = ax.collections[0].get_array()
+    np.testing.assert_array_equal(np.ma.getmaskarray(drawn).T, status[:, :, 0, 0] == 7)
+    assert "no answer" in [text.get_text() for legend in ax.figure.legends for text in legend.get_texts()]
+
+
+def test_a_color_means_one_radius_in_all_panels():
+    arrays = grid_map(np.array([0.0, 0.5]))
+    arrays["spectral_radius"] = arrays["spectral_radius"] * np.array([1.0, 0.5])[:, None]
+    one, other = (ax.collections[0].norm for ax in figures.draw_map(arrays, "spectral_radius"))
+    assert (one.vmin, one.vmax) == (other.vmin, other.vmax)
+    assert one.vmin == arrays["spectral_radius"].min()
+
+
 def fine():
     alpha, beta = np.linspace(0.0, 1.0, 30), np.linspace(-1.0, 1.0, 30)
     radius = 0.5 + alpha[:, None] + beta[None] ** 2

@@ -270,12 +270,18 @@ def test_walls_that_a_measured_response_leaves_open_are_undecided(tmp_path):
     device = zwidth.MeasuredDevice(lines, response, 0.1 * np.abs(response))
     device.save(tmp_path / "response.csv")
     config = config_of(study("s", {"period": 1e-3, **WALLS}, ("stable",), device=str(tmp_path / "response.csv")))
-    assert zwidth.run(config, out=tmp_path / "run").ok
+    result = zwidth.run(config, out=tmp_path / "run")
+    assert result.ok
     found = open_dataset(tmp_path / "run")
     told = zwidth.Scene(device, zwidth.Timing(1e-3)).decide_stability(STIFFNESS[:, None], VIRTUAL)
     assert set(told.status.ravel().tolist()) == {Status.OK, Status.UNDECIDED}
     np.testing.assert_array_equal(found.stable, told.stable)
     np.testing.assert_array_equal(found.status, told.status)
+    many, failed = told.status.size, np.count_nonzero(told.status)
+    note = f"{failed} of {many} walls have no answer: {failed} undecided"
+    assert (result.studies[0].notes, zwidth.run(config, out=tmp_path / "run", resume=True).studies[0].notes) == (
+        (note,),
+    ) * 2
 
 
 def test_walls_of_devices_with_parts_that_are_out_of_range_say_so(tmp_path):
