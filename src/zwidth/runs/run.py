@@ -231,7 +231,7 @@ class _Run:
             entry = self.record.entry(study.name)
             faults = self.record.faults(study.name)
             if entry is not None and entry["state"] == "done" and not faults:
-                kept = {name: tuple(entry.get(name, ())) for name in ("files", "notes", "answer")}
+                kept: Any = {name: tuple(entry.get(name, ())) for name in ("files", "notes", "answer")}
                 self.results.append(StudyResult(study.name, event.kind, "kept", **kept))
                 self.tell(replace(event, result=self.results[-1]))
                 continue
