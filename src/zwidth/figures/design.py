@@ -144,7 +144,8 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         _mark_required(ax, curve_drawn, target * factor, value * scale, str(enough), colors[target], spelled)
         for target, value, enough in rows
     ]
-    for name, scaled in (("x", values * scale), ("y", stiffness * factor)):
+    heights = np.append(stiffness, targets)
+    for name, scaled in (("x", values * scale), ("y", heights * factor)):
         style.use_logarithmic(ax, name, scaled, style.DECADES)
     ax.set(
         xlim=(values[0] * scale, values[-1] * scale),

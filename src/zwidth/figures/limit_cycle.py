@@ -23,6 +23,8 @@ _AXES = {
     "coulomb_N": ("dry friction", "F_c", "N"),
 }
 _DIVERGED = 4
+# Up to so many points of a curve are seen one by one.
+_FEW = 12
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
 _BEYOND: dict[str, Any] = {"facecolor": "#D9D9D9", "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
@@ -123,11 +125,13 @@ def draw_limit_cycle_curves(
     amplitudes = cycles["amplitude_m"][buzzes] * factor
     quantities = (("amplitude_m", factor, f"amplitude  in {meter}"), ("frequency_Hz", 1.0, "frequency  in Hz"))
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
+    # A wall that buzzes between two that do not is a dot without a line.
+    dots = {"marker": "o", "markersize": 3.5 if arrays[over].size <= _FEW else 1.25, "clip_on": False}
     for row, (name, times, words) in enumerate(quantities):
         for column, ax in enumerate(panels[row * len(labels) : (row + 1) * len(labels)]):
             for curve, buzz, look in zip(cycles[name][column], buzzes[column], looks, strict=True):
                 shown = np.where(buzz, curve, np.nan) * times
-                ax.plot(arrays[over] * scale, shown, marker=".", markersize=2.5, linewidth=1.0, **look)
+                ax.plot(arrays[over] * scale, shown, linewidth=1.0, **dots, **look)
             grid.scale_axis(ax, "x", arrays[over] * scale)
             for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")

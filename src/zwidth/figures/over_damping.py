@@ -58,7 +58,8 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
 
 
 def _draw_curve(ax: Axes, of: Any, x: Any, y: Any, colors: dict[float, Any], words: str, **look: Any) -> None:
-    """One curve of a delay in its color, dashed in the model of the fractional power."""
+    """One curve of a delay in its color, dashed in the model of the fractional power; a single point is a dot."""
+    look |= {"marker": "o", "clip_on": False} if np.size(x) == 1 else {}
     label = ", ".join([f"{words}, d = {of.d:g}", *([of.delay_model] if hasattr(of, "delay_model") else [])])
     ax.plot(x, y, label=label, **{"color": colors[of.d], "linestyle": style.dash_of(of), "zorder": 3, **look})
 
@@ -107,18 +108,24 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
         _draw_curve(ax, path, path.delta, path.alpha_max, colors, "alpha_max")
         if path.delay_model == "held":
             ax.fill_between(path.delta, 0.0, path.alpha_max, color=colors[path.d], alpha=0.07, linewidth=0.0, zorder=1)
-    ax.set_xlim(float(columns["delta"].min()), end)
-    highest = float(np.nanmax(columns["alpha_max"]))
-    ax.set_ylim(0.0, 1.04 * highest)
+    if columns["delta"].min() < end:
+        ax.set_xlim(float(columns["delta"].min()), end)
     if grid.logarithmic(shown[0].delta):
-        # The stiffest wall grows with the damping, over as many decades.
         style.use_logarithmic(ax, "x", columns["delta"])
-        style.use_logarithmic(ax, "y", columns["alpha_max"])
-        ax.set_ylim(float(np.nanmin(columns["alpha_max"])), 1.2 * highest)
+    _scale_stiffness(ax, shown[0].delta, columns["alpha_max"])
     style.label_ends(ax, shown, [path.alpha_max[-1] for path in shown], colors)
     ax.set(xlabel=style.DELTA_LABEL, ylabel=style.ALPHA_MAX_LABEL)
     if handles := style.delay_model_handles(shown):
         ax.legend(handles=handles, loc="upper left")
+
+
+def _scale_stiffness(ax: Axes, delta: np.ndarray, stiffness: np.ndarray) -> None:
+    """From 0 up; logarithmic where the damping is, with which it grows over as many decades."""
+    highest = float(np.nanmax(stiffness))
+    ax.set_ylim(0.0, 1.04 * highest)
+    if grid.logarithmic(delta):
+        style.use_logarithmic(ax, "y", stiffness)
+        ax.set_ylim(float(np.nanmin(stiffness)), 1.2 * highest)
 
 
 @draws_tables
@@ -201,7 +208,7 @@ def _draw_maxima(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
         _draw_curve(ax, cost, delta, best, colors, "alpha_max")
         _draw_curve(ax, cost, delta, passive, colors, "alpha_max_passive", linestyle=style.DASH_DOTTED)
         ax.fill_between(delta, passive, best, color=colors[cost.d], alpha=0.12, linewidth=0.0, zorder=1)
-    ax.set_ylim(0.0, 1.04 * max(float(np.nanmax(cost.alpha_max)) for cost in costs))
+    _scale_stiffness(ax, costs[0].delta, np.concatenate([[*cost.alpha_max, *cost.alpha_max_passive] for cost in costs]))
     style.label_ends(ax, costs, [cost.alpha_max[-1] for cost in costs], colors)
     ax.set_ylabel(style.ALPHA_LABEL)
     stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")

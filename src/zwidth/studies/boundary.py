@@ -20,7 +20,7 @@ from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.figures.stable_set import Outlines, tabulate_sets
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
-from zwidth.loops.rigid.device import valid_device, wall_status
+from zwidth.loops.rigid.device import wall_status
 from zwidth.loops.rigid.passivity import is_passive
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import is_stable
@@ -295,9 +295,7 @@ class MapStudy(ComputedStudy):
         # One plane at a time: the columns that broadcasting lays out are several times as large as the results.
         for delta_index, d_index in np.ndindex(delta.size, d.size):
             place = (slice(None), slice(None), delta_index, d_index)
-            # As arrays: a device that is out of range has a status, and does not end the study.
-            walls = alpha[:, None], beta[None, :]
-            device = delta[delta_index, None, None], d[d_index, None, None]
+            walls, device = (alpha[:, None], beta[None, :]), (delta[delta_index], d[d_index])
             for name in outputs:
                 damping = device[0] * (share if name == "passive" else 1.0)
                 outputs[name][place] = np.asarray(_FUNCTIONS[name](*walls, damping, device[1]))
@@ -310,8 +308,7 @@ class MapStudy(ComputedStudy):
         names = outputs if min(alpha.size, beta.size) > 1 else ()
 
         def find_edge(name: str, delta: float, d: float) -> Outlines | None:
-            known = valid_device(np.float64(delta), np.float64(d))
-            return find_edges(delta * (share if name == "passive" else 1.0), d).get(name) if known else None
+            return find_edges(delta * (share if name == "passive" else 1.0), d).get(name)
 
         draw = partial(figures.draw_map, arrays)
         drawn = {f"_{name}": partial(draw, name, edges=partial(find_edge, name)) for name in names}

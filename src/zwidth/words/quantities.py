@@ -143,7 +143,7 @@ _PARAMETERS = (
         short_name="delay in periods", definition="t_d/T",
     ),
     Parameter(
-        "delta", "normalized damping of the device, b T/m", r"\delta", NOT_NEGATIVE, slider=(0.0, 5.0),
+        "delta", "normalized damping of the device, b T/m", r"\delta", Range(0.0, LARGEST_DAMPING), slider=(0.0, 5.0),
         short_name="normalized physical damping", definition="b\\,T/m",
     ),
     Parameter(

@@ -160,7 +160,7 @@ def test_configs_are_frozen_and_travel_between_processes():
 
 @pytest.mark.parametrize("text", ["1e-3", "no", "0o7", "0x1F", "~", "", "it: is\nmany", "- µ", "true", "1 kHz"])
 def test_what_is_written_is_read_as_it_was(tmp_path, text):
-    study = {"kind": "ridge", "name": "r", "delta": [1e-7, 1e22, 0.1 + 0.2], "d": 0}
+    study = {"kind": "ridge", "name": "r", "delta": [1e-7, 1e-22, 0.1 + 0.2], "d": 0}
     data = {"version": 1, "name": "n", "description": text, "studies": [study, {**study, "name": "again"}]}
     (tmp_path / "written.yaml").write_text(write_yaml(data), encoding="utf-8")
     read = load_config(tmp_path / "written.yaml")
