@@ -37,6 +37,10 @@ _MOST_STEPS, _ARRIVED = 120, 1e-10
 _SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
 
 
+# Pairs of rows and arcs that are looked at in one go: what they need stays in caches.
+_BLOCK = 1 << 17
+
+
 class Crossings(NamedTuple):
     """Where rows cross the boundary: shape (rows, arcs and lines), NaN where one does not."""
 
@@ -214,6 +218,9 @@ class Boundary:
 
     def borders(self, w: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of the curve at each angle (V18)."""
+        block = max(1, _BLOCK // max(1, len(self.arcs)))
+        if w.size > block:
+            return np.concatenate([self.borders(w[k : k + block]) for k in range(0, w.size, block)])
         here = curve_at(self.loop, w)
         own = self.arc_at(w)
         # By the arc: next to z = -1 the slope at one angle may be rounding.
