@@ -281,9 +281,11 @@ def _norm(parts: list[xarray.Dataset], name: str) -> Any:
     output = OUTPUTS[name]
     low, high = _range(parts, name) or (0.0, 1.0)
     if output.look == "diverging":
-        # As far on the bad side as on the good one: what lies beyond is no better known by its color.
-        good = max(output.center - low if output.below else high - output.center, 1e-6)
-        return TwoSlopeNorm(output.center, output.center - good, output.center + good)
+        # As far on the bad side as on the good one, where there is one: what lies beyond is no better known by its color.
+        sides = [output.center - low, high - output.center]
+        good, bad = sides if output.below else reversed(sides)
+        span = max(good if good > 0 else bad, 1e-6)
+        return TwoSlopeNorm(output.center, output.center - span, output.center + span)
     if output.look in ("logarithmic", "steep"):
         low = max(low, 1e-300)
         high = min(high, _STEEP * low) if output.look == "steep" else high
