@@ -281,7 +281,7 @@ def _norm(parts: list[xarray.Dataset], name: str) -> Any:
     output = OUTPUTS[name]
     low, high = _range(parts, name) or (0.0, 1.0)
     if output.look == "diverging":
-        # As far on the bad side as on the good one, where there is one: what lies beyond is no better known by its color.
+        # As far on the bad side as on the good one, where there is one: beyond, a color would tell no more.
         sides = [output.center - low, high - output.center]
         good, bad = sides if output.below else reversed(sides)
         span = max(good if good > 0 else bad, 1e-6)

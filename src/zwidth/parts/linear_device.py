@@ -149,7 +149,7 @@ def _read(given: Any) -> RationalResponse:
         raise InputError("device: got a sampled system without its period; give it dt, that of the loop, in s")
     try:
         top, bottom = _read_form(given, flint)
-    except (TypeError, ValueError, OverflowError, IndexError) as error:
+    except (TypeError, ValueError, OverflowError, LookupError) as error:
         raise InputError(f"device: got {str(given)[:60]!r}; needed are finite numbers as {_FORMS}") from error
     if not top or bottom.degree() < 1:
         raise InputError("device: got a system that a force does not move; check input and output")

@@ -267,7 +267,11 @@ class SceneAnswers(SceneParts):
 
 def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     """Whether walls with B < 0 count: by default only where B acts on the plain difference of two samples."""
-    return isinstance(scene.velocity, BackwardDifference) if negative_damping is None else bool(negative_damping)
+    if negative_damping is None:
+        return isinstance(scene.velocity, BackwardDifference)
+    if not isinstance(negative_damping, bool | np.bool_):
+        raise InputError(f"negative_damping: got {negative_damping!r}; it is True, False or None")
+    return bool(negative_damping)
 
 
 def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, alpha: Any, beta: Any) -> StateSpace:

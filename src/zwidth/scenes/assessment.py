@@ -11,6 +11,7 @@ import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
+from zwidth.scenes.base import of_scene
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
@@ -80,7 +81,7 @@ class Assessment:
         return to_json(asdict(self))
 
 
-@in_own_units
+@of_scene
 def assess(scene: SceneOptima) -> Assessment:
     """Judge the wall of a scene.
 
@@ -226,7 +227,7 @@ class Limit(NamedTuple):
         return f"{self.words}: K_max {with_unit(self.stiffness, 'N/m')}, {plain(self.gain, 3)} times{less}"
 
 
-@in_own_units
+@of_scene
 def limits_of(scene: SceneOptima) -> list[Limit]:
     """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, NamedTuple, Self
+from functools import cached_property, wraps
+from typing import Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 
@@ -24,6 +25,10 @@ from zwidth.words.errors import InputError
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
+
+Owner = TypeVar("Owner", bound="SceneParts")
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 # What each part may be, and an example.
 _KINDS = {
@@ -209,3 +214,19 @@ class SceneParts(Part):
                 "another unit; make a new scene, of a new zwidth.Device"
             )
         return made
+
+
+def of_scene(
+    function: Callable[Concatenate[Owner, Parameters], Result],
+) -> Callable[Concatenate[Owner, Parameters], Result]:
+    """Let a function of a scene read and write the units of its device; anything but a scene is refused."""
+    answer = in_own_units(function)
+
+    @wraps(function)
+    def checked(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        if not isinstance(scene, SceneParts):
+            example = "zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3))"
+            raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed, as {example}")
+        return answer(scene, *args, **kwargs)
+
+    return checked

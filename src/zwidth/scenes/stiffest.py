@@ -107,7 +107,7 @@ def _present_value(scene: SceneAnswers, parameter: str) -> float:
     known = scene.parameters()
     known = {path: value for path, value in known.items() if path not in ("stiffness", "virtual_damping")}
     known["rate"] = 1.0 / known["period"]
-    if parameter not in known:
+    if not isinstance(parameter, str) or parameter not in known:
         raise InputError(f"parameter: {describe_choice(parameter, tuple(known))}")
     if isinstance(known[parameter], int | np.integer):
         raise InputError(f"parameter: got {parameter!r}, a whole number; try its few values one by one")

@@ -12,9 +12,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from zwidth.parts.checks import check_whole
+from zwidth.scenes.base import of_scene
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError, check_choice, describe_choice
-from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 
 # Of the interval in which the share of all devices lies.
@@ -50,7 +50,7 @@ class ToleranceEstimate:
     labels: np.ndarray  # whether each device bears the wall
 
 
-@in_own_units
+@of_scene
 def simulate_tolerances(
     scene: Scene, tolerances: dict[str, Any], *, samples: int = 10_000, seed: int = 0, reliability: float = 0.99
 ) -> ToleranceEstimate:

@@ -17,7 +17,7 @@ from zwidth.parts.checks import check_whole
 from zwidth.parts.velocity import Estimate
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import SceneAnswers, one_wall
-from zwidth.words.rotation import in_own_units
+from zwidth.scenes.base import of_scene
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
@@ -52,7 +52,7 @@ class WorstMotion(NamedTuple):
     status: Status
 
 
-@in_own_units
+@of_scene
 def worst_motion(
     scene: SceneAnswers, stiffness: float | None = None, virtual_damping: float | None = None, *, longest: int = 1 << 20
 ) -> WorstMotion:

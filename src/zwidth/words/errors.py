@@ -67,5 +67,5 @@ def describe_choice(value: object, allowed: tuple[str, ...]) -> str:
 
 
 def check_choice(field: str, value: object, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
+    if not isinstance(value, str) or value not in allowed:
         raise InputError(f"{field}: {describe_choice(value, allowed)}")

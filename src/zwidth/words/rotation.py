@@ -75,7 +75,8 @@ def in_own_units(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
 def find_kind_of(owner: Any) -> bool:
     """Whether a scene, several scenes or a result are of a rotary device; what knows no kind has that in question."""
-    several = owner.values() if isinstance(owner, Mapping) else getattr(owner, "flat", owner)
+    holds = getattr(getattr(owner, "dtype", None), "hasobject", False)
+    several = owner.values() if isinstance(owner, Mapping) else owner.flat if holds else owner
     if isinstance(owner, list | Mapping) or several is not owner:
         kinds = {find_kind_of(each) for each in several}
         if len(kinds) == 2:

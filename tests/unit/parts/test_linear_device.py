@@ -160,6 +160,7 @@ def test_a_sampled_system_belongs_to_its_period(change, words):
     "system, words",
     [
         (3, "got '3'; needed are finite numbers as"),
+        ({}, "got '{}'; needed are finite numbers as"),
         (([1.0], [1.0]), "a force does not move"),
         (([0.0], [1.0, 2.0]), "a force does not move"),
         (([1.0, 2.0], [1.0, 2.0]), "numerator of degree 1 over a denominator of degree 1"),

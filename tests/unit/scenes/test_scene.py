@@ -1,6 +1,7 @@
 """Scenes, and the way between SI units and normalized numbers, against the paper's own example."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -141,6 +142,9 @@ def test_a_scene_without_a_wall_has_none():
     assert (scene.alpha, scene.beta, scene.delta, scene.d) == (0, 0, 0, 0)
 
 
+SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
+
+
 @pytest.mark.parametrize(
     "make, message",
     [
@@ -156,6 +160,14 @@ def test_a_scene_without_a_wall_has_none():
             lambda: zwidth.Timing(period=1e-3, delay_model="hold"),  # pyright: ignore[reportArgumentType]
             "delay_model: got 'hold', .* did you mean 'held'",
         ),
+        *(
+            (lambda ask=ask, given=given: ask(given), "scene: got .*; a zwidth.Scene is needed, as zwidth.Scene")
+            for ask in (zwidth.assess, zwidth.limits_of, zwidth.worst_motion)
+            for given in (zwidth.Device(0.1), np.ones(2), 3)
+        ),
+        (lambda: SCENE.max_stiffness(negative_damping=np.ones(2)), "negative_damping: got array.*; it is True, False"),
+        (lambda: SCENE.required(np.ones(2), 1e3), "parameter: got array"),
+        (lambda: SCENE.best_damping(1e3, goal=np.ones(2)), "goal: got array"),
     ],
 )
 def test_what_a_scene_refuses(make, message):
