@@ -75,7 +75,7 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array, delay_model: str) -> 
     ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     spoiled = nan_with_nan_slopes(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
-    curve = frequency_boundary(omega, frequency_loop(delta, d, delay_model), delay_model)
+    curve = frequency_boundary(omega, frequency_loop(delta, d, delay_model))
     return Wall(curve.alpha + spoiled, curve.beta + spoiled)
 
 

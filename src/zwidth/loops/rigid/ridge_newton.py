@@ -22,7 +22,7 @@ no point waits for another.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,12 +58,13 @@ class Wave(NamedTuple):
 
     y: Array
     q: Array
-    half: Array  # omega/2, of no meaning at the corner
-    per_sin: Array  # 1/sin omega, of no meaning at the corner
     tau: Array
     kappa: Array
-    tau1: Array  # d tau/dy
-    tau2: Array
+    # For the ridge:
+    half: Any = None  # omega/2, of no meaning at the corner
+    per_sin: Any = None  # 1/sin omega, of no meaning at the corner
+    tau1: Any = None  # d tau/dy
+    tau2: Any = None
 
 
 def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
@@ -79,7 +80,7 @@ def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
     half = xp.where(low, half, 0.5 * np.pi - half)
     per_sin = 0.5 / (s * root)
     if undelayed:
-        return Wave(y, q, half, per_sin, 1.0, cos_w, 0.0, 0.0)
+        return Wave(y, q, 1.0, cos_w, half, per_sin, 0.0, 0.0)
     # D omega as omega + lag omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
     D, x = lag + 1.0, lag * half
     square = x * x
@@ -91,7 +92,34 @@ def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
     square = 4.0 * per_sin * per_sin
     # D kappa - tau cos omega
     tau1 = 0.5 * (lag * cos_w * cosine - ratio * (D * sin2 + cos_w * cos_w)) * square
-    return Wave(y, q, half, per_sin, tau, kappa, tau1, -(1.5 * cos_w * tau1 + lag * (D + 1.0) * tau) * square)
+    return Wave(y, q, tau, kappa, half, per_sin, tau1, -(1.5 * cos_w * tau1 + lag * (D + 1.0) * tau) * square)
+
+
+def wave_at(omega: Array, lag: Array) -> Wave:
+    """The factors that `wall` needs at a frequency from 0 to pi, for any lag >= 0."""
+    xp = namespace(omega, lag)
+    s, cos_half = xp.sin(0.5 * omega), xp.abs(xp.cos(0.5 * omega))
+    y, q = s * s, cos_half * cos_half
+    nearest = xp.round(lag)
+    whole, excess = nearest + 1.0, lag - nearest
+    # Whole turns are counted from pi where that is nearer; it is no float64, its second half keeps the last digits.
+    sign, beyond = 1.0 - 2.0 * xp.mod(whole, 2.0), omega > 2.0
+    x = xp.where(beyond, (np.pi - omega) + 1.2246467991473532e-16, omega)
+    tau = xp.where(beyond, -sign, 1.0) * whole * _cardinal_sine(whole * x) / _cardinal_sine(x)
+    kappa = xp.where(beyond, sign, 1.0) * xp.cos(whole * x)
+    # sin(excess omega)/sin omega: what is unbounded towards pi vanishes with the excess.
+    turn = excess * omega
+    rest = excess * _cardinal_sine(turn) / (_cardinal_sine(0.5 * omega) * cos_half)
+    level = xp.cos(turn)
+    return Wave(y, q, tau * level + kappa * rest, kappa * level - 4.0 * y * q * tau * rest)
+
+
+def _cardinal_sine(x: Array) -> Array:
+    """``sin(x)/x``, for small x by its series: the quotient has no digit of its derivatives there."""
+    xp = namespace(x)
+    small = xp.abs(x) < 1.5
+    inner, outer = xp.where(small, x, 0.0), xp.where(small, 2.0, x)
+    return xp.where(small, horner(inner * inner, SINE), xp.sin(outer) / outer)
 
 
 class Sides(NamedTuple):
