@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import jax
@@ -37,23 +37,18 @@ _HALVINGS = 52
 _NEWTON_STEPS = 16
 
 
-@cache
-def _jaxopt() -> Any:
-    with warnings.catch_warnings():
-        # jaxopt announces at import that it is no longer maintained; a user of zwidth cannot act on that.
-        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
-        import jaxopt
-
-    return jaxopt
-
-
 def bisect(function: Callable[..., Array], lower: Array, upper: Array, *args: Any) -> tuple[Array, Array]:
     """A sign change of ``function(x, *args)`` in [lower, upper], and whether the bracket held one.
 
     No derivative passes through: the result is a starting point, to be polished by something differentiable.
     """
+    with warnings.catch_warnings():
+        # jaxopt announces at import that it is no longer maintained; a user of zwidth cannot act on that.
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        from jaxopt import Bisection
+
     lower, upper, args = jax.lax.stop_gradient((lower, upper, args))
-    solver = _jaxopt().Bisection(
+    solver = Bisection(
         optimality_fun=function,
         lower=lower,
         upper=upper,

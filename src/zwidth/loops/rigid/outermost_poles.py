@@ -45,10 +45,9 @@ FEW_FOR_CELLS = 1 << 15
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
 
-
+# The relative error of radii and rates where nobody asks for another.
+ACCURACY = 1e-9
 _NONE = np.empty(0)
-# Of the pole of one wall, its radius and its rate.
-SLOWEST_ACCURACY = 1e-9
 
 
 def outermost_poles(columns: list[np.ndarray], accuracy: float, route: Route = "auto") -> OutermostPoles:
@@ -177,7 +176,7 @@ def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = Fal
 
 def slowest_pole(wall: tuple[float, float, float, float]) -> tuple[float, float, float]:
     """The spectral radius of one wall, its rate of decay and the angle of that pole."""
-    poles, found = _find_listed([np.array([value]) for value in wall], SLOWEST_ACCURACY, True, "auto")
+    poles, found = _find_listed([np.array([value]) for value in wall], ACCURACY, True, "auto")
     return float(poles.radius[0]), float(poles.rate[0]), abs(float(found.im[0]))
 
 
