@@ -97,9 +97,7 @@ def gain_cubic(alpha: Any, beta: Any, here: Any) -> tuple[Any, ...]:
 def long_verdict(alpha: Any, beta: Any, whole: Any, here: Any, solve: Solve, take_lag: TakeLag) -> Verdict:
     """The verdict for d >= 1, alpha > 0 and beta > -delta: the curve where the gain is one.
 
-    At alpha = 0, where a pole is at z = 1, it is on the others, for ``beta > delta``: with ``P = (z - 1) R``, R is
-    stable exactly if P is for every small alpha > 0, because the pole at 1 then moves inside, and all below is
-    continuous.
+    At alpha = 0, where a pole is at z = 1, it is on the others, for ``beta > delta`` (docs/theory, S15b).
     """
     cubic = gain_cubic(alpha, beta, here)
     u, found = solve(cubic)
