@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import newton
-from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
+from zwidth.arrays.xp import ARCSINE, SINE, epsilon, frozen, horner, namespace, repeat, sine_cosine, store_once
 from zwidth.loops.rigid.device import ANY, DelayClasses, Plant
 from zwidth.words.types import Array
 
@@ -51,7 +51,6 @@ class Wave(NamedTuple):
     half: Any = None  # omega/2, of no meaning at the corner
     per_sin: Any = None  # 1/sin omega, of no meaning at the corner
     tau1: Any = None  # d tau/dy
-    tau2: Any = None
 
 
 def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
@@ -67,19 +66,16 @@ def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
     half = xp.where(low, half, 0.5 * np.pi - half)
     per_sin = 0.5 / (s * root)
     if undelayed:
-        return Wave(y, q, 1.0, cos_w, half, per_sin, 0.0, 0.0)
+        return Wave(y, q, 1.0, cos_w, half, per_sin, 0.0)
     # D omega as omega + lag omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
     D, x = lag + 1.0, lag * half
-    square = x * x
-    sine, cosine = x * horner(square, SINE), horner(square, COSINE)
+    sine, cosine = sine_cosine(x, xp)
     ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
     sin2 = 4.0 * y * q
     tau, kappa = cosine + cos_w * ratio, cos_w * cosine - sin2 * ratio
-    # For D = 1 kappa is cos omega and the next two are exactly 0.
-    square = 4.0 * per_sin * per_sin
-    # D kappa - tau cos omega
-    tau1 = 0.5 * (lag * cos_w * cosine - ratio * (D * sin2 + cos_w * cos_w)) * square
-    return Wave(y, q, tau, kappa, half, per_sin, tau1, -(1.5 * cos_w * tau1 + lag * (D + 1.0) * tau) * square)
+    # For D = 1 kappa is cos omega and D kappa - tau cos omega exactly 0.
+    tau1 = (lag * cos_w * cosine - ratio * (D * sin2 + cos_w * cos_w)) * (2.0 * per_sin * per_sin)
+    return Wave(y, q, tau, kappa, half, per_sin, tau1)
 
 
 def wave_at(omega: Array, lag: Array) -> Wave:
@@ -130,9 +126,10 @@ def wall(at: Wave, curve: Curve) -> tuple[Array, Array]:
 def stationarity(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
     """T of B2, and dT/ds."""
     at = wave(s, lag, undelayed)
-    y, q, tau, kappa, tau1, tau2 = at.y, at.q, at.tau, at.kappa, at.tau1, at.tau2
+    y, q, tau, kappa, tau1 = at.y, at.q, at.tau, at.kappa, at.tau1
     E, H, m, V = _sides(at, curve)
     cos_w, k2, twice = q - y, curve.mu * curve.mu, 2.0 * (lag + 1.0)
+    tau2 = 0.0 if undelayed else -(1.5 * cos_w * tau1 + lag * (lag + 2.0) * tau) * (4.0 * at.per_sin * at.per_sin)
     dE, dH = curve.E[1] + 2.0 * y * curve.E[2], curve.H[1]
     dV, ddV = 4.0 * (k2 * cos_w - curve.sigma * m), 8.0 * (curve.sigma * curve.sigma - k2)
     value = tau * E + kappa * H
