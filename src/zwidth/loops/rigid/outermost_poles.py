@@ -82,8 +82,7 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, route: 
             found = [np.concatenate(leaves)[:size] for leaves in zip(*blocks, strict=True)]
         else:
             # Always of one size: other batches may round differently.
-            padded = [np.pad(column, (0, max(0, PIECE - size)), mode="edge") for column in asked]
-            found = [leaf[:size] for leaf in map_blocks(compile_columns(quick_kernel, (kind,)), padded, PIECE)]
+            found = map_blocks(compile_columns(quick_kernel, (kind,)), asked, PIECE, exact=True)
     return _finish_poles(columns, OutermostPoles(*(np.array(leaf) for leaf in found)), accuracy, kind)
 
 
