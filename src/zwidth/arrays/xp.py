@@ -283,12 +283,3 @@ def find_turn(x: Array, y: Array, xp: Any) -> Array:
     low = xp.where(beyond, y, x)
     value = 2.0 * xp.sqrt(low) * horner(4.0 * low - 1.0, ARCSINE)
     return xp.where(beyond, np.pi - value, value)
-
-
-def sine_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
-    """Sine and cosine for |x| <= pi/2."""
-    if xp is np:
-        # Python's numbers stay Python's.
-        return (float(np.sin(x)), float(np.cos(x))) if type(x) is float else (np.sin(x), np.cos(x))
-    square = x * x
-    return x * horner(square, SINE), horner(square, COSINE)

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import follow_root
-from zwidth.arrays.xp import ARCSINE, find_turn, frozen, horner, namespace, roots, sine_cosine, within
+from zwidth.arrays.xp import ARCSINE, COSINE, SINE, find_turn, frozen, horner, namespace, roots, within
 from zwidth.loops.rigid.device import ANY, DelayClasses, DeviceTerms, device, long_curve, short_curve
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
@@ -154,7 +154,8 @@ def _take_lag(u: Array, whole: Array) -> Lag:
     xp = namespace(u, whole)
     # Half of the angle, so that its sine keeps its digits for slow loops.
     half = xp.minimum((whole + 0.5) * xp.sqrt(0.5 * u) * horner(2.0 * u - 1.0, ARCSINE), 0.5 * np.pi)
-    sine, cosine = sine_cosine(half, xp)
+    square = half * half
+    sine, cosine = half * horner(square, SINE), horner(square, COSINE)
     # w < pi/(n + 1), with room: where that binds the wall is unstable by far, and only a full turn must be excluded.
     near = u * (whole + 1.0) * (whole + 1.0) < 0.5 * np.pi * np.pi
     return Lag((cosine - sine) * (cosine + sine), 2.0 * sine * cosine, sine * sine, near, near ^ True)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import newton
-from zwidth.arrays.xp import ARCSINE, epsilon, frozen, horner, namespace, sine_cosine
+from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace
 from zwidth.loops.rigid.device import ANY, DelayClasses, split_delay
 from zwidth.words.types import Array
 
@@ -121,7 +121,8 @@ def _wave(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
         x = 2.0 * k * np.arcsin(np.sqrt(0.5 * u))
         return np.cos(x), np.sin(x)
     half = k * xp.sqrt(0.5 * u) * horner(2.0 * u - 1.0, ARCSINE)
-    sine, cosine = sine_cosine(half, xp)
+    square = half * half
+    sine, cosine = half * horner(square, SINE), horner(square, COSINE)
     return (cosine - sine) * (cosine + sine), 2.0 * sine * cosine
 
 

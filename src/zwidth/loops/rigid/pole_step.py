@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import epsilon, namespace, sine_cosine, store_once
+from zwidth.arrays.xp import COSINE, SINE, epsilon, horner, namespace, store_once
 from zwidth.loops.rigid.circle import Loop
 from zwidth.words.types import Array
 
@@ -77,6 +77,15 @@ class Value(NamedTuple):
     rounding: Array
 
 
+def _half_turn(x: Array, xp: Any) -> tuple[Array, Array]:
+    """Sine and cosine for |x| <= pi/2."""
+    if xp is np:
+        # Python's numbers stay Python's.
+        return (float(np.sin(x)), float(np.cos(x))) if type(x) is float else (np.sin(x), np.cos(x))
+    square = x * x
+    return x * horner(square, SINE), horner(square, COSINE)
+
+
 def _store(value: Any, witness: Array) -> Any:
     """A pair that five loops use, each of which would repeat its series: a step takes 0.7 of the time."""
     return Pair(*store_once((value.real, value.imag), witness))
@@ -92,7 +101,7 @@ def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     power = loop.turns + 1.0 if fractional else loop.turns
     size = float(np.expm1(re)) if number is complex else xp.expm1(re)
     r = 1.0 + size
-    sine, cosine = sine_cosine(0.5 * im, xp)
+    sine, cosine = _half_turn(0.5 * im, xp)
     gap = number(size - 2.0 * r * sine * sine, 2.0 * r * sine * cosine)
     growth = power * re
     # Not by the modulus: its derivative at 0 would be lost.
@@ -103,7 +112,7 @@ def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     if number is complex:
         up, down, whole = float(up), float(down), float(whole)
     phase = phase - 2.0 * np.pi * whole
-    turned, level = sine_cosine(0.5 * phase, xp)
+    turned, level = _half_turn(0.5 * phase, xp)
     lag = number(up * (1.0 - 2.0 * turned * turned), 2.0 * up * turned * level)
     if number is Pair:
         gap, lag = _store(gap, re), _store(lag, re)

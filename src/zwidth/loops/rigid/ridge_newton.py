@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import newton
-from zwidth.arrays.xp import ARCSINE, SINE, epsilon, frozen, horner, namespace, repeat, sine_cosine, store_once
+from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
 from zwidth.loops.rigid.device import ANY, DelayClasses, Plant
 from zwidth.words.types import Array
 
@@ -69,7 +69,8 @@ def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
         return Wave(y, q, 1.0, cos_w, half, per_sin, 0.0)
     # D omega as omega + lag omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
     D, x = lag + 1.0, lag * half
-    sine, cosine = sine_cosine(x, xp)
+    square = x * x
+    sine, cosine = x * horner(square, SINE), horner(square, COSINE)
     ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
     sin2 = 4.0 * y * q
     tau, kappa = cosine + cos_w * ratio, cos_w * cosine - sin2 * ratio
