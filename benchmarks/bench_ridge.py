@@ -55,7 +55,7 @@ def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
 
     def slope(omega: jax.Array, point: tuple[jax.Array, jax.Array]) -> jax.Array:
         loop = frequency_loop(*point, "held")
-        return jax.grad(lambda w: frequency_boundary(w, loop, "held").alpha)(omega)
+        return jax.grad(lambda w: frequency_boundary(w, loop).alpha)(omega)
 
     # As good a start as the fast route has, which fits s = sin(omega/2): within 4 %.
     u, t = 1.0 / (d + 1.0), delta * (d + 1.0) / (delta * (d + 1.0) + 3.0)
@@ -64,7 +64,7 @@ def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
     omega = optimistix.root_find(
         slope, solver, jax.lax.stop_gradient(start), args=(delta, d), max_steps=16, throw=False
     ).value
-    return frequency_boundary(omega, frequency_loop(delta, d, "held"), "held").alpha
+    return frequency_boundary(omega, frequency_loop(delta, d, "held")).alpha
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, float]:

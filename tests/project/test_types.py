@@ -50,7 +50,7 @@ CALLS = [
     (pole_kernel, KERNEL),
     (aberth_kernel, {**KERNEL, "spring": False}),
     (discs, {"z": ROOTS_FIRST, "loop": product_form(**KERNEL), "degree": HALF, "spring": False}),
-    (frequency_boundary, {"omega": np.full((2, 3), 0.3), "loop": LOOP, "delay_model": "held"}),
+    (frequency_boundary, {"omega": np.full((2, 3), 0.3), "loop": LOOP}),
 ]
 
 

@@ -57,14 +57,11 @@ def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) 
         done = last <= _SMALL * xp.abs(x)
         return xp.where(done, x, new), low, high, xp.where(done, last, xp.abs(new - x))
 
-    state = (start, low, high, xp.full_like(start, xp.inf)[()])
-    if xp is not np:
-        state = repeat(steps, step, state, xp)
-    for _ in range(steps if xp is np else 0):
-        state = step(state)
-        if np.all(state[3] <= _SMALL * np.abs(state[0])):
-            break
-    return state[0], state[3]
+    def arrived(_: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
+        return bool(np.all(new[3] <= _SMALL * np.abs(new[0])))
+
+    x, _, _, last = repeat(steps, step, (start, low, high, xp.full_like(start, xp.inf)[()]), xp, arrived)
+    return x, last
 
 
 # Of a step of golden section.

@@ -278,6 +278,8 @@ def find_turn(x: Array, y: Array, xp: Any) -> Array:
     """The w of ``x = sin^2(w/2)`` and y = 1 - x."""
     if xp is np:
         return 2.0 * np.arctan2(np.sqrt(x), np.sqrt(y))
-    low = xp.minimum(x, y)
+    # Not by the minimum, which has half of two derivatives where both are equal.
+    beyond = x > y
+    low = xp.where(beyond, y, x)
     value = 2.0 * xp.sqrt(low) * horner(4.0 * low - 1.0, ARCSINE)
-    return xp.where(x > y, np.pi - value, value)
+    return xp.where(beyond, np.pi - value, value)

@@ -23,9 +23,8 @@ from zwidth.loops.linear.curve import (
     circle_zeros,
     curve_at,
     cut_arcs,
-    end_lines,
     find_dips,
-    interior_line,
+    lines_at,
     nodes_of,
     zeros_of,
 )
@@ -70,13 +69,13 @@ class Boundary:
         vertical = zeros_of(loop, w, here.fall, "fall")
         touched = [p for p in circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
         vertical = np.union1d(vertical, touched)
-        lines = tuple(line for p in vertical if (line := interior_line(loop, p)) is not None)
+        lines = lines_at(loop, vertical)
         poles = np.array([p for p in vertical if all(p != line.w for line in lines)])
         turns = zeros_of(loop, w, here.turn, "turn")
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
-        lines = (*lines, *end_lines(loop))
+        lines += lines_at(loop, (0.0, np.pi))
         limits = {0.0: np.nan, np.pi: np.nan} | {line.w: line.meeting for line in lines}
-        return cls(loop, w, tuple(cut_arcs(loop, w, here, poles, turns, limits)), lines, poles)
+        return cls(loop, w, tuple(cut_arcs(loop, w, here, poles, turns, limits)), tuple(lines), poles)
 
     def crossings(self, beta: np.ndarray) -> Crossings:
         """Where the rows of these dampings, shape (rows,), cross the boundary."""

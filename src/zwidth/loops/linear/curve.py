@@ -7,6 +7,7 @@ well: real poles, and pairs of undamped devices at one frequency.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -125,17 +126,22 @@ class CrossingLine(NamedTuple):
         return self.poles * np.sign(self.f_turn) * np.where(beta < self.meeting, 1.0, -1.0)
 
 
-def interior_line(loop: LoopRoots, w: float) -> CrossingLine | None:
-    """The line of a zero of Im F at which q is real as well, as for an undamped device and some windows."""
-    at = circle(np.array([w]))
-    if np.min(np.abs(at.before + loop.zeros), initial=1.0) < 1e-9:
-        # q is infinite, not real.
-        return None
-    q, f = loop.required_wall(at), loop.estimate.jet(at)
-    if not abs(q.value[0].imag) <= _NONE * abs(q.value[0]):
-        return None
-    value, turn = float(q.value[0].real), float(q.slope[0].imag)
-    return CrossingLine(w, value, float(f.value[0].real), turn, float(f.slope[0].imag), 2)
+def lines_at(loop: LoopRoots, angles: Iterable[float]) -> list[CrossingLine]:
+    """The lines of zeros of Im F where q is real as well: at z = 1 and -1, and inside of undamped devices and windows.
+
+    There is none where q or F is infinite: where the device does not move, say.
+    """
+    lines = []
+    for w in angles:
+        at, end = circle(np.array([w])), w in (0.0, np.pi)
+        with np.errstate(all="ignore"):
+            q, f = loop.required_wall(at), loop.estimate.jet(at)
+        numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
+        infinite = np.any(np.abs(at.before + loop.zeros) <= (ON_CIRCLE if end else 1e-9))
+        real = end or abs(q.value[0].imag) <= _NONE * abs(q.value[0])
+        if real and not infinite and np.all(np.isfinite(numbers)):
+            lines.append(CrossingLine(float(w), *map(float, numbers), poles=1 if end else 2))
+    return lines
 
 
 def circle_zeros(loop: LoopRoots) -> np.ndarray:
@@ -143,21 +149,6 @@ def circle_zeros(loop: LoopRoots) -> np.ndarray:
     zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
     angles = np.angle(1.0 - zeros[np.abs(depths(zeros)) <= ON_CIRCLE])
     return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
-
-
-def end_lines(loop: LoopRoots) -> list[CrossingLine]:
-    """The lines of real poles at z = 1 and z = -1; where the device does not move there is none."""
-    lines = []
-    for w in (0.0, np.pi):
-        at = circle(np.array([w]))
-        with np.errstate(all="ignore"):
-            q, f = loop.required_wall(at), loop.estimate.jet(at)
-        numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
-        infinite = np.any(np.abs(loop.zeros - (2.0 if w else 0.0)) <= ON_CIRCLE)
-        if np.all(np.isfinite(numbers)) and not infinite:
-            q_value, f_value, q_turn, f_turn = (float(n) for n in numbers)
-            lines.append(CrossingLine(w, q_value, f_value, q_turn, f_turn, 1))
-    return lines
 
 
 # How far beyond two neighboring nodes the curve may be between them, of what alpha is a difference of.

@@ -85,8 +85,11 @@ class Sampled(NamedTuple):
 
 
 def respond(chain: AnyChain) -> Sampled | Plant:
-    """The chain between two samples, what `needed` is computed from at every angle."""
-    return _rigid_plant(chain) if isinstance(chain, Chain) and chain.rigid else sampled(chain)
+    """The chain between two samples, what `required_wall` is computed from at every angle."""
+    if not (isinstance(chain, Chain) and chain.rigid):
+        return sampled(chain)
+    fraction = chain.d - chain.whole
+    return held_plant(chain.bodies[0].damping, None if is_zero(fraction) else fraction)
 
 
 def sampled(chain: AnyChain) -> Sampled:
@@ -98,10 +101,9 @@ def sampled(chain: AnyChain) -> Sampled:
     return Sampled(psi, full, late)
 
 
-def required_wall(chain: AnyChain, w: Any, parts: Sampled | Plant | None = None) -> Any:
+def required_wall(chain: AnyChain, w: Any, parts: Sampled | Plant) -> Any:
     """``q = -1/G`` at ``e^(jw)``, one angle, without any root: what derivatives are taken of."""
     at: CirclePoints = circle(w)
-    parts = respond(chain) if parts is None else parts
     if isinstance(parts, Plant):
         # N(z)/z = a2 z + a1 + a0/z, around z = 1.
         answer = parts.a2 * at.z + parts.a1 + parts.a0 / at.z
@@ -111,11 +113,6 @@ def required_wall(chain: AnyChain, w: Any, parts: Sampled | Plant | None = None)
     turns = chain.whole if parts.late is None else chain.whole + 1
     moved = xp.linalg.solve(at.before * xp.eye(parts.psi.shape[0]) - parts.psi, force)
     return -lag_jet(at, turns).value / moved[0]
-
-
-def _rigid_plant(chain: Chain) -> Plant:
-    fraction = chain.d - chain.whole
-    return held_plant(chain.bodies[0].damping, None if is_zero(fraction) else fraction)
 
 
 def find_roots(chain: AnyChain) -> LoopRoots:

@@ -14,7 +14,7 @@ before and beyond must confirm the first of these delays.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -192,23 +192,20 @@ _TRIALS, _ROUNDED = 30, 1e-9
 _WITNESSES, _BEYOND = (0.25, 0.5, 0.75, 1.0 - 1e-5), 1.0 + 1e-5
 
 
-@dataclass(frozen=True)
-class DelayedLoops:
-    """The loops of one chain at its own delay and at longer ones, up to one period more."""
+class DelayedLoop(NamedTuple):
+    """The loop of a chain at another delay, and the nodes of its curve."""
 
-    chain: AnyChain
-    delays: np.ndarray
-    loops: list[LoopRoots]
-    nodes: list[np.ndarray]
+    delay: np.float64
+    loop: LoopRoots
+    nodes: np.ndarray
 
-    @classmethod
-    def lay_out(cls, chain: AnyChain) -> DelayedLoops:
-        """At every eighth of a period, whole ones among them."""
-        own = float(chain.d)
-        grid = (np.floor(own * _PARTS) + 1.0 + np.arange(_PARTS)) / _PARTS
-        delays = np.concatenate([[own], grid[(grid > own + 1e-9) & (grid < own + 1.0 - 1e-9)], [own + 1.0]])
-        loops = [loop_at(chain, delay) for delay in delays]
-        return cls(chain, delays, loops, [nodes_of(loop) for loop in loops])
+
+def lay_delays(chain: AnyChain) -> list[DelayedLoop]:
+    """The loops at the chain's own delay and at every eighth of a period, whole ones among them, up to one more."""
+    own = float(chain.d)
+    grid = (np.floor(own * _PARTS) + 1.0 + np.arange(_PARTS)) / _PARTS
+    delays = np.concatenate([[own], grid[(grid > own + 1e-9) & (grid < own + 1.0 - 1e-9)], [own + 1.0]])
+    return [DelayedLoop(delay, loop := loop_at(chain, delay), nodes_of(loop)) for delay in delays]
 
 
 def loop_at(chain: AnyChain, delay: float) -> LoopRoots:
@@ -216,13 +213,13 @@ def loop_at(chain: AnyChain, delay: float) -> LoopRoots:
     return find_roots(replace(chain, d=float(delay), whole=int(np.floor(delay))))
 
 
-def delay_margin(loops: DelayedLoops, alpha: float, beta: float) -> float:
+def delay_margin(chain: AnyChain, delayed: list[DelayedLoop], alpha: float, beta: float) -> float:
     """Periods of delay that a stable wall bears; infinite where no delay is too long, NaN where that is in doubt."""
-    chain, wall = loops.chain, (alpha, beta)
-    laid = [OpenLoop.lay_out(loop, *wall, nodes) for loop, nodes in zip(loops.loops, loops.nodes, strict=True)]
+    wall = alpha, beta
+    laid = [OpenLoop.lay_out(each.loop, *wall, each.nodes) for each in delayed]
     crossed = [each.gain_crossovers() for each in laid]
     ends = []
-    for delay, each, w in zip(loops.delays, laid, crossed, strict=True):
+    for (delay, *_), each, w in zip(delayed, laid, crossed, strict=True):
         # So many periods more turn L to -1; whole ones leave its size as it is.
         more = np.mod(np.angle(-each.at(w).value), 2.0 * np.pi) / w
         near = (np.abs(more - np.round(more)) <= _SPARE / _PARTS) & (more < _LONGEST)
@@ -230,7 +227,7 @@ def delay_margin(loops: DelayedLoops, alpha: float, beta: float) -> float:
         ends += [_follow(chain, wall, w, delay) for w, delay in starts]
     last = np.array([each.L.value[-1].real for each in laid])
     for k in np.flatnonzero((np.abs(last[1:]) > 1.0) != (np.abs(last[:-1]) > 1.0)):
-        low, high = loops.delays[k : k + 2]
+        low, high = delayed[k].delay, delayed[k + 1].delay
         sign = 1.0 if abs(last[k]) > 1.0 else -1.0
         at_low, at_high = sign * np.log(np.abs(last[k : k + 2]))
 
@@ -279,7 +276,7 @@ def linear_margins(
     """All margins of walls of one shape, periods and radians a period; NaN where a wall is out of range."""
     stable = label_walls(boundary, alpha, beta)
     inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
-    loops: DelayedLoops | None = None
+    delayed: list[DelayedLoop] = []
     # What a sampled device does between its samples is not known.
     with_delay = with_delay and not chain.sampled
     out = np.full((len(Margins._fields), *alpha.shape), np.nan)
@@ -290,7 +287,7 @@ def linear_margins(
         found = margins_of(OpenLoop.lay_out(boundary.loop, a, b, boundary.w), good)
         delay = 0.0 if with_delay else np.nan
         if good and with_delay:
-            loops = loops or DelayedLoops.lay_out(chain)
-            delay = delay_margin(loops, a, b)
+            delayed = delayed or lay_delays(chain)
+            delay = delay_margin(chain, delayed, a, b)
         out[(slice(None), *place)] = found._replace(delay_margin=delay)
     return Margins(*(part[()] for part in out))

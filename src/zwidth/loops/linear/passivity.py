@@ -6,10 +6,9 @@ physical damping must exceed, with s = sin(w/2),
     needed = (-a + sqrt(a^2 + 4 f (1 - f) |C|^2))/4
     a = -alpha sin((n + 1/2) w)/s + 2 beta Re(z^-n E) - 2 f Re(z^-(n+1) C),     F = (z - 1) E
 
-It is the larger eigenvalue of [[-a/2, q], [conj q, 0]] with ``q = sqrt(f (1 - f)) C/2``. Between two angles that are h
-apart an eigenvalue exceeds its chord by at most ``h^2/8 max |M''|``, so that bounds of a'' and C'' prove the maximum:
-intervals that cannot hold it are left, the others halved. An estimate that answers a position at rest with F(1) != 0
-adds ``beta F(1)`` to the stiffness; E is then that of F - F(1).
+Its maximum is proved by bounds of a'' and C'' (docs/theory/passivity.md, P4): intervals that cannot hold it are left,
+the others halved. An estimate that answers a position at rest with F(1) != 0 adds ``beta F(1)`` to the stiffness; E is
+then that of F - F(1).
 """
 
 from __future__ import annotations

@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
 from zwidth.arrays.evaluate import as_number, check_count, check_scalars, evaluate
 from zwidth.arrays.roots import follow_root, integrate
 from zwidth.arrays.xp import frozen, namespace, nan_with_nan_slopes, store_once, tree_map
-from zwidth.loops.rigid.curve import (
-    column_end,
-    creeps,
-    frequency,
-    lobe,
-    on_line,
-    peak,
-    row_end,
-    wall,
-)
+from zwidth.loops.rigid.curve import column_end, creeps, frequency, lobe, on_line, peak, row_end, wall
 from zwidth.loops.rigid.device import DelayClasses, classify_delays, valid_device, wall_status
 from zwidth.loops.rigid.polynomial import Wall, check_delay_model, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.ridge import ridge_kernel
@@ -29,7 +20,6 @@ from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, DelayModel, Vertices
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
-_METHODS: tuple[str, ...] = ("auto", "optimistix")
 
 # Closer to pi the frequency of a fractional power of less than one has too few digits.
 _NEAREST_PI = 1e-3
@@ -75,7 +65,7 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array, delay_model: str) -> 
     ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     spoiled = nan_with_nan_slopes(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
-    curve = frequency_boundary(omega, frequency_loop(delta, d, delay_model), delay_model)
+    curve = frequency_boundary(omega, frequency_loop(delta, d, delay_model))
     return Wall(curve.alpha + spoiled, curve.beta + spoiled)
 
 
@@ -138,7 +128,7 @@ def boundary_point(
     """
     check_delay_model(delay)
     check_choice("side", side, ("lower", "upper"))
-    check_choice("method", method, _METHODS)
+    check_choice("method", method, get_args(PointMethod))
     given = [(name, value) for name, value in (("beta", beta), ("alpha", alpha)) if value is not None]
     if len(given) != 1:
         raise InputError(f"beta, alpha: got {'both' if given else 'none'}; give exactly one of the two")

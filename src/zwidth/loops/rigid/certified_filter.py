@@ -3,16 +3,7 @@
 The text is that of `loops.rigid.crossover`. Here are the numbers that go into it: device, crossover and lag. Balls are
 the certified method's first step, which settles nearly all walls; affine forms prove that every wall of a box of walls
 and devices is stable, with NumPy's sine, cosine and arcsine trusted to 2^-45. ``u = 2^-53``. No library's exp is
-trusted.
-
-- ``exp``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 14 terms below 3u: together
-  below 8u. Below x = -700 it is off by 1e-304 at most.
-- `loops.rigid.device.phi_functions` on it: ``c = exp(-x/2)^2`` is within 17u. Below the switch at 2.5 both series have
-  positive terms only, 4u: phi1 and gap are within 14u, phi2 15u, and psi, in which phi1 and gap share the error of the
-  exponential, 8u + 12u. Above, where c < 0.083, phi1 is within 5u, phi2 7u, psi 14u, gap 20u. All are within 30u.
-- Held fraction: t = 1 - f is off by u, and x = delta t by 2u. phi1 and phi2 amplify that at most once and psi twice,
-  e^-x x times; as ``x e^-x <= phi1(x)`` and ``<= 1/2``, that error is below 2u of another term of a1, and of a0 below u
-  of a1. Term by term, sums included, a2 is within 40u, a1 within 75u, a0 within 60u (and u of a1).
+trusted; by how many u each number may be off is F1 to F3 of docs/theory/certified.md.
 """
 
 from __future__ import annotations

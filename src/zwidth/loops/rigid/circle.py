@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.xp import angle, apply_each, epsilon, find_turn, namespace, nan_unless, repeat
+from zwidth.loops.rigid.crossover import first_zero
 from zwidth.loops.rigid.device import factor_numerator, held_plant, split_delay, valid_wall
 from zwidth.words.types import Array
 
@@ -161,24 +162,13 @@ def _find_zero_between(piece: tuple[Array, ...], at: _Circle, xp: Any) -> Array:
     return xp.where(exists, x, np.nan)
 
 
-def _only_zero(at: _Circle, fractional: bool, xp: Any) -> tuple[Array, Array]:
+def _only_zero(at: _Circle, fractional: bool, xp: Any) -> tuple[Array, Array | bool]:
     """The one zero in (0, 1) of a difference whose signs at the ends differ, and whether it is known to be the one."""
     h0, h1, h2, h3 = at.h
     sign = xp.where(h0 > 0, 1.0, -1.0)
-    bend = h2 + h3 if fractional else h2
-    root = xp.sqrt(xp.maximum(h1 * h1 - 4.0 * h0 * bend, 0.0))
-    ahead = sign * h1 < 0
-    x = xp.where(ahead, 2.0 * h0, -h1 - sign * root) / xp.where(ahead, sign * root - h1, 2.0 * bend)
+    x = first_zero(tuple([sign * h for h in (at.h if fractional else at.h[:3])]))
     if not fractional:
-        return x, root > 0
-    low, high = 0.0 * x, 1.0 + 0.0 * x
-    x = xp.where((x > 0) & (x < 1.0), x, 0.5)
-    for _ in range(_CUBIC_STEPS):
-        value = at.value(x)
-        before = sign * value > 0
-        low, high = xp.where(before, x, low), xp.where(before, high, x)
-        new = x - value / at.slope(x)
-        x = xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
+        return x, True
     # Monotone, or with one extreme, or none inside; and the steps have arrived.
     alone = (h2 * h2 < 3.0 * h1 * h3) | (h1 * at.slope(1.0) < 0) | (xp.abs(h2) > 3.0 * xp.abs(h3)) | (h2 * h3 > 0)
     return x, alone & (xp.abs(at.value(x)) <= 8.0 * epsilon(x) * at.parts(x))

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import follow_root
-from zwidth.arrays.xp import ARCSINE, COSINE, SINE, frozen, horner, namespace, roots, within
+from zwidth.arrays.xp import ARCSINE, COSINE, SINE, find_turn, frozen, horner, namespace, roots, within
 from zwidth.loops.rigid.device import ANY, DelayClasses, DeviceTerms, device, long_curve, short_curve
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
@@ -97,9 +97,7 @@ def gain_cubic(alpha: Any, beta: Any, here: Any) -> tuple[Any, ...]:
 def long_verdict(alpha: Any, beta: Any, whole: Any, here: Any, solve: Solve, take_lag: TakeLag) -> Verdict:
     """The verdict for d >= 1, alpha > 0 and beta > -delta: the curve where the gain is one.
 
-    At alpha = 0, where a pole is at z = 1, it is on the others, for ``beta > delta``: with ``P = (z - 1) R``, R is
-    stable exactly if P is for every small alpha > 0, because the pole at 1 then moves inside, and all below is
-    continuous.
+    At alpha = 0, where a pole is at z = 1, it is on the others, for ``beta > delta`` (docs/theory, S15b).
     """
     cubic = gain_cubic(alpha, beta, here)
     u, found = solve(cubic)
@@ -163,16 +161,11 @@ def _take_lag(u: Array, whole: Array) -> Lag:
     return Lag((cosine - sine) * (cosine + sine), 2.0 * sine * cosine, sine * sine, near, near ^ True)
 
 
-class Crossover(NamedTuple):
-    """Where the two parts of the loop are equally large, of no meaning unless it exists."""
+def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
+    """The w at which the gain is one, for margins, and whether there is one, without which w means nothing.
 
-    u: Array  # 1 - cos w
-    y: Array  # 1 + cos w
-    exists: Array
-
-
-def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> Crossover:
-    """The crossover for margins: the nearer of u and 1 + cos w, which then has all its digits."""
+    Of u and 2 - u = 1 + cos w the nearer one is found, which then has all its digits.
+    """
     xp = namespace(alpha, here.delta)
     cubic = gain_cubic(alpha, beta, here)
     # At z = -1 the device and its delay must be the larger part; there the cubic starts in y with the opposite sign.
@@ -192,7 +185,8 @@ def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> Crossover:
         lambda x, *powers: horner(x, powers), first_zero(frozen(known, xp)), lambda x, slope, _: slope != 0, *known
     )
     exists = (xp.abs(other) < one) & (near > 0) & (near <= 1.0)
-    return Crossover(xp.where(far, 2.0 - near, near), xp.where(far, near, 2.0 - near), exists)
+    u, y = xp.where(far, 2.0 - near, near), xp.where(far, near, 2.0 - near)
+    return find_turn(0.5 * u, 0.5 * y, xp), exists
 
 
 def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:

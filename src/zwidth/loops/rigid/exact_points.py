@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import jax
@@ -37,23 +37,18 @@ _HALVINGS = 52
 _NEWTON_STEPS = 16
 
 
-@cache
-def _jaxopt() -> Any:
-    with warnings.catch_warnings():
-        # jaxopt announces at import that it is no longer maintained; a user of zwidth cannot act on that.
-        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
-        import jaxopt
-
-    return jaxopt
-
-
 def bisect(function: Callable[..., Array], lower: Array, upper: Array, *args: Any) -> tuple[Array, Array]:
     """A sign change of ``function(x, *args)`` in [lower, upper], and whether the bracket held one.
 
     No derivative passes through: the result is a starting point, to be polished by something differentiable.
     """
+    with warnings.catch_warnings():
+        # jaxopt announces at import that it is no longer maintained; a user of zwidth cannot act on that.
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        from jaxopt import Bisection
+
     lower, upper, args = jax.lax.stop_gradient((lower, upper, args))
-    solver = _jaxopt().Bisection(
+    solver = Bisection(
         optimality_fun=function,
         lower=lower,
         upper=upper,
@@ -74,12 +69,10 @@ def polish(residual: Callable[[Array, Any], Array], start: Array, args: Any) -> 
     return optimistix.root_find(residual, solver, start, args=args, max_steps=_NEWTON_STEPS, throw=False).value
 
 
-def lobe_end(loop: FrequencyLoop, d: Array, delay_model: str) -> Array:
+def lobe_end(loop: FrequencyLoop, d: Array) -> Array:
     """The frequency at which the boundary curve first returns to alpha = 0, pi where it reaches the corner before."""
     limit = jnp.minimum(jnp.pi, jnp.pi / (d + 0.5))
-    end, found = bisect(
-        lambda omega, loop: frequency_boundary(omega, loop, delay_model).alpha, 1e-6 * limit, limit, loop
-    )
+    end, found = bisect(lambda omega, loop: frequency_boundary(omega, loop).alpha, 1e-6 * limit, limit, loop)
     return jnp.where(found & ~corner(expand_curve(loop.plant), loop.lag).reached, end, jnp.pi)
 
 
@@ -117,15 +110,15 @@ def _residual(line: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Arra
     return jnp.append(value, (by_beta[0] * by_omega[1] - by_beta[1] * by_omega[0]) / size)
 
 
-def _solve(line: str, start: Array, number: Array, loop: FrequencyLoop, delay_model: str) -> tuple[Array, Wall]:
+def _solve(line: str, start: Array, number: Array, loop: FrequencyLoop) -> tuple[Array, Wall]:
     """The frequency at which the three equations hold, next to a start, and the wall there, differentiable."""
-    wall = jax.lax.stop_gradient(store_once(frequency_boundary(start, loop, delay_model), start))
+    wall = jax.lax.stop_gradient(store_once(frequency_boundary(start, loop), start))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
     unknowns = jnp.stack([*wall, start]) / scales
     omega = polish(lambda *at: _residual(line, *at), unknowns, (loop, number, scales))[2]
     omega = store_once(omega, start)
-    return omega, frequency_boundary(omega, loop, delay_model)
+    return omega, frequency_boundary(omega, loop)
 
 
 @partial(jnp.vectorize, excluded=(2,))
@@ -139,14 +132,14 @@ def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
     summit = corner(expand_curve(loop.plant), loop.lag)
 
     def slope(omega: Array, loop: FrequencyLoop) -> Array:
-        return jax.grad(lambda w: frequency_boundary(w, loop, delay_model).alpha)(omega)
+        return jax.grad(lambda w: frequency_boundary(w, loop).alpha)(omega)
 
-    end = store_once(lobe_end(loop, d, delay_model), d)
+    end = store_once(lobe_end(loop, d), d)
     # Below, the slope is positive; at pi itself it vanishes by symmetry whatever the optimum.
     upper = jnp.where(end < jnp.pi, end, jnp.pi * (1.0 - 1e-7))
     start, bracketed = bisect(slope, 1e-6 * end, upper, loop)
     start = store_once(start, d)
-    omega, smooth = _solve("ridge", start, d, loop, delay_model)
+    omega, smooth = _solve("ridge", start, d, loop)
     # Rounding can keep Newton from its last tolerance; what counts is that it stayed where the bracket put it.
     converged = summit.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
     spoiled = nan_with_nan_slopes(ok & converged, *inputs)
@@ -173,19 +166,19 @@ def point_kernel(
     ok = given == Status.OK
     delta, d, number = (jnp.where(ok, value, 1.0) for value in inputs)
     loop = frequency_loop(delta, d, delay_model)
-    ridge, end = jax.lax.stop_gradient(find_ridge(delta, d, delay_model)), lobe_end(loop, d, delay_model)
+    ridge, end = jax.lax.stop_gradient(find_ridge(delta, d, delay_model)), lobe_end(loop, d)
 
     def offset(wall: Wall, number: Array) -> Array:
         return (wall.beta if is_row else wall.alpha) - number
 
     start, on_lobe = bisect(
-        lambda omega, loop, number: offset(frequency_boundary(omega, loop, delay_model), number),
+        lambda omega, loop, number: offset(frequency_boundary(omega, loop), number),
         ridge.omega if line == "upper" else jnp.zeros_like(end),
         ridge.omega if line == "lower" else end,
         loop,
         number,
     )
-    omega, wall = _solve(line, start, number, loop, delay_model)
+    omega, wall = _solve(line, start, number, loop)
     near = float(jnp.finfo(start.dtype).eps) ** 0.5
     # Of a very soft wall the frequency is below what a bracket resolves.
     hit = jnp.abs(offset(wall, number)) <= 0.1 * near * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))

@@ -13,15 +13,10 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.roots import follow_root, newton
-from zwidth.arrays.xp import along, apply_each, find_turn, frozen, namespace, store_once
-from zwidth.loops.rigid.crossover import Crossover, gain_crossover
+from zwidth.arrays.xp import along, apply_each, frozen, namespace, store_once
+from zwidth.loops.rigid.crossover import gain_crossover
 from zwidth.loops.rigid.device import DeviceTerms
 from zwidth.words.types import Array
-
-
-def find_angle(crossover: Crossover) -> Array:
-    """w of u and 2 - u."""
-    return find_turn(0.5 * crossover.u, 0.5 * crossover.y, namespace(crossover.u))
 
 
 def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
@@ -55,8 +50,8 @@ def _factors(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[An
 def gain_frequency(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array, Array]:
     """The gain crossover, the phase there, and whether there is one, without which both mean nothing."""
     xp = namespace(alpha, here.delta)
-    found = gain_crossover(alpha, beta, here)
-    w, exists = store_once((xp.where(found.exists, find_angle(found), 1.0), found.exists), alpha)
+    w, exists = gain_crossover(alpha, beta, here)
+    w, exists = store_once((xp.where(exists, w, 1.0), exists), alpha)
     return w, size_and_phase(w, alpha, beta, here)[1], exists
 
 
@@ -106,20 +101,15 @@ def modulus(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]
     """The least ``|1 + L|`` over (0, pi] and its w, for alpha > 0, elementwise."""
     xp = namespace(alpha, here.c)
     wall = alpha, beta, here
-    w = follow_root(_slope, _lowest(*frozen(wall, xp), xp), _is_dip, *wall, slope=_bend)
+
+    def is_dip(w: Array, bend: Array, _: Array) -> Array:
+        return (w < np.pi) & (bend > 0)
+
+    lowest = _lowest(*frozen(wall, xp), xp)
+    w = follow_root(
+        lambda *at: _slope_and_bend(*at)[0], lowest, is_dip, *wall, slope=lambda *at: _slope_and_bend(*at)[1]
+    )
     return xp.sqrt(xp.maximum(squared_distance(w, *wall), 0.0)), w
-
-
-def _slope(w: Array, *wall: Any) -> Array:
-    return _slope_and_bend(w, *wall)[0]
-
-
-def _bend(w: Array, *wall: Any) -> Array:
-    return _slope_and_bend(w, *wall)[1]
-
-
-def _is_dip(w: Array, bend: Array, _: Array) -> Array:
-    return (w < np.pi) & (bend > 0)
 
 
 def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
@@ -127,8 +117,8 @@ def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
 
     def at(level: Array) -> Array:
         """Where |L| has a value; pi if it is larger everywhere."""
-        found = gain_crossover(alpha / level, beta / level, here)
-        w = xp.where(found.exists, find_angle(found), np.pi)
+        w, exists = gain_crossover(alpha / level, beta / level, here)
+        w = xp.where(exists, w, np.pi)
         return store_once(w, w)
 
     alpha, beta = xp.asarray(alpha), xp.asarray(beta)

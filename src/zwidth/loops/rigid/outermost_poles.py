@@ -45,10 +45,9 @@ FEW_FOR_CELLS = 1 << 15
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
 
-
+# The relative error of radii and rates where nobody asks for another.
+ACCURACY = 1e-9
 _NONE = np.empty(0)
-# Of the pole of one wall, its radius and its rate.
-SLOWEST_ACCURACY = 1e-9
 
 
 def outermost_poles(columns: list[np.ndarray], accuracy: float, route: Route = "auto") -> OutermostPoles:
@@ -83,8 +82,7 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, route: 
             found = [np.concatenate(leaves)[:size] for leaves in zip(*blocks, strict=True)]
         else:
             # Always of one size: other batches may round differently.
-            padded = [np.pad(column, (0, max(0, PIECE - size)), mode="edge") for column in asked]
-            found = [leaf[:size] for leaf in map_blocks(compile_columns(quick_kernel, (kind,)), padded, PIECE)]
+            found = map_blocks(compile_columns(quick_kernel, (kind,)), asked, PIECE, exact=True)
     return _finish_poles(columns, OutermostPoles(*(np.array(leaf) for leaf in found)), accuracy, kind)
 
 
@@ -177,7 +175,7 @@ def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = Fal
 
 def slowest_pole(wall: tuple[float, float, float, float]) -> tuple[float, float, float]:
     """The spectral radius of one wall, its rate of decay and the angle of that pole."""
-    poles, found = _find_listed([np.array([value]) for value in wall], SLOWEST_ACCURACY, True, "auto")
+    poles, found = _find_listed([np.array([value]) for value in wall], ACCURACY, True, "auto")
     return float(poles.radius[0]), float(poles.rate[0]), abs(float(found.im[0]))
 
 

@@ -1,12 +1,8 @@
 """One or two poles of all walls of a cell, as polynomials in the place of the wall in it.
 
-On a pole ``alpha + beta f = Q(z)``, ``f = 1 - 1/z``, ``Q = -z^n (z - 1)(z - c)/M(z)``. Around a center z0, with
-``z = z0 (1 + u)``, ``alpha = alpha0 + a xi``, ``beta = beta0 + b eta`` (|xi|, |eta| <= 1), a wall's poles solve
-
-    A(u) = Q(z) - beta0 f(z) - alpha0 = a xi + b eta f(z)
-
+A wall's poles solve ``A(u) = a xi + b eta f(z)``, z = z0 (1 + u), in the notation of docs/theory/maps.md.
 A group is one pole, or the two next to the real axis that may meet there: their sums have no branch where they do. Sums
-over a group are integrals along a circle around it. The steps C1 to C3 are those of docs/theory/maps.md.
+over a group are integrals along a circle around it (C1 to C3).
 """
 
 from __future__ import annotations

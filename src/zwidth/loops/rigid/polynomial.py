@@ -10,14 +10,12 @@ factored. Pole methods use the coefficients `coefficients`, frequency methods `f
 
 from __future__ import annotations
 
-from math import factorial
 from typing import NamedTuple
 
-import numpy as np
-
-from zwidth.arrays.xp import horner, namespace, nan_with_nan_slopes
+from zwidth.arrays.xp import namespace, nan_with_nan_slopes
 from zwidth.loops.rigid.device import Plant, held_plant, split_delay, valid_wall
 from zwidth.loops.rigid.folding import Degree, map_by_degree
+from zwidth.loops.rigid.ridge_newton import expand_curve, wall, wave_at
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
 
@@ -76,77 +74,9 @@ def frequency_loop(delta: Array, d: Array, delay_model: str) -> FrequencyLoop:
     return FrequencyLoop(held_plant(delta, fraction), whole)
 
 
-def frequency_boundary(omega: Reals, loop: FrequencyLoop, delay_model: str) -> Wall:
-    """The wall (alpha, beta) that puts a pole at z = e^(j omega), in closed form, for one point.
-
-    On the unit circle P = 0 is a real linear 2x2 system. With s = sin(omega/2), C = cos(omega/2), M = N(z)/z,
-    G = (z - c)/M, W = e^(j k omega) G and k = n + 1/2, it solves to
-
-        beta = -Re W / C          alpha = 2 s (Im W - s beta)
-
-    Re W vanishes with C at omega = pi. cos(k omega)/C and Im G/C are therefore formed as ratios that stay finite.
-    """
-    plant, whole = loop
-    xp = namespace(omega, whole, plant.c)
-    half = 0.5 * omega
-    s, cos_half, sin_w = xp.sin(half), xp.cos(half), xp.sin(omega)
-    below_pi = cos_half > 0
-    c_safe = xp.where(below_pi, cos_half, 1.0)
-    k = whole + 0.5
-    re_m = -plant.gap + 2.0 * (plant.a2 + plant.a0) * cos_half * cos_half
-    im_m_over_sin = plant.a2 - plant.a0
-    re_z = plant.em - 2.0 * s * s
-    norm = re_m * re_m + (im_m_over_sin * sin_w) ** 2
-    finite = norm > 0
-    norm = xp.where(finite, norm, 1.0)
-    re_g = (re_z * re_m + sin_w * im_m_over_sin * sin_w) / norm
-    # sin_w/C = 2 s
-    im_g_over_c = 2.0 * s * (re_m - re_z * im_m_over_sin) / norm
-    sin_k, cos_k = xp.sin(k * omega), xp.cos(k * omega)
-    ratio = _cosine_ratio(omega, whole, c_safe, delay_model)
-    beta = -(ratio * re_g - sin_k * im_g_over_c)
-    alpha = 2.0 * s * (sin_k * re_g + cos_k * im_g_over_c * cos_half - s * beta)
-    # Where N(z) vanishes (delta = 0 at omega = pi) the curve runs to infinity with alternating sign.
-    far = xp.inf * (1.0 - 2.0 * xp.mod(whole, 2.0))
-    inside = (omega >= 0) & (omega <= np.pi)
-    limits = ((alpha, -far), (beta, far))
-    return Wall(*(xp.where(inside, xp.where(finite, value, limit), xp.nan) for value, limit in limits))
-
-
-def _cosine_ratio(omega: Array, lag: Array, cos_half: Array, delay_model: str) -> Array:
-    """``cos((lag + 1/2) omega)/cos(omega/2)``, finite at pi for a whole lag."""
-    if delay_model == "held":
-        return _whole_cosine_ratio(omega, lag, cos_half)
-    # With lag = n + e, n the nearest whole number: only the part with sin(e omega) is unbounded towards pi, and it
-    # vanishes with e.
-    xp = namespace(omega, lag)
-    nearest = xp.round(lag)
-    excess = (lag - nearest) * omega
-    unbounded = xp.sin((nearest + 0.5) * omega) * xp.sin(excess) / cos_half
-    return _whole_cosine_ratio(omega, nearest, cos_half) * xp.cos(excess) - unbounded
-
-
-def _whole_cosine_ratio(omega: Array, n: Array, cos_half: Array) -> Array:
-    """The ratio for a whole lag n: near pi as ``(-1)^n sin(k v)/sin(v/2)``, k = n + 1/2, v = pi - omega."""
-    xp = namespace(omega, n)
-    k = n + 0.5
-    # pi is not a float64: its second half keeps v exact to the last digit.
-    v = (np.pi - omega) + 1.2246467991473532e-16
-    sign = 1.0 - 2.0 * xp.mod(n, 2.0)
-    near = sign * 2.0 * k * _cardinal_sine(k * v) / _cardinal_sine(0.5 * v)
-    return xp.where(omega > 2.0, near, xp.cos(k * omega) / cos_half)
-
-
-_CARDINAL = [(-1.0) ** i / factorial(2 * i + 1) for i in range(11)]
-
-
-def _cardinal_sine(x: Array) -> Array:
-    """``sin(x)/x``, for small x by its series: the quotient has no digit of its derivatives there."""
-    xp = namespace(x)
-    small = xp.abs(x) < 1.5
-    safe = xp.where(small, 2.0, x)
-    inner = xp.where(small, x, 0.0)
-    return xp.where(small, horner(inner * inner, _CARDINAL), xp.sin(safe) / safe)
+def frequency_boundary(omega: Reals, loop: FrequencyLoop) -> Wall:
+    """The wall (alpha, beta) that puts a pole at z = e^(j omega), 0 <= omega <= pi, in closed form, for one point."""
+    return Wall(*wall(wave_at(omega, loop.lag), expand_curve(loop.plant)))
 
 
 def check_delay_model(delay_model: str) -> None:

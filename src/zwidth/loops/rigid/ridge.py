@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
@@ -139,7 +139,6 @@ def _jax_ridge() -> Any:
 
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
-_METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
 
 
 @shown(omega="", kind=RidgeKind)
@@ -192,7 +191,7 @@ def alpha_max(
         0.1445
     """
     check_delay_model(delay)
-    check_choice("method", method, _METHODS)
+    check_choice("method", method, get_args(RidgeMethod))
     arguments = {"delta": delta, "d": d}
     if method == "kkt":
         # The general route iterates over long formulas; its solvers take a second to import.

@@ -1,20 +1,7 @@
 """The ridge of the rigid loop by Newton's method on its closed-form optimality condition.
 
-The curve z = e^(j omega) and its slope are written in ``y = s^2``, ``s = sin(omega/2)``. There the maximum stays a
-regular one at omega = pi, where every derivative in omega vanishes by symmetry, and the corner is the end point s = 1.
-With D = lag + 1, lag = n (held) or d (fractional power), q = 1 - y, M = N(z)/z and a prime for d/dy:
-
-    (z - c) conj M = g1 + j g2 sin omega     quadratic and linear in y
-    |M|^2 = rho = m^2 + k^2 4 y q            m = Re M = N(1) - 2 b y, b = a2 + a0, k = a2 - a0
-    tau = sin(D omega)/sin omega             kappa = cos(D omega)
-    Q = tau g1 + kappa g2                    B = kappa g1 - 4 y q tau g2
-    alpha = 4 y Q/rho                        beta = -B/rho - alpha/2
-    T = rho (Q + y Q') - y Q rho' = 0        T = rho^2 alpha'/4,  T' = rho (2 Q' + y Q'') - y Q rho''
-
-tau is the Chebyshev polynomial U_(D-1) of cos omega for whole D, kappa is T_D, hence
-
-    kappa' = -2 D tau     tau' = (D kappa - tau cos omega)/(2 y q)
-    tau'' = -((3/2) cos omega tau' + (D^2 - 1) tau)/(y q)          and for D = 1: tau = 1, kappa = 1 - 2 y
+Curve and condition are written in ``y = s^2``, ``s = sin(omega/2)``, with D = lag + 1, lag = n (held) or d (fractional
+power), and the letters of docs/theory/boundary.md, B1 and B2. A prime there is a trailing digit or a leading d here.
 
 The lobe has one maximum (docs/theory/one-lobe.md, Theorem B), so nothing is searched. The number of steps is fixed:
 no point waits for another.
@@ -22,7 +9,7 @@ no point waits for another.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,22 +22,22 @@ from zwidth.words.types import Array
 class Curve(NamedTuple):
     """Coefficients in y of the curve of one device: all that the solver needs beside the exponent D."""
 
-    g1: tuple[Array, Array, Array]
-    g2: tuple[Array, Array]
+    E: tuple[Array, Array, Array]
+    H: tuple[Array, Array]
     at_one: Array  # N(1)
-    b: Array
-    k: Array
+    sigma: Array
+    mu: Array
     gap: Array  # N(-1)
 
 
 def expand_curve(plant: Plant) -> Curve:
     """The curve of one plant; every coefficient is free of cancellation where the ridge can be."""
     c, em, a2, a1, a0, gap = plant
-    b = a2 + a0
-    at_one = b + a1
-    g1 = (em * at_one, -2.0 * (4.0 * a0 - gap + em * b), 8.0 * a0)
-    g2 = (a1 + a2 * c + a0 * (1.0 + em), -4.0 * a0)
-    return Curve(g1, g2, at_one, b, a2 - a0, gap)
+    sigma = a2 + a0
+    at_one = sigma + a1
+    E = (em * at_one, -2.0 * (4.0 * a0 - gap + em * sigma), 8.0 * a0)
+    H = (a1 + a2 * c + a0 * (1.0 + em), -4.0 * a0)
+    return Curve(E, H, at_one, sigma, a2 - a0, gap)
 
 
 class Wave(NamedTuple):
@@ -58,12 +45,12 @@ class Wave(NamedTuple):
 
     y: Array
     q: Array
-    half: Array  # omega/2, of no meaning at the corner
-    per_sin: Array  # 1/sin omega, of no meaning at the corner
     tau: Array
     kappa: Array
-    tau1: Array  # d tau/dy
-    tau2: Array
+    # For the ridge:
+    half: Any = None  # omega/2, of no meaning at the corner
+    per_sin: Any = None  # 1/sin omega, of no meaning at the corner
+    tau1: Any = None  # d tau/dy
 
 
 def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
@@ -79,7 +66,7 @@ def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
     half = xp.where(low, half, 0.5 * np.pi - half)
     per_sin = 0.5 / (s * root)
     if undelayed:
-        return Wave(y, q, half, per_sin, 1.0, cos_w, 0.0, 0.0)
+        return Wave(y, q, 1.0, cos_w, half, per_sin, 0.0)
     # D omega as omega + lag omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
     D, x = lag + 1.0, lag * half
     square = x * x
@@ -87,54 +74,71 @@ def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
     ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
     sin2 = 4.0 * y * q
     tau, kappa = cosine + cos_w * ratio, cos_w * cosine - sin2 * ratio
-    # For D = 1 kappa is cos omega and the next two are exactly 0.
-    square = 4.0 * per_sin * per_sin
-    # D kappa - tau cos omega
-    tau1 = 0.5 * (lag * cos_w * cosine - ratio * (D * sin2 + cos_w * cos_w)) * square
-    return Wave(y, q, half, per_sin, tau, kappa, tau1, -(1.5 * cos_w * tau1 + lag * (D + 1.0) * tau) * square)
+    # For D = 1 kappa is cos omega and D kappa - tau cos omega exactly 0.
+    tau1 = (lag * cos_w * cosine - ratio * (D * sin2 + cos_w * cos_w)) * (2.0 * per_sin * per_sin)
+    return Wave(y, q, tau, kappa, half, per_sin, tau1)
 
 
-class Sides(NamedTuple):
-    """What wall and stationarity share."""
+def wave_at(omega: Array, lag: Array) -> Wave:
+    """The factors that `wall` needs at a frequency from 0 to pi, for any lag >= 0."""
+    xp = namespace(omega, lag)
+    s, cos_half = xp.sin(0.5 * omega), xp.abs(xp.cos(0.5 * omega))
+    y, q = s * s, cos_half * cos_half
+    nearest = xp.round(lag)
+    whole, excess = nearest + 1.0, lag - nearest
+    # Whole turns are counted from pi where that is nearer; it is no float64, its second half keeps the last digits.
+    sign, beyond = 1.0 - 2.0 * xp.mod(whole, 2.0), omega > 2.0
+    x = xp.where(beyond, (np.pi - omega) + 1.2246467991473532e-16, omega)
+    tau = xp.where(beyond, -sign, 1.0) * whole * _cardinal_sine(whole * x) / _cardinal_sine(x)
+    kappa = xp.where(beyond, sign, 1.0) * xp.cos(whole * x)
+    # sin(excess omega)/sin omega: what is unbounded towards pi vanishes with the excess.
+    turn = excess * omega
+    rest = excess * _cardinal_sine(turn) / (_cardinal_sine(0.5 * omega) * cos_half)
+    level = xp.cos(turn)
+    return Wave(y, q, tau * level + kappa * rest, kappa * level - 4.0 * y * q * tau * rest)
 
-    g1: Array
-    g2: Array
-    m: Array
-    rho: Array
+
+def _cardinal_sine(x: Array) -> Array:
+    """``sin(x)/x``, for small x by its series: the quotient has no digit of its derivatives there."""
+    xp = namespace(x)
+    small = xp.abs(x) < 1.5
+    inner, outer = xp.where(small, x, 0.0), xp.where(small, 2.0, x)
+    return xp.where(small, horner(inner * inner, SINE), xp.sin(outer) / outer)
 
 
-def sides(at: Wave, curve: Curve) -> Sides:
-    """(z - c) conj M and M at one s."""
-    xp = namespace(at.y, curve.b)
-    g1 = curve.g1[0] + at.y * (curve.g1[1] + at.y * curve.g1[2])
-    g2 = curve.g2[0] + at.y * curve.g2[1]
+def _sides(at: Wave, curve: Curve) -> tuple[Array, Array, Array, Array]:
+    """E, H, m and V at one s."""
+    xp = namespace(at.y, curve.sigma)
+    E = curve.E[0] + at.y * (curve.E[1] + at.y * curve.E[2])
+    H = curve.H[0] + at.y * curve.H[1]
     # Free of cancellation at both ends.
-    m = xp.where(at.y < 0.5, curve.at_one - 2.0 * curve.b * at.y, 2.0 * curve.b * at.q - curve.gap)
-    return Sides(g1, g2, m, m * m + curve.k * curve.k * (4.0 * at.y * at.q))
+    m = xp.where(at.y < 0.5, curve.at_one - 2.0 * curve.sigma * at.y, 2.0 * curve.sigma * at.q - curve.gap)
+    return E, H, m, m * m + curve.mu * curve.mu * (4.0 * at.y * at.q)
 
 
 def wall(at: Wave, curve: Curve) -> tuple[Array, Array]:
     """(alpha, beta) of the curve at one s."""
-    g1, g2, _, rho = sides(at, curve)
-    per_rho = 1.0 / rho
-    alpha = 4.0 * at.y * (at.tau * g1 + at.kappa * g2) * per_rho
-    return alpha, -(at.kappa * g1 - 4.0 * at.y * at.q * at.tau * g2) * per_rho - 0.5 * alpha
+    E, H, _, V = _sides(at, curve)
+    per_V = 1.0 / V
+    alpha = 4.0 * at.y * (at.tau * E + at.kappa * H) * per_V
+    return alpha, -(at.kappa * E - 4.0 * at.y * at.q * at.tau * H) * per_V - 0.5 * alpha
 
 
 def stationarity(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
-    """T and dT/ds, see the head of this file."""
+    """T of B2, and dT/ds."""
     at = wave(s, lag, undelayed)
-    y, q, tau, kappa, tau1, tau2 = at.y, at.q, at.tau, at.kappa, at.tau1, at.tau2
-    g1, g2, m, rho = sides(at, curve)
-    cos_w, k2, twice = q - y, curve.k * curve.k, 2.0 * (lag + 1.0)
-    dg1, dg2 = curve.g1[1] + 2.0 * y * curve.g1[2], curve.g2[1]
-    drho, ddrho = 4.0 * (k2 * cos_w - curve.b * m), 8.0 * (curve.b * curve.b - k2)
-    value = tau * g1 + kappa * g2
-    slope = tau1 * g1 + tau * (dg1 - twice * g2) + kappa * dg2
-    bend = tau2 * g1 + tau1 * (2.0 * dg1 - twice * g2) + 2.0 * tau * (curve.g1[2] - twice * dg2)
+    y, q, tau, kappa, tau1 = at.y, at.q, at.tau, at.kappa, at.tau1
+    E, H, m, V = _sides(at, curve)
+    cos_w, k2, twice = q - y, curve.mu * curve.mu, 2.0 * (lag + 1.0)
+    tau2 = 0.0 if undelayed else -(1.5 * cos_w * tau1 + lag * (lag + 2.0) * tau) * (4.0 * at.per_sin * at.per_sin)
+    dE, dH = curve.E[1] + 2.0 * y * curve.E[2], curve.H[1]
+    dV, ddV = 4.0 * (k2 * cos_w - curve.sigma * m), 8.0 * (curve.sigma * curve.sigma - k2)
+    value = tau * E + kappa * H
+    slope = tau1 * E + tau * (dE - twice * H) + kappa * dH
+    bend = tau2 * E + tau1 * (2.0 * dE - twice * H) + 2.0 * tau * (curve.E[2] - twice * dH)
     weighted = y * value
-    first = rho * (value + y * slope) - weighted * drho
-    return first, 2.0 * s * (rho * (2.0 * slope + y * bend) - weighted * ddrho)
+    first = V * (value + y * slope) - weighted * dV
+    return first, 2.0 * s * (V * (2.0 * slope + y * bend) - weighted * ddV)
 
 
 class Corner(NamedTuple):
@@ -149,19 +153,19 @@ class Corner(NamedTuple):
 def corner(curve: Curve, lag: Array) -> Corner:
     """The corner: where the lobe reaches y = 1 with alpha > 0, the ridge if it is still rising there.
 
-    The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, k > 0.
+    The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, mu > 0.
     """
-    xp = namespace(curve.b, lag)
-    g1 = sum(curve.g1[1:], curve.g1[0])
-    g2 = curve.g2[0] + curve.g2[1]
-    value, slope = g1 - g2, curve.g1[1] + 2.0 * curve.g1[2] - 2.0 * g2 - curve.g2[1]
-    rho, drho = curve.gap**2, 4.0 * (curve.b * curve.gap - curve.k**2)
-    reached = (lag <= 0.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0)
-    is_ridge = reached & (rho * (value + slope) - value * drho >= 0.0)
+    xp = namespace(curve.sigma, lag)
+    E = sum(curve.E[1:], curve.E[0])
+    H = curve.H[0] + curve.H[1]
+    value, slope = E - H, curve.E[1] + 2.0 * curve.E[2] - 2.0 * H - curve.H[1]
+    V, dV = curve.gap**2, 4.0 * (curve.sigma * curve.gap - curve.mu**2)
+    reached = (lag <= 0.0) & (curve.gap > 0.0) & (curve.mu > 0.0) & (value > 0.0)
+    is_ridge = reached & (V * (value + slope) - value * dV >= 0.0)
     # Elsewhere nothing may overflow: its derivative would be NaN and spoil what is chosen instead.
-    rho = xp.where(reached, rho, 1.0)
-    alpha = 4.0 * value / rho
-    return Corner(alpha, g1 / rho - 0.5 * alpha, reached, is_ridge)
+    V = xp.where(reached, V, 1.0)
+    alpha = 4.0 * value / V
+    return Corner(alpha, E / V - 0.5 * alpha, reached, is_ridge)
 
 
 class Start(NamedTuple):
@@ -227,7 +231,7 @@ class Ridge(NamedTuple):
 
 def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
     """Newton's method clipped to a bracket that holds every ridge; the last step comes back too."""
-    xp = namespace(curve.b, lag)
+    xp = namespace(curve.sigma, lag)
     lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
     s = xp.minimum(xp.maximum(start.s, lower), upper)
 
@@ -246,7 +250,7 @@ def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Ar
 
     For small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2).
     """
-    xp = namespace(curve.b, lag)
+    xp = namespace(curve.sigma, lag)
     # d = 0 may end at pi itself, where 1/sin omega is infinite.
     rest = xp.maximum(0.3 * xp.minimum(lag, 0.05) ** (2.0 / 3.0), epsilon(lag))
     lower, upper = 0.5 * start.scale, xp.minimum(xp.sqrt(1.0 - rest), 1.05 * start.scale)

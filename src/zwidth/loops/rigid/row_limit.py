@@ -4,16 +4,7 @@ For a held delay d = n + f the stable walls of one (beta, delta, d) are ``0 < al
 lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1 (docs/theory/one-lobe.md,
 Theorem C).
 
-Notation: ``N(z) = a2 z^2 + a1 z + a0`` of `loops.rigid.device`, ``em = 1 - c``, ``sigma = a2 + a0``, ``mu = a2 - a0``,
-``y = sin(w/2)^2``, ``k = n + 1/2``, and the boundary at ``z = e^(j w)`` in the form
-
-    alpha = 2 sin(w/2)/V (sin((n+1) w)/cos(w/2) E + 2 sin(w/2) cos((n+1) w) H)
-    beta  = -(cos(k w)/cos(w/2) E - 2 sin(w/2) sin(k w) H)/V
-
-    V = |N|^2          = phi1^2 - 4 (a1 sigma + 4 a2 a0) y + 16 a2 a0 y^2
-    E = V Re (z - c)z/N = em phi1 - 2 (phi1 + sigma em - 2 mu) y + 8 a0 y^2
-    H = V Im (z - c)z/N / sin w = phi1 (phi1 + f em) - 4 a0 y
-
+The boundary is taken in the form of docs/theory/boundary.md, B1, by half angles, with its letters and k = n + 1/2.
 Rows are told apart by ``b = beta + delta``, which vanishes with w^2: ``V b = delta V - cos(k w)/cos(w/2) E + ...`` is
 rearranged below so that nothing cancels, for every damping.
 """

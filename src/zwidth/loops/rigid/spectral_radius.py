@@ -10,7 +10,7 @@ from zwidth.arrays.evaluate import broadcast, check_scalars, evaluate, to_caller
 from zwidth.arrays.xp import is_traced, namespace
 from zwidth.loops.rigid.device import classify_delays
 from zwidth.loops.rigid.folding import NAMES
-from zwidth.loops.rigid.outermost_poles import find_poles
+from zwidth.loops.rigid.outermost_poles import ACCURACY, find_poles
 from zwidth.loops.rigid.pole_search import traced_kernel
 from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.loops.rigid.polynomial import check_has_poles
@@ -18,9 +18,7 @@ from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
-RADIUS_METHODS: tuple[str, ...] = get_args(RadiusMethod)
 
-_DEFAULT_ACCURACY = _DECAY_ACCURACY = 1e-9
 # Closer in, the rounding of two counts would meet.
 _LEAST_ACCURACY = 1e-12
 
@@ -128,14 +126,14 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     check_scalars(arguments)
     if is_traced(*values):
         return -evaluate(traced_kernel, arguments, classify_delays(d).fractional)
-    return to_caller(find_poles(broadcast(arguments), _DECAY_ACCURACY, with_rate=True).rate, values)
+    return to_caller(find_poles(broadcast(arguments), ACCURACY, with_rate=True).rate, values)
 
 
 def _check_radius(method: str, accuracy: float | None, delay_model: str) -> float:
     check_has_poles(delay_model)
-    check_choice("method", method, RADIUS_METHODS)
+    check_choice("method", method, get_args(RadiusMethod))
     if accuracy is None:
-        return _DEFAULT_ACCURACY
+        return ACCURACY
     least = 0.0 if method == "companion" else _LEAST_ACCURACY
     number: Any = accuracy
     good = isinstance(number, int | float | np.floating) and np.isfinite(number) and 0 < number < 1 and number >= least

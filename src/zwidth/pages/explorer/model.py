@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.loops.linear.curve import end_lines
+from zwidth.loops.linear.curve import lines_at
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
@@ -63,7 +63,7 @@ def quick_edge(scene: Scene) -> Curve:
     low, high = (float(known.min()), float(known.max())) if known.size else (-1.0, 1.0)
     damping = np.linspace(low - 0.5 * (high - low), high + 0.5 * (high - low), _QUICK_LINE)
     units = scene.units
-    for line in end_lines(scene.loop.roots):
+    for line in lines_at(scene.loop.roots, (0.0, np.pi)):
         stiffness = (line.q - damping / units.virtual_damping * line.f) * units.stiffness
         parts.append(_on_edge(scene, stiffness, damping))
     x, y = (np.concatenate([np.append(part[k], np.nan) for part in parts]) for k in (0, 1))
