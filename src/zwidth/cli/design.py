@@ -109,8 +109,10 @@ def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
     result |= {"spectral_radius": best.spectral_radius, "modulus_margin": best.modulus_margin}
     text = f"no B is stable at K = {with_unit(wanted, 'N/m')}"
     if best.status == Status.OK:
-        B, radius = with_unit(best.virtual_damping, "N s/m"), plain(best.spectral_radius)
-        text = f"{B} settles fastest: spectral radius {radius}, modulus margin {plain(best.modulus_margin)}"
+        B, radius = best.virtual_damping, plain(best.spectral_radius)
+        digits = next((n for n in range(4, 17) if scene.is_stable(wanted, float(f"{B:.{n}g}"))), 17)
+        text = f"{with_unit(B, 'N s/m', digits)} settles fastest: spectral radius {radius}"
+        text += f", modulus margin {plain(best.modulus_margin)}"
     return result, [row("virtual damping", text)]
 
 

@@ -82,10 +82,14 @@ def round_safely(value: float, enough: str, digits: int = 4) -> float:
     return steps * step
 
 
-def spell_stiffness(value: float) -> str:
-    """A stiffness with its unit; of a rotary device per degree as well, as people picture it."""
-    text = with_unit(value, "N/m")
-    return f"{text} ({plain(value * 1e3 * math.pi / 180)} mN m/deg)" if is_rotary() and math.isfinite(value) else text
+def spell_stiffness(value: float, digits: int = 4) -> str:
+    """A stiffness with its unit, rounded down: most are the largest of which something holds.
+
+    Of a rotary device per degree as well, as people picture it.
+    """
+    text = with_unit(round_safely(value, "below", digits), "N/m", digits)
+    turned = round_safely(value * 1e3 * math.pi / 180, "below", digits)
+    return f"{text} ({plain(turned, digits)} mN m/deg)" if is_rotary() and math.isfinite(value) else text
 
 
 def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
