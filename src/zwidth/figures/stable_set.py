@@ -217,8 +217,8 @@ def draw_stable_set(
     wide = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
     # Room for words to the right of the stiffest wall, as wide as they are in a narrow panel too.
     beyond, most = 0.28 * max(1.0, 5.6 / wide), max(rows[names[0]], default=np.nan) * factors[0]
-    told = rows.get("digits", [4] * len(rows["wall"]))
-    for kind, label, digits, *wall in zip(rows["wall"], rows["label"], told, *(rows[name] for name in names), strict=True):
+    rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
+    for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
         wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
         which = kind.split()[0]
         # It holds as it is read.

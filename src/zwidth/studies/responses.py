@@ -263,7 +263,8 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
     def spell(value: float | None, unit: str = "") -> str:
         return "not known" if value is None else with_unit(value, unit) if unit else plain(value)
 
-    def cells(row: dict[str, Any], digits: int = 4, mark: str = "") -> str:
+    def cells(row: dict[str, Any], mark: str = "") -> str:
+        digits = row.get("digits", 4)
         # Rounded up a stiffness might be stable no longer, or not have what is wanted.
         K, alpha = (round_safely(row[name], "below", digits) for name in ("stiffness", "alpha"))
         wall = with_unit(K, "N/m", digits), with_unit(row["virtual_damping"], "N s/m", digits)
@@ -298,7 +299,7 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
         if best["settling_time"] is None:
             settles = f"has a slowest motion that decays to 2 % in {spell(best['decay_time'], 's')}"
         lines += [
-            f"| **recommended, {100 * best['stiffness_fraction']:.4g} % of it** | {cells(best, best['digits'], '**')} |",
+            f"| **recommended, {100 * best['stiffness_fraction']:.4g} % of it** | {cells(best, '**')} |",
             "",
             "The recommended wall",
             "",

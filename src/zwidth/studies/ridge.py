@@ -108,9 +108,10 @@ class PassivityStudy(CurvesStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         ridge, notes = ridge_table(self.delta.values(), self.d.values(), self.delay_model)
         table = {name: ridge[name] for name in ("d", "delta", "alpha_max", "beta")}
-        slopes, share = map(passive_stiffness_slope, self.d.values().tolist()), share_of_device(self.delta, self.d, scene)
+        slopes = map(passive_stiffness_slope, self.d.values().tolist())
+        own = share_of_device(self.delta, self.d, scene) * table["delta"]
         for name, slope in zip(("alpha_max_passive", "beta_passive"), zip(*slopes, strict=True), strict=True):
-            table[name] = np.repeat(slope, self.delta.size) * (share * table["delta"])
+            table[name] = np.repeat(slope, self.delta.size) * own
         return Outcome(table=table, figures={"": partial(figures.draw_passivity_cost, table)}, notes=tuple(notes))
 
 

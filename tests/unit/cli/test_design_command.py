@@ -107,6 +107,11 @@ def test_the_damping_for_a_stiffness_is_that_of_the_library():
     assert (found["value"], found["spectral_radius"]) == (best.virtual_damping, best.spectral_radius)
     assert "settles fastest" in design("--find", "virtual_damping", "--stiffness", "5 kN/m", *DEVICE)
     assert "no B is stable at K = 500.0 kN/m" in design("--find", "virtual_damping", "--stiffness", "5e5", *DEVICE)
+    # Next to the stiffest wall B has the digits that it needs.
+    stiffness = 266.96362243298
+    text = design("--find=virtual_damping", f"--stiffness={stiffness}", "--mass=0.1", "--period=0.01", "--delay=5 ms")
+    scene = zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(0.01, 5e-3))
+    assert scene.is_stable(stiffness, text.partition("damping")[2].partition(" settles")[0].strip())
 
 
 @pytest.mark.parametrize(
