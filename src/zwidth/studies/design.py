@@ -26,7 +26,7 @@ from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, summarize_stiffest, track
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import ENOUGH, describe, header, plain, round_safely, short, suggestion, with_unit
+from zwidth.words.formatting import describe, header, short, spell_enough, suggestion, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -162,10 +162,9 @@ class DesignStudy(ComputedStudy):
             ranges.append(needed.range)
             rows.append(self._describe(nominal, stiffness, needed))
             notes += self._note(stiffness, needed)
-            if side := ENOUGH.get(needed.enough):
-                value = round_safely(needed.value, needed.enough)
-                value = plain(value) if unit == "1" else with_unit(value, unit)
-                answer.append(f"K_max = {with_unit(self.reserve * stiffness, 'N/m')}: {self.find} of {value} {side}")
+            if needed.crossings and needed.status == Status.OK:
+                value = spell_enough(needed.value, needed.enough, [one.value for one in needed.crossings], unit)
+                answer.append(f"K_max = {with_unit(self.reserve * stiffness, 'N/m')}: {self.find} of {value}")
         low, high = min(ends[0] for ends in ranges), max(ends[1] for ends in ranges)
         curve = self._trace(nominal, low, high)
         table = stack(rows)

@@ -105,6 +105,16 @@ def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
     return spell(low, 4), spell(high, 4)
 
 
+def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, digits: int = 4) -> str:
+    """Of which values there is enough: on one side of a value, or up to the first of others there."""
+    side, unit = (1.0 if enough == "above" else -1.0), unit.removeprefix("1")
+    beyond = [side * other for other in others if side * other > side * value]
+    if beyond:
+        return " to ".join(tell_apart(*sorted((value, side * min(beyond))), unit))
+    value = round_safely(value, enough, digits)
+    return f"{with_unit(value, unit, digits) if unit else plain(value, digits)} {ENOUGH[enough]}"
+
+
 def header(name: str, unit: str) -> str:
     """The name of a column with its unit, as ``stiffness_N_per_m``; a number without unit has its name alone."""
     if unit in ("", "1", "sampling periods"):
