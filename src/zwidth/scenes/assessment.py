@@ -10,10 +10,11 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.rigid.margins import Margins
 from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
+from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
@@ -148,6 +149,14 @@ def check_held(scene: SceneOptima) -> None:
 def name_kind(wall: StiffestWall) -> str:
     """The kind of a stiffest wall in words, "none" where there is no such wall."""
     return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
+
+
+def round_margin(name: str, margins: Assessment | Margins, stable: bool | None, digits: int = 4) -> float:
+    """A margin in few digits, rounded so that a wall bears what is read, or that an unstable one is stable by it."""
+    value = float(getattr(margins, name))
+    # A gain margin may be a factor below 1 of a stable wall, too.
+    outward = name == "gain_margin" and (value > 1.0) != bool(stable)
+    return round_safely(value, "above" if outward else "below", digits)
 
 
 def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:

@@ -15,7 +15,16 @@ from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
 from zwidth.parts.wall import NoWall, VirtualWall
-from zwidth.scenes.assessment import Assessment, Limit, assess, check_held, describe_islands, limits_of, name_kind
+from zwidth.scenes.assessment import (
+    Assessment,
+    Limit,
+    assess,
+    check_held,
+    describe_islands,
+    limits_of,
+    name_kind,
+    round_margin,
+)
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, find_lowest, soft_dampings
 from zwidth.scenes.wall_code import write_wall
 from zwidth.words.errors import InputError
@@ -168,8 +177,9 @@ class Recommendation:
         lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
         # A unit that both have stands once.
         lower = lower.removesuffix(f" {upper.partition(' ')[2]}")
-        delay = "not known" if math.isnan(verdict.delay_margin) else with_unit(verdict.delay_margin, "s")
-        apart = f"gain {plain(verdict.gain_margin)}, phase {plain(verdict.phase_margin)} degrees, delay {delay}"
+        gain, phase, late = (round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay"))
+        delay = "not known" if math.isnan(late) else with_unit(late, "s")
+        apart = f"gain {plain(gain)}, phase {plain(phase)} degrees, delay {delay}"
         rest = f"margins: {apart}; passive: {self.spell_passive()}"
         return first, f"stable for B from {lower} to {upper}; {rest}"
 
