@@ -134,8 +134,11 @@ def _tolerate(
     result |= {"seed": seed, "distribution": distribution, "shares": shares}
     percent = f"{100 * found.reliability:g} %"
     borne, most = (with_unit(round_safely(end, "below"), "N/m") for end in (found.stiffness, found.stiffness_max))
-    share = f"{plain(100 * found.stable)} % of {found.samples} devices drawn"
-    known = f"{plain(100 * found.stable_low)} to {plain(100 * found.stable_high)} % of all, with 95 % confidence"
+    # Not 100 % where one of many does not bear it.
+    ends = (found.stable, "below"), (found.stable_low, "below"), (found.stable_high, "above")
+    stable, low, high = (plain(round_safely(100 * each, side)) for each, side in ends)
+    share = f"{stable} % of {found.samples} devices drawn"
+    known = f"{low} to {high} % of all, with 95 % confidence"
     lines = [
         row("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping)),
         row("stable", f"{share} ({known})"),

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, select
-from zwidth.words.formatting import ENOUGH, header, spell_enough
+from zwidth.words.formatting import ENOUGH, header, round_safely, spell_enough
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 
@@ -168,7 +168,9 @@ def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[f
     shares = required["stable_share"] if borne else np.full(len(required["reserve"]), np.nan)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.3g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
-        yield wanted * reserve, words + (f": {100 * share:.3g} % of devices bear it" if np.isfinite(share) else "")
+        # Not 100 % where one of many does not.
+        percent = f"{round_safely(100.0 * share, 'below', 3):.3g}"
+        yield wanted * reserve, words + (f": {percent} % of devices bear it" if np.isfinite(share) else "")
 
 
 def _mark_present(ax: Axes, values: np.ndarray, stiffness: np.ndarray, present: float) -> None:

@@ -232,7 +232,8 @@ class Limit(NamedTuple):
     def spell(self) -> str:
         """The step and what it buys."""
         less = " (it helps as it is)" if self.gain < 1 else ""
-        return f"{self.words}: K_max {with_unit(self.stiffness, 'N/m')}, {plain(self.gain, 3)} times{less}"
+        K_max = with_unit(round_safely(self.stiffness, "below"), "N/m")
+        return f"{self.words}: K_max {K_max}, {plain(self.gain, 3)} times{less}"
 
 
 @in_own_units

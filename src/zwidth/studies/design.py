@@ -26,7 +26,7 @@ from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, summarize_stiffest, track
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, header, short, spell_enough, suggestion, with_unit
+from zwidth.words.formatting import describe, header, round_safely, short, spell_enough, suggestion, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -327,7 +327,7 @@ def _spell_best(row: dict[str, Any]) -> str:
     """The best filter of a damping, in a line."""
     (stiffness, damping), size = (row[name] for name in SI_COLUMNS), f"{row['samples']:g} samples"
     size = size if row["samples"] == row["samples"] else with_unit(row["cutoff_Hz"], "Hz")
-    wall = f"K_max = {with_unit(stiffness, 'N/m')} at B = {with_unit(damping, 'N s/m')}"
+    wall = f"K_max = {with_unit(round_safely(stiffness, 'below'), 'N/m')} at B = {with_unit(damping, 'N s/m')}"
     return f"b = {with_unit(row['damping_N_s_per_m'], 'N s/m')}: {row['estimate'].replace('_', ' ')}, {size}: {wall}"
 
 

@@ -64,8 +64,9 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
 
 
 def name_wall(stiffness: Any, virtual_damping: Any) -> str:
-    """A wall by its numbers."""
-    return f"K = {with_unit(float(stiffness), 'N/m')}, B = {with_unit(float(virtual_damping), 'N s/m')}"
+    """A wall by its numbers, K rounded down: it holds as it is read."""
+    K = with_unit(round_safely(float(stiffness), "below"), "N/m")
+    return f"K = {K}, B = {with_unit(float(virtual_damping), 'N s/m')}"
 
 
 # Words behind a number, by the side of it on which there is enough.
