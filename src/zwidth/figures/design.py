@@ -106,7 +106,8 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float], 
         which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
         ax.plot(noise * factors[0], stiffness * factors[1], linestyle="", label="best", **look)
-        spelled = f":  ${which}$,  {stiffness * factors[1]:.3g} {words.rpartition('  in ')[2]}"
+        most = round_safely(stiffness * factors[1], "below", 3)
+        spelled = f":  ${which}$,  {most:.3g} {words.rpartition('  in ')[2]}"
     return spelled
 
 
