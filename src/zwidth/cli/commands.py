@@ -148,7 +148,7 @@ def _say_stiffer(scene: Any) -> list[str]:
     top = find_nominal_limit(scene)
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == 0 else []
     return [
-        f"K_max = {with_unit(float(top.stiffness), 'N/m')} by the curve without its deviation; {text}" for text in said
+        f"K_max = {spell_stiffness(float(top.stiffness))} by the curve without its deviation; {text}" for text in said
     ]
 
 

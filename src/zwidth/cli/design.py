@@ -10,7 +10,7 @@ import click
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
 from zwidth.pages.words import row, tell
-from zwidth.words.formatting import ENOUGH, name_wall, plain, round_safely, with_unit
+from zwidth.words.formatting import name_wall, plain, round_safely, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -87,19 +87,24 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     wanted = float(scene.wall.stiffness)
     needed = scene.required(path, wanted, within=within)
     result = {"parameter": path, "value": needed.value, "unit": own_unit(unit), "enough": needed.enough}
+    result["status"] = Status(needed.status).name
     result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
-    text = with_unit(round_safely(needed.value, needed.enough), unit)
     if path == "period":
         result["rate"] = 1.0 / needed.value
-        rate = round_safely(result["rate"], {"above": "below", "below": "above"}.get(needed.enough, ""))
-        text += f" (a rate of {with_unit(rate, 'Hz')}; the same delay in seconds)"
-    if needed.enough in ("nowhere", "everywhere"):
-        low, high = (with_unit(end, unit) for end in needed.range)
-        reached = "reached nowhere" if needed.enough == "nowhere" else "reached everywhere"
-        text = f"K_max = {with_unit(wanted, 'N/m')} is {reached} from {low} to {high}"
+    low, high = (with_unit(end, unit) for end in needed.range)
+    if needed.status not in (Status.OK, Status.UNREACHABLE):
+        text = f"not found from {low} to {high}: {Status(needed.status).message}"
+    elif needed.enough in ("nowhere", "everywhere"):
+        text = f"K_max = {with_unit(wanted, 'N/m')} is reached {needed.enough} from {low} to {high}"
     else:
-        others = len(needed.crossings) - 1
-        text += f" {ENOUGH[needed.enough]}"
+        values = [crossing.value for crossing in needed.crossings]
+        text = spell_enough(needed.value, needed.enough, values, unit)
+        # One or two of them are told.
+        others = len(values) - 1 - (" to " in text)
+        if path == "period":
+            side = {"above": "below", "below": "above"}[needed.enough]
+            rate = spell_enough(result["rate"], side, [1.0 / value for value in values], "Hz")
+            text += f" (a rate of {rate}; the same delay in seconds)"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
     return result, [row(f"{path} needed", text)]
 
@@ -111,8 +116,10 @@ def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
     result |= {"spectral_radius": best.spectral_radius, "modulus_margin": best.modulus_margin}
     text = f"no B is stable at K = {with_unit(wanted, 'N/m')}"
     if best.status == Status.OK:
-        B, radius = with_unit(best.virtual_damping, "N s/m"), plain(best.spectral_radius)
-        text = f"{B} settles fastest: spectral radius {radius}, modulus margin {plain(best.modulus_margin)}"
+        B, radius = best.virtual_damping, plain(best.spectral_radius)
+        digits = next((n for n in range(4, 17) if scene.is_stable(wanted, float(f"{B:.{n}g}"))), 17)
+        text = f"{with_unit(B, 'N s/m', digits)} settles fastest: spectral radius {radius}"
+        text += f", modulus margin {plain(best.modulus_margin)}"
     return result, [row("virtual damping", text)]
 
 
@@ -129,8 +136,11 @@ def _tolerate(
     result |= {"seed": seed, "distribution": distribution, "shares": shares}
     percent = f"{100 * found.reliability:g} %"
     borne, most = (with_unit(round_safely(end, "below"), "N/m") for end in (found.stiffness, found.stiffness_max))
-    share = f"{plain(100 * found.stable)} % of {found.samples} devices drawn"
-    known = f"{plain(100 * found.stable_low)} to {plain(100 * found.stable_high)} % of all, with 95 % confidence"
+    # Not 100 % where one of many does not bear it.
+    ends = (found.stable, "below"), (found.stable_low, "below"), (found.stable_high, "above")
+    stable, low, high = (plain(round_safely(100 * each, side)) for each, side in ends)
+    share = f"{stable} % of {found.samples} devices drawn"
+    known = f"{low} to {high} % of all, with 95 % confidence"
     lines = [
         row("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping)),
         row("stable", f"{share} ({known})"),

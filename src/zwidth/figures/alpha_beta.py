@@ -17,6 +17,7 @@ from zwidth.figures import grid, stable_set, style
 from zwidth.figures.stable_set import draw_zeros, mark_wall, shade_region
 from zwidth.figures.table import Table, curves, draws_tables, select, si_scale
 from zwidth.words.errors import InputError
+from zwidth.words.formatting import round_safely
 from zwidth.words.status import Status
 
 # A legend of more entries than this is harder to read than a color bar.
@@ -111,10 +112,10 @@ def _mark_maximum(ax: Axes, edge: Any, scale: tuple[float, float] | None) -> Non
     """A dot at the stiffest stable wall, labelled inside the region."""
     top = int(np.argmax(edge.alpha))
     place = (edge.alpha[top], edge.beta[top])
-    text = rf"$\alpha_{{\max}} = {place[0]:.4g}$"
+    text = rf"$\alpha_{{\max}} = {round_safely(place[0], 'below'):.4g}$"
     if scale is not None:
         factor, unit = style.si_unit(place[0] * scale[0], "N/m")
-        text += "\n" + rf"$K_{{\max}} = {place[0] * scale[0] * factor:.4g}$ {unit}"
+        text += "\n" + rf"$K_{{\max}} = {round_safely(place[0] * scale[0] * factor, 'below'):.4g}$ {unit}"
     mark_wall(ax, place, "alpha_max", kind="stiffest", text=text)
 
 

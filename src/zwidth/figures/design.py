@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, select
-from zwidth.words.formatting import ENOUGH, header, round_safely
+from zwidth.words.formatting import ENOUGH, header, round_safely, spell_enough
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 
@@ -106,7 +106,8 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float], 
         which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
         ax.plot(noise * factors[0], stiffness * factors[1], linestyle="", label="best", **look)
-        spelled = f":  ${which}$,  {stiffness * factors[1]:.3g} {words.rpartition('  in ')[2]}"
+        most = round_safely(stiffness * factors[1], "below", 3)
+        spelled = f":  ${which}$,  {most:.3g} {words.rpartition('  in ')[2]}"
     return spelled
 
 
@@ -121,8 +122,8 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
 
     Args:
         curve: columns parameter, value with its unit (as ``value_Hz``), stiffness_N_per_m.
-        required: columns of a design study: stiffness_N_per_m, reserve, present and value with their unit, enough, and
-            stable_share where tolerances are given.
+        required: columns of a design study: stiffness_N_per_m, reserve, present and value and
+            other_crossings with their unit, enough, and stable_share where tolerances are given.
         axes: an Axes of yours.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 3.8)
@@ -138,12 +139,15 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     colors = style.color_by_value(targets.tolist())
     ax.set(xscale="log", yscale="log")
     _mark_present(ax, values * scale, stiffness * factor, float(required[present_in][0]) * scale)
-    rows = zip(targets, required[value_in], required["enough"], strict=True)
     curve_drawn = np.stack([values * scale, stiffness * factor])
-    names = [
-        _mark_required(ax, curve_drawn, target * factor, value * scale, str(enough), colors[target], spelled)
-        for target, value, enough in rows
-    ]
+    columns = (required[name] for name in (value_in, "enough", header("other_crossings", parameter.unit)))
+    names = []
+    for target, value, enough, others in zip(targets, *columns, strict=True):
+        known = enough in ENOUGH
+        _mark_required(ax, curve_drawn, target * factor, value * scale if known else np.nan, colors[target])
+        # As a design study writes them.
+        crossings = [float(each.split()[0]) for each in str(others).split("; ") if each]
+        names.append(spell_enough(float(value), enough, crossings, parameter.unit, 3) if known else "")
     heights = np.append(stiffness, targets)
     for name, scaled in (("x", values * scale), ("y", heights * factor)):
         style.use_logarithmic(ax, name, scaled, style.DECADES)
@@ -166,7 +170,9 @@ def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[f
     shares = required["stable_share"] if borne else np.full(len(required["reserve"]), np.nan)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.3g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
-        yield wanted * reserve, words + (f": {100 * share:.3g} % of devices bear it" if np.isfinite(share) else "")
+        # Not 100 % where one of many does not.
+        percent = f"{round_safely(100.0 * share, 'below', 3):.3g}"
+        yield wanted * reserve, words + (f": {percent} % of devices bear it" if np.isfinite(share) else "")
 
 
 def _mark_present(ax: Axes, values: np.ndarray, stiffness: np.ndarray, present: float) -> None:
@@ -177,15 +183,12 @@ def _mark_present(ax: Axes, values: np.ndarray, stiffness: np.ndarray, present: 
     ax.plot([present], [height], linestyle="", label="present", zorder=5, **look)
 
 
-def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, enough: str, color: Any, unit: str) -> str:
-    """Mark the wanted stiffness, and where on the curve there is enough for it; returns the value that is, in words."""
+def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, color: Any) -> None:
+    """Mark the wanted stiffness, and where on the curve there is enough for it."""
     ax.axhline(target, color=color, linewidth=0.9, linestyle=style.DASHED, zorder=2, label=f"wanted {target:g}")
-    known = np.isfinite(value) and enough in ENOUGH
-    x, y = (np.append(part, end) for part, end in zip(curve, (value, target) if known else (np.nan,) * 2, strict=True))
+    x, y = (np.append(part, end) for part, end in zip(curve, (value, target), strict=True))
     order = np.argsort(x)
     band = np.where(y[order] >= target, target, np.nan)
     ax.plot(x[order], band, color=color, linewidth=3.5, alpha=0.35, label="enough", zorder=2.5)
-    if not known:
-        return ""
-    ax.plot([value], [target], linestyle="", marker="o", markersize=6, color=color, label="required", zorder=6)
-    return f"{round_safely(value, enough, 3):g} {unit} {ENOUGH[enough]}"
+    if np.isfinite(value):
+        ax.plot([value], [target], linestyle="", marker="o", markersize=6, color=color, label="required", zorder=6)

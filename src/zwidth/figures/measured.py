@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from zwidth.figures import style
 from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
+from zwidth.words.formatting import round_safely
 
 # Samples that one panel shows; of longer logs every n-th.
 _MOST = 4000
@@ -178,7 +179,9 @@ def _mark_walls(ax: Axes, walls: Table, stiffness: tuple[float, str], damping: t
         _, K, B = kinds[kind]
         mark_wall(ax, (K, B), kind, kind=mark)
         if K.size:
-            text = f": $K = {K[0]:.3g}$ {stiffness[1]}, $B = {B[0]:.3g}$ {damping[1]}" if K.size == 1 else ""
+            # With four digits and K rounded down the wall holds as it is read.
+            numbers = f": $K = {round_safely(K[0], 'below'):.4g}$ {stiffness[1]}, $B = {B[0]:.4g}$ {damping[1]}"
+            text = numbers if K.size == 1 else ""
             handles.append(style.line(words + text, "", color=style.BLACK, **MARKS[mark]))
     if not kinds["set"][1].size:
         handles.append(style.line("no wall to set: a doubt, or none holds", ""))

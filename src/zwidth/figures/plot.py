@@ -35,7 +35,7 @@ from zwidth.loops.rigid.response import settling_time
 from zwidth.parts.checks import read_texts
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.assessment import passive_edge
+from zwidth.scenes.assessment import passive_edge, round_margin
 from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
@@ -253,6 +253,8 @@ def bode(
     known = scene.margins(stiffness, virtual_damping)
     upper, lower = _two(axes, 2, 1, None)
     gain, phase = float(known.gain_margin), float(known.phase_margin)
+    stable = bool(scene.is_stable(stiffness, virtual_damping))
+    read = {name: round_margin(f"{name}_margin", known, stable, 3) for name in ("gain", "phase")}
     at_phase, at_gain = float(known.gain_crossover), float(known.phase_crossover)
     # The turn that the margin is measured from, where the phase crosses -180 degrees.
     angles = np.unwrap(np.angle(found))
@@ -263,11 +265,11 @@ def bode(
     lower.axhline(-180.0, color=style.GRAY, linewidth=0.6, zorder=0.5)
     bar: dict[str, Any] = {"color": style.VERMILION, "marker": "_", "markersize": 7, "zorder": 4}
     if np.isfinite(gain) and gain > 0:
-        upper.plot([at_gain] * 2, [1.0, 1.0 / gain], label=f"gain margin {gain:.3g}", **bar)
+        upper.plot([at_gain] * 2, [1.0, 1.0 / gain], label=f"gain margin {read['gain']:.3g}", **bar)
     if np.isfinite(phase):
         there = float(np.interp(at_phase, hertz, angles))
         foot = there - (there + 180.0 + 180.0) % 360.0 + 180.0
-        lower.plot([at_phase] * 2, [foot, there], label=f"phase margin {phase:.3g}°", **bar)
+        lower.plot([at_phase] * 2, [foot, there], label=f"phase margin {read['phase']:.3g}°", **bar)
     upper.set(yscale="log", ylabel="$|L|$")
     for ax in (upper, lower):
         style.use_logarithmic(ax, "x", hertz, style.DECADES)

@@ -198,7 +198,7 @@ def draw_stable_set(
     Args:
         outlines: columns label, number, piece (outline, island, hole or passive), stiffness_N_per_m,
             virtual_damping_N_s_per_m.
-        walls: columns label, wall (stiffest or recommended) and the same two.
+        walls: columns label, wall (stiffest or recommended), the same two and, where one needs more than 4, digits.
         axes: an Axes of yours.
         normalized: from the columns alpha and beta in place of those two.
     """
@@ -217,13 +217,14 @@ def draw_stable_set(
     wide = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
     # Room for words to the right of the stiffest wall, as wide as they are in a narrow panel too.
     beyond, most = 0.28 * max(1.0, 5.6 / wide), max(rows[names[0]], default=np.nan) * factors[0]
-    for kind, label, *wall in zip(*(rows[name] for name in ("wall", "label", *names)), strict=True):
+    rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
+    for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
         wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
         which = kind.split()[0]
-        # A wall to be set holds as it is read.
-        read = [round_safely(wall[0], "below") if which == "recommended" else wall[0], wall[1]]
+        # It holds as it is read.
+        read = round_safely(wall[0], "below", digits), wall[1]
         symbols = zip((r"\alpha", r"\beta") if normalized else "KB", read, units, strict=True)
-        numbers = [f"${symbol} = {value:.4g}$ {unit}".rstrip() for symbol, value, unit in symbols]
+        numbers = [f"${symbol} = {value:.{digits}g}$ {unit}".rstrip() for symbol, value, unit in symbols]
         text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""
         look = {"color": style.BLACK} if alone else {"color": colors[label]}
         look |= {"marker": markers[label]} if which == "stiffest" else {}
@@ -291,7 +292,8 @@ def draw_recommendation(
     outlines["label"] = np.full(len(outlines["piece"]), "")
     kinds = np.array(["stiffest", f"recommended ({100 * wall['stiffness_fraction']:.3g} %)"])
     walls = {name: np.array([row[key] for row in (maximum, wall)]) for name, key in zip(SI_COLUMNS, _WALL, strict=True)}
-    draw_stable_set(outlines, {"label": np.array(["", ""]), "wall": kinds, **walls}, panels[:1])
+    digits = np.array([4, wall.get("digits", 4)])
+    draw_stable_set(outlines, {"label": np.array(["", ""]), "wall": kinds, "digits": digits, **walls}, panels[:1])
     (spring, damper), _ = scale_walls([outlines, walls])
     # A bound that is not known is None in JSON.
     interval = np.array([wall["virtual_damping_lower"], wall["virtual_damping_upper"]], dtype=np.float64)

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
-from zwidth.fitting.safe_wall import SafeWall, bears_resonances
+from zwidth.fitting.safe_wall import bears_resonances
 from zwidth.parts.paths import spell_estimate
-from zwidth.words.formatting import name_wall, plain, round_safely, with_unit
+from zwidth.words.formatting import name_wall, plain, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 from zwidth.words.status import Status
@@ -129,11 +129,11 @@ def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     safe, wall = fit.safe_wall(), choose_wall(fit)
     if safe.status == Status.OK and safe.stiffness > 0:
         borne = "stable on 99 % of the devices that these records allow"
-        rows.append(("safe wall", f"{_spell_wall(safe)}: {borne}"))
+        rows.append(("safe wall", f"{name_wall(*safe[:2])}: {borne}"))
     if fit.is_doubted:
         rows.append(("no wall", NO_WALL))
     if wall is not None:
-        rows.append(("set", f"{_spell_wall(wall)}: {wall.why}"))
+        rows.append(("set", f"{name_wall(*wall[:2])}: {wall.why}"))
     rows += [("doubt", doubt) for doubt in fit.doubts]
     if not fit.is_doubted and (rigid := choose_wall(fit, rigid=True)) not in (None, wall):
         at = "" if math.isnan(safe.resonance) else f" near {with_unit(safe.resonance, 'Hz', 3)}"
@@ -141,7 +141,7 @@ def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
         if fit.damping_tried is not None:
             hidden = f"a resonance may make other walls unstable, K_max too, and not show in these: {_TRY_MORE}"
         alone = "if nothing hides" if fit.is_structured else "if it is rigid"
-        rows += [("not seen", hidden), (alone, f"{_spell_wall(rigid)}: {rigid.why}")]
+        rows += [("not seen", hidden), (alone, f"{name_wall(*rigid[:2])}: {rigid.why}")]
     if fit.next is not None:
         step = fit.next
         B, K = spell("damping", step.virtual_damping, 3), spell("stiffness", step.stiffness, 3)
@@ -177,11 +177,6 @@ def spell_rival(rival: RivalDevice) -> str:
     parts |= {_name_part(name, 1).strip(): spell(name, value) for name, value in (rival.parts or {}).items()}
     parts[SYMBOLS["stiffness_max"]] = spell("stiffness", rival.stiffness_max)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
-
-
-def _spell_wall(wall: SafeWall | WallChoice) -> str:
-    # Rounded up it might no longer be what is said of it.
-    return name_wall(round_safely(wall.stiffness, "below"), wall.virtual_damping)
 
 
 def _spell(fit: DeviceFit, name: str) -> str:
@@ -245,7 +240,7 @@ def write_scene(fit: DeviceFit, source: str) -> list[str]:
             alone = "these parts alone" if fit.is_structured else "a rigid device"
             lines += [
                 f"# As of {alone}. A resonance that the log does not show may make walls unstable,",
-                f"# if they are stiffer than {_spell_wall(safe)}: {_SEE_MORE}.",
+                f"# if they are stiffer than {name_wall(*safe[:2])}: {_SEE_MORE}.",
             ]
         lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
     if fit.friction and math.isfinite(fit.errors["friction"]):

@@ -160,14 +160,18 @@ def _distance(value: float, intervals: Intervals, unit: str, name: str, other: s
 
 def margin_lines(stiffness: float, verdict: Assessment) -> list[str]:
     """The margins of control engineering, where the wall has a stiffness or stands without one."""
+    from zwidth.scenes.assessment import round_margin
+
     if (stiffness <= 0 and not verdict.stable) or verdict.stable is None:
         return []
-    parts = [f"gain {plain(verdict.gain_margin)}"]
-    if isfinite(verdict.phase_margin):
+    gain, phase, late, least = (
+        round_margin(f"{name}_margin", verdict, verdict.stable) for name in ("gain", "phase", "delay", "modulus")
+    )
+    parts = [f"gain {plain(gain)}"]
+    if isfinite(phase):
         at = with_unit(verdict.gain_crossover, "Hz", 3)
-        parts.append(f"phase {plain(verdict.phase_margin)} degrees at {at}")
-    delay = "not known" if isnan(verdict.delay_margin) else with_unit(verdict.delay_margin, "s")
-    parts += [f"delay {delay}", f"modulus {plain(verdict.modulus_margin)}"]
+        parts.append(f"phase {plain(phase)} degrees at {at}")
+    parts += [f"delay {'not known' if isnan(late) else with_unit(late, 's')}", f"modulus {plain(least)}"]
     return [row("margins", ", ".join(parts))]
 
 

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.rigid.margins import Margins
 from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
+from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
@@ -151,6 +152,14 @@ def name_kind(wall: StiffestWall) -> str:
     return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
 
 
+def round_margin(name: str, margins: Assessment | Margins, stable: bool | None, digits: int = 4) -> float:
+    """A margin in few digits, rounded so that a wall bears what is read, or that an unstable one is stable by it."""
+    value = float(getattr(margins, name))
+    # A gain margin may be a factor below 1 of a stable wall, too.
+    outward = name == "gain_margin" and (value > 1.0) != bool(stable)
+    return round_safely(value, "above" if outward else "below", digits)
+
+
 def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
     """The interval that holds a value or is the nearest to it; NaN where there is none."""
     away = [max(low - value, value - high, 0.0) for low, high in intervals]
@@ -224,7 +233,8 @@ class Limit(NamedTuple):
     def spell(self) -> str:
         """The step and what it buys."""
         less = " (it helps as it is)" if self.gain < 1 else ""
-        return f"{self.words}: K_max {with_unit(self.stiffness, 'N/m')}, {plain(self.gain, 3)} times{less}"
+        K_max = with_unit(round_safely(self.stiffness, "below"), "N/m")
+        return f"{self.words}: K_max {K_max}, {plain(self.gain, 3)} times{less}"
 
 
 @of_scene

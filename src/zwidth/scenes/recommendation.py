@@ -15,7 +15,16 @@ from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
 from zwidth.parts.wall import NoWall, VirtualWall
-from zwidth.scenes.assessment import Assessment, Limit, assess, check_held, describe_islands, limits_of, name_kind
+from zwidth.scenes.assessment import (
+    Assessment,
+    Limit,
+    assess,
+    check_held,
+    describe_islands,
+    limits_of,
+    name_kind,
+    round_margin,
+)
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, find_lowest, soft_dampings
 from zwidth.scenes.wall_code import write_wall
 from zwidth.words.errors import InputError
@@ -112,6 +121,19 @@ class Recommendation:
         return float(self.scene.wall.virtual_damping) if self.status == Status.OK else math.nan
 
     @cached_property
+    def read(self) -> tuple[float, float, int]:
+        """K and B as they are printed, and their digits: the fewest, from 4 on, with which the wall has what is wanted.
+
+        K is rounded down; of a tip that leans, or of a narrow column, B needs more digits than others.
+        """
+        surplus = _measure(self.scene, self.wanted)
+        for digits in range(4, 17):
+            K, B = round_safely(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
+            if np.all(self.scene.is_stable(K, B)) and (surplus is None or min(surplus(K, B).values()) >= 0):
+                return K, B, digits
+        return self.stiffness, self.virtual_damping, 17
+
+    @cached_property
     def verdict(self) -> Assessment | None:
         """What `zwidth.assess` finds of the wall; None where there is none."""
         return assess(self.scene) if self.status == Status.OK else None
@@ -145,18 +167,19 @@ class Recommendation:
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        # Rounded up it might no longer have what is wanted.
-        K = spell_stiffness(round_safely(self.stiffness, "below"))
-        B, largest = with_unit(self.virtual_damping, "N s/m"), self.stiffest[0]
-        share = 100.0 * self.stiffness / float(largest)
-        first = f"K = {K}, B = {B}: {share:.4g} % of the stiffest stable wall, {spell_stiffness(float(largest))}"
+        K, B, digits = self.read
+        wall = f"K = {spell_stiffness(K, digits)}, B = {with_unit(B, 'N s/m', digits)}"
+        largest = float(self.stiffest.stiffness)
+        share = 100.0 * self.stiffness / largest
+        first = f"{wall}: {share:.4g} % of the stiffest stable wall, {spell_stiffness(largest)}"
         if self.limited_by != "stiffness_fraction":
             first += f"; {self.wanted.spell(self.limited_by)} allows no more"
         lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
         # A unit that both have stands once.
         lower = lower.removesuffix(f" {upper.partition(' ')[2]}")
-        delay = "not known" if math.isnan(verdict.delay_margin) else with_unit(verdict.delay_margin, "s")
-        apart = f"gain {plain(verdict.gain_margin)}, phase {plain(verdict.phase_margin)} degrees, delay {delay}"
+        gain, phase, late = (round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay"))
+        delay = "not known" if math.isnan(late) else with_unit(late, "s")
+        apart = f"gain {plain(gain)}, phase {plain(phase)} degrees, delay {delay}"
         rest = f"margins: {apart}; passive: {self.spell_passive()}"
         return first, f"stable for B from {lower} to {upper}; {rest}"
 
@@ -190,6 +213,8 @@ class Recommendation:
                 "limited_by": self.limited_by,
                 "stiffness": self.stiffness,
                 "virtual_damping": self.virtual_damping,
+                # As many as it takes to write it down.
+                "digits": None if verdict is None else self.read[2],
                 **{name: judged.get(name) for name in _JUDGED},
                 "stable": verdict is not None and verdict.stable,
                 "decay_time": float(decay_time(1.0 / np.float64(constant))),

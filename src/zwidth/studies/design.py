@@ -26,7 +26,7 @@ from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, summarize_stiffest, track
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import ENOUGH, describe, header, plain, round_safely, short, suggestion, with_unit
+from zwidth.words.formatting import describe, header, round_safely, short, spell_enough, suggestion, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -162,10 +162,9 @@ class DesignStudy(ComputedStudy):
             ranges.append(needed.range)
             rows.append(self._describe(nominal, stiffness, needed))
             notes += self._note(stiffness, needed)
-            if side := ENOUGH.get(needed.enough):
-                value = round_safely(needed.value, needed.enough)
-                value = plain(value) if unit == "1" else with_unit(value, unit)
-                answer.append(f"K_max = {with_unit(self.reserve * stiffness, 'N/m')}: {self.find} of {value} {side}")
+            if needed.crossings and needed.status == Status.OK:
+                value = spell_enough(needed.value, needed.enough, [one.value for one in needed.crossings], unit)
+                answer.append(f"K_max = {with_unit(self.reserve * stiffness, 'N/m')}: {self.find} of {value}")
         low, high = min(ends[0] for ends in ranges), max(ends[1] for ends in ranges)
         curve = self._trace(nominal, low, high)
         table = stack(rows)
@@ -328,7 +327,7 @@ def _spell_best(row: dict[str, Any]) -> str:
     """The best filter of a damping, in a line."""
     (stiffness, damping), size = (row[name] for name in SI_COLUMNS), f"{row['samples']:g} samples"
     size = size if row["samples"] == row["samples"] else with_unit(row["cutoff_Hz"], "Hz")
-    wall = f"K_max = {with_unit(stiffness, 'N/m')} at B = {with_unit(damping, 'N s/m')}"
+    wall = f"K_max = {with_unit(round_safely(stiffness, 'below'), 'N/m')} at B = {with_unit(damping, 'N s/m')}"
     return f"b = {with_unit(row['damping_N_s_per_m'], 'N s/m')}: {row['estimate'].replace('_', ' ')}, {size}: {wall}"
 
 

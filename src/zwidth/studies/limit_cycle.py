@@ -197,19 +197,15 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
     walls = [name for name in ("stiffness", "virtual_damping") if name in varied]
     if not walls:
         return []
-    lines = []
-    for outline in trace_outlines(scene):
-        ends: dict[str, np.ndarray] = {name: outline[_COLUMNS[name]] for name in ("stiffness", "virtual_damping")}
-        if len(walls) == 2:
-            lines.append(ends)
-            continue
-        (along,), (fixed,) = walls, {"stiffness", "virtual_damping"} - set(walls)
-        x, y, level = ends[along], ends[fixed], float(axes[fixed])
-        k = np.flatnonzero((y[:-1] < level) != (y[1:] < level))
-        crossed = x[k] + (level - y[k]) / (y[k + 1] - y[k]) * (x[k + 1] - x[k])
+    if len(walls) == 2:
+        lines = [{name: outline[_COLUMNS[name]] for name in walls} for outline in trace_outlines(scene)]
+    else:
+        (along,) = walls
+        ends = scene.stable_stiffness if along == "stiffness" else scene.stable_damping
         others = {name: varied[name].values() for name in varied if name != along}
         far = {name: np.array([values.min(), values.max()]) for name, values in others.items()}
-        lines += [{along: np.full(2, value), **far} for value in crossed]
+        (level,) = (float(axes[name]) for name in ("stiffness", "virtual_damping") if name != along)
+        lines = [{along: np.full(2, value), **far} for value in ends(level).ravel()]
     return [
         {"condition": label, "number": number, **{_COLUMNS[name]: part for name, part in line.items()}}
         for number, line in enumerate(lines, start=1)

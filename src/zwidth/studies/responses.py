@@ -264,10 +264,12 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
         return "not known" if value is None else with_unit(value, unit) if unit else plain(value)
 
     def cells(row: dict[str, Any], mark: str = "") -> str:
-        # Of a wall to set a stiffness that is rounded up might no longer have what is wanted.
-        K, alpha = (round_safely(row[name], "below" if mark else "") for name in ("stiffness", "alpha"))
-        wall = spell(K, "N/m"), spell(row["virtual_damping"], "N s/m")
-        return " | ".join([*(f"{mark}{text}{mark}" for text in wall), spell(alpha), spell(row["beta"])])
+        digits = row.get("digits", 4)
+        # Rounded up a stiffness might be stable no longer, or not have what is wanted.
+        K, alpha = (round_safely(row[name], "below", digits) for name in ("stiffness", "alpha"))
+        wall = with_unit(K, "N/m", digits), with_unit(row["virtual_damping"], "N s/m", digits)
+        normalized = plain(alpha, digits), plain(row["beta"], digits)
+        return " | ".join([*(f"{mark}{text}{mark}" for text in wall), *normalized])
 
     parts = [f"{name} = {value}" for name, value in found["device"].items() if name not in _BARE]
     by_mass = isinstance(scene.device, Device)

@@ -21,7 +21,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
-from zwidth.studies.outcome import CurvesStudy, Outcome, Table
+from zwidth.studies.outcome import CurvesStudy, Outcome, Table, share_of_device
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import DelayModel
 
@@ -98,6 +98,7 @@ class PassivityStudy(CurvesStudy):
 
     method = "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms."
     from_scene = ("delta", "d", "delay_model")
+    reads_scene = True
 
     kind: Literal["passivity"]
 
@@ -107,9 +108,10 @@ class PassivityStudy(CurvesStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         ridge, notes = ridge_table(self.delta.values(), self.d.values(), self.delay_model)
         table = {name: ridge[name] for name in ("d", "delta", "alpha_max", "beta")}
-        slopes = [passive_stiffness_slope(d) for d in self.d.values().tolist()]
+        slopes = map(passive_stiffness_slope, self.d.values().tolist())
+        own = share_of_device(self.delta, self.d, scene) * table["delta"]
         for name, slope in zip(("alpha_max_passive", "beta_passive"), zip(*slopes, strict=True), strict=True):
-            table[name] = np.repeat(slope, self.delta.size) * table["delta"]
+            table[name] = np.repeat(slope, self.delta.size) * own
         return Outcome(table=table, figures={"": partial(figures.draw_passivity_cost, table)}, notes=tuple(notes))
 
 

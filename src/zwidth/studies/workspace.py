@@ -144,7 +144,8 @@ class WorkspaceStudy(ComputedStudy):
         # Other poses are heavier or more damped, but not alike in both: the wall as it is written is tried on each.
         wall = round_safely(RECOMMENDED_SHARE * stiffness[weakest], "below"), float(f"{virtual_damping[weakest]:.4g}")
         bears = np.asarray(is_stable(wall[0] * self.period / rate, wall[1] / rate, delta, d))
-        low, high = (with_unit(float(each), "N/m") for each in (stiffness[weakest], np.nanmax(stiffness)))
+        ends = stiffness[weakest], np.nanmax(stiffness)
+        low, high = (with_unit(round_safely(float(each), "below"), "N/m") for each in ends)
         answer = (
             f"K_max from {low} at {spell_pose(weakest)} to {high}",
             f"{name_wall(*wall)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "

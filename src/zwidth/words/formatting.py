@@ -64,8 +64,9 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
 
 
 def name_wall(stiffness: Any, virtual_damping: Any) -> str:
-    """A wall by its numbers."""
-    return f"K = {with_unit(float(stiffness), 'N/m')}, B = {with_unit(float(virtual_damping), 'N s/m')}"
+    """A wall by its numbers, K rounded down: it holds as it is read."""
+    K = with_unit(round_safely(float(stiffness), "below"), "N/m")
+    return f"K = {K}, B = {with_unit(float(virtual_damping), 'N s/m')}"
 
 
 # Words behind a number, by the side of it on which there is enough.
@@ -82,10 +83,14 @@ def round_safely(value: float, enough: str, digits: int = 4) -> float:
     return steps * step
 
 
-def spell_stiffness(value: float) -> str:
-    """A stiffness with its unit; of a rotary device per degree as well, as people picture it."""
-    text = with_unit(value, "N/m")
-    return f"{text} ({plain(value * 1e3 * math.pi / 180)} mN m/deg)" if is_rotary() and math.isfinite(value) else text
+def spell_stiffness(value: float, digits: int = 4) -> str:
+    """A stiffness with its unit, rounded down: most are the largest of which something holds.
+
+    Of a rotary device per degree as well, as people picture it.
+    """
+    text = with_unit(round_safely(value, "below", digits), "N/m", digits)
+    turned = round_safely(value * 1e3 * math.pi / 180, "below", digits)
+    return f"{text} ({plain(turned, digits)} mN m/deg)" if is_rotary() and math.isfinite(value) else text
 
 
 def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
@@ -99,6 +104,16 @@ def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
         if ends[0] < ends[1]:
             return spell(ends[0], digits), spell(ends[1], digits)
     return spell(low, 4), spell(high, 4)
+
+
+def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, digits: int = 4) -> str:
+    """Of which values there is enough: on one side of a value, or up to the first of others there."""
+    side, unit = (1.0 if enough == "above" else -1.0), unit.removeprefix("1")
+    beyond = [side * other for other in others if side * other > side * value]
+    if beyond:
+        return " to ".join(tell_apart(*sorted((value, side * min(beyond))), unit))
+    value = round_safely(value, enough, digits)
+    return f"{with_unit(value, unit, digits) if unit else plain(value, digits)} {ENOUGH[enough]}"
 
 
 def header(name: str, unit: str) -> str:

@@ -120,6 +120,18 @@ def test_how_far_it_is_to_the_boundary(wall, words, name):
     assert words in run("check", *arguments, *DEVICE, *RATE).stdout
 
 
+@pytest.mark.parametrize("damping", [0.3, 5.0, 16.0, 40.0, 70.0, 75.0])
+def test_a_wall_bears_the_margins_that_are_read_and_an_unstable_one_needs_them(damping):
+    """Rounded to the nearest, half of these would promise too much."""
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
+    out = run("check", "--stiffness", "8e3", "--virtual-damping", f"{damping}", *DEVICE, *RATE).stdout
+    gain = float(*re.findall("margins +gain ([0-9.]+)", out))
+    assert scene.is_stable(8e3 * gain, damping * gain)
+    if scene.is_stable(8e3, damping):
+        (delay,) = re.findall("degrees at .*, delay (.*?),", out)
+        assert scene.replace(delay=1e-3 + zwidth.Timing(1e-3, delay).delay).is_stable(8e3, damping)
+
+
 def test_a_rigid_scene_says_what_limits_it_too():
     out = run("check", *WALL, *DEVICE, *RATE).stdout
     assert "\npassive               " in out

@@ -10,6 +10,7 @@ from required_values import find_required
 
 import zwidth
 from zwidth.cli.commands import cli
+from zwidth.scenes.stiffest import RequiredValue
 
 DEVICE = ["--mass", "100 g", "--damping", "10", "--rate", "1 kHz", "--delay", "0.5 ms"]
 
@@ -51,6 +52,25 @@ def test_what_is_printed_is_enough_as_it_is_rounded():
             assert rest == unit
             scene = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 0.5e-3))
             assert scene.replace(**{name: factor * float(value)}).max_stiffness().stiffness >= 1e3 * stiffness
+
+
+def test_where_there_is_enough_between_two_values_both_are_told():
+    """Strong damping: an eighth of a period of delay is better than none, and than a quarter."""
+    device = "--mass=0.1", "--damping=1e4", "--rate=1000", "--delay=0.1 ms", "--stiffness=42 MN/m"
+    ends = design("--find=delay", *device).partition("needed")[2].strip().split(" to ")
+    scene = zwidth.Scene(zwidth.Device(0.1, 1e4), zwidth.Timing(1e-3))
+    for end, beyond in zip(ends, (0.99, 1.01), strict=True):
+        assert scene.replace(delay=end).max_stiffness().stiffness >= 42e6
+        further = beyond * zwidth.Timing(1e-3, end).delay
+        assert scene.replace(delay=further).max_stiffness().stiffness < 42e6
+
+
+def test_a_search_that_failed_does_not_say_nowhere(monkeypatch):
+    failed = RequiredValue(np.nan, "nowhere", (), (0.1, 10.0), zwidth.Status.NOT_CONVERGED)
+    monkeypatch.setattr(zwidth.Scene, "required", lambda *_, **__: failed)
+    find = "--find", "damping", "--stiffness", "20 kN/m", *DEVICE
+    assert "not found from 100.0 mN s/m to 10.00 N s/m: The solver stopped" in design(*find)
+    assert needed(*find)["status"] == "NOT_CONVERGED"
 
 
 def test_a_cutoff_is_enough_and_a_lower_one_is_not():
@@ -107,6 +127,11 @@ def test_the_damping_for_a_stiffness_is_that_of_the_library():
     assert (found["value"], found["spectral_radius"]) == (best.virtual_damping, best.spectral_radius)
     assert "settles fastest" in design("--find", "virtual_damping", "--stiffness", "5 kN/m", *DEVICE)
     assert "no B is stable at K = 500.0 kN/m" in design("--find", "virtual_damping", "--stiffness", "5e5", *DEVICE)
+    # Next to the stiffest wall B has the digits that it needs.
+    stiffness = 266.96362243298
+    text = design("--find=virtual_damping", f"--stiffness={stiffness}", "--mass=0.1", "--period=0.01", "--delay=5 ms")
+    scene = zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(0.01, 5e-3))
+    assert scene.is_stable(stiffness, text.partition("damping")[2].partition(" settles")[0].strip())
 
 
 @pytest.mark.parametrize(

@@ -111,6 +111,16 @@ def test_the_wall_that_is_printed_is_no_stiffer(damping, delay):
     assert scene.is_passive(K, B)
 
 
+@pytest.mark.parametrize("share", [0.95, 0.99])
+def test_a_wall_next_to_a_corner_is_stable_as_it_is_printed(share):
+    """Strong damping without delay: its column ends so close to B that four digits of it lie beyond."""
+    scene = zwidth.Scene(zwidth.Device(0.1, 20e3), zwidth.Timing(1e-3))
+    found = scene.recommend(stiffness_fraction=share)
+    (K, B), *_ = re.findall("K = (.*?), B = (.*?):", found.lines()[0])
+    assert scene.is_stable(K, B)
+    assert found.as_dict()["recommended"]["digits"] > 4
+
+
 def test_steps_are_those_of_limits_that_help():
     found = ISLANDS.recommend()
     assert found.steps == [limit for limit in zwidth.limits_of(ISLANDS) if limit.gain > 1]

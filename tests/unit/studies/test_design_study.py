@@ -102,7 +102,10 @@ def test_the_figure_marks_what_is_needed_on_the_curve():
         assert value <= written < 1.01 * value
     curve = {"parameter": np.array(["damping"] * 2), "value_N_s_per_m": np.array([1.0, 50.0])}
     curve[SI_COLUMNS[0]] = np.array([15e3, 45e3])
-    assert list(figures.draw_requirement(curve, outcome.table, ax)) == [ax]
+    borne = outcome.table | {"stable_share": np.array([0.9996, 1.0])}
+    assert list(figures.draw_requirement(curve, borne, ax)) == [ax]
+    words = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert [text.partition(": ")[2] for text in words[:2]] == ["99.9 % of devices bear it", "100 % of devices bear it"]
 
 
 REFUSED = {

@@ -139,8 +139,7 @@ def test_the_boundary_over_one_stiffness_axis_is_a_line():
     (ax,) = outcome.figures[""]()
     lines = [line.get_xdata()[0] for line in ax.lines if line.get_label().startswith("linear")]
     expected = SCENE.stable_stiffness(40.0).ravel() / 1e3
-    # A polygon of some hundreds of points.
-    np.testing.assert_allclose(sorted(lines), expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(sorted(lines), expected, rtol=1e-14)
 
 
 def test_an_adaptive_window_has_no_linear_boundary():

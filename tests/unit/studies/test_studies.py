@@ -83,6 +83,17 @@ def test_a_passive_wall_is_never_stiffer_than_a_stable_one():
         np.testing.assert_array_equal((table["alpha_max_passive"][here], table["beta_passive"][here]), slopes)
 
 
+def test_a_hand_that_holds_the_device_makes_no_wall_passive():
+    """Passive is what is so for any hand: the device's own damping counts, a seventh of both here."""
+    device = {"mass": 0.1, "damping": 1.0, "period": "1 ms", "delay": "1 ms"}
+    scene = PhysicalScene.model_validate({**device, "operator": {"mass": 0.5, "damping": 6.0}})
+    study = PassivityStudy.model_validate({"kind": "passivity", "name": "p", "delta": scene.delta, "d": scene.d})
+    table = study.compute(scene, alone=True).table
+    edge = table["alpha_max_passive"] * scene.to_scene().units.stiffness
+    damping = table["beta_passive"] * scene.to_scene().units.virtual_damping
+    assert abs(scene.to_scene().passivity_margin(edge, damping)) < 1e-12
+
+
 def test_ridges_are_those_of_the_library():
     delta, d = np.linspace(0.0, 10.0, 7), np.array([0.0, 0.125, 3.0])
     table, notes = ridge_table(delta, d, "held")

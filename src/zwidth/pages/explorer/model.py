@@ -18,7 +18,7 @@ from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
 from zwidth.pages.words import check_lines, list_slopes, pole_words, row
 from zwidth.parts.device import Device
-from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge
+from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import plain, round_safely, tell_apart
@@ -234,9 +234,11 @@ def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
     word, hertz, margins = word_of(verdict).capitalize(), "per period" if normalized else "Hz", []
     around = "leave the cross at −1 outside" if verdict.stable else "go around the cross at −1"
     if isfinite(verdict.phase_margin):
-        margins.append(f"phase {plain(verdict.phase_margin, 3)}° at {plain(verdict.gain_crossover)} {hertz} (circle)")
+        phase = plain(round_margin("phase_margin", verdict, verdict.stable, 3), 3)
+        margins.append(f"phase {phase}° at {plain(verdict.gain_crossover)} {hertz} (circle)")
     if verdict.gain_margin > 0 and isfinite(verdict.phase_crossover):
-        decibel = plain(20.0 * log10(verdict.gain_margin), 3)
+        side = "below" if (verdict.gain_margin > 1.0) == bool(verdict.stable) else "above"
+        decibel = plain(round_safely(20.0 * log10(verdict.gain_margin), side, 3), 3)
         margins.append(f"gain {decibel} dB at {plain(verdict.phase_crossover)} {hertz} (diamond)")
     slowest = pole_words(verdict.time_constant, verdict.frequency)
     if normalized and isfinite(verdict.time_constant):
@@ -253,15 +255,21 @@ def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
 def normalized_lines(verdict: Assessment) -> list[str]:
     """The verdict on a normalized wall, whose units are the period and the mass."""
     span = " to ".join(tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper))
+    gain, phase, delay, modulus = (
+        plain(round_margin(f"{name}_margin", verdict, verdict.stable)) for name in ("gain", "phase", "delay", "modulus")
+    )
+    limit, spare, most = (
+        plain(round_safely(end, "below"))
+        for end in (verdict.stiffness_limit, verdict.passivity_margin, verdict.alpha_max)
+    )
     rows = {
         "verdict": f"{word_of(verdict)}, spectral radius {verdict.spectral_radius:.6f}",
-        "stable alpha": f"up to {plain(round_safely(verdict.stiffness_limit, 'below'))} at this beta",
+        "stable alpha": f"up to {limit} at this beta",
         "stable beta": f"{span} at this alpha",
-        "passive": f"{'yes' if verdict.passive else 'no'}, margin {plain(verdict.passivity_margin)} of delta",
-        "stiffest stable wall": f"alpha_max = {plain(verdict.alpha_max)} at beta = {plain(verdict.beta_at_max)}",
+        "passive": f"{'yes' if verdict.passive else 'no'}, margin {spare} of delta",
+        "stiffest stable wall": f"alpha_max = {most} at beta = {plain(verdict.beta_at_max)}",
         "slowest pole": f"time constant {plain(verdict.time_constant)} periods",
-        "margins": f"gain {plain(verdict.gain_margin)}, phase {plain(verdict.phase_margin)} degrees, "
-        f"delay {plain(verdict.delay_margin)} periods, modulus {plain(verdict.modulus_margin)}",
+        "margins": f"gain {gain}, phase {phase} degrees, delay {delay} periods, modulus {modulus}",
     }
     return [row(*each) for each in rows.items()]
 
