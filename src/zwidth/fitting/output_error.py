@@ -27,6 +27,8 @@ _STARTS, _APART = 3, 2
 _GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
 # So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
+# Starts that have come as near to one another are one, as a share of the squares.
+_ALIKE = 1e-4
 # Devices with other parts are compared at this promised reduction.
 _CLOSELY = 2e-5
 # Promised reductions of the squares that end the search, and that tell the noise and excuse a corner; steps; how they
@@ -211,14 +213,14 @@ def _start(model: Recordings) -> list[np.ndarray]:
         tuple(Recording(log.force, np.zeros(log.position.size + most), log.skip - most) for log in model.logs)
     )
     ends = np.cumsum([log.position.size for log in early.logs])
-    rows = np.concatenate([np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)])
+    samples = np.concatenate([np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)])
 
     def search(deltas: tuple[float, ...] = _DELTAS) -> list[tuple[float, float, int]]:
         """The sums of squares of dampings and delays, the least first."""
         found = []
         for delta, some in product(deltas, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
-            columns = _answer(early, delta, 0.0, base)[rows - some[:, None]]
-            rests = _combine(columns, model.measured)[1]
+            answers = np.swapaxes(_answer(early, delta, 0.0, base)[:, samples - some[:, None]], 0, 1)
+            rests = _combine(answers, model.measured)[1]
             found += [(float(rest), delta, d) for rest, d in zip(rests, some.tolist(), strict=True)]
         return sorted(found)
 
@@ -246,29 +248,33 @@ def _start(model: Recordings) -> list[np.ndarray]:
 
 
 def _answer(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.ndarray:
-    """Positions where g is 1 and the first speeds, o and c are as in ``base``, and their slopes in x0, v0 and o."""
+    """Positions where g is 1 and the first speeds, o and c are as in ``base``, and their slopes in x0, v0, o: rows."""
     places, slopes = model.predict(np.array([1.0, delta, d, *base[3:]]))
-    return np.column_stack([places, slopes[:, 3:-1]])
+    return np.vstack([places, slopes[:, 3:-1].T])
 
 
-def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _combine(rows: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least squares to half of the digits, which are enough to start from, and their sums of squares."""
-    sizes = np.linalg.norm(columns, axis=-2, keepdims=True)
+    square = rows @ np.swapaxes(rows, -1, -2)
+    sizes = np.sqrt(np.diagonal(square, axis1=-2, axis2=-1))
     sizes = np.where(sizes > 0, sizes, 1.0)
-    scaled = columns / sizes
-    turned = np.swapaxes(scaled, -1, -2)
     least = sizes.shape[-1] * np.finfo(float).eps
-    values = (np.linalg.pinv(turned @ scaled, least, hermitian=True) @ (turned @ wanted)[..., None])[..., 0]
-    rest = wanted - (scaled @ values[..., None])[..., 0]
-    return values / sizes[..., 0, :], np.sum(rest**2, -1)
+    inverse = np.linalg.pinv(square / sizes[..., None] / sizes[..., None, :], least, hermitian=True)
+    values = (inverse @ (rows @ wanted / sizes)[..., None])[..., 0] / sizes
+    return values, np.sum((wanted - (values[..., None, :] @ rows)[..., 0, :]) ** 2, -1)
 
 
 def _follow(model: Recordings, starts: list[np.ndarray]) -> np.ndarray:
     """The best start, followed through ever longer beginnings: few turns and rests make hardly a false optimum."""
     for count, kept in _ROUNDS:
         part = model.begin(count)
-        found = [_refine(part, start, (), _FOLLOWED, _NEAR) for start in starts]
-        starts = [theta for theta, *_ in sorted(found, key=lambda found: found[1])[:kept]]
+        found = sorted((_refine(part, start, (), _FOLLOWED, _NEAR)[:2] for start in starts), key=lambda each: each[1])
+        starts, places = [], []
+        for theta, squares in found[:kept]:
+            place = part.follow(theta).position
+            if all(np.sum((place - other) ** 2) > _ALIKE * squares for other in places):
+                starts.append(theta)
+                places.append(place)
     return starts[0]
 
 
@@ -327,15 +333,14 @@ def _refine(
     (motion, rest, squares), promised = look(theta), np.inf
     for _ in range(most):
         slopes = model.weigh(motion.slopes)
-        sizes = np.linalg.norm(slopes, axis=0)
+        # Products of columns keep half of their digits: enough for a step, since the residuals keep all of theirs.
+        square, fall = slopes.T @ slopes, slopes.T @ rest
         # Only what moves the positions moves, and nothing out of its bounds.
-        fall = slopes.T @ rest
+        sizes = np.sqrt(np.diagonal(square))
         free = (sizes > 0) & ((theta > low) | (fall > 0)) & ((theta < high) | (fall < 0))
         sizes = sizes[free]
-        columns = slopes[:, free] / sizes
-        square, fall = columns.T @ columns, fall[free] / sizes
+        square, fall = square[np.ix_(free, free)] / np.outer(sizes, sizes), fall[free] / sizes
         while True:
-            # Products of columns keep half of their digits: enough for a step, since the residuals keep all of theirs.
             step = np.linalg.lstsq(square + damping * np.eye(sizes.size), fall, rcond=None)[0]
             promised = float(step @ (2.0 * fall - square @ step))
             trial = theta.copy()

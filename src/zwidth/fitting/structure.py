@@ -129,7 +129,8 @@ class Recordings:
         beside = self.add_parts(theta, which) if self.lag or self.modes else None
 
         def differentiate() -> np.ndarray:
-            slopes = rigid.slopes @ np.eye(theta.size)[into]
+            slopes = np.zeros((theta.size, rigid.position.size)).T
+            slopes[:, into] = rigid.slopes
             if beside is not None:
                 slopes += beside.slopes
                 slopes[:, 3 : 3 + self.lag] += np.outer(rigid.slopes[:, 2], by_late)
