@@ -89,7 +89,9 @@ class Recording:
         return ModelledMotion(x0 + np.append(0.0, way), differentiate)
 
 
-def _glide(push: np.ndarray, spans: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float) -> Pieces:
+def _glide(
+    push: np.ndarray, spans: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float
+) -> Pieces:
     """Without friction; with it, what is gained from rest in one direction."""
     gains = (spans * kinds.phi1)[:, None] * push
     late = recur(kinds.c[0] * kinds.c[1], kinds.c[1] * gains[0] + gains[1], v0)
@@ -104,7 +106,8 @@ def _rub(push: np.ndarray, spans: np.ndarray, kinds: PhiFunctions, delta: float,
     # Both parts in turn. What is gained from rest in a direction s, G: from v_m on,
     # s v_k = G_k + (s v_m - G_m) e^(-delta (t_k - t_m)).
     gliding, rubbing = (
-        np.append(0.0, _glide(each, spans, kinds, delta, 0.0, 0.0).end.T) for each in (push, np.full(push.shape, friction))
+        np.append(0.0, _glide(each, spans, kinds, delta, 0.0, 0.0).end.T)
+        for each in (push, np.full(push.shape, friction))
     )
     push = push.T.ravel()
     able, gained = np.flatnonzero(np.abs(push) > friction), {s: s * gliding - rubbing for s in (1.0, -1.0)}
@@ -147,7 +150,10 @@ def _rub(push: np.ndarray, spans: np.ndarray, kinds: PhiFunctions, delta: float,
     starts, ways = np.array(begun).T
     way = np.repeat(ways, np.diff(np.append(starts, count)).astype(int))
     held = way == 0
-    factors, added = np.where(held, 0.0, np.tile(slow, count // 2)), np.tile(rates, count // 2) * (push - way * friction)
+    factors, added = (
+        np.where(held, 0.0, np.tile(slow, count // 2)),
+        np.tile(rates, count // 2) * (push - way * friction),
+    )
     added[held] = 0.0
     k, before, after, speeds = np.reshape(turns, (-1, 4)).T
     k = k.astype(int)
@@ -171,7 +177,8 @@ def _follow(
     if turned:
         held_after, r = way_after == 0, spans[k[0]] - t
         a_after = np.where(held_after, 0.0, push[k] - way_after * c)
-        first, second = (PhiFunctions(*each) for each in zip(*(np.split(each, 2) for each in phi_functions(delta * np.append(t, r)))))
+        both = phi_functions(delta * np.append(t, r))
+        first, second = (PhiFunctions(*(each[part] for each in both)) for part in np.s_[: t.size, t.size :])
         moved[k] = t * first.phi1 * v[k] + t**2 * first.phi2 * a[k] + r**2 * second.phi2 * a_after
 
     def differentiate() -> np.ndarray:

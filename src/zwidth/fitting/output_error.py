@@ -213,7 +213,9 @@ def _start(model: Recordings) -> list[np.ndarray]:
         tuple(Recording(log.force, np.zeros(log.position.size + most), log.skip - most) for log in model.logs)
     )
     ends = np.cumsum([log.position.size for log in early.logs])
-    samples = np.concatenate([np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)])
+    samples = np.concatenate(
+        [np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)]
+    )
 
     def search(deltas: tuple[float, ...] = _DELTAS) -> list[tuple[float, float, int]]:
         """The sums of squares of dampings and delays, the least first."""

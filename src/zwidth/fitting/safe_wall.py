@@ -251,7 +251,10 @@ def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damp
 
 def _realize(devices: DimensionlessDevice) -> tuple[np.ndarray, np.ndarray]:
     """Of devices ``((A, B), (0, 0))`` of ``x' = A x + B u``, and C: the mass, its modes, and the amplifier."""
-    bodies = [(0.0, devices.delta, 1.0), *((turns**2, 2.0 * ratio * turns, share) for turns, ratio, share in devices.modes)]
+    bodies = [
+        (0.0, devices.delta, 1.0),
+        *((turns**2, 2.0 * ratio * turns, share) for turns, ratio, share in devices.modes),
+    ]
     count, order = 2 * len(bodies), len(devices.lag)
     motions, sensed = (np.zeros((devices.mass.size, *shape)) for shape in (2 * (count + order + 1,), (count + order,)))
     for k, (pull, rub, share) in enumerate(bodies):

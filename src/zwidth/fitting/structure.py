@@ -176,8 +176,10 @@ class Recordings:
             for sign, by, speed, slide in slides:
                 parts += [(slide.position, sign / g * own[0]), (slide.slopes, sign * own[1])]
                 parts += [(speed[0] - speed, sign * by)]
-            rows = np.array([half for row, _ in parts for half in (row.real, row.imag)])
-            return rows.T @ np.array([half for _, factor in parts for half in (factor.real, -factor.imag)])
+            rows = [(row.real, factor.real) for row, factor in parts]
+            rows += [(row.imag, -factor.imag) for row, factor in parts if np.iscomplexobj(row)]
+            columns, factors = map(np.array, zip(*rows, strict=True))
+            return columns.T @ factors
 
         return ModelledMotion(place, differentiate)
 
