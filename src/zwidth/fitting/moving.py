@@ -170,22 +170,21 @@ def _follow(
 ) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
     """The way gone at the end of every period, and the derivatives of places in g, delta, d, x0, v0, o and c: rows."""
     v, end, way, held, (*k, t, way_after) = pieces
-    k, turned = tuple(k), t.size > 0
+    k = tuple(k)
     span, kinds = spans[:, None], PhiFunctions(*(each[:, None] for each in kinds))
     a = np.where(held, 0.0, push - way * c)
     moved = kinds.phi1 * span * v + kinds.phi2 * span**2 * a
-    if turned:
-        held_after, r = way_after == 0, spans[k[0]] - t
-        a_after = np.where(held_after, 0.0, push[k] - way_after * c)
-        both = phi_functions(delta * np.append(t, r))
-        first, second = (PhiFunctions(*(each[part] for each in both)) for part in np.s_[: t.size, t.size :])
-        moved[k] = t * first.phi1 * v[k] + t**2 * first.phi2 * a[k] + r**2 * second.phi2 * a_after
+    held_after, r = way_after == 0, spans[k[0]] - t
+    a_after = np.where(held_after, 0.0, push[k] - way_after * c)
+    both = phi_functions(delta * np.append(t, r))
+    first, second = (PhiFunctions(*(each[part] for each in both)) for part in np.s_[: t.size, t.size :])
+    moved[k] = t * first.phi1 * v[k] + t**2 * first.phi2 * a[k] + r**2 * second.phi2 * a_after
 
     def differentiate() -> np.ndarray:
         by = _derive(kinds, delta, span, v, a, force, way, held)
         # What sticks forgets its speed.
         slow, again, speed = np.where(held, 0.0, kinds.c), by[1, 5].copy(), a - delta * end
-        if turned:
+        if t.size:
             speed[k] = a_after - delta * end[k]
             turn, onward = speed[k] / a[k], end[k] / a[k]
             again[k], slow[k] = t * first.phi1 + onward * first.c, turn * first.c

@@ -263,6 +263,6 @@ def _realize(devices: DimensionlessDevice) -> tuple[np.ndarray, np.ndarray]:
     if order:
         rate = 1.0 / devices.lag[0]
         motions[:, -2, -1], motions[:, -2, -2] = rate**order, -rate
-    if order == 2:
-        motions[:, -3, -2], motions[:, -2, -3], motions[:, -2, -2] = 1.0, -(rate**2), -2.0 * devices.lag[1] * rate
+        if order == 2:
+            motions[:, -3, -2], motions[:, -2, -3], motions[:, -2, -2] = 1.0, -(rate**2), -2.0 * devices.lag[1] * rate
     return motions, sensed
