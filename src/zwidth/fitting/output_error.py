@@ -27,8 +27,6 @@ _STARTS, _APART = 3, 2
 _GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
 # So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
-# Starts that have come as near to one another are one, as a share of the squares.
-_ALIKE = 1e-4
 # Devices with other parts are compared at this promised reduction.
 _CLOSELY = 2e-5
 # Promised reductions of the squares that end the search, and that tell the noise and excuse a corner; steps; how they
@@ -270,13 +268,8 @@ def _follow(model: Recordings, starts: list[np.ndarray]) -> np.ndarray:
     """The best start, followed through ever longer beginnings: few turns and rests make hardly a false optimum."""
     for count, kept in _ROUNDS:
         part = model.begin(count)
-        found = sorted((_refine(part, start, (), _FOLLOWED, _NEAR)[:2] for start in starts), key=lambda each: each[1])
-        starts, places = [], []
-        for theta, squares in found[:kept]:
-            place = part.follow(theta).position
-            if all(np.sum((place - other) ** 2) > _ALIKE * squares for other in places):
-                starts.append(theta)
-                places.append(place)
+        found = [_refine(part, start, (), _FOLLOWED, _NEAR) for start in starts]
+        starts = [theta for theta, *_ in sorted(found, key=lambda found: found[1])[:kept]]
     return starts[0]
 
 
@@ -335,14 +328,15 @@ def _refine(
     (motion, rest, squares), promised = look(theta), np.inf
     for _ in range(most):
         slopes = model.weigh(motion.slopes)
-        # Products of columns keep half of their digits: enough for a step, since the residuals keep all of theirs.
-        square, fall = slopes.T @ slopes, slopes.T @ rest
+        sizes = np.linalg.norm(slopes, axis=0)
         # Only what moves the positions moves, and nothing out of its bounds.
-        sizes = np.sqrt(np.diagonal(square))
+        fall = slopes.T @ rest
         free = (sizes > 0) & ((theta > low) | (fall > 0)) & ((theta < high) | (fall < 0))
         sizes = sizes[free]
-        square, fall = square[np.ix_(free, free)] / np.outer(sizes, sizes), fall[free] / sizes
+        columns = slopes[:, free] / sizes
+        square, fall = columns.T @ columns, fall[free] / sizes
         while True:
+            # Products of columns keep half of their digits: enough for a step, since the residuals keep all of theirs.
             step = np.linalg.lstsq(square + damping * np.eye(sizes.size), fall, rcond=None)[0]
             promised = float(step @ (2.0 * fall - square @ step))
             trial = theta.copy()
