@@ -180,6 +180,10 @@ class DeviceEstimate:
         """The scene with other values of ``numbers``."""
         return scene_of(values, self.period, self.velocity, self.lag_order)
 
+    def normalize(self, drawn: np.ndarray) -> DimensionlessDevice:
+        """Devices of other values of ``numbers``, a row each."""
+        return DimensionlessDevice.of_numbers(np.moveaxis(drawn, 1, 0), self.period, self.lag_order)
+
     def differ(self, ask: Callable[[Scene], Any]) -> np.ndarray:
         """By how much an answer changes along each axis of the covariance, one standard deviation far: a row each."""
         values, middle, rows = self.estimates, ask(self.scene), []

@@ -21,20 +21,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.loops.rigid.device import PhiFunctions, phi_functions, split_delay
+from zwidth.loops.rigid.device import PhiFunctions, phi_functions
 
 
 class Pieces(NamedTuple):
-    """Every part of a period: velocities at its ends; where it turns, how long before; directions; what sticks."""
+    """Both parts of all periods, two rows: velocities at their ends, directions, what sticks; and the turns.
+
+    Of each turn: the period, the part, the time before it, and the direction after it.
+    """
 
     start: np.ndarray
     end: np.ndarray
-    turned: np.ndarray
-    before: np.ndarray
     way: np.ndarray
-    way_after: np.ndarray
     held: np.ndarray
-    held_after: np.ndarray
+    turns: tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
@@ -80,117 +80,128 @@ class Recording:
         friction: float = 0.0,
     ) -> ModelledMotion:
         """Where the mass is at the samples; ``offset`` is o, ``friction`` c."""
-        whole, f = (float(part) for part in split_delay(np.float64(d)))
-        now = self.skip + np.arange(self.position.size - 1) - int(whole)
-        force = np.stack([self.force[now - 1], self.force[now]], -1).ravel()
-        push, length = g * force + offset, np.tile([f, 1.0 - f], now.size)
-        kinds = phi_functions(delta * length[:2])
-        pieces = (_rub if friction else _glide)(push, length, kinds, delta, v0, friction)
-        way, differentiate = _follow(pieces, force, push, length, kinds, delta, friction)
+        whole = int(np.floor(d))
+        past = self.force[self.skip - whole - 1 :][: self.position.size]
+        force, spans = np.array([past[:-1], past[1:]]), np.array([d - whole, whole + 1.0 - d])
+        push, kinds = g * force + offset, phi_functions(delta * spans)
+        pieces = (_rub if friction else _glide)(push, spans, kinds, delta, v0, friction)
+        way, differentiate = _follow(pieces, force, push, spans, kinds, delta, friction)
         return ModelledMotion(x0 + np.append(0.0, way), differentiate)
 
 
 def _glide(
-    push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float
+    push: np.ndarray, spans: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float
 ) -> Pieces:
-    slow, rates = (np.tile(each, push.size // 2) for each in (kinds.c, length[:2] * kinds.phi1))
-    end = recur(slow, rates * push, v0)
-    never, still = np.zeros(push.shape, bool), np.zeros_like(push)
-    return Pieces(np.append(v0, end[:-1]), end, never, length, still, still, never, never)
+    """Without friction; with it, what is gained from rest in one direction."""
+    gains = (spans * kinds.phi1)[:, None] * push
+    late = recur(kinds.c[0] * kinds.c[1], kinds.c[1] * gains[0] + gains[1], v0)
+    start = np.append(v0, late[:-1])
+    middle, none = kinds.c[0] * start + gains[0], np.zeros(0, int)
+    still = np.zeros_like(gains)
+    return Pieces(np.array([start, middle]), np.array([middle, late]), still, still > 0, (none, none, 0.0 * none, none))
 
 
-def _rub(push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float) -> Pieces:
-    count = push.size
-    slow, rates = (np.tile(each, count // 2) for each in (kinds.c, length[:2] * kinds.phi1))
-    able, times = np.flatnonzero(np.abs(push) > friction), np.append(0.0, np.cumsum(length))
-    # What is gained from rest in a direction s, G. From v_m on, s v_k = G_k + (s v_m - G_m) e^(-delta (t_k - t_m)).
-    gliding, rubbing = np.append(0.0, recur(slow, rates * push)), np.append(0.0, recur(slow, rates * friction))
-    gained = {s: s * gliding - rubbing for s in (1.0, -1.0)}
-    decays = [np.exp(-delta * (times[k:] - times[k])) for k in (0, 1)]
+def _rub(push: np.ndarray, spans: np.ndarray, kinds: PhiFunctions, delta: float, v0: float, friction: float) -> Pieces:
+    count, slow, rates = push.size, kinds.c.tolist(), (spans * kinds.phi1).tolist()
+    # Both parts in turn. What is gained from rest in a direction s, G: from v_m on,
+    # s v_k = G_k + (s v_m - G_m) e^(-delta (t_k - t_m)).
+    gliding, rubbing = (
+        np.append(0.0, _glide(each, spans, kinds, delta, 0.0, 0.0).end.T)
+        for each in (push, np.full(push.shape, friction))
+    )
+    push = push.T.ravel()
+    able, gained = np.flatnonzero(np.abs(push) > friction), {s: s * gliding - rubbing for s in (1.0, -1.0)}
+    decay = np.exp(-delta * np.arange(count // 2 + 1))
+    decays = [np.outer(decay, [1.0, each]).ravel() for each in slow]
     # Where it moves on in which direction; where it turned from which one, how long before, and its velocity then.
     m, v, way = 0, v0, float(np.sign(v0))
     begun, turns = [(0, way)], []
     while m < count:
         if way == 0.0:
-            after = np.searchsorted(able, m)
+            after = able.searchsorted(m)
             if after == able.size:
                 break
             m, v = int(able[after]), 0.0
             way = 1.0 if push[m] > 0 else -1.0
             begun.append((m, way))
         # The next part that ends at no speed in this direction, in ever longer windows.
-        gain, decay, first, size = gained[way], decays[m % 2], m + 1, 32
+        gain, decay, first, size = gained[way], decays[m % 2], m + 1, 128
         ahead = way * v - gain.item(m)
         while first <= count:
-            stopped = (
-                gain[first : first + size] + ahead * decay[first - m : first - m + size][: count + 1 - first] <= 0.0
-            )
+            last = min(first + size, count + 1)
+            stopped = gain[first:last] + ahead * decay[first - m : last - m] <= 0.0
             if stopped[k := int(stopped.argmax())]:
                 break
-            first, size = first + size, 4 * size
+            first, size = last, 4 * size
         else:
             break
         k += first - 1
-        v, a, h = way * max(0.0, gain.item(k) + ahead * decay.item(k - m)), push.item(k), length.item(k)
-        m = k + 1
-        pull = a - way * friction
+        v, a, part = way * max(0.0, gain.item(k) + ahead * decay.item(k - m)), push.item(k), k % 2
+        m, h, pull = k + 1, spans.item(part), a - way * friction
         if not (pull * way < 0.0 and h > 0.0):
-            v = slow.item(k) * v + rates.item(k) * pull
+            v = slow[part] * v + rates[part] * pull
             continue
         before = -v / pull
         before = min(log1p(delta * before) / delta if delta else before, h)
-        rest, old, way = h - before, way, -way if abs(a) > friction else 0.0
+        rest, way = h - before, -way if abs(a) > friction else 0.0
         v = (-expm1(-delta * rest) / delta if delta else rest) * (a - way * friction) if way else 0.0
-        turns.append((k, before, old, v))
-        begun.append((k, way))
+        turns.append((k, before, way, v))
+        begun.append((k + 1, way))
     starts, ways = np.array(begun).T
-    way_after = np.repeat(ways, np.diff(np.append(starts, count)).astype(int))
-    turned, before, at = np.zeros(count, bool), length.copy(), way_after.copy()
-    held, added = way_after == 0, rates * (push - way_after * friction)
-    if turns:
-        k = [turn[0] for turn in turns]
-        turned[k], (before[k], at[k], added[k]) = True, np.array(turns)[:, 1:].T
-    end = recur(np.where(held | turned, 0.0, slow), np.where(held, 0.0, added), v0)
-    return Pieces(np.append(v0, end[:-1]), end, turned, before, at, way_after, at == 0, held)
+    way = np.repeat(ways, np.diff(np.append(starts, count)).astype(int))
+    held = way == 0
+    factors, added = (
+        np.where(held, 0.0, np.tile(slow, count // 2)),
+        np.tile(rates, count // 2) * (push - way * friction),
+    )
+    added[held] = 0.0
+    k, before, after, speeds = np.reshape(turns, (-1, 4)).T
+    k = k.astype(int)
+    factors[k], added[k] = 0.0, speeds
+    end = recur(factors, added, v0)
+    start, end, way, held = (
+        np.ascontiguousarray(each.reshape(-1, 2).T) for each in (np.append(v0, end[:-1]), end, way, held)
+    )
+    return Pieces(start, end, way, held, (k % 2, k // 2, before, after))
 
 
 def _follow(
-    pieces: Pieces, force: np.ndarray, push: np.ndarray, length: np.ndarray, kinds: PhiFunctions, delta: float, c: float
+    pieces: Pieces, force: np.ndarray, push: np.ndarray, spans: np.ndarray, kinds: PhiFunctions, delta: float, c: float
 ) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
-    """The way gone at the end of every period, and the derivatives of places in g, delta, d, x0, v0, o and c."""
-    v, end, way, held, k = pieces.start, pieces.end, pieces.way, pieces.held, np.flatnonzero(pieces.turned)
-    a, held_after, way_after = np.where(held, 0.0, push - way * c), pieces.held_after[k], pieces.way_after[k]
+    """The way gone at the end of every period, and the derivatives of places in g, delta, d, x0, v0, o and c: rows."""
+    v, end, way, held, (*k, t, way_after) = pieces
+    k = tuple(k)
+    span, kinds = spans[:, None], PhiFunctions(*(each[:, None] for each in kinds))
+    a = np.where(held, 0.0, push - way * c)
+    moved = kinds.phi1 * span * v + kinds.phi2 * span**2 * a
+    held_after, r = way_after == 0, spans[k[0]] - t
     a_after = np.where(held_after, 0.0, push[k] - way_after * c)
-    t, r = pieces.before[k], (length - pieces.before)[k]
-    both, spans = phi_functions(delta * np.append(t, r)), length[:2]
+    both = phi_functions(delta * np.append(t, r))
     first, second = (PhiFunctions(*(each[part] for each in both)) for part in np.s_[: t.size, t.size :])
-    moved = (kinds.phi1 * spans * v.reshape(-1, 2) + kinds.phi2 * spans**2 * a.reshape(-1, 2)).ravel()
     moved[k] = t * first.phi1 * v[k] + t**2 * first.phi2 * a[k] + r**2 * second.phi2 * a_after
 
     def differentiate() -> np.ndarray:
-        by = _derive(kinds, delta, spans, *(each.reshape(-1, 2) for each in (v, a, force, way, held))).reshape(2, 7, -1)
+        by = _derive(kinds, delta, span, v, a, force, way, held)
         # What sticks forgets its speed.
-        again, slow = (np.where(held.reshape(-1, 2), 0.0, each).ravel() for each in (spans * kinds.phi1, kinds.c))
-        speed = a - delta * end
-        if k.size:
+        slow, again, speed = np.where(held, 0.0, kinds.c), by[1, 5].copy(), a - delta * end
+        if t.size:
             speed[k] = a_after - delta * end[k]
             turn, onward = speed[k] / a[k], end[k] / a[k]
             again[k], slow[k] = t * first.phi1 + onward * first.c, turn * first.c
             before = _derive(first, delta, t, v[k], a[k], force[k], way[k], held[k])
             after = _derive(second, delta, r, 0.0 * r, a_after, force[k], way_after, held_after)
-            by[0][:, k], by[1][:, k] = before[0] + onward * before[1] + after[0], turn * before[1] + after[1]
+            by[0][:, *k], by[1][:, *k] = before[0] + onward * before[1] + after[0], turn * before[1] + after[1]
         # A part that lasts longer goes on as it ended.
-        by[:, 2] = np.tile([1.0, -1.0], end.size // 2) * np.array([end, speed])
+        by[:, 2] = np.array([end, speed]) * [[1.0], [-1.0]]
         # Two parts a period.
-        (place, late_place), (moves, late_moves) = (np.moveaxis(each.reshape(7, -1, 2), -1, 0) for each in by)
-        (again, late_again), (slow, late_slow) = again.reshape(-1, 2).T, slow.reshape(-1, 2).T
-        speeds = np.column_stack(
-            [np.eye(7)[4], recur(slow * late_slow, (late_slow * moves + late_moves).T, np.eye(7)[4])[:-1].T]
-        )
-        place = place + late_place + late_again * moves + (again + late_again * slow) * speeds
+        (place, late_place), (moves, late_moves) = np.moveaxis(by, 2, 1)
+        (again, late_again), (slow, late_slow) = again, slow
+        speeds = recur(slow * late_slow, (late_slow * moves + late_moves).T, np.eye(7)[4])[:-1].T
+        place = place + late_place + late_again * moves
+        place += (again + late_again * slow) * np.column_stack([np.eye(7)[4], speeds])
         return np.cumsum(np.column_stack([np.eye(7)[3], place]), axis=1).T
 
-    return np.cumsum(moved[::2] + moved[1::2]), differentiate
+    return np.cumsum(moved[0] + moved[1]), differentiate
 
 
 def _derive(at: PhiFunctions, delta: float, t: np.ndarray, *piece: np.ndarray) -> np.ndarray:
@@ -199,7 +210,7 @@ def _derive(at: PhiFunctions, delta: float, t: np.ndarray, *piece: np.ndarray) -
     # -phi2'.
     bend = np.where(delta * t == 0, 1.0 / 6.0, at.gap / np.where(delta * t == 0, 1.0, delta * t))
     by = np.zeros((2, 7, *v.shape))
-    by[0, 1], by[1, 1] = -(t**2) * (at.psi * v + t * bend * a), -t * (at.c * v + t * at.psi * a)
+    by[0, 1], by[1, 1] = -(t**2) * at.psi * v - t**3 * bend * a, -t * at.c * v - t**2 * at.psi * a
     by[0, 5], by[1, 5] = np.where(held, 0.0, t**2 * at.phi2), np.where(held, 0.0, t * at.phi1)
     by[:, 0], by[:, 6] = force * by[:, 5], -way * by[:, 5]
     return by

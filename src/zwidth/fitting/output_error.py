@@ -211,14 +211,16 @@ def _start(model: Recordings) -> list[np.ndarray]:
         tuple(Recording(log.force, np.zeros(log.position.size + most), log.skip - most) for log in model.logs)
     )
     ends = np.cumsum([log.position.size for log in early.logs])
-    rows = np.concatenate([np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)])
+    samples = np.concatenate(
+        [np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)]
+    )
 
     def search(deltas: tuple[float, ...] = _DELTAS) -> list[tuple[float, float, int]]:
         """The sums of squares of dampings and delays, the least first."""
         found = []
         for delta, some in product(deltas, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
-            columns = _answer(early, delta, 0.0, base)[rows - some[:, None]]
-            rests = _combine(columns, model.measured)[1]
+            answers = np.swapaxes(_answer(early, delta, 0.0, base)[:, samples - some[:, None]], 0, 1)
+            rests = _combine(answers, model.measured)[1]
             found += [(float(rest), delta, d) for rest, d in zip(rests, some.tolist(), strict=True)]
         return sorted(found)
 
@@ -246,21 +248,20 @@ def _start(model: Recordings) -> list[np.ndarray]:
 
 
 def _answer(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.ndarray:
-    """Positions where g is 1 and the first speeds, o and c are as in ``base``, and their slopes in x0, v0 and o."""
+    """Positions where g is 1 and the first speeds, o and c are as in ``base``, and their slopes in x0, v0, o: rows."""
     places, slopes = model.predict(np.array([1.0, delta, d, *base[3:]]))
-    return np.column_stack([places, slopes[:, 3:-1]])
+    return np.vstack([places, slopes[:, 3:-1].T])
 
 
-def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _combine(rows: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least squares to half of the digits, which are enough to start from, and their sums of squares."""
-    sizes = np.linalg.norm(columns, axis=-2, keepdims=True)
+    square = rows @ np.swapaxes(rows, -1, -2)
+    sizes = np.sqrt(np.diagonal(square, axis1=-2, axis2=-1))
     sizes = np.where(sizes > 0, sizes, 1.0)
-    scaled = columns / sizes
-    turned = np.swapaxes(scaled, -1, -2)
     least = sizes.shape[-1] * np.finfo(float).eps
-    values = (np.linalg.pinv(turned @ scaled, least, hermitian=True) @ (turned @ wanted)[..., None])[..., 0]
-    rest = wanted - (scaled @ values[..., None])[..., 0]
-    return values / sizes[..., 0, :], np.sum(rest**2, -1)
+    inverse = np.linalg.pinv(square / sizes[..., None] / sizes[..., None, :], least, hermitian=True)
+    values = (inverse @ (rows @ wanted / sizes)[..., None])[..., 0] / sizes
+    return values, np.sum((wanted - (values[..., None, :] @ rows)[..., 0, :]) ** 2, -1)
 
 
 def _follow(model: Recordings, starts: list[np.ndarray]) -> np.ndarray:

@@ -20,7 +20,7 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
-from zwidth.loops.linear.state_space import StateSpace, delayed_device, estimate_matrices, in_series
+from zwidth.loops.linear.state_space import estimate_matrices
 from zwidth.loops.rigid.device import device_status
 from zwidth.loops.variants import RigidVariants
 from zwidth.parts.velocity import BackwardDifference
@@ -103,7 +103,7 @@ def _bear_response(fit: DeviceEstimate, reliability: float, rigid: bool, drawn: 
     if top.status != Status.OK:
         return SafeWall(0.0, 0.0, 1.0, int(Status.OK), float(top.frequency))
     wall = float(top.stiffness), float(top.virtual_damping)
-    share = float(np.mean([_bears(fit.vary(values), *wall) for values in drawn]))
+    share = float(_bear(fit, drawn, *wall).mean())
     if share < reliability - 1.0 / np.sqrt(len(drawn)):
         return _UNDECIDED
     return SafeWall(*wall, share, int(Status.OK), np.nan if rigid else float(top.frequency))
@@ -175,10 +175,10 @@ class _SearchedDevices:
         # Beyond what is looked at nothing is believed to be borne.
         self.others = np.zeros(np.count_nonzero(~known))
         drawn, d, rate = drawn[known], d[known], rate[known]
-        self.scenes = [fit.vary(values) for values in drawn]
+        self.fit, self.drawn = fit, drawn
         even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max(initial=0.0)))[1:]
         w = np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even])
-        devices = DimensionlessDevice.of_numbers(drawn.T[..., None], period, fit.lag_order)
+        devices = fit.normalize(drawn[..., None])
         if devices.modes:
             beside = [np.clip(turns * (1.0 + ratio * _BESIDE), _SLOWEST, np.pi) for turns, ratio, _ in devices.modes]
             w = np.sort(np.concatenate([np.broadcast_to(w, (len(drawn), w.size)), *beside], -1), -1)
@@ -205,19 +205,64 @@ class _SearchedDevices:
 
     def share(self, stiffness: float, virtual_damping: float) -> float:
         """Of the devices on which the wall and softer ones of its damping are stable, by eigenvalues."""
-        borne = sum(_bears(scene, stiffness, virtual_damping) for scene in self.scenes)
-        return borne / (len(self.scenes) + self.others.size)
+        borne = _bear(self.fit, self.drawn, stiffness, virtual_damping)
+        return float(borne.sum()) / (borne.size + self.others.size)
 
     def _borne_by(self, limits: np.ndarray, reliability: float) -> float:
         return borne_by(np.concatenate([limits, self.others]), reliability)
 
 
-def _bears(scene: Scene, stiffness: float, virtual_damping: float) -> bool:
-    alpha, beta = scene.normalize_walls(stiffness * np.array(_SOFTER), virtual_damping)
-    chain = scene.loop.chain
-    estimate, device = estimate_matrices(chain.estimate), delayed_device(chain)
-    loop = in_series(StateSpace(estimate.A, estimate.B, float(beta) * estimate.C, float(beta) * estimate.D), device)
-    closed = np.repeat((loop.A - loop.B @ loop.C)[None], alpha.size, 0)
-    size = device.A.shape[0]
-    closed[:, -size:, -size:] -= alpha[:, None, None] * device.B @ device.C
-    return bool(np.all(np.abs(np.linalg.eigvals(closed)) < 1.0))
+def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damping: float) -> np.ndarray:
+    """Which devices bear a wall and softer ones of its damping, by the eigenvalues of their closed loops.
+
+    The states: of the velocity estimate, of the device, and the forces on their way, the newest first.
+    """
+    from scipy.linalg import expm
+
+    f, devices = estimate_matrices(fit.velocity.estimate(fit.period)), fit.normalize(drawn)
+    motions, sensed = _realize(devices)
+    whole, borne = np.floor(devices.d).astype(int), np.zeros(len(drawn), bool)
+    first, end = len(f.A), len(f.A) + sensed.shape[1]
+    late = expm(motions * (whole + 1.0 - devices.d)[:, None, None])[:, :-1, -1]
+    moved = expm(motions)[:, :-1]
+    for n in np.unique(whole):
+        own = whole == n
+        closed = np.zeros((own.sum(), end + n + 1, end + n + 1))
+        closed[:, :first, :first], closed[:, :first, first:end] = f.A, f.B * sensed[own, None]
+        closed[:, first:end, first:end], closed[:, first:end, -1] = moved[own, :, :-1], moved[own, :, -1] - late[own]
+        closed[:, end + 1 :, end:-1] = np.eye(n)
+        if n:
+            closed[:, first:end, -2] = late[own]
+        stable = np.ones(own.sum(), bool)
+        for softer in _SOFTER:
+            alpha, beta = (
+                wall / devices.mass[own, None]
+                for wall in (softer * stiffness * fit.period**2, virtual_damping * fit.period)
+            )
+            force = np.concatenate([-beta * f.C, -(alpha + beta * f.D) * sensed[own]], -1)
+            loop = closed.copy()
+            loop[:, end, :end] = force
+            if not n:
+                loop[:, first:end, :end] += late[own, :, None] * force[:, None]
+            stable &= np.abs(np.linalg.eigvals(loop)).max(-1) < 1.0
+        borne[own] = stable
+    return borne
+
+
+def _realize(devices: DimensionlessDevice) -> tuple[np.ndarray, np.ndarray]:
+    """Of devices ``((A, B), (0, 0))`` of ``x' = A x + B u``, and C: the mass, its modes, and the amplifier."""
+    bodies = [
+        (0.0, devices.delta, 1.0),
+        *((turns**2, 2.0 * ratio * turns, share) for turns, ratio, share in devices.modes),
+    ]
+    count, order = 2 * len(bodies), len(devices.lag)
+    motions, sensed = (np.zeros((devices.mass.size, *shape)) for shape in (2 * (count + order + 1,), (count + order,)))
+    for k, (pull, rub, share) in enumerate(bodies):
+        motions[:, 2 * k, 2 * k + 1], motions[:, 2 * k + 1, count] = 1.0, 1.0
+        motions[:, 2 * k + 1, 2 * k], motions[:, 2 * k + 1, 2 * k + 1], sensed[:, 2 * k] = -pull, -rub, share
+    if order:
+        rate = 1.0 / devices.lag[0]
+        motions[:, -2, -1], motions[:, -2, -2] = rate**order, -rate
+        if order == 2:
+            motions[:, -3, -2], motions[:, -2, -3], motions[:, -2, -2] = 1.0, -(rate**2), -2.0 * devices.lag[1] * rate
+    return motions, sensed

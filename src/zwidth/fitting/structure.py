@@ -129,7 +129,8 @@ class Recordings:
         beside = self.add_parts(theta, which) if self.lag or self.modes else None
 
         def differentiate() -> np.ndarray:
-            slopes = rigid.slopes @ np.eye(theta.size)[into]
+            slopes = np.zeros((theta.size, rigid.position.size)).T
+            slopes[:, into] = rigid.slopes
             if beside is not None:
                 slopes += beside.slopes
                 slopes[:, 3 : 3 + self.lag] += np.outer(rigid.slopes[:, 2], by_late)
@@ -175,8 +176,10 @@ class Recordings:
             for sign, by, speed, slide in slides:
                 parts += [(slide.position, sign / g * own[0]), (slide.slopes, sign * own[1])]
                 parts += [(speed[0] - speed, sign * by)]
-            rows = np.array([half for row, _ in parts for half in (row.real, row.imag)])
-            return rows.T @ np.array([half for _, factor in parts for half in (factor.real, -factor.imag)])
+            rows = [(row.real, factor.real) for row, factor in parts]
+            rows += [(row.imag, -factor.imag) for row, factor in parts if np.iscomplexobj(row)]
+            columns, factors = map(np.array, zip(*rows, strict=True))
+            return columns.T @ factors
 
         return ModelledMotion(place, differentiate)
 
