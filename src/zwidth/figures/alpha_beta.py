@@ -162,7 +162,8 @@ def draw_map(
     known = arrays["status"] == Status.OK if "status" in arrays else np.isfinite(arrays[output])
     values = np.ma.masked_array(arrays[output].astype(float), ~known)
     colors = _choose_colors(output, [values[:, :, column, row] for row, column in places])
-    image, missing = None, False
+    image: Any = None
+    missing = False
     for ax, (row, column) in zip(panels, places, strict=False):
         cells = arrays["alpha"], arrays["beta"], values[:, :, column, row].T
         image = _draw_cells(ax, *cells, output, colors)

@@ -111,7 +111,8 @@ def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, 
     side, unit = (1.0 if enough == "above" else -1.0), unit.removeprefix("1")
     beyond = [side * other for other in others if side * other > side * value]
     if beyond:
-        return " to ".join(tell_apart(*sorted((value, side * min(beyond))), unit))
+        low, high = sorted((value, side * min(beyond)))
+        return " to ".join(tell_apart(low, high, unit))
     value = round_safely(value, enough, digits)
     return f"{with_unit(value, unit, digits) if unit else plain(value, digits)} {ENOUGH[enough]}"
 
