@@ -328,6 +328,10 @@ class SceneOptima(SceneAnswers):
             return RequiredValue(math.nan, "nowhere", proved, (low, high), Status.NOT_CONVERGED)
         middle = now if now > 0 else low
         best = min(proved, key=lambda crossing: abs(math.log(crossing.value / middle)))
+        ends = sorted((middle, best.value))
+        if any(ends[0] <= value <= ends[1] and math.isnan(known[value]) for value in grid):
+            # A nearer crossing may hide where K_max could not be computed.
+            return RequiredValue(math.nan, "nowhere", proved, (low, high), Status.NOT_CONVERGED)
         return RequiredValue(best.value, best.enough, proved, (low, high), Status.OK)
 
     def best_damping(

@@ -165,7 +165,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
                 stable[...] = placed.is_stable(axes["stiffness"], axes["virtual_damping"])
                 edges += trace_edges(placed, label, varied, axes)
             found["linearly_stable"].append(stable)
-            notes.append(f"{label}: {describe_shares(motion, stable, self.silence, self.widest)}")
+            notes.append(f"{label}: {describe_outcomes(motion, stable, self.silence, self.widest)}")
         units = {name: unit for name, (_, unit) in OF_WHOLE.items()}
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
         arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
@@ -212,8 +212,8 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
     ]
 
 
-def describe_shares(motion: Any, stable: np.ndarray, silence: float, widest: float) -> str:
-    """How much of the linearly stable and unstable walls is silent, buzzes, or goes beyond."""
+def describe_outcomes(motion: Any, stable: np.ndarray, silence: float, widest: float) -> str:
+    """How many of the linearly stable and unstable walls is silent, buzzes, or goes beyond."""
     beyond = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > widest)
     silent = ~beyond & (motion.amplitude < silence)
     known = motion.status == Status.OK
@@ -222,7 +222,7 @@ def describe_shares(motion: Any, stable: np.ndarray, silence: float, widest: flo
     for name, kind in {"linearly stable ": 1, "linearly unstable ": 0, "": -1}.items():
         those = known & (stable == kind)
         if those.any():
-            shares = ", ".join(f"{np.mean(end[those]):.1%} {word}" for word, end in ends.items())
-            words.append(f"of {those.sum()} {name}walls {shares}")
+            counts = ", ".join(f"{np.count_nonzero(end[those]):,} {word}" for word, end in ends.items())
+            words.append(f"of {np.count_nonzero(those):,} {name}walls {counts}")
     lost = int(np.count_nonzero(~known))
     return "; ".join(words) + (f"; {lost} not followed to the end" if lost else "")

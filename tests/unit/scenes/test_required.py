@@ -68,6 +68,20 @@ def test_out_of_reach_and_everywhere():
     assert (always.status, always.enough, always.value) == (Status.OK, "everywhere", 0.1)
 
 
+@pytest.mark.parametrize("unknown, status", [((11, 15), Status.NOT_CONVERGED), ((60, 80), Status.OK)])
+def test_a_nearer_crossing_may_hide_where_nothing_is_known(unknown, status, monkeypatch):
+    known = Scene.max_stiffness
+
+    def ask(scene, **options):
+        top = known(scene, **options)
+        return top._replace(status=Status.NOT_CONVERGED) if unknown[0] < scene.device.damping < unknown[1] else top
+
+    monkeypatch.setattr(Scene, "max_stiffness", ask)
+    got = RIGID.required("damping", 25e3)
+    assert (got.status, np.isnan(got.value)) == (status, status != Status.OK)
+    assert [crossing.enough for crossing in got.crossings] == ["above"]
+
+
 def test_the_range_ends_where_values_are_refused():
     got = FILTERED.required("velocity.cutoff", 9e3, within=(20.0, 5e3))
     assert got.range[1] < 500.0

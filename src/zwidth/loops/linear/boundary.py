@@ -34,8 +34,6 @@ from zwidth.loops.linear.roots import LoopRoots
 _MOST_STEPS, _ARRIVED = 120, 1e-10
 # By what share a row is moved, at most, that rounding keeps from being counted.
 _SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
-
-
 # Pairs of rows and arcs that are looked at in one go: what they need stays in caches.
 _BLOCK = 1 << 17
 
