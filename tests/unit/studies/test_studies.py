@@ -189,7 +189,7 @@ def test_step_responses_of_devices_and_walls():
     expected = zwidth.step_response(0.75 * float(ridge.alpha), float(ridge.beta), 0.1, 1, periods=50)
     np.testing.assert_allclose(table["position_m"], expected.position * 1e-3**2 / 0.1, rtol=1e-12)
     np.testing.assert_allclose(table["time_s"], expected.time * 1e-3, rtol=1e-12)
-    assert table["label"][0] == "K = 14.90 kN/m, B = 41.60 N s/m"
+    assert table["label"][0] == "K = 14.89 kN/m, B = 41.60 N s/m"
     np.testing.assert_allclose(table["final_position_m"], expected.final_position * 1e-3**2 / 0.1, rtol=1e-12)
     np.testing.assert_allclose(table["settling_time_s"], expected.settling_time * 1e-3, rtol=1e-12)
 
