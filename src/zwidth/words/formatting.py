@@ -112,7 +112,9 @@ def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, 
     beyond = [side * other for other in others if side * other > side * value]
     if beyond:
         low, high = sorted((value, side * min(beyond)))
-        return " to ".join(tell_apart(low, high, unit))
+        # Inwards, where there is enough, unless nothing is left between them.
+        inner = round_safely(low, "above", digits), round_safely(high, "below", digits)
+        return " to ".join(tell_apart(*(inner if inner[0] < inner[1] else (low, high)), unit))
     value = round_safely(value, enough, digits)
     return f"{with_unit(value, unit, digits) if unit else plain(value, digits)} {ENOUGH[enough]}"
 

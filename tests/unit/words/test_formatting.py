@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from zwidth.words.formatting import plain, round_safely, tell_apart, with_unit
+from zwidth.words.formatting import plain, round_safely, spell_enough, tell_apart, with_unit
 
 
 @pytest.mark.parametrize(
@@ -78,3 +78,10 @@ def test_what_has_no_digits_stays():
     assert round_safely(0.0, "above") == 0.0
     assert round_safely(float("inf"), "below") == float("inf")
     assert round_safely(1.23456, "") == 1.23456
+
+
+def test_a_range_in_which_there_is_enough_is_read_inside_of_it():
+    assert spell_enough(40.653e-6, "above", [40.653e-6, 224.97e-6], "s") == "40.66 µs to 224.9 µs"
+    assert spell_enough(224.97e-6, "below", [40.653e-6, 1.0], "s") == "40.66 µs to 224.9 µs"
+    assert spell_enough(1.00001, "above", [1.00002], "1") == "1.00001 to 1.00002"
+    assert spell_enough(224.97e-6, "below", [1.0], "s") == "224.9 µs or less"
