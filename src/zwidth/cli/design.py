@@ -10,7 +10,7 @@ import click
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
 from zwidth.pages.words import row, tell
-from zwidth.words.formatting import name_wall, plain, round_safely, spell_enough, with_unit
+from zwidth.words.formatting import count_digits, name_wall, plain, round_safely, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -117,7 +117,7 @@ def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
     text = f"no B is stable at K = {with_unit(wanted, 'N/m')}"
     if best.status == Status.OK:
         B, radius = best.virtual_damping, plain(best.spectral_radius)
-        digits = next((n for n in range(4, 17) if scene.is_stable(wanted, float(f"{B:.{n}g}"))), 17)
+        digits = count_digits(lambda digits: scene.is_stable(wanted, float(f"{B:.{digits}g}")))
         text = f"{with_unit(B, 'N s/m', digits)} settles fastest: spectral radius {radius}"
         text += f", modulus margin {plain(best.modulus_margin)}"
     return result, [row("virtual damping", text)]

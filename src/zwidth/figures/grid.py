@@ -82,10 +82,9 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
     for name, values in data.coords.items():
         if name in VARIABLES:
             # Over many decades the middle has few digits.
-            middle = (
-                np.sqrt(np.min(values.values) * np.max(values.values)) if logarithmic(values.values) else values.values
-            )
-            factor, unit = style.si_unit(middle, str(values.attrs.get("units", "1")))
+            known = values.values
+            known = np.sqrt(known.min() * known.max()) if logarithmic(known) else known
+            factor, unit = style.si_unit(known, str(values.attrs.get("units", "1")))
             # Without the coordinates of its own, which would bring back those that are scaled already.
             scaled = (values.dims, values.values * factor, {**values.attrs, "units": unit, "factor": factor})
             data = data.assign_coords({name: scaled})

@@ -152,12 +152,14 @@ def name_kind(wall: StiffestWall) -> str:
     return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
 
 
-def round_margin(name: str, margins: Assessment | Margins, stable: bool | None, digits: int = 4) -> float:
+def round_margin(
+    name: str, margins: Assessment | Margins, stable: bool | None, digits: int = 4, *, decibel: bool = False
+) -> float:
     """A margin in few digits, rounded so that a wall bears what is read, or that an unstable one is stable by it."""
     value = float(getattr(margins, name))
     # A gain margin may be a factor below 1 of a stable wall, too.
     outward = name == "gain_margin" and (value > 1.0) != bool(stable)
-    return round_safely(value, "above" if outward else "below", digits)
+    return round_safely(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
 
 
 def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:

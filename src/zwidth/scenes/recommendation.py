@@ -28,7 +28,7 @@ from zwidth.scenes.assessment import (
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, find_lowest, soft_dampings
 from zwidth.scenes.wall_code import write_wall
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
+from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
@@ -127,11 +127,16 @@ class Recommendation:
         K is rounded down; of a tip that leans, or of a narrow column, B needs more digits than others.
         """
         surplus = _measure(self.scene, self.wanted)
-        for digits in range(4, 17):
-            K, B = round_safely(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
-            if np.all(self.scene.is_stable(K, B)) and (surplus is None or min(surplus(K, B).values()) >= 0):
-                return K, B, digits
-        return self.stiffness, self.virtual_damping, 17
+
+        def rounded(digits: int) -> tuple[float, float]:
+            return round_safely(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
+
+        def holds(digits: int) -> bool:
+            wall = rounded(digits)
+            return bool(self.scene.is_stable(*wall) and (surplus is None or min(surplus(*wall).values()) >= 0))
+
+        digits = count_digits(holds)
+        return *rounded(digits), digits
 
     @cached_property
     def verdict(self) -> Assessment | None:

@@ -20,7 +20,7 @@ from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.figures.stable_set import Outlines, tabulate_sets
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
-from zwidth.loops.rigid.device import wall_status
+from zwidth.loops.rigid.device import status_of_results
 from zwidth.loops.rigid.passivity import is_passive
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import is_stable
@@ -35,7 +35,7 @@ from zwidth.studies.outcome import (
 )
 from zwidth.studies.ridge import find_edges, needed_models, passive_intervals, passive_outlines, ridge_table
 from zwidth.words.quantities import WALL_RANGE
-from zwidth.words.status import Status, note_failures
+from zwidth.words.status import note_failures
 from zwidth.words.types import DelayModel
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
@@ -291,7 +291,7 @@ class MapStudy(ComputedStudy):
         share = share_of_device(self.delta, self.d, scene)
         shape = tuple(self.sizes.values())
         outputs = {name: np.empty(shape, dtype=_TYPES[name]) for name in self.outputs}
-        status = np.full(shape, Status.OK, np.uint8)
+        status = np.empty(shape, np.uint8)
         # One plane at a time: the columns that broadcasting lays out are several times as large as the results.
         for delta_index, d_index in np.ndindex(delta.size, d.size):
             place = (slice(None), slice(None), delta_index, d_index)
@@ -299,10 +299,8 @@ class MapStudy(ComputedStudy):
             for name in outputs:
                 damping = device[0] * (share if name == "passive" else 1.0)
                 outputs[name][place] = np.asarray(_FUNCTIONS[name](*walls, damping, device[1]))
-                if outputs[name].dtype == np.float64:
-                    status[place][np.isnan(outputs[name][place])] = Status.NOT_CONVERGED
-            told = wall_status(*walls, *device)
-            np.copyto(status[place], told, where=told != Status.OK, casting="unsafe")
+            numbers = [outputs[name][place] for name in outputs if _TYPES[name] is np.float64]
+            status[place] = status_of_results(shape[:2], numbers, walls, device)
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs, "status": status}
         arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()

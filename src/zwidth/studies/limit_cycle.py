@@ -213,7 +213,7 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
 
 
 def describe_outcomes(motion: Any, stable: np.ndarray, silence: float, widest: float) -> str:
-    """How many of the linearly stable and unstable walls is silent, buzzes, or goes beyond."""
+    """How many of the linearly stable and unstable walls are silent, buzz, or go beyond."""
     beyond = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > widest)
     silent = ~beyond & (motion.amplitude < silence)
     known = motion.status == Status.OK

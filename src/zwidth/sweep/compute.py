@@ -16,8 +16,7 @@ from typing import TypeAlias
 import numpy as np
 
 from zwidth.arrays.evaluate import Route, map_blocks
-from zwidth.arrays.xp import within
-from zwidth.loops.rigid.device import valid_device, wall_status
+from zwidth.loops.rigid.device import status_of_results
 from zwidth.loops.rigid.margins import margins_kernel
 from zwidth.loops.rigid.outermost_poles import area_poles, list_poles
 from zwidth.loops.rigid.passivity import margin_at_one_delay
@@ -26,7 +25,7 @@ from zwidth.loops.rigid.response import decay_time
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.row_limit import row_limits
 from zwidth.sweep.grid import Block
-from zwidth.words.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, WALL_RANGE, Family
+from zwidth.words.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.words.status import Status
 
 Columns: TypeAlias = list[np.ndarray]
@@ -108,17 +107,12 @@ def _status(
     block: Block,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    status = np.full(shape, Status.OK, dtype=np.uint8)
-    status[unproved] = Status.NOT_CONVERGED
-    for name in outputs:
-        if OUTPUTS[name].dtype == "float64" and name not in MARGIN_OUTPUTS:
-            status[np.isnan(found[name])] = Status.NOT_CONVERGED
+    # Of a wall that is unstable margins are NaN.
+    numbers = [found[name] for name in outputs if OUTPUTS[name].dtype == "float64" and name not in MARGIN_OUTPUTS]
     device = block.delta[:, None, None], block.d[:, None, None]
     walls = block.alpha[:, :, None], block.beta[:, None, :]
-    # Each by itself first: seldom is one of them where the model is not computed.
-    if not (valid_device(*device).all() and all(within(part, WALL_RANGE).all() for part in walls)):
-        told = wall_status(*walls, *device)
-        np.copyto(status, told, where=told != Status.OK, casting="unsafe")
+    status = status_of_results(shape, numbers, walls, device)
+    status[unproved & (status == Status.OK)] = Status.NOT_CONVERGED
     return status
 
 

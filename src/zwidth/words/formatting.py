@@ -15,7 +15,7 @@ import gzip
 import math
 import re
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -81,6 +81,11 @@ def round_safely(value: float, enough: str, digits: int = 4) -> float:
     # A value that has so few digits stays, whatever the rounding of the quotient.
     steps = math.ceil(value / step - 1e-9) if enough == "above" else math.floor(value / step + 1e-9)
     return steps * step
+
+
+def count_digits(holds: Callable[[int], Any]) -> int:
+    """The fewest digits of a printed number, from 4 on, with which something holds."""
+    return next((digits for digits in range(4, 17) if holds(digits)), 17)
 
 
 def spell_stiffness(value: float, digits: int = 4) -> str:

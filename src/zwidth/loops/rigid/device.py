@@ -22,7 +22,7 @@ it the closed forms lose less than two bits.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from math import factorial
 from typing import Any, NamedTuple
 
@@ -226,6 +226,20 @@ def device_status(delta: Array, d: Array) -> Array:
 def wall_status(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     """The `Status` of a wall on a device."""
     return _status(valid_wall(alpha, beta, delta, d), delta, d, alpha, beta)
+
+
+def status_of_results(
+    shape: tuple[int, ...], numbers: Iterable[np.ndarray], walls: tuple[np.ndarray, ...], device: tuple[np.ndarray, ...]
+) -> np.ndarray:
+    """The `Status` of each wall on each device, of numbers that are NaN where none was found."""
+    status = np.full(shape, Status.OK, np.uint8)
+    for found in numbers:
+        status[np.isnan(found)] = Status.NOT_CONVERGED
+    # Each by itself first: seldom is one of them where the model is not computed.
+    if not (valid_device(*device).all() and all(within(part, WALL_RANGE).all() for part in walls)):
+        told = wall_status(*walls, *device)
+        np.copyto(status, told, where=told != Status.OK, casting="unsafe")
+    return status
 
 
 def _status(inside: Array, delta: Array, d: Array, *others: Array) -> Array:

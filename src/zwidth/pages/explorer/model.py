@@ -237,8 +237,7 @@ def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
         phase = plain(round_margin("phase_margin", verdict, verdict.stable, 3), 3)
         margins.append(f"phase {phase}° at {plain(verdict.gain_crossover)} {hertz} (circle)")
     if verdict.gain_margin > 0 and isfinite(verdict.phase_crossover):
-        side = "below" if (verdict.gain_margin > 1.0) == bool(verdict.stable) else "above"
-        decibel = plain(round_safely(20.0 * log10(verdict.gain_margin), side, 3), 3)
+        decibel = plain(round_margin("gain_margin", verdict, verdict.stable, 3, decibel=True), 3)
         margins.append(f"gain {decibel} dB at {plain(verdict.phase_crossover)} {hertz} (diamond)")
     slowest = pole_words(verdict.time_constant, verdict.frequency)
     if normalized and isfinite(verdict.time_constant):
