@@ -77,13 +77,9 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     if path not in values:
         raise click.UsageError(f"--find {find}: this scene has none; give {flag_of(path)} to start from")
     present = values[path]
-    # From nothing there is no range to search: a range that any device has. Of delays in periods, with whose square the
-    # cost grows.
+    # From nothing there is no range to search: a range that any device has.
     period = scene.timing.period
-    within = None if present else {"damping": (1e-6, 1e4), "delay": (1e-3 * period, 100 * period)}[path]
-    if path == "velocity.cutoff":
-        # A filter has none from half its sampling rate on.
-        within = present / 30.0, min(30.0 * present, 0.499 / (scene.velocity.coded_period or period))
+    within = None if present else {"damping": (1e-6, 1e4), "delay": (1e-3 * period, 500 * period)}[path]
     wanted = float(scene.wall.stiffness)
     needed = scene.required(path, wanted, within=within)
     result = {"parameter": path, "value": needed.value, "unit": own_unit(unit), "enough": needed.enough}

@@ -63,6 +63,8 @@ def soft_dampings(
 
 # How far the range reaches to both sides of the present value where none is given, and its points.
 _REACH, _POINTS = 30.0, 25
+# Delays so long are looked at, in periods, where none longer is there.
+_MOST_PERIODS = 1000.0
 # Closer than that a value and the present one are the same.
 _SAME = 1e-9
 # By what share of the value both sides of a crossing are proved, the closest that tells them apart.
@@ -114,11 +116,21 @@ def _present_value(scene: SceneAnswers, parameter: str) -> float:
     return float(known[parameter])
 
 
-def _range(parameter: str, now: float, within: tuple[Any, Any] | None) -> tuple[float, float]:
+def _range(scene: SceneAnswers, parameter: str, within: tuple[Any, Any] | None) -> tuple[float, float]:
     if within is None:
+        now, timing = _present_value(scene, parameter), scene.timing
         if not now > 0:
             raise InputError(f"within: {parameter} is 0 now; give the range to search, as within=(0.1, 10)")
-        return now / _REACH, now * _REACH
+        # The cost grows with the square of the delay in periods, and a filter has no cut-off from half its rate on.
+        longest = max(float(timing.delay / timing.period), _MOST_PERIODS)
+        ends = {
+            "delay": (0.0, longest * timing.period),
+            "period": (timing.delay / longest, math.inf),
+            "rate": (0.0, longest / timing.delay if timing.delay else math.inf),
+            "velocity.cutoff": (0.0, 0.499 / (getattr(scene.velocity, "coded_period", None) or timing.period)),
+        }
+        low, high = ends.get(parameter, (0.0, math.inf))
+        return max(now / _REACH, float(low)), min(now * _REACH, float(high))
     low, high = (float(end) for end in read_texts("within", within, FIELDS[parameter].unit))
     if not 0 < low < high < math.inf:
         raise InputError(f"within: got {within!r}; two finite numbers with 0 < low < high are needed")
@@ -266,7 +278,8 @@ class SceneOptima(SceneAnswers):
         Args:
             parameter: its dotted path, such as "damping", "velocity.cutoff" or "rate".
             stiffness: wanted, in N/m, > 0.
-            within: the range that is searched, 0 < low < high; by default a thirtieth to 30 times the present value.
+            within: the range that is searched, 0 < low < high; by default a thirtieth to 30 times the present value,
+                where the delay is no longer than 1,000 periods or than it is.
             negative_damping: as for `max_stiffness`.
 
         Returns:
@@ -289,7 +302,7 @@ class SceneOptima(SceneAnswers):
         """
         stiffness = _read_stiffness(stiffness)
         now = _present_value(self, parameter)
-        low, high = _range(parameter, now, within)
+        low, high = _range(self, parameter, within)
 
         def surplus(value: float) -> float:
             """How K_max compares with the wanted stiffness, in logarithms; NaN where it cannot be computed."""

@@ -88,7 +88,8 @@ class DesignStudy(ComputedStudy):
     """How many times the wanted stiffness the stiffest stable wall is to reach, 1 or more."""
 
     within: Ends | None = None
-    """The two ends of the range that is searched; a thirtieth to 30 times the present value where left out."""
+    """The two ends of the range that is searched; a thirtieth to 30 times the present value where left out, and
+    delays of no more than 1,000 periods."""
 
     num: Count = 61
     """Points of the curve in the figure."""

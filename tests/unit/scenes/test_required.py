@@ -88,6 +88,21 @@ def test_the_range_ends_where_values_are_refused():
     assert [crossing.enough for crossing in got.crossings] == ["above"]
 
 
+@pytest.mark.parametrize(
+    "parameter, delay, ends",
+    [
+        ("delay", 0.3, (0.01, 1.0)),
+        ("delay", 2.0, (2.0 / 30.0, 2.0)),
+        ("period", 0.3, (3e-4, 0.03)),
+        ("rate", 0.3, (1e3 / 30.0, 1e3 / 0.3)),
+        ("rate", 0.0, (1e3 / 30.0, 3e4)),
+    ],
+)
+def test_a_range_of_long_delays_has_an_end(parameter, delay, ends):
+    got = RIGID.replace(delay=delay).required(parameter, 10.0)
+    np.testing.assert_allclose(got.range, ends, rtol=1e-12)
+
+
 def test_a_crossing_next_to_what_cannot_be_computed_is_none():
     assert _cross(lambda x: np.log(x) if abs(x - 1.5) > 0.6 else np.nan, 0.5, 3.0) is None
     assert _cross(np.log, 0.5, 3.0) == Crossing(1.0 + 1e-11, "above")

@@ -175,10 +175,13 @@ class Boundary:
 
     def _missed(self, beta: np.ndarray) -> np.ndarray:
         """By how many poles the crossings of each row fail to lead to the count far above."""
-        total = float(self.base - self.top) + self._steps.leaving @ self._steps.are_met(beta)
-        for line in self.lines:
-            total += line.leaving(beta)
-        return total
+        return self.base - self.top + self._sum_leaving(beta)
+
+    def _sum_leaving(self, beta: np.ndarray, most: float = np.inf) -> np.ndarray:
+        """Poles that leave at all crossings of each row, where each counts for no more than ``most``."""
+        steps = self._steps
+        total = steps.sum_met(np.minimum(steps.leaving, most), beta)
+        return total + sum(np.minimum(line.leaving(beta), most) for line in self.lines)
 
     def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
         """How many poles of each wall lie outside the unit circle, for arrays of one shape (points,).
@@ -215,17 +218,16 @@ class Boundary:
 
     def borders(self, w: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of the curve at each angle (V18)."""
-        block = max(1, _BLOCK // max(1, len(self.arcs)))
-        if w.size > block:
-            return np.concatenate([self.borders(w[k : k + block]) for k in range(0, w.size, block)])
         here = curve_at(self.loop, w)
-        own = self.arc_at(w)
-        # By the arc: next to z = -1 the slope at one angle may be rounding.
-        leaves = np.array([arc.leaving for arc in self.arcs])[own] > 0
-        finite = np.isfinite(here.alpha) & np.isfinite(here.beta)
-        at = np.where(finite, here.alpha, 0.0), np.where(finite, here.beta, 0.0)
-        passed, sound = self._passed(*at, own)
-        return finite & sound & (self.base + passed == np.where(leaves, 0, 2))
+        held = np.isfinite(here.alpha) & np.isfinite(here.beta)
+        # Of a long delay's rows most hold no stable wall wherever: not enough poles enter on them.
+        held[held] = self.base + self._sum_leaving(self._settle(here.beta[held])[0], 0.0) <= 0
+        own, block = self.arc_at(w), max(1, _BLOCK // max(1, len(self.arcs)))
+        for part in np.array_split(np.flatnonzero(held), 1 + held.sum() // block):
+            passed, sound = self._passed(here.alpha[part], here.beta[part], own[part])
+            # By the arc: next to z = -1 the slope at one angle may be rounding.
+            held[part] = sound & (self.base + passed == np.where(self._steps.leaving[own[part]] > 0, 0, 2))
+        return held
 
     def line_borders(self, line: int, beta: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of a line at each damping."""
@@ -286,14 +288,18 @@ class _Steps(NamedTuple):
         own = np.array([(arc.leaving, arc.first) for arc in arcs]).T
         return cls(w, beta, alpha, straight, room, keys, dampings, np.cumsum([0, *sizes[:-1]]), ends, *own)
 
-    def are_met(self, beta: np.ndarray) -> np.ndarray:
-        """Which arcs rows meet: (arcs, rows)."""
-        # A row through an end of arcs is counted as the row just above it.
-        return (beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None])
+    def sum_met(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """The sum of weights of the arcs that rows meet; a row through an end of arcs as the row just above it."""
+        total = np.zeros(beta.shape)
+        for side, ends in zip((1.0, -1.0), self.ends, strict=True):
+            order = np.argsort(ends)
+            sums = np.cumsum(np.append(0.0, side * weights[order]))
+            total += sums[np.searchsorted(ends[order], beta, side="right")]
+        return total
 
     def meet(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The arcs that rows meet, the rows, and before which of the nodes."""
-        place, row = np.nonzero(self.are_met(beta))
+        place, row = np.nonzero((beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None]))
         k = np.searchsorted(self.keys, place * self.dampings.size + np.searchsorted(self.dampings, beta)[row])
         return place, row, np.maximum(k, self.first[place] + 1)
 

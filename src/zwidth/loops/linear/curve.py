@@ -179,10 +179,9 @@ def cut_arcs(
     # Its dampings there; NaN where it runs to infinity.
     betas = dict(zip(turns.tolist(), curve_at(loop, turns).beta.tolist(), strict=True)) | limits
     betas |= dict.fromkeys(poles.tolist(), np.nan)
-    arcs = []
-    for a, b in pairwise(ends.tolist()):
-        inner = (w > a) & (w < b)
-        nodes, curve = w[inner], CurvePoints(*(values[inner] for values in here))
+    arcs, starts, stops = [], np.searchsorted(w, ends, "right").tolist(), np.searchsorted(w, ends, "left").tolist()
+    for (a, b), start, stop in zip(pairwise(ends.tolist()), starts[:-1], stops[1:], strict=True):
+        nodes, curve = w[start:stop], CurvePoints(*(values[start:stop] for values in here))
         if not nodes.size:
             nodes = np.array([0.5 * (a + b)])
             curve = curve_at(loop, nodes)

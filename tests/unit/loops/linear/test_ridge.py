@@ -10,6 +10,7 @@ from waiting import LONGEST
 
 import zwidth
 from zwidth import Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
+from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.linear.ridge import BoundRidge, Condition, find_ridge, moving_paths
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import RidgeKind
@@ -45,6 +46,23 @@ def test_the_table_of_filters(velocity, undamped, damped):
         assert -0.0051 <= wall.stiffness / 1e3 - expected <= 0.0151
         binds = wall.kind == RidgeKind.NO_DAMPING
         assert binds == (expected == 6.85) == (wall.virtual_damping == 0)
+
+
+@pytest.mark.parametrize(
+    "delay, damping, velocity",
+    [(4.3e-3, 0.5, LowPass(30.0)), (0.05, 10.0, LowPass(100.0)), (0.12, 0.0, WindowedDifference(4))],
+)
+def test_the_curve_borders_the_stable_walls_beside_it(delay, damping, velocity):
+    scene = PAPER.replace(delay=delay, damping=damping, velocity=velocity)
+    boundary = scene.loop.boundary
+    curve = curve_at(boundary.loop, boundary.w)
+    # Next to other crossings, and where the curve's own angle is rounding, the two differ in which side they look at.
+    sides = [boundary.outside(curve.alpha * (1.0 + side), curve.beta) for side in (-1e-9, 1e-9)]
+    clear = (np.abs(sides[0] - sides[1]) == 2) & (np.minimum(*sides) >= 0)
+    borders = boundary.borders(boundary.w)
+    assert clear.mean() > 0.95
+    assert 50 < borders.sum() < 0.5 * borders.size
+    np.testing.assert_array_equal(borders[clear], np.minimum(*sides)[clear] == 0)
 
 
 def test_an_island_of_negative_damping_does_not_count():
