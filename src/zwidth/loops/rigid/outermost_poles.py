@@ -6,11 +6,12 @@ On maps of alpha and beta they come from series (`loops.rigid.pole_map`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.arrays.evaluate import BLOCK, FEW, Route, compile_columns, map_blocks
+from zwidth.arrays.threads import run_in_threads
 from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import classify_delays, wall_status
@@ -75,11 +76,8 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, route: 
             found = [np.reshape(leaf, 1) for leaf in quick_kernel(*(column[0] for column in asked), fractional=kind)]
         elif route == "numpy" or (route == "auto" and size <= FEW):
             full = [column[fill_up(np.arange(size))] for column in asked]
-            blocks = [
-                quick_kernel(*(column[start : start + _AT_ONCE] for column in full), fractional=kind)
-                for start in range(0, max(size, 1), _AT_ONCE)
-            ]
-            found = [np.concatenate(leaves)[:size] for leaves in zip(*blocks, strict=True)]
+            found = zip(*_in_lists(lambda some: quick_kernel(*some, fractional=kind), full), strict=True)
+            found = [np.concatenate(leaves)[:size] for leaves in found]
         else:
             # Always of one size: other batches may round differently.
             found = map_blocks(compile_columns(quick_kernel, (kind,)), asked, PIECE, exact=True)
@@ -94,20 +92,32 @@ def _finish_poles(columns: list[np.ndarray], poles: OutermostPoles, accuracy: fl
     looser = accuracy * _LADDER
     attempts = [(method, accuracy) for method in (certify_again, certify_starts, bound_radius, search)]
     attempts += [(bound_radius, error) for error in looser[looser <= _LARGEST_ERROR].tolist()]
-    with np.errstate(all="ignore"):
-        for method, tolerance in attempts:
-            tried = [left[:0]]
-            for start in range(0, left.size, _AT_ONCE):
-                some = left[start : start + _AT_ONCE]
-                full = fill_up(some)
-                loop = factor_loop(*(column[full] for column in columns), fractional=kind)
-                new = method(OutermostPoles(*(leaf[full] for leaf in poles)), tolerance, loop, kind)
-                good = np.isfinite(new.re[: some.size])
-                for whole, leaf in zip(poles, new, strict=True):
-                    whole[some[good]] = leaf[: some.size][good]
-                tried.append(some[~new.proved[: some.size]])
-            left = np.concatenate(tried)
+    for method, tolerance in attempts:
+        if not left.size:
+            break
+
+        def attempt(lists: list[np.ndarray], method: Any = method, tolerance: float = tolerance) -> np.ndarray:
+            (some,) = lists
+            full = fill_up(some)
+            loop = factor_loop(*(column[full] for column in columns), fractional=kind)
+            new = method(OutermostPoles(*(leaf[full] for leaf in poles)), tolerance, loop, kind)
+            good = np.isfinite(new.re[: some.size])
+            for whole, leaf in zip(poles, new, strict=True):
+                whole[some[good]] = leaf[: some.size][good]
+            return some[~new.proved[: some.size]]
+
+        left = np.concatenate(_in_lists(attempt, [left]))
     return poles
+
+
+def _in_lists(function: Callable[[list[np.ndarray]], Any], columns: list[np.ndarray]) -> list[Any]:
+    """The function's results for lists of walls, whose NumPy is quiet, on every processor."""
+
+    def apply(start: int) -> Any:
+        with np.errstate(all="ignore"):
+            return function([column[start : start + _AT_ONCE] for column in columns])
+
+    return run_in_threads(apply, range(0, max(columns[0].size, 1), _AT_ONCE))
 
 
 def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:

@@ -168,8 +168,9 @@ class _Canvas:
         places = np.concatenate([np.empty((3, 0), int), *self.special], axis=1) - [[0], [rows.start], [columns.start]]
         inside = (places[1:] >= 0).all(0) & (places[1] < radius.shape[1]) & (places[2] < radius.shape[2])
         # Walls at which two groups were compared may be there twice.
-        flat = np.unique(np.ravel_multi_index(tuple(places[:, inside]), radius.shape))
-        return FollowedPoles(radius, rate, np.unravel_index(flat, radius.shape))
+        noted = np.zeros(radius.shape, bool)
+        noted[tuple(places[:, inside])] = True
+        return FollowedPoles(radius, rate, np.nonzero(noted))
 
 
 def _sides(rows: int, columns: int) -> list[tuple[int, int]]:
