@@ -268,6 +268,8 @@ class _Steps(NamedTuple):
     dampings: np.ndarray
     first: np.ndarray  # of each arc: its first node in these
     ends: np.ndarray  # (2, arcs): between which dampings it is
+    order: np.ndarray  # of the first ends, then of the last ones
+    sorted_ends: np.ndarray
     leaving: np.ndarray
     slowest: np.ndarray  # its lowest angle
 
@@ -285,17 +287,15 @@ class _Steps(NamedTuple):
         dampings, keys = np.unique(beta, return_inverse=True)
         keys = keys + np.repeat(np.arange(len(arcs)), sizes) * dampings.size
         ends = np.array([arc.beta[[0, -1]] for arc in arcs]).T
+        order = np.argsort(ends, axis=None)
+        ends, first = (ends, order, ends.ravel()[order]), np.cumsum([0, *sizes[:-1]])
         own = np.array([(arc.leaving, arc.first) for arc in arcs]).T
-        return cls(w, beta, alpha, straight, room, keys, dampings, np.cumsum([0, *sizes[:-1]]), ends, *own)
+        return cls(w, beta, alpha, straight, room, keys, dampings, first, *ends, *own)
 
     def sum_met(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
         """The sum of weights of the arcs that rows meet; a row through an end of arcs as the row just above it."""
-        total = np.zeros(beta.shape)
-        for side, ends in zip((1.0, -1.0), self.ends, strict=True):
-            order = np.argsort(ends)
-            sums = np.cumsum(np.append(0.0, side * weights[order]))
-            total += sums[np.searchsorted(ends[order], beta, side="right")]
-        return total
+        sums = np.cumsum(np.concatenate([[0.0], np.concatenate([weights, -weights])[self.order]]))
+        return sums[np.searchsorted(self.sorted_ends, beta, side="right")]
 
     def meet(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The arcs that rows meet, the rows, and before which of the nodes."""
