@@ -1,0 +1,115 @@
+#!/usr/bin/env python3
+"""Measure functions inside `jit` on every kind of device that JAX has here, a graphics processor beside the CPU.
+
+    python benchmarks/bench_device.py [--points 1000000] [--runs 5] [--write benchmarks/results/device.md]
+
+Float64, scattered walls, each of a device of its own with a delay of its own. The time to compile stands apart; beside
+each speed stands the largest difference from what the same function says when it is called directly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import zwidth
+from methods.clock import time_calls
+
+SEED, SAMPLE = 20060901, 20_000
+
+
+def draw_walls(points: int) -> tuple[np.ndarray, ...]:
+    """alpha, beta, delta and d of as many walls, about half of them stable."""
+    generator = np.random.default_rng(SEED)
+    delta, d = generator.uniform(0.01, 1.0, points), generator.uniform(0.0, 8.0, points)
+    top = zwidth.alpha_max(delta, d)
+    share = generator.uniform(0.05, 1.2, points)
+    return share * np.asarray(top.alpha), np.asarray(top.beta) * generator.uniform(0.3, 1.4, points), delta, d
+
+
+def list_questions() -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Functions of (alpha, beta, delta, d), each with a name."""
+    yield "`is_stable`", zwidth.is_stable
+    yield "`spectral_radius`", zwidth.spectral_radius
+    yield "`margins`, modulus", lambda *wall: zwidth.margins(*wall).modulus_margin
+    yield "`passivity_margin`", zwidth.passivity_margin
+    yield "`alpha_max`", lambda _alpha, _beta, *device: zwidth.alpha_max(*device).alpha
+
+    def slope(_alpha: Any, _beta: Any, delta: Any, d: Any) -> Any:
+        return jax.jvp(lambda x: zwidth.alpha_max(x, d).alpha, (delta,), (jnp.ones_like(delta),))[1]
+
+    yield "`alpha_max`, its derivative in delta", slope
+
+
+def measure(function: Callable[..., Any], walls: tuple[np.ndarray, ...], device: Any, runs: int) -> tuple[float, ...]:
+    """Seconds to compile, walls a second, and the largest difference from a direct call, of 1 or the value."""
+    with jax.default_device(device):
+        program, there = jax.jit(function), [jax.device_put(column, device) for column in walls]
+        first = time_calls(lambda: jax.block_until_ready(program(*there)), 1)[0].min()
+        best = time_calls(lambda: jax.block_until_ready(program(*there)), runs)[0].min()
+        got = np.asarray(program(*there))[:SAMPLE].astype(float)
+    with jax.default_device(jax.devices("cpu")[0]):
+        # A derivative is compiled here, too.
+        direct = np.asarray(function(*(column[:SAMPLE] for column in walls))).astype(float)
+    same = np.isnan(got) == np.isnan(direct)
+    apart = np.abs(got - direct) / np.maximum(1.0, np.abs(direct))
+    return first - best, walls[0].size / best, float(np.nanmax(apart)) if same.all() else np.nan
+
+
+def name_of(device: Any) -> str:
+    """What a device is called, with the processors of a CPU."""
+    return f"{os.cpu_count()} CPU cores" if device.platform == "cpu" else device.device_kind
+
+
+def measure_all(points: int, runs: int) -> str:
+    """The table as a page."""
+    devices = {device.platform: device for kind in ("cpu", jax.default_backend()) for device in jax.devices(kind)[:1]}
+    walls = draw_walls(points)
+    head = [
+        f"{name_of(device)}: {what}" for device in devices.values() for what in ("M walls/s", "s to compile", "apart")
+    ]
+    lines = [
+        "# Inside `jit`, by device",
+        "",
+        f"Written by `benchmarks/bench_device.py --write`: {points:,} scattered walls, each of a device and a delay",
+        f"(0 to 8 periods) of its own, float64, JAX {jax.__version__}, Python {platform.python_version()}; the best of",
+        f"{runs} runs. Apart: the largest difference of {SAMPLE:,} values from a direct call's, over 1 or the value.",
+        "",
+        f"| function | {' | '.join(head)} |",
+        f"|---|{'--:|' * len(head)}",
+    ]
+    for name, function in list_questions():
+        cells = []
+        for device in devices.values():
+            compiling, speed, apart = measure(function, walls, device, runs)
+            cells += [f"{speed / 1e6:.3g}", f"{compiling:.1f}", f"{apart:.0e}"]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+        print(lines[-1], flush=True)
+    return "\n".join([*lines, ""])
+
+
+def main() -> None:
+    """Measure, and print or write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, default=1_000_000)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--write", type=Path, help="the page to write")
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    text = measure_all(given.points, given.runs)
+    if given.write is None:
+        print(text)
+    else:
+        given.write.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
