@@ -39,6 +39,8 @@ _COUNTED, _RELATIVE = 4096.0, 2e-11
 # crossovers depend on it.
 _SMALLEST, _HALVINGS, _POLISHING, _NEWTON = -690.0, 62, 6, 3
 _TOGETHER = 3
+# Inside a transformation walls are taken in so many parts, or fewer of so many walls.
+_PARTS, _LEAST_PART = 16, 1 << 9
 # Off the real axis, of the angle of the first pair.
 _OFF = 0.1
 # And between there and the pair's angle, where a short delay has a third pole.
@@ -208,7 +210,7 @@ def search(_: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) ->
 
 
 class _Round(NamedTuple):
-    """What a round of `_find_traced` knows."""
+    """What a round of `_find_part` knows."""
 
     re: Array
     im: Array
@@ -220,6 +222,37 @@ class _Round(NamedTuple):
 
 def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
     """The outermost pole, and whether it is proved to be it, and to be single: as `quick_kernel` and `search` find it.
+
+    Part by part; then those walls alone that this has left are searched for, as many at one time: one program for both.
+    """
+    import jax.numpy as xp
+    from jax.lax import while_loop
+
+    shape, size = loop.alpha.shape, loop.alpha.size
+    length = max(-(-size // _PARTS), _LEAST_PART)
+    if size <= length:
+        return _find_part(0, 3, loop, fractional)
+    columns, parts = [xp.broadcast_to(column, shape).reshape(-1) for column in loop], -(-size // length)
+
+    def take(state: tuple[Any, ...]) -> tuple[Any, ...]:
+        k, left, *known = state
+        first = k < parts
+        index = xp.where(first, k * length + xp.arange(length), xp.nonzero(left, size=length, fill_value=size)[0])
+        some = Loop(*(column.at[index].get(mode="clip") for column in columns))
+        found = _find_part(xp.where(first, 0, 1), xp.where(first, 1, 3), some, fractional)
+        left = left.at[index].set(first & ~(found[2] | xp.isnan(some.alpha)), mode="drop")
+        known = (whole.at[index].set(new, mode="drop") for whole, new in zip(known, found, strict=True))
+        return k + 1, left, *known
+
+    none = 0.0 * columns[0]
+    start = 0, none > 0, none, none, none > 0
+    found = while_loop(lambda state: (state[0] < parts) | state[1].any(), take, start)[2:]
+    re, im, proved = (part.reshape(shape) for part in found)
+    return re, im, proved
+
+
+def _find_part(begin: Any, end: Any, loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
+    """Some of the rounds of `_find_traced`, of some walls.
 
     A step on a pole and a count, which take a compiler its time, stand in two loops that every round runs through: the
     larger pole and its proof; where that leaves any wall, the halvings; the pole on the circle they lead to, its proof.
@@ -252,8 +285,8 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
             im = xp.where(kept, im, xp.where(looking, place, to_im))
             return xp.where(looking, re, to_re), im, xp.where(kept, within, by.within)
 
-        begin = xp.where(turn == 0, known.re, known.high), known.im, xp.full_like(high, np.inf)
-        re, im, within = fori_loop(steps[turn, 0], steps[turn, 1], step, begin)
+        at = xp.where(turn == 0, known.re, known.high), known.im, xp.full_like(high, np.inf)
+        re, im, within = fori_loop(steps[turn, 0], steps[turn, 1], step, at)
         # A wall without stiffness has a pole at 1.
         at_one = (loop.alpha == 0) & ~(re > tolerance)
         re, im = xp.where(at_one, 0.0, re), xp.where(at_one, 0.0, im)
@@ -276,11 +309,11 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
         return turn + 1, fori_loop(counts[turn, 0], counts[turn, 1], look, known)
 
     def going(state: tuple[Any, _Round]) -> Any:
-        return (state[0] == 0) | ((state[0] < len(steps)) & ~(state[1].proved | xp.isnan(loop.alpha)).all())
+        return (state[0] == begin) | ((state[0] < end) & ~(state[1].proved | xp.isnan(loop.alpha)).all())
 
     none = xp.stack([0.0 * high] * (looks - 2))
     start = _Round(*larger_pole(loop, fractional), high > np.inf, 0.0 * high + _SMALLEST, high, none)
-    return while_loop(going, run, (0, start))[1][:3]
+    return while_loop(going, run, (begin, start))[1][:3]
 
 
 def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Array:

@@ -15,6 +15,7 @@ from waiting import LONGEST
 
 import oracles
 import zwidth
+from zwidth.loops.rigid.pole_search import quick_kernel
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -163,3 +164,21 @@ def test_a_wall_without_stiffness_keeps_its_pole_at_one_exactly():
     found = bound_radius(0.0, np.linspace(0.0, 0.5, 9), 0.1, 1.5)
     assert found.certified.any()
     np.testing.assert_array_equal(found.radius[found.certified], 1.0)
+
+
+def test_many_walls_inside_jit_are_those_called_directly(labels):
+    # They are taken in parts of 512, the last one shorter, and more are left over than the search takes at one time.
+    walls = [np.tile(labels[name], 3) for name in ("alpha", "beta", "delta", "d")]
+    with np.errstate(all="ignore"):
+        left = np.flatnonzero(~quick_kernel(*walls, np.full(walls[0].size, 3e-10), fractional=True).proved)
+    walls = [np.concatenate([column[:1300], np.resize(column[left], 700)]) for column in walls]
+    walls[0][::97], walls[3][1::97] = np.nan, -1.0
+    direct = zwidth.spectral_radius(*walls)
+    with jax.enable_x64(True):
+        inside = np.asarray(jax.jit(zwidth.spectral_radius, compiler_options=QUICKLY)(*walls))
+    assert left.size > 3
+    assert np.isnan(inside[np.isnan(direct)]).all()
+    # Of multiple poles a program with derivatives says nothing.
+    known = np.isfinite(inside)
+    assert 0.95 < known.mean() < 0.99
+    np.testing.assert_allclose(inside[known], direct[known], rtol=2e-9)
