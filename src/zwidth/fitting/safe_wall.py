@@ -20,10 +20,12 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
-from zwidth.loops.linear.state_space import estimate_matrices
+from zwidth.loops.linear.chain import Body, Chain, Resonance
+from zwidth.loops.linear.held import Sampled
+from zwidth.loops.linear.state_space import StateSpace, delay_force, estimate_matrices, in_series
 from zwidth.loops.rigid.device import device_status
 from zwidth.loops.variants import RigidVariants
-from zwidth.parts.velocity import BackwardDifference
+from zwidth.parts.velocity import BackwardDifference, Estimate
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.tolerances import borne_by
 from zwidth.words.quantities import SI_RANGE
@@ -213,56 +215,34 @@ class _SearchedDevices:
 
 
 def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damping: float) -> np.ndarray:
-    """Which devices bear a wall and softer ones of its damping, by the eigenvalues of their closed loops.
-
-    The states: of the velocity estimate, of the device, and the forces on their way, the newest first.
-    """
+    """Which devices bear a wall and softer ones of its damping, by the eigenvalues of their closed loops."""
     from scipy.linalg import expm
 
-    f, devices = estimate_matrices(fit.velocity.estimate(fit.period)), fit.normalize(drawn)
-    motions, sensed = _realize(devices)
-    whole, borne = np.floor(devices.d).astype(int), np.zeros(len(drawn), bool)
-    first, end = len(f.A), len(f.A) + sensed.shape[1]
+    estimate, devices = fit.velocity.estimate(fit.period), fit.normalize(drawn)
+    A, B, _ = (np.moveaxis(part, -1, 0) for part in _lay_chain(devices, estimate).realize())
+    # Of ((A, B), (0, 0)): behind the motion of the state that of a force which is held.
+    motions = np.pad(np.concatenate([A, B[..., None]], -1), ((0, 0), (0, 1), (0, 0)))
+    whole, f = np.floor(devices.d).astype(int), estimate_matrices(estimate)
     late = expm(motions * (whole + 1.0 - devices.d)[:, None, None])[:, :-1, -1]
     moved = expm(motions)[:, :-1]
+    parts = moved[..., :-1] - np.eye(A.shape[-1]), moved[..., -1], late
+    borne = np.zeros(len(drawn), bool)
     for n in np.unique(whole):
         own = whole == n
-        closed = np.zeros((own.sum(), end + n + 1, end + n + 1))
-        closed[:, :first, :first], closed[:, :first, first:end] = f.A, f.B * sensed[own, None]
-        closed[:, first:end, first:end], closed[:, first:end, -1] = moved[own, :, :-1], moved[own, :, -1] - late[own]
-        closed[:, end + 1 :, end:-1] = np.eye(n)
-        if n:
-            closed[:, first:end, -2] = late[own]
-        stable = np.ones(own.sum(), bool)
-        for softer in _SOFTER:
-            alpha, beta = (
-                wall / devices.mass[own, None]
-                for wall in (softer * stiffness * fit.period**2, virtual_damping * fit.period)
-            )
-            force = np.concatenate([-beta * f.C, -(alpha + beta * f.D) * sensed[own]], -1)
-            loop = closed.copy()
-            loop[:, end, :end] = force
-            if not n:
-                loop[:, first:end, :end] += late[own, :, None] * force[:, None]
-            stable &= np.abs(np.linalg.eigvals(loop)).max(-1) < 1.0
-        borne[own] = stable
+        plant = delay_force(Sampled(*(part[own] for part in parts)), int(n))
+        alpha, beta = (
+            wall / devices.mass[own, None, None] for wall in (stiffness * fit.period**2, virtual_damping * fit.period)
+        )
+        loops = (in_series(StateSpace(f.A, f.B, beta * f.C, softer * alpha + beta * f.D), plant) for softer in _SOFTER)
+        radii = [np.abs(np.linalg.eigvals(loop.A - loop.B @ loop.C)).max(-1) for loop in loops]
+        borne[own] = np.max(radii, 0) < 1.0
     return borne
 
 
-def _realize(devices: DimensionlessDevice) -> tuple[np.ndarray, np.ndarray]:
-    """Of devices ``((A, B), (0, 0))`` of ``x' = A x + B u``, and C: the mass, its modes, and the amplifier."""
-    bodies = [
-        (0.0, devices.delta, 1.0),
-        *((turns**2, 2.0 * ratio * turns, share) for turns, ratio, share in devices.modes),
-    ]
-    count, order = 2 * len(bodies), len(devices.lag)
-    motions, sensed = (np.zeros((devices.mass.size, *shape)) for shape in (2 * (count + order + 1,), (count + order,)))
-    for k, (pull, rub, share) in enumerate(bodies):
-        motions[:, 2 * k, 2 * k + 1], motions[:, 2 * k + 1, count] = 1.0, 1.0
-        motions[:, 2 * k + 1, 2 * k], motions[:, 2 * k + 1, 2 * k + 1], sensed[:, 2 * k] = -pull, -rub, share
-    if order:
-        rate = 1.0 / devices.lag[0]
-        motions[:, -2, -1], motions[:, -2, -2] = rate**order, -rate
-        if order == 2:
-            motions[:, -3, -2], motions[:, -2, -3], motions[:, -2, -2] = 1.0, -(rate**2), -2.0 * devices.lag[1] * rate
-    return motions, sensed
+def _lay_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
+    """The bodies, modes and amplifiers of all devices as arrays."""
+    modes = tuple(Resonance(turns, ratio, 1.0 / share) for turns, ratio, share in devices.modes)
+    lag = 1.0 / devices.lag[0] if devices.lag else None
+    if len(devices.lag) == 2:
+        lag = Resonance(lag, devices.lag[1], devices.lag[0] ** 2)
+    return Chain((Body(1.0, devices.delta, 0.0),), (), modes, lag, 0, devices.d, 0, estimate)
