@@ -26,8 +26,8 @@ from zwidth.loops.linear.state_space import StateSpace, delay_force, estimate_ma
 from zwidth.loops.rigid.device import device_status
 from zwidth.loops.variants import RigidVariants
 from zwidth.parts.velocity import BackwardDifference, Estimate
-from zwidth.scenes.scene import Scene
 from zwidth.scenes.tolerances import borne_by
+from zwidth.simulation.flow import flow
 from zwidth.words.quantities import SI_RANGE
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
@@ -75,7 +75,9 @@ def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> Safe
     if fit.is_structured and fit.damping_tried is None:
         return _bear_response(fit, reliability, rigid, drawn)
     searched = fit.is_structured or scene.velocity != BackwardDifference()
-    devices = _SearchedDevices(drawn, fit) if searched else _RigidDevices(drawn, scene)
+    devices = (
+        _SearchedDevices(drawn, fit) if searched else _RigidDevices(scene, dict(zip(fit.numbers, drawn.T, strict=True)))
+    )
     most = np.inf if rigid or fit.damping_tried is None else fit.damping_tried
     (stiffness, virtual_damping), resonance = devices.find(reliability, most), np.nan
     if virtual_damping == most:
@@ -122,15 +124,12 @@ def bears_resonances(fit: DeviceEstimate, stiffness: float, virtual_damping: flo
     return scene.loop.holds_softly(float(alpha), float(beta))
 
 
-class _RigidDevices:
+class _RigidDevices(RigidVariants):
     """Devices with the backward difference, by closed forms."""
-
-    def __init__(self, drawn: np.ndarray, scene: Scene) -> None:
-        self.devices = RigidVariants(scene, dict(zip(("mass", "damping", "delay"), drawn.T, strict=True)))
 
     def find(self, reliability: float, most: float) -> tuple[float, float]:
         """K and B, which is ``most`` at most; both 0 where there is none."""
-        low, high, damping = 0.0, borne_by(self.devices.stiffest()[0], reliability), 0.0
+        low, high, damping = 0.0, borne_by(self.stiffest()[0], reliability), 0.0
         least = _NOTHING * high
         while high > max((1.0 + _CLOSE) * low, least):
             stiffness = 0.5 * (low + high)
@@ -146,11 +145,11 @@ class _RigidDevices:
 
     def limit(self, virtual_damping: float, reliability: float) -> float:
         """The K up to which so many devices bear walls of a damping."""
-        return borne_by(self.devices.row_ends(np.array([virtual_damping]))[:, 0], reliability)
+        return borne_by(self.row_ends(np.array([virtual_damping]))[:, 0], reliability)
 
     def _most_borne(self, stiffness: float) -> float:
         """The middle of the dampings at which most devices bear this stiffness."""
-        sides = [self.devices.column_ends(stiffness, side) for side in ("lower", "upper")]
+        sides = [self.column_ends(stiffness, side) for side in ("lower", "upper")]
         real = np.isfinite(sides[0]) & np.isfinite(sides[1])
         places = np.concatenate([side[real] for side in sides])
         if not places.size:
@@ -162,7 +161,7 @@ class _RigidDevices:
 
     def share(self, stiffness: float, virtual_damping: float) -> float:
         """Of the devices on which the wall is stable; softer ones are so with it."""
-        return float(self.devices.labels(stiffness, virtual_damping).mean())
+        return float(self.labels(stiffness, virtual_damping).mean())
 
 
 class _SearchedDevices:
@@ -216,16 +215,13 @@ class _SearchedDevices:
 
 def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damping: float) -> np.ndarray:
     """Which devices bear a wall and softer ones of its damping, by the eigenvalues of their closed loops."""
-    from scipy.linalg import expm
-
     estimate, devices = fit.velocity.estimate(fit.period), fit.normalize(drawn)
     A, B, _ = (np.moveaxis(part, -1, 0) for part in _lay_chain(devices, estimate).realize())
-    # Of ((A, B), (0, 0)): behind the motion of the state that of a force which is held.
-    motions = np.pad(np.concatenate([A, B[..., None]], -1), ((0, 0), (0, 1), (0, 0)))
     whole, f = np.floor(devices.d).astype(int), estimate_matrices(estimate)
-    late = expm(motions * (whole + 1.0 - devices.d)[:, None, None])[:, :-1, -1]
-    moved = expm(motions)[:, :-1]
-    parts = moved[..., :-1] - np.eye(A.shape[-1]), moved[..., -1], late
+    rate, size = np.concatenate([A, B[..., None]], -1), B.shape[-1]
+    times = np.stack([np.ones_like(devices.d), whole + 1.0 - devices.d], -1)
+    moved = flow(rate, np.zeros((len(A), size + 1, size + 1)), times).change
+    parts = moved[:, 0, :, :size], moved[:, 0, :, size], moved[:, 1, :, size]
     borne = np.zeros(len(drawn), bool)
     for n in np.unique(whole):
         own = whole == n
