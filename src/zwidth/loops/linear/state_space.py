@@ -112,10 +112,8 @@ def open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
 
 def closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
     """From a force held on the device to the sampled position, in contact with the wall."""
-    loop = open_loop(chain, alpha, beta)
-    size = loop.A.shape[0]
+    loop, filtered = open_loop(chain, alpha, beta), len(estimate_matrices(chain.estimate).A)
     A, _, held = chain.realize()
-    filtered = size - delayed_device(chain).A.shape[0]
-    push = np.zeros((size, 1))
+    push = np.zeros((len(loop.A), 1))
     push[filtered : filtered + len(held), 0] = hold(chain, A, held, 1.0)[1]
     return StateSpace(loop.A - loop.B @ loop.C, push, loop.C, np.zeros((1, 1)))
