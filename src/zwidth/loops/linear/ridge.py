@@ -31,7 +31,7 @@ from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 
-# How far apart, as shares of alpha, two crossings that meet in a corner are, and where the curve ends at z = -1 from one.
+# How far apart, as shares of alpha, two crossings of a corner are, and from a corner where the curve ends at z = -1.
 _MEETS, _NEAR = 1e-8, 1e-5
 # By what share rounding may make a row's wall stiffer.
 _ABOVE = 1e-7
