@@ -18,9 +18,8 @@ from zwidth.config.values import Delay, Quantity, quantity_of
 from zwidth.parts.checks import Span
 from zwidth.parts.devices import DEVICES
 from zwidth.parts.linear_device import LinearDevice, split_fraction
-from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.measured import SUFFIXES, MeasuredDevice
 from zwidth.parts.paths import PARTS
-from zwidth.parts.response_table import SUFFIXES
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, suggestion
 from zwidth.words.quantities import POSITIVE

@@ -37,16 +37,11 @@ def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = (
 def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
     """Every sample of the logs: measured, modelled, and what is left."""
     logs = [np.full(motion.time.size, k, int) for k, motion in enumerate(fit.motions, start=1)]
-    columns = {name: np.concatenate([getattr(motion, name) for motion in fit.motions])
-               for name in ("time", "force", "position", "modelled")}  # fmt: skip
-    return {
-        "log": np.concatenate(logs),
-        header("time", "s"): columns["time"],
-        header("force", unit_of("force")): columns["force"],
-        header("position", unit_of("position")): columns["position"],
-        header("modelled", unit_of("position")): columns["modelled"],
-        header("residual", unit_of("position")): columns["position"] - columns["modelled"],
-    }
+    units = {"time": "s"} | {name: unit_of(name) for name in ("force", "position")} | {"modelled": unit_of("position")}
+    columns = {name: np.concatenate([getattr(motion, name) for motion in fit.motions]) for name in units}
+    table = {header(name, unit): columns[name] for name, unit in units.items()}
+    rest = columns["position"] - columns["modelled"]
+    return {"log": np.concatenate(logs), **table, header("residual", units["position"]): rest}
 
 
 def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:

@@ -11,8 +11,9 @@ from zwidth.fitting.device_estimate import differentiate, find_stiffest, reach_o
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FittedMotion
 from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted, weigh_resonances
+from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
-from zwidth.fitting.recordings import Log, find_stretches, read_logs
+from zwidth.fitting.recordings import find_stretches, read_logs
 from zwidth.fitting.structure import Recordings
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity
@@ -30,6 +31,8 @@ _LONGEST = 20
 _LIGHTEST, _HEAVIEST = 2e-3, 10.0
 # The longest way in m and the largest force in N of a device.
 _FARTHEST, _STRONGEST = 3.0, 1e3
+# Positions beyond the past forces.
+_FEWEST = 20
 # Fewer positions than this are explained by other devices as well, far outside of the errors.
 _FEW = 60
 # So many positions of all logs are fitted, minutes of a record: more would cost gigabytes and narrow errors alone.
@@ -125,12 +128,18 @@ def fit_log(
 
 
 def _fit(
-    logs: tuple[Log, ...], period: float, wavers: float, velocity: Velocity, max_delay: Any, resolution: Any
+    logs: tuple[Recording, ...], period: float, wavers: float, velocity: Velocity, max_delay: Any, resolution: Any
 ) -> DeviceFit:
     """The same of logs that are read, whose period has the relative standard error ``wavers``."""
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
-    recordings = tuple(log.recording(skip, k).begin(_MOST // len(logs)) for k, log in enumerate(logs))
+    for k, log in enumerate(logs):
+        if log.force.size < skip + _FEWEST:
+            raise InputError(
+                f"time: log {k + 1} has {log.force.size} samples, and the first {skip} serve as past force; at least "
+                f"{skip + _FEWEST} are needed: record longer, or give a shorter max_delay"
+            )
+    recordings = tuple(Recording(log.force, log.position[skip:], skip).begin(_MOST // len(logs)) for log in logs)
     doubts = [doubt for log in logs for doubt in find_stretches(log)]
     step, odd = _find_step(resolution, logs)
     best, pole, banks, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
@@ -207,7 +216,7 @@ def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
     return 0.0 if none else float(value), error
 
 
-def _find_step(resolution: Any, logs: tuple[Log, ...]) -> tuple[float, list[str]]:
+def _find_step(resolution: Any, logs: tuple[Recording, ...]) -> tuple[float, list[str]]:
     """The encoder's step, and what is odd about it."""
     if resolution is None:
         steps = [find_resolution(log.position) for log in logs]
@@ -245,7 +254,7 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
         )
 
 
-def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Log, ...]) -> list[str]:
+def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Recording, ...]) -> list[str]:
     mass, damping, delay = scene.device.mass, scene.device.damping, scene.timing.delay
     doubts, residuals = [], best.residuals
     if not is_rotary() and not _LIGHTEST <= mass <= _HEAVIEST:
@@ -284,7 +293,7 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Log,
     return doubts
 
 
-def _place(best: FittedModel, logs: tuple[Log, ...], skip: int, period: float) -> tuple[FittedMotion, ...]:
+def _place(best: FittedModel, logs: tuple[Recording, ...], skip: int, period: float) -> tuple[FittedMotion, ...]:
     """Every log beside its fit, NaN at its first samples and where it is too long."""
     places = []
     for log, part in zip(logs, best.model.split(best.moved[0]), strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,32 +17,15 @@ from zwidth.words.quantities import POSITIVE
 # asked for, less than what a missing sample looks like; how far periods of logs may differ beyond their errors.
 _UNEVEN, _WAVERING, _SAME = 0.05, 0.25, 1e-5
 _SURE = 5.0
-# Positions beyond the past forces.
-_FEWEST = 20
 # Samples that a stretch at one end lasts before it is suspected; a force of so many values varies, as a share.
 _STUCK, _MANY = 25, 0.1
 # A step of so many usual ones lacks a sample.
 _MISSING = 1.5
 
 
-@dataclass(frozen=True)
-class Log:
-    """One log, checked."""
-
-    force: np.ndarray
-    position: np.ndarray
-
-    def recording(self, skip: int, k: int) -> Recording:
-        """What is computed with: positions from ``skip`` on."""
-        if self.force.size < skip + _FEWEST:
-            raise InputError(
-                f"time: log {k + 1} has {self.force.size} samples, and the first {skip} serve as past force; at least "
-                f"{skip + _FEWEST} are needed: record longer, or give a shorter max_delay"
-            )
-        return Recording(self.force, self.position[skip:], skip)
-
-
-def read_logs(time: Any, position: Any, force: Any, resample: bool = False) -> tuple[tuple[Log, ...], float, float]:
+def read_logs(
+    time: Any, position: Any, force: Any, resample: bool = False
+) -> tuple[tuple[Recording, ...], float, float]:
     """The logs, their period, and its relative standard error."""
     several = isinstance(position, list | tuple) and len(position) > 0 and np.ndim(position[0]) == 1
     positions, forces = (position, force) if several else ([position], [force])
@@ -63,7 +45,7 @@ def read_logs(time: Any, position: Any, force: Any, resample: bool = False) -> t
     return tuple(log for log, *_ in read), float(np.mean(periods)), error
 
 
-def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Log, float, float]:
+def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Recording, float, float]:
     x, f = as_float64("position", position), as_float64("force", force)
     clock = None if isinstance(time, str) or np.ndim(time) == 0 else as_float64("time", time)
     given = {"position": x, "force": f} | ({} if clock is None else {"time": clock})
@@ -87,7 +69,7 @@ def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Log, fl
         )
     if np.ptp(x) == 0:
         raise InputError("position: it never changes; check the column, and that nothing holds the device")
-    return Log(f, x), period, error
+    return Recording(f, x, 0), period, error
 
 
 def _period(clock: np.ndarray, wavering: bool) -> tuple[float, float]:
@@ -127,7 +109,7 @@ def _period(clock: np.ndarray, wavering: bool) -> tuple[float, float]:
     return period, error / period
 
 
-def find_stretches(log: Log) -> list[str]:
+def find_stretches(log: Recording) -> list[str]:
     """What hints at an end stop, a saturated sensor, or a saturated motor, a sentence each."""
     doubts = []
     for end, way in ((log.position.max(), 1.0), (log.position.min(), -1.0)):

@@ -15,7 +15,8 @@ import numpy as np
 
 from zwidth.fitting.columns import LoggedMotion
 from zwidth.fitting.encoder import find_resolution
-from zwidth.fitting.recordings import Log, find_runs, read_logs
+from zwidth.fitting.moving import Recording
+from zwidth.fitting.recordings import find_runs, read_logs
 from zwidth.loops.measured.loop import MeasuredLoop
 from zwidth.parts.checks import check_number
 from zwidth.parts.measured import MeasuredDevice
@@ -170,7 +171,7 @@ def _find_repeats(force: np.ndarray, count: int) -> list[tuple[int, int]]:
     return [(first, last + count) for first, last in runs if last - first >= count]
 
 
-def _split(log: Log, count: int, trusted: bool) -> list[tuple[np.ndarray, np.ndarray]]:
+def _split(log: Recording, count: int, trusted: bool) -> list[tuple[np.ndarray, np.ndarray]]:
     """Stretches of two periods or more that repeat one force, as force and position, shape (periods, count)."""
     runs = _find_repeats(log.force, count)
     if trusted and not runs and log.force.size >= 2 * count:
@@ -233,7 +234,7 @@ def _smooth(values: np.ndarray, reach: int) -> np.ndarray:
     return total / count
 
 
-def _average_pieces(logs: tuple[Log, ...], period: float, doubts: list[str]) -> ResponseEstimate:
+def _average_pieces(logs: tuple[Recording, ...], period: float, doubts: list[str]) -> ResponseEstimate:
     """Averaged spectra of a force that does not repeat; of the position's steps, for positions wander."""
     from scipy.signal import csd, welch
 

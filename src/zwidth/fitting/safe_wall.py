@@ -20,12 +20,14 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
-from zwidth.loops.linear.state_space import estimate_matrices
+from zwidth.loops.linear.chain import Body, Chain, Resonance
+from zwidth.loops.linear.held import Sampled
+from zwidth.loops.linear.state_space import StateSpace, delay_force, estimate_matrices, in_series
 from zwidth.loops.rigid.device import device_status
 from zwidth.loops.variants import RigidVariants
-from zwidth.parts.velocity import BackwardDifference
-from zwidth.scenes.scene import Scene
+from zwidth.parts.velocity import BackwardDifference, Estimate
 from zwidth.scenes.tolerances import borne_by
+from zwidth.simulation.flow import flow
 from zwidth.words.quantities import SI_RANGE
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
@@ -73,7 +75,9 @@ def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> Safe
     if fit.is_structured and fit.damping_tried is None:
         return _bear_response(fit, reliability, rigid, drawn)
     searched = fit.is_structured or scene.velocity != BackwardDifference()
-    devices = _SearchedDevices(drawn, fit) if searched else _RigidDevices(drawn, scene)
+    devices = (
+        _SearchedDevices(drawn, fit) if searched else _RigidDevices(scene, dict(zip(fit.numbers, drawn.T, strict=True)))
+    )
     most = np.inf if rigid or fit.damping_tried is None else fit.damping_tried
     (stiffness, virtual_damping), resonance = devices.find(reliability, most), np.nan
     if virtual_damping == most:
@@ -120,15 +124,12 @@ def bears_resonances(fit: DeviceEstimate, stiffness: float, virtual_damping: flo
     return scene.loop.holds_softly(float(alpha), float(beta))
 
 
-class _RigidDevices:
+class _RigidDevices(RigidVariants):
     """Devices with the backward difference, by closed forms."""
-
-    def __init__(self, drawn: np.ndarray, scene: Scene) -> None:
-        self.devices = RigidVariants(scene, dict(zip(("mass", "damping", "delay"), drawn.T, strict=True)))
 
     def find(self, reliability: float, most: float) -> tuple[float, float]:
         """K and B, which is ``most`` at most; both 0 where there is none."""
-        low, high, damping = 0.0, borne_by(self.devices.stiffest()[0], reliability), 0.0
+        low, high, damping = 0.0, borne_by(self.stiffest()[0], reliability), 0.0
         least = _NOTHING * high
         while high > max((1.0 + _CLOSE) * low, least):
             stiffness = 0.5 * (low + high)
@@ -144,11 +145,11 @@ class _RigidDevices:
 
     def limit(self, virtual_damping: float, reliability: float) -> float:
         """The K up to which so many devices bear walls of a damping."""
-        return borne_by(self.devices.row_ends(np.array([virtual_damping]))[:, 0], reliability)
+        return borne_by(self.row_ends(np.array([virtual_damping]))[:, 0], reliability)
 
     def _most_borne(self, stiffness: float) -> float:
         """The middle of the dampings at which most devices bear this stiffness."""
-        sides = [self.devices.column_ends(stiffness, side) for side in ("lower", "upper")]
+        sides = [self.column_ends(stiffness, side) for side in ("lower", "upper")]
         real = np.isfinite(sides[0]) & np.isfinite(sides[1])
         places = np.concatenate([side[real] for side in sides])
         if not places.size:
@@ -160,7 +161,7 @@ class _RigidDevices:
 
     def share(self, stiffness: float, virtual_damping: float) -> float:
         """Of the devices on which the wall is stable; softer ones are so with it."""
-        return float(self.devices.labels(stiffness, virtual_damping).mean())
+        return float(self.labels(stiffness, virtual_damping).mean())
 
 
 class _SearchedDevices:
@@ -213,56 +214,31 @@ class _SearchedDevices:
 
 
 def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damping: float) -> np.ndarray:
-    """Which devices bear a wall and softer ones of its damping, by the eigenvalues of their closed loops.
-
-    The states: of the velocity estimate, of the device, and the forces on their way, the newest first.
-    """
-    from scipy.linalg import expm
-
-    f, devices = estimate_matrices(fit.velocity.estimate(fit.period)), fit.normalize(drawn)
-    motions, sensed = _realize(devices)
-    whole, borne = np.floor(devices.d).astype(int), np.zeros(len(drawn), bool)
-    first, end = len(f.A), len(f.A) + sensed.shape[1]
-    late = expm(motions * (whole + 1.0 - devices.d)[:, None, None])[:, :-1, -1]
-    moved = expm(motions)[:, :-1]
+    """Which devices bear a wall and softer ones of its damping, by the eigenvalues of their closed loops."""
+    estimate, devices = fit.velocity.estimate(fit.period), fit.normalize(drawn)
+    A, B, _ = (np.moveaxis(part, -1, 0) for part in _lay_chain(devices, estimate).realize())
+    whole, f = np.floor(devices.d).astype(int), estimate_matrices(estimate)
+    rate, size = np.concatenate([A, B[..., None]], -1), B.shape[-1]
+    times = np.stack([np.ones_like(devices.d), whole + 1.0 - devices.d], -1)
+    moved = flow(rate, np.zeros((len(A), size + 1, size + 1)), times).change
+    parts = moved[:, 0, :, :size], moved[:, 0, :, size], moved[:, 1, :, size]
+    borne = np.zeros(len(drawn), bool)
     for n in np.unique(whole):
         own = whole == n
-        closed = np.zeros((own.sum(), end + n + 1, end + n + 1))
-        closed[:, :first, :first], closed[:, :first, first:end] = f.A, f.B * sensed[own, None]
-        closed[:, first:end, first:end], closed[:, first:end, -1] = moved[own, :, :-1], moved[own, :, -1] - late[own]
-        closed[:, end + 1 :, end:-1] = np.eye(n)
-        if n:
-            closed[:, first:end, -2] = late[own]
-        stable = np.ones(own.sum(), bool)
-        for softer in _SOFTER:
-            alpha, beta = (
-                wall / devices.mass[own, None]
-                for wall in (softer * stiffness * fit.period**2, virtual_damping * fit.period)
-            )
-            force = np.concatenate([-beta * f.C, -(alpha + beta * f.D) * sensed[own]], -1)
-            loop = closed.copy()
-            loop[:, end, :end] = force
-            if not n:
-                loop[:, first:end, :end] += late[own, :, None] * force[:, None]
-            stable &= np.abs(np.linalg.eigvals(loop)).max(-1) < 1.0
-        borne[own] = stable
+        plant = delay_force(Sampled(*(part[own] for part in parts)), int(n))
+        alpha, beta = (
+            wall / devices.mass[own, None, None] for wall in (stiffness * fit.period**2, virtual_damping * fit.period)
+        )
+        loops = (in_series(StateSpace(f.A, f.B, beta * f.C, softer * alpha + beta * f.D), plant) for softer in _SOFTER)
+        radii = [np.abs(np.linalg.eigvals(loop.A - loop.B @ loop.C)).max(-1) for loop in loops]
+        borne[own] = np.max(radii, 0) < 1.0
     return borne
 
 
-def _realize(devices: DimensionlessDevice) -> tuple[np.ndarray, np.ndarray]:
-    """Of devices ``((A, B), (0, 0))`` of ``x' = A x + B u``, and C: the mass, its modes, and the amplifier."""
-    bodies = [
-        (0.0, devices.delta, 1.0),
-        *((turns**2, 2.0 * ratio * turns, share) for turns, ratio, share in devices.modes),
-    ]
-    count, order = 2 * len(bodies), len(devices.lag)
-    motions, sensed = (np.zeros((devices.mass.size, *shape)) for shape in (2 * (count + order + 1,), (count + order,)))
-    for k, (pull, rub, share) in enumerate(bodies):
-        motions[:, 2 * k, 2 * k + 1], motions[:, 2 * k + 1, count] = 1.0, 1.0
-        motions[:, 2 * k + 1, 2 * k], motions[:, 2 * k + 1, 2 * k + 1], sensed[:, 2 * k] = -pull, -rub, share
-    if order:
-        rate = 1.0 / devices.lag[0]
-        motions[:, -2, -1], motions[:, -2, -2] = rate**order, -rate
-        if order == 2:
-            motions[:, -3, -2], motions[:, -2, -3], motions[:, -2, -2] = 1.0, -(rate**2), -2.0 * devices.lag[1] * rate
-    return motions, sensed
+def _lay_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
+    """The bodies, modes and amplifiers of all devices as arrays."""
+    modes = tuple(Resonance(turns, ratio, 1.0 / share) for turns, ratio, share in devices.modes)
+    lag = 1.0 / devices.lag[0] if devices.lag else None
+    if len(devices.lag) == 2:
+        lag = Resonance(lag, devices.lag[1], devices.lag[0] ** 2)
+    return Chain((Body(1.0, devices.delta, 0.0),), (), modes, lag, 0, devices.d, 0, estimate)

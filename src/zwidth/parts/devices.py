@@ -13,9 +13,8 @@ from typing import Any, Literal, NamedTuple
 
 from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
-from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.measured import SUFFIXES, MeasuredDevice
 from zwidth.parts.operator import Operator
-from zwidth.parts.response_table import SUFFIXES
 from zwidth.words.errors import InputError, describe_choice
 from zwidth.words.formatting import with_unit
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, lag_jet, product_jet
 from zwidth.arrays.xp import is_jax, namespace
-from zwidth.parts.checks import Part, check_whole
+from zwidth.parts.checks import Part
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import Range
 
@@ -124,7 +124,7 @@ class LowPass(_Checked):
 
     cutoff: Any = None
     time_constant: Any = None
-    order: int = 1
+    order: int = field(default=1, metadata={"allowed": Range(1, 2)})
     coded_period: Any = None
 
     def __post_init__(self) -> None:
@@ -133,7 +133,6 @@ class LowPass(_Checked):
             raise InputError(
                 f"velocity: got {got}; give either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them"
             )
-        check_whole("velocity.order", self.order, 1, 2)
         super().__post_init__()
 
     def estimate(self, period: Any) -> Estimate:

@@ -19,7 +19,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from zwidth.config.reader import find_values
-from zwidth.parts.response_table import SUFFIXES
+from zwidth.parts.measured import SUFFIXES
 from zwidth.sweep.engine import refuse_changes, refuse_versions
 from zwidth.sweep.files import (
     LOCKS,

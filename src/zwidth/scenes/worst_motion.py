@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.passivity import PassivityCondition, needed_damping
+from zwidth.loops.linear.passivity import PassivityCondition, find_need
 from zwidth.parts.checks import check_whole
 from zwidth.parts.velocity import Estimate
 from zwidth.parts.wall import resolve_wall
@@ -30,9 +30,8 @@ _ROUNDING, _SCALE, _SEEN = 2.0**-49, 0.7, 8.0
 _ROUNDED = 1e-9
 # A share of what a filter has been given that no sum shows.
 _FORGOTTEN = 1e-30
-# Nodes of a scan, rounds that narrow its highest one eightfold each, the share of the proved height it must reach, and
-# that of needs which differ by rounding.
-_NODES, _ROUNDS, _REACHED, _SAME = (1 << 10, 1 << 14, 1 << 18), 12, 1.0 - 1e-10, 1.0 - 1e-14
+# Needs that differ by rounding, as a share.
+_SAME = 1.0 - 1e-14
 
 
 @shown(time="s", position="m", velocity="m/s", force="N", energy="J", missing_damping="N s/m", frequency="Hz")
@@ -104,12 +103,12 @@ def worst_motion(
         return _no_motion(Status.UNREACHABLE if margin >= 0 else Status.OUT_OF_RANGE)
     condition = PassivityCondition.derive(scene.loop.chain.estimate, scene.d)
     stiff = alpha + beta * condition.spring
-    needed = needed_damping(condition, alpha, beta)
-    unit = scene.units.virtual_damping
-    kinds = []
-    if needed * unit > scene.device.damping:
-        w = _worst_angle(condition, max(stiff, 0.0), beta, needed)
-        kinds += [(w, needed * unit)] if w is not None else []
+    needed, w = find_need(condition, alpha, beta)
+    # The ends first: next to them the need is the same but for rounding.
+    places = np.array([0.0, np.pi, w])
+    needs = condition.needed(max(stiff, 0.0), beta, places)
+    w, damping = float(places[np.argmax(needs >= needs.max() * _SAME)]), needed * scene.units.virtual_damping
+    kinds = [(w, damping)] if damping > scene.device.damping else []
     # A push; between the samples as slow as at them.
     kinds += [(None, np.inf)] if stiff < 0 else []
     periods = _SHORTEST
@@ -137,21 +136,6 @@ def _shorten_push(scene: SceneAnswers, wall: tuple[float, float], periods: int, 
 def _no_motion(status: Status) -> WorstMotion:
     none = np.full(1, np.nan)
     return WorstMotion(none, none, none, none, none, np.nan, np.nan, status)
-
-
-def _worst_angle(condition: PassivityCondition, stiff: float, beta: float, needed: float) -> float | None:
-    """Where the condition needs what is proved to be its highest need; None where no scan finds that."""
-    for count in _NODES:
-        w = np.unique(np.concatenate([[0.0], np.geomspace(1e-8, 1.0, 256), np.linspace(0.0, np.pi, count)]))
-        for _ in range(_ROUNDS):
-            best = int(np.argmax(condition.needed(stiff, beta, w)))
-            w = np.linspace(w[max(best - 1, 0)], w[min(best + 1, w.size - 1)], 17)
-        # The ends first: next to them the need is the same but for rounding.
-        w = np.concatenate([[0.0, np.pi], w])
-        values = condition.needed(stiff, beta, w)
-        if values.max() >= needed * _REACHED:
-            return float(w[np.argmax(values >= values.max() * _SAME)])
-    return None
 
 
 def _sampled_position(w: float | None, periods: int) -> np.ndarray:

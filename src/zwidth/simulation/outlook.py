@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.simulation.engine import round_to
 from zwidth.simulation.lanes import Lanes, Options
 from zwidth.simulation.maps import (
     LaneGroup,
@@ -24,10 +25,9 @@ from zwidth.simulation.maps import (
     square,
     take,
 )
-from zwidth.simulation.period import round_to
 
-# Samples that a cycle of readings is looked for in, how much longer than simulated a drift must not matter.
-CYCLE, _LONG = 256, 1e3
+# How much longer than simulated a drift must not matter.
+_LONG = 1e3
 # What bounds between samples have room for.
 _ROOM = 2.0
 # How near, in steps of the encoder, a motion must come to where it was a cycle ago.

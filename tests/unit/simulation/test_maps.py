@@ -13,10 +13,9 @@ from tolerances import SIMULATED_LINEAR
 import zwidth
 from zwidth.arrays.evaluate import compute_concretely
 from zwidth.simulation.batch import Batch, name_bodies
-from zwidth.simulation.engine import run_lanes
+from zwidth.simulation.engine import round_to, run_lanes
 from zwidth.simulation.lanes import Course
 from zwidth.simulation.maps import LaneGroup, find_kept, gather, lay_loop
-from zwidth.simulation.period import round_to
 
 HAND = zwidth.Operator(0.3, 4.0, 500.0, coupling_stiffness=900.0, coupling_damping=3.0)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,8 @@ from zwidth.loops.linear.roots import LoopRoots
 _MOST_STEPS, _ARRIVED = 120, 1e-10
 # By what share a row is moved, at most, that rounding keeps from being counted.
 _SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
+# How near to an angle where the curve has no point of its own it is looked at, as a share of the way to a node.
+_PROBE = 1e-6
 # Pairs of rows and arcs that are looked at in one go: what they need stays in caches.
 _BLOCK = 1 << 17
 
@@ -148,6 +151,26 @@ class Boundary:
     def arc_at(self, w: np.ndarray) -> np.ndarray:
         """The arc that an angle lies on."""
         return np.searchsorted(self._steps.slowest, w, side="right") - 1
+
+    @cached_property
+    def heights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Angles between which alpha is monotone along the curve, and alpha there; NaN where it runs to infinity."""
+        # Where the curve has no point of its own: it meets a line there, or runs to infinity in stiffness or damping.
+        limits = dict.fromkeys([0.0, np.pi, *self.infinite.tolist()], np.nan)
+        limits |= {line.w: line.q - line.meeting * line.f for line in self.lines}
+        slope = curve_at(self.loop, self.w).alpha_slope
+        tops = zeros_of(self.loop, self.w, slope, "alpha_slope")
+        nodes = np.unique(np.concatenate([self.w, tops, find_dips(self.w, slope)]))
+        pieces, heights = [], []
+        for a, b in pairwise(sorted(limits)):
+            inner = nodes[(nodes > a) & (nodes < b)]
+            inner = inner if inner.size else np.array([0.5 * (a + b)])
+            # Towards an end at infinity the curve is looked at no further than this.
+            probes = a + _PROBE * (inner[0] - a), b - _PROBE * (b - inner[-1])
+            inner = np.concatenate([probes[:1], inner, probes[1:]])
+            pieces.append(np.concatenate([[a], inner, [b]]))
+            heights.append(np.concatenate([[limits[a]], curve_at(self.loop, inner).alpha, [limits[b]]]))
+        return np.concatenate(pieces), np.concatenate(heights)
 
     @property
     def _fixed(self) -> list[float]:

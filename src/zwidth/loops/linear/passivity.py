@@ -163,10 +163,10 @@ def _enclose_difference(low: np.ndarray, high: np.ndarray, offset: complex) -> t
     return np.abs(circle(middle).before + offset) + 0.5 * (high - low), one, one
 
 
-def needed_damping(condition: PassivityCondition, alpha: float, beta: float) -> float:
-    """The damping that the worst frequency asks for, to a relative 1e-13, proved; NaN for what is not finite."""
+def find_need(condition: PassivityCondition, alpha: float, beta: float) -> tuple[float, float]:
+    """The damping that the worst frequency asks for, to a relative 1e-13, proved, and its angle; NaN of no numbers."""
     if not (np.isfinite(alpha) and np.isfinite(beta)):
-        return np.nan
+        return np.nan, np.nan
     stiff = max(alpha + beta * condition.spring, 0.0)
     w = np.concatenate([[0.0], np.geomspace(1e-6, 1e-2, 24), np.linspace(1e-2, np.pi, _NODES)[1:]])
     values = condition.needed(stiff, beta, w)
@@ -174,28 +174,28 @@ def needed_damping(condition: PassivityCondition, alpha: float, beta: float) -> 
     low: Array
     high: Array
     low, high, first, last = w[:-1], w[1:], values[:-1], values[1:]
-    best, most = float(values.max()), values
+    best, most = (float(values.max()), float(w[values.argmax()])), values
     for _ in range(_ROUNDS):
         most = np.maximum(first, last) + condition.curvature(stiff, beta, low, high) * (high - low) ** 2 / 8.0
-        open_ = most > best + _PROVED * (abs(best) + 1e-300)
+        open_ = most > best[0] + _PROVED * (abs(best[0]) + 1e-300)
         if not open_.any():
             return best
         if open_.sum() > _MOST:
             # Flat all over: what is left open is a bound, on the side of caution.
-            return float(most.max())
+            break
         low, high, first, last = low[open_], high[open_], first[open_], last[open_]
         middle = 0.5 * (low + high)
         inner = condition.needed(stiff, beta, middle)
-        best = max(best, float(inner.max()))
+        best = max(best, (float(inner.max()), float(middle[inner.argmax()])))
         low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
         first, last = np.concatenate([first, inner]), np.concatenate([inner, last])
-    return float(most.max())
+    return float(most.max()), best[1]
 
 
 def passivity_margins(condition: PassivityCondition, alpha: np.ndarray, beta: np.ndarray, delta: float) -> np.ndarray:
     """By how much delta exceeds what walls of one shape need; at most their stiffness where that is negative."""
     pairs = zip(alpha.ravel().tolist(), beta.ravel().tolist(), strict=True)
-    needed = [needed_damping(condition, *wall) for wall in pairs]
+    needed = [find_need(condition, *wall)[0] for wall in pairs]
     margin = delta - np.array(needed).reshape(alpha.shape)
     stiff = alpha + beta * condition.spring
     return np.where(stiff < 0, np.minimum(margin, stiff), margin)

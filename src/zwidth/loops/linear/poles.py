@@ -225,28 +225,4 @@ def _by_circles(loop: LoopRoots, alpha: float, beta: float) -> float:
         low, high = max([low, *lacks]), min([high, *holds])
         if high - low <= _WIDTH * max(1.0, abs(high)):
             break
-    if not high - low <= _UNKNOWN:
-        return np.nan
-    return _polish_on_circle(loop, alpha, beta, low, high)
-
-
-def _polish_on_circle(loop: LoopRoots, alpha: float, beta: float, low: float, high: float) -> float:
-    """Newton's method from where P is smallest on the circle; the pole counts if it lies within the bracket."""
-    middle = 0.5 * (low + high)
-    w = np.concatenate([np.geomspace(1e-9, 1e-2, 200), np.linspace(1e-2, np.pi, 16 * loop.order)])
-    # e^(middle + jw) - 1
-    zeta = np.expm1(middle) * np.cos(w) - 2.0 * np.sin(0.5 * w) ** 2 + 1j * np.exp(middle) * np.sin(w)
-    a, b = np.float64(alpha), np.float64(beta)
-    with np.errstate(all="ignore"):
-        at = evaluate(loop, a, b, zeta)
-        # By how far Newton's method would go, in units of the way between the points.
-        away = np.abs(at.value / at.slope)
-        zeta = zeta[np.argsort(np.where(np.isfinite(away), away, np.inf))[:16]]
-        for _ in range(8):
-            at = evaluate(loop, a, b, zeta)
-            step = at.value / at.slope
-            zeta = zeta - np.where(np.isfinite(step) & (square(step) < 1e-2), step, 0.0)
-    logs = log_size(zeta)
-    spare = 1e-13 + (high - low)
-    near = (logs > low - spare) & (logs < high + spare)
-    return float(logs[near][np.argmin(np.abs(logs[near] - middle))]) if near.any() else middle
+    return 0.5 * (low + high) if high - low <= _UNKNOWN else np.nan

@@ -31,8 +31,8 @@ from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 
-# Newton steps on a corner at most; the residual, as a share of |q|, at which it holds; how far it may move a start.
-_MOST_STEPS, _HOLDS, _NEAR = 12, 1e-11, 1e-5
+# How far apart, as shares of alpha, two crossings of a corner are, and from a corner where the curve ends at z = -1.
+_MEETS, _NEAR = 1e-8, 1e-5
 # By what share rounding may make a row's wall stiffer.
 _ABOVE = 1e-7
 # Rows next to a top, as shares of the plane, that must reach nearly as high; and how many tops are looked at.
@@ -142,17 +142,13 @@ def _condition(w: float) -> Condition:
 
 
 def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
-    """The two conditions that meet at a corner, and the corner to the last place."""
+    """The two conditions that meet at a corner."""
     found = border.boundary.crossings(np.array([beta]))
     away = np.abs(found.alpha[0] - alpha)
     near = [int(k) for k in np.argsort(np.where(np.isnan(away), np.inf, away))[:2]]
     angles = sorted(float(found.w[0, k]) for k in near)
-    met = len(near) == 2 and away[near[1]] <= 1e-4 * abs(alpha)
-    if met and angles[1] - angles[0] > 1e-6:
-        start = BoundRidge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
-        held = _polish(border.boundary.loop, start)
-        if held is not None:
-            return held
+    if len(near) == 2 and away[near[1]] <= _MEETS * abs(alpha) and angles[1] - angles[0] > 1e-6:
+        return BoundRidge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
     # A double pole at z = -1: the curve ends on the line there.
     top, damping = border.at_end(np.pi)
     if not abs(top - alpha) <= _NEAR * abs(alpha):
@@ -160,47 +156,16 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
 
 
-def _polish(loop: LoopRoots, start: BoundRidge) -> BoundRidge | None:
-    """Newton's method on a corner of two different angles; None where it does not hold near the start."""
-    now, best, worst = start, start, np.inf
-    for _ in range(_MOST_STEPS):
-        held = _conditions(loop, now)
-        error = float(np.linalg.norm(held.rest / held.size))
-        if not error < worst:
-            break
-        best, worst = now, error
-        x = np.array(now[:4])
-        try:
-            x[held.columns] -= np.linalg.solve(held.matrix, held.rest)
-        except np.linalg.LinAlgError:
-            break
-        now = BoundRidge._make([*x.tolist(), now.first, now.second])
-        if not all(0 < x[k] < np.pi for k in held.columns[2:]):
-            break
-    near = abs(best.alpha - start.alpha) <= _NEAR * abs(start.alpha) and abs(best.w2 - best.w1) > 1e-7
-    return best if worst <= _HOLDS and near else None
+def _conditions(loop: LoopRoots, wall: BoundRidge) -> tuple[np.ndarray, list[int]]:
+    """How what binds a wall moves with what may move of alpha, beta, w1 and w2, and which of five conditions these are.
 
-
-class _Binding(NamedTuple):
-    """The conditions that bind a wall, and how they move with what may move."""
-
-    rest: np.ndarray
-    size: np.ndarray  # of which each is a difference
-    matrix: np.ndarray
-    rows: list[int]  # which of the five
-    columns: list[int]  # which of alpha, beta, w1 and w2
-
-
-def _conditions(loop: LoopRoots, wall: BoundRidge) -> _Binding:
-    """Of ``r = alpha + beta F - q``: Re and Im at w1, the same at w2, and Im dr/dw at w1, where w stays.
-
-    At a smooth optimum the angle may stay where it is: to first order it does not matter.
+    Of ``r = alpha + beta F - q``: Re and Im at w1, the same at w2, and Im dr/dw at w1, where w stays. At a smooth
+    optimum the angle may stay where it is: to first order it does not matter.
     """
     at = circle(np.array([wall.w1, wall.w2]))
     with np.errstate(all="ignore"):
         q, f = loop.required_wall(at), loop.estimate.jet(at)
-        rest, slope = wall.alpha + wall.beta * f.value - q.value, wall.beta * f.slope - q.slope
-        size = np.abs(q.value) + np.abs(wall.beta * f.value) + 1e-300
+        slope = wall.beta * f.slope - q.slope
     matrix = np.zeros((5, 4))
     matrix[[0, 2], 0] = 1.0
     matrix[:, 1] = _list_conditions(f.value, f.slope)
@@ -215,8 +180,7 @@ def _conditions(loop: LoopRoots, wall: BoundRidge) -> _Binding:
         rows.append(4)
     if wall.second != Condition.STATIONARY:
         columns += [2 + k for k in range(2) if pair[k]]
-    rest, size = _list_conditions(rest, slope)[rows], np.repeat(size, (2, 3))[rows]
-    return _Binding(rest, size, matrix[np.ix_(rows, columns)], rows, columns)
+    return matrix[np.ix_(rows, columns)], rows
 
 
 def _list_conditions(rest: np.ndarray, slope: np.ndarray) -> np.ndarray:
@@ -303,7 +267,7 @@ def _slope(scene: Any, found: BoundRidge, path: str) -> float:
     The derivatives of the conditions are exact in the wall and its angles. In the parameter they are exact but for the
     rates of the chain and the velocity estimate, which are smooth over its own size (docs/theory/scenes.md, V21).
     """
-    held = _conditions(scene.loop.roots, found)
+    matrix, rows = _conditions(scene.loop.roots, found)
     at, whole = circle(np.array([found.w1, found.w2])), scene.whole_delay
     for weights in _stencils(scene, path):
         try:
@@ -320,7 +284,7 @@ def _slope(scene: Any, found: BoundRidge, path: str) -> float:
         q, q_slope = _needed_slopes(scene, at, by_rate, by_push, by_delay)
         rest, slope = found.beta * by_f - q, found.beta * by_f_slope - q_slope
         try:
-            by_alpha = -np.linalg.solve(held.matrix, _list_conditions(rest, slope)[held.rows])[0]
+            by_alpha = -np.linalg.solve(matrix, _list_conditions(rest, slope)[rows])[0]
         except np.linalg.LinAlgError:
             break
         return float(scene.units.stiffness * by_alpha + found.alpha * by_unit)

@@ -78,42 +78,24 @@ def estimate_polynomials(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
         difference[[0, -1]] = 1.0 / f.window, -1.0 / f.window
         top = np.convolve(top, difference)
     turns = f.window + f.lag
-    return (top, _raised(bottom, turns)) if turns >= 0 else (_raised(top, -turns), bottom)
-
-
-def _raised(polynomial: np.ndarray, power: int) -> np.ndarray:
-    return np.concatenate([polynomial, np.zeros(power)])
+    return np.pad(top, (0, max(-turns, 0))), np.pad(bottom, (0, max(turns, 0)))
 
 
 def affine_polynomial(loop: LoopRoots) -> Affine:
     """D, N1 and N2 of the closed loop."""
     top, bottom = estimate_polynomials(loop)
-    device, answer = _product(loop.poles), loop.gain * _product(loop.zeros)
-    if loop.lag >= 0:
-        device = _raised(device, loop.lag)
-    else:
-        answer = _raised(answer, -loop.lag)
+    device = np.pad(_product(loop.poles), (0, max(loop.lag, 0)))
+    answer = np.pad(loop.gain * _product(loop.zeros), (0, max(-loop.lag, 0)))
     parts = [np.convolve(device, bottom), np.convolve(answer, bottom), np.convolve(answer, top)]
     length = max(part.size for part in parts)
-    return Affine(*(np.concatenate([np.zeros(length - part.size), part]) for part in parts))
+    return Affine(*(np.pad(part, (length - part.size, 0)) for part in parts))
 
 
 def closed_loop_roots(loop: LoopRoots, alpha: float, beta: float) -> tuple[np.ndarray, np.ndarray, float, int]:
     """Zeros, poles, gain and lag of ``P = z^lag prod(z - poles) + gain prod(z - zeros)`` for one wall."""
-    top, bottom = estimate_polynomials(loop)
-    length = max(top.size, bottom.size)
-    wall = alpha * np.concatenate([np.zeros(length - bottom.size), bottom])
-    wall = wall + beta * np.concatenate([np.zeros(length - top.size), top])
-    lead = np.flatnonzero(wall)
-    if not lead.size:
-        wall_zeros, gain = np.zeros(0), 0.0
-    else:
-        wall_zeros, gain = np.roots(wall), float(wall[lead[0]])
-    f = loop.estimate
-    turns = f.window + f.lag
-    zeros = np.concatenate([1.0 - loop.zeros, wall_zeros])
-    poles = np.concatenate([1.0 - loop.poles, 1.0 - f.poles])
-    lag = loop.lag + max(turns, 0)
-    if lag < 0:
-        zeros, lag = np.concatenate([zeros, np.zeros(-lag)]), 0
-    return zeros, poles, gain * loop.gain, lag
+    f, (top, bottom) = loop.estimate, estimate_polynomials(loop)
+    wall = np.trim_zeros(np.polyadd(alpha * bottom, beta * top), "f")
+    lag = loop.lag + max(f.window + f.lag, 0)
+    zeros = np.concatenate([1.0 - loop.zeros, np.roots(wall), np.zeros(max(-lag, 0))])
+    poles = 1.0 - np.concatenate([loop.poles, f.poles])
+    return zeros, poles, loop.gain * float(wall[0] if wall.size else 0.0), max(lag, 0)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.loops.linear.chain import AnyChain
-from zwidth.loops.linear.held import hold, sampled
+from zwidth.loops.linear.held import Sampled, hold, sampled
 from zwidth.parts.velocity import Estimate
 from zwidth.words.showing import shown
 
@@ -58,11 +58,13 @@ def _filter(estimate: Estimate) -> StateSpace:
 
 
 def in_series(first: StateSpace, second: StateSpace) -> StateSpace:
-    """The second behind the first."""
-    n, m = first.A.shape[0], second.A.shape[0]
-    A = np.block([[first.A, np.zeros((n, m))], [second.B @ first.C, second.A]])
-    B = np.concatenate([first.B, second.B @ first.D])
-    return StateSpace(A, B, np.concatenate([second.D @ first.C, second.C], 1), second.D @ first.D)
+    """The second behind the first; of many second ones, along leading axes, all behind it."""
+    n = len(first.A)
+    A = np.zeros((*second.A.shape[:-2], *2 * (n + second.A.shape[-1],)))
+    B = np.zeros((*A.shape[:-1], 1))
+    A[..., :n, :n], A[..., n:, :n], A[..., n:, n:] = first.A, second.B @ first.C, second.A
+    B[..., :n, :], B[..., n:, :] = first.B, second.B @ first.D
+    return StateSpace(A, B, np.concatenate([second.D @ first.C, second.C], -1), second.D @ first.D)
 
 
 def estimate_matrices(estimate: Estimate) -> StateSpace:
@@ -79,24 +81,27 @@ def estimate_matrices(estimate: Estimate) -> StateSpace:
 
 def delayed_device(chain: AnyChain) -> StateSpace:
     """G: from the wall's force to the sampled position, with the forces that are on their way."""
-    parts = sampled(chain)
-    size = parts.psi.shape[0]
-    held = parts.late is not None
+    return delay_force(sampled(chain), chain.whole)
+
+
+def delay_force(parts: Sampled, whole: int) -> StateSpace:
+    """The same of a device between two samples, or of many along leading axes, and so many whole periods of delay."""
+    size, held = parts.psi.shape[-1], parts.late is not None
     now = parts.late if held else parts.full
-    count = chain.whole + (1 if held else 0)
-    A = np.zeros((size + count, size + count))
-    B = np.zeros((size + count, 1))
-    A[:size, :size] = np.eye(size) + parts.psi
-    A[size:, size:] = np.eye(count, k=-1)
-    B[size : size + 1] = 1.0
-    if chain.whole:
-        A[:size, size + chain.whole - 1] = now
+    count = whole + held
+    A = np.zeros((*parts.psi.shape[:-2], size + count, size + count))
+    B = np.zeros((*A.shape[:-1], 1))
+    A[..., :size, :size] = np.eye(size) + parts.psi
+    A[..., size:, size:] = np.eye(count, k=-1)
+    B[..., size : size + 1, :] = 1.0
+    if whole:
+        A[..., :size, size + whole - 1] = now
     else:
-        B[:size, 0] = now
+        B[..., :size, 0] = now
     if held:
-        A[:size, size + chain.whole] += parts.full - now
-    C = np.eye(1, size + count)
-    return StateSpace(A, B, C, np.zeros((1, 1)))
+        A[..., :size, size + whole] += parts.full - now
+    C = np.broadcast_to(np.eye(1, size + count), (*A.shape[:-2], 1, size + count))
+    return StateSpace(A, B, C, np.zeros((*A.shape[:-2], 1, 1)))
 
 
 def open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
@@ -107,10 +112,8 @@ def open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
 
 def closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
     """From a force held on the device to the sampled position, in contact with the wall."""
-    loop = open_loop(chain, alpha, beta)
-    size = loop.A.shape[0]
+    loop, filtered = open_loop(chain, alpha, beta), len(estimate_matrices(chain.estimate).A)
     A, _, held = chain.realize()
-    filtered = size - delayed_device(chain).A.shape[0]
-    push = np.zeros((size, 1))
+    push = np.zeros((len(loop.A), 1))
     push[filtered : filtered + len(held), 0] = hold(chain, A, held, 1.0)[1]
     return StateSpace(loop.A - loop.B @ loop.C, push, loop.C, np.zeros((1, 1)))
