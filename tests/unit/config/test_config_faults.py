@@ -26,7 +26,7 @@ FILES = {name: text.encode() for name, text in zip(_PARTS[1::2], _PARTS[2::2], s
 # and how its remedy begins.
 FAULTS = {
     "a_list": [("1:1: got a list of 2 items", "write 'key: value' lines, or {key: value}")],
-    "alias_bomb": [("1:23: e[5][5][7][4][5]: too many values", "write long axes as linear or log")],
+    "alias_bomb": [("1:29: e[5][5][7][3][7]: too many values", "write long axes as linear or log")],
     "alias_of_itself": [("4:5: studies[0]: an alias of what it is part of", "write the values out")],
     "alias_undefined": [("3:10: not valid YAML", "define it before with '&', or remove the '*'")],
     "axis_boolean": [("7:16: studies[0].delta[1]: got true", "write a number such as 0.5")],
