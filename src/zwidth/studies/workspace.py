@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
+from pydantic import PrivateAttr, ValidationError
 
 from zwidth import figures
 from zwidth.config.device_table import DeviceTable, find_file, read_table
-from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.faults import LocatedProblem, problem, problems_of
+from zwidth.config.fields import Strict
 from zwidth.config.scenes import AnyScene, PhysicalScene
 from zwidth.config.study import register
 from zwidth.config.values import Delay, quantity_of
@@ -27,57 +27,59 @@ from zwidth.words.status import Status
 from zwidth.words.tables import read_columns, split_head
 
 _FORM = "poses are a file with columns mass and damping, and the two columns of it that a pose is drawn over"
-_EXAMPLE = "write {csv: arm.csv, across: shoulder, up: elbow}"
 
 
-@dataclass(frozen=True)
-class Poses:
-    """Masses and dampings of a device, one row a pose, and two coordinates of it with their names and units."""
+class Poses(Strict, what="a table of poses"):
+    """Masses and dampings of a device, one row a pose, and two coordinates of it."""
 
-    source: dict[str, str]  # as it is written: the file and its two columns
-    table: DeviceTable
-    names: tuple[tuple[str, str], ...]
-    places: tuple[tuple[float, ...], ...]
+    csv: str
+    """Name of the file, relative to the configuration."""
 
+    across: str
+    """Name of the column that poses are drawn over from left to right."""
 
-def _read_poses(raw: Any) -> Any:
-    """A validator for poses in a file."""
-    if isinstance(raw, Poses):
-        return raw
-    if not isinstance(raw, dict) or set(raw) != {"csv", "across", "up"}:
-        raise problem(f"got {describe(raw)}", _FORM, _EXAMPLE)
-    table = read_table({"csv": raw["csv"]})
-    if set(table.columns) != {"mass", "damping"}:
-        raise problem(f"got columns {' and '.join(table.columns)}", _FORM, "give these two, and no other parameter")
-    try:
-        columns = read_columns(find_file(raw["csv"]))
-        heads = [split_head(head) for head in columns.heads]
-        known = {name: place for place, (name, _) in enumerate(heads)}
-        for key in ("across", "up"):
-            if raw[key] not in known:
-                remedy = suggestion(raw[key], known, f"choose from {', '.join(known)}")
-                raise problem(f"{key}: got {describe(raw[key])}", "it names a column of the file", remedy)
-        chosen = [known[raw[key]] for key in ("across", "up")]
-        places = columns.numbers(chosen)
-    except InputError as error:
-        raise problem(str(error).partition("; ")[0], _FORM, "complete the file") from None
-    return Poses(dict(raw), table, tuple(heads[at] for at in chosen), tuple(tuple(each.tolist()) for each in places))
+    up: str
+    """Name of the one from bottom to top."""
 
+    _table: DeviceTable = PrivateAttr()
+    # Name, unit and values of both.
+    _coordinates: list[tuple[str, str, list[float]]] = PrivateAttr()
 
-_KEYS = ("csv", "across", "up")
-_SCHEMA = {
-    "type": "object",
-    "description": f"{_FORM[0].upper()}{_FORM[1:]}.",
-    "properties": {key: {"type": "string"} for key in _KEYS},
-    "required": list(_KEYS),
-    "additionalProperties": False,
-}
-PosesField = Annotated[
-    Poses,
-    PlainValidator(_read_poses),
-    PlainSerializer(lambda poses: poses.source, return_type=dict[str, str]),
-    WithJsonSchema(_SCHEMA),
-]
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        return _FORM, "write {csv: arm.csv, across: shoulder, up: elbow}"
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        try:
+            self._table, columns = read_table({"csv": self.csv}), read_columns(find_file(self.csv))
+            known = {name: (unit, place) for place, (name, unit) in enumerate(map(split_head, columns.heads))}
+            chosen = {key: getattr(self, key) for key in ("across", "up")}
+            if set(self._table.columns) != {"mass", "damping"}:
+                what = f"got columns {' and '.join(self._table.columns)}"
+                yield ("csv",), problem(what, _FORM, "give these two, and no other parameter")
+            for key in (key for key, name in chosen.items() if name not in known):
+                remedy = suggestion(chosen[key], known, f"choose from {', '.join(known)}")
+                yield (key,), problem(f"got {describe(chosen[key])}", "it names a column of the file", remedy)
+            found = [(name, *known[name]) for name in chosen.values() if name in known]
+            values = columns.numbers([place for _, _, place in found])
+            self._coordinates = [(name, unit, of.tolist()) for (name, unit, _), of in zip(found, values, strict=True)]
+        except ValidationError as error:
+            yield from problems_of(error)
+        except InputError as error:
+            yield ("csv",), problem(str(error).partition("; ")[0], _FORM, "complete the file")
+
+    @property
+    def table(self) -> DeviceTable:
+        """The masses and dampings."""
+        return self._table
+
+    def tabulate(self) -> dict[str, np.ndarray]:
+        """The coordinates as columns, across and up."""
+        return {header(name, unit): np.array(values) for name, unit, values in self._coordinates}
+
+    def spell(self, pose: int) -> str:
+        """A pose by its coordinates."""
+        return ", ".join(f"{name} {values[pose]:.4g} {unit}".rstrip() for name, unit, values in self._coordinates)
 
 
 @register
@@ -91,7 +93,7 @@ class WorkspaceStudy(ComputedStudy):
 
     kind: Literal["workspace"]
 
-    poses: PosesField
+    poses: Poses
     """A file with a row for each pose: its mass and damping, and the two columns that they are drawn over."""
 
     period: Annotated[float, quantity_of("period")]
@@ -121,21 +123,14 @@ class WorkspaceStudy(ComputedStudy):
         delta = damping / rate
         top = alpha_max(delta, d)
         stiffness, virtual_damping = top.alpha * rate / self.period, top.beta * rate
-        names = [header(name, unit) for name, unit in self.poses.names]
-        places = map(np.array, self.poses.places)
-        table = dict(zip(names, places, strict=True)) | {"mass_kg": mass, "damping_N_s_per_m": damping}
+        coordinates = self.poses.tabulate()
+        table = {**coordinates, "mass_kg": mass, "damping_N_s_per_m": damping}
         table |= dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))
-        known, file = np.isfinite(stiffness), self.poses.source["csv"]
-
-        def spell_pose(k: int) -> str:
-            units = (unit for _, unit in self.poses.names)
-            parts = zip((name for name, _ in self.poses.names), names, units, strict=True)
-            return ", ".join(f"{name} {table[column][k]:.4g} {unit}".rstrip() for name, column, unit in parts)
-
+        known, file = np.isfinite(stiffness), self.poses.csv
         notes = [
-            f"{spell_pose(k)}: mass {with_unit(mass[k], 'kg')} and damping {with_unit(damping[k], 'N s/m')} (delta = "
-            f"{plain(delta[k])}) have no K_max: {Status(int(top.status[k])).message} Correct this pose in {file}, or "
-            "leave it out."
+            f"{self.poses.spell(k)}: mass {with_unit(mass[k], 'kg')} and damping {with_unit(damping[k], 'N s/m')} "
+            f"(delta = {plain(delta[k])}) have no K_max: {Status(int(top.status[k])).message} Correct this pose in "
+            f"{file}, or leave it out."
             for k in np.flatnonzero(~known).tolist()
         ]
         if not known.any():
@@ -147,9 +142,9 @@ class WorkspaceStudy(ComputedStudy):
         ends = stiffness[weakest], np.nanmax(stiffness)
         low, high = (with_unit(round_safely(float(each), "below"), "N/m") for each in ends)
         answer = (
-            f"K_max from {low} at {spell_pose(weakest)} to {high}",
+            f"K_max from {low} at {self.poses.spell(weakest)} to {high}",
             f"{name_wall(*wall)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
             f"stable in {np.count_nonzero(bears)} of {np.count_nonzero(known)} poses",
         )
-        draw = partial(figures.draw_workspace, table, *names)
+        draw = partial(figures.draw_workspace, table, *coordinates)
         return Outcome(table=table, figures={"": draw}, answer=answer, notes=tuple(notes))
