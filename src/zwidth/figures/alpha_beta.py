@@ -9,24 +9,22 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize, TwoSlopeNorm
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
-from zwidth.figures import grid, stable_set, style
-from zwidth.figures.stable_set import draw_zeros, mark_wall, shade_region
+from zwidth.figures import style
+from zwidth.figures.plane import Panel, draw_panels, panel_grid
+from zwidth.figures.stable_set import Outlines, draw_zeros, mark_wall, shade_region
 from zwidth.figures.table import Table, curves, draws_tables, select, si_scale
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import round_safely
+from zwidth.words.quantities import OUTPUTS
 from zwidth.words.status import Status
 
 # A legend of more entries than this is harder to read than a color bar.
 _LEGEND_ENTRIES = 8
 # A grid of more panels than this says nothing on a page: evenly spaced deltas and delays stand for all.
 _PANELS = 3
-
-# Light, so that labels and curves drawn over them stay legible; in gray, passive is the darker one.
-SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
 
 
 @draws_tables
@@ -140,7 +138,7 @@ def draw_map(
     output: str,
     axes: style.AnyAxes | None = None,
     *,
-    edges: Callable[[float, float], stable_set.Outlines | None] = lambda delta, d: None,
+    edges: Callable[[float, float], Outlines | None] = lambda delta, d: None,
 ) -> np.ndarray:
     """Draw one output over alpha and beta: panels for delta (columns) and d (rows), three of each at most.
 
@@ -149,66 +147,23 @@ def draw_map(
             these; with stiffness_N_per_m and virtual_damping_N_s_per_m a single panel is in SI units as well.
         output: "stable", "spectral_radius" or "passive".
         axes: an Axes of yours for the first delta and d alone, or one for each panel.
-        edges: gives the exact edge of what is stable or passive at a delta and d, drawn in place of that of the cells
-            where all cells agree with it.
+        edges: gives the exact edge of what is stable, or for "passive" passive, at a delta and d, drawn in place of
+            that of the cells where all cells agree with it.
     """
     delta, d = arrays["delta"], arrays["d"]
     rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
     places = list(product(rows, columns))
-    single = len(places) == 1
-    width, height = (5.9, 4.3) if single else (0.6 + 2.3 * len(columns), 1.0 + 2.1 * len(rows))
-    size = (max(width, 4.0), height, len(columns))
-    panels = style.panels(axes, len(places), *size, sharex=True, sharey=True)
+    panels = panel_grid(axes, len(places), len(columns))
     known = arrays["status"] == Status.OK if "status" in arrays else np.isfinite(arrays[output])
     values = np.ma.masked_array(arrays[output].astype(float), ~known)
-    colors = _choose_colors(output, [values[:, :, column, row] for row, column in places])
-    image: Any = None
-    missing = False
+    shown = []
     for ax, (row, column) in zip(panels, places, strict=False):
-        cells = arrays["alpha"], arrays["beta"], values[:, :, column, row].T
-        image = _draw_cells(ax, *cells, output, colors)
-        exact = edges(float(delta[column]), float(d[row])) if output in SHADES else None
-        whole = cells[2].count() == cells[2].size
-        missing |= not whole
-        look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.2, "zorder": 2}
-        if whole and stable_set.draw_exact(ax, exact, *cells[:2], cells[2].data > 0, SHADES.get(output), **look):
-            image.set_cmap(ListedColormap(["white", "white"]))
+        exact = edges(float(delta[column]), float(d[row]))
+        outlines = {} if exact is None else {"passive" if output == "passive" else "stable": exact}
+        shown.append(Panel(arrays["alpha"], arrays["beta"], {output: values[:, :, column, row].T}, outlines))
         ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")
     style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)
-    scale = si_scale(arrays)
-    if single and scale is not None:
+    draw_panels(panels, shown, output, rf"{OUTPUTS[output].words}  ${OUTPUTS[output].symbol}$", outside=axes is None)
+    if len(places) == 1 and (scale := si_scale(arrays)) is not None:
         style.add_si_axes(panels[0], scale)
-    edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.6}
-    shades = {output: SHADES[output], f"not {output}": "white"} if output in SHADES else {}
-    shades |= {"no answer": grid.MISSING} if missing else {}
-    if output == "spectral_radius":
-        beyond = "max" if np.ma.max(values) > image.norm.vmax else "neither"
-        panels[0].figure.colorbar(image, ax=list(panels), label="spectral radius (stable below 1)", extend=beyond)
-    if shades:
-        handles = [Patch(facecolor=color, label=label, **edge) for label, color in shades.items()]
-        style.legend(panels, handles, outside=axes is None, ncols=len(handles))
     return panels
-
-
-def _choose_colors(output: str, panels: list[np.ma.MaskedArray]) -> dict[str, Any]:
-    """The colors of an output and what they stand for, the same in all panels."""
-    if output != "spectral_radius":
-        return {"cmap": ListedColormap(["white", SHADES[output]]), "vmin": 0, "vmax": 1}
-    # Shades on both sides of 1, where the loop changes from stable to unstable.
-    low = min(float(np.min(values.compressed(), initial=0.9)) for values in panels)
-    return {"cmap": "PuOr_r", "norm": TwoSlopeNorm(1.0, min(low, 1.0 - 1e-6), max(2.0 - low, 1.0 + 1e-6))}
-
-
-def _draw_cells(
-    ax: Axes, alpha: np.ndarray, beta: np.ndarray, values: np.ma.MaskedArray, output: str, colors: dict[str, Any]
-) -> Any:
-    ax.set_facecolor(grid.MISSING)
-    for which, axis in (("x", alpha), ("y", beta)):
-        grid.scale_axis(ax, which, axis)
-    image = grid.draw_cells(ax, alpha, beta, values, **colors)
-    # On alpha = 0 a pole sits at z = 1 whatever beta is, and the contour would follow that column.
-    keep = alpha != 0
-    shown = values[:, keep]
-    if output == "spectral_radius" and min(shown.shape) >= 2 and shown.count() and shown.min() < 1.0 < shown.max():
-        ax.contour(alpha[keep], beta, shown, levels=[1.0], colors=style.BLACK, linewidths=1.2)
-    return image

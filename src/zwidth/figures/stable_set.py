@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # Points (x, y) of each closed line, and whether it surrounds a hole.
 Outlines: TypeAlias = Sequence[tuple[np.ndarray, bool]]
+# Light, so that labels and curves drawn over them stay legible; in gray, passive is the darker one.
+SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
 # So many points a step of an outline bend it as a logarithmic axis does.
 _BEND = 32
 # How walls that matter are marked, in a legend as well.

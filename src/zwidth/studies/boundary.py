@@ -306,7 +306,8 @@ class MapStudy(ComputedStudy):
         names = outputs if min(alpha.size, beta.size) > 1 else ()
 
         def find_edge(name: str, delta: float, d: float) -> Outlines | None:
-            return find_edges(delta * (share if name == "passive" else 1.0), d).get(name)
+            passive = name == "passive"
+            return find_edges(delta * (share if passive else 1.0), d).get("passive" if passive else "stable")
 
         draw = partial(figures.draw_map, arrays)
         drawn = {f"_{name}": partial(draw, name, edges=partial(find_edge, name)) for name in names}
