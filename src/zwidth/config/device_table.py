@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
+from zwidth.config.fields import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.values import quantity_of, read_entries, share
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, read_rows, resembling, split_title, suggestion

@@ -11,8 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.config.device_table import find_file
-from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
-from zwidth.config.fields import Strict
+from zwidth.config.fields import LocatedProblem, Strict, listing, problem, validation_error
 from zwidth.config.parts import PART_NAMES, PartSection, split_refusal
 from zwidth.config.values import Delay, Quantity, quantity_of
 from zwidth.parts.checks import Span

@@ -21,8 +21,7 @@ from pydantic import (
     create_model,
 )
 
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Strict, describe_parameter, find_kind
+from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, find_kind, problem
 from zwidth.config.values import Quantity, read_entries
 from zwidth.parts.checks import find_range
 from zwidth.parts.mode import Mode

@@ -22,7 +22,7 @@ from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
 from zwidth.config.device_table import files_relative_to
-from zwidth.config.faults import (
+from zwidth.config.fields import (
     ConfigFileError,
     Fault,
     FieldPath,

@@ -12,7 +12,7 @@ from pydantic import ConfigDict, WrapValidator
 
 from zwidth.arrays.xp import within
 from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
-from zwidth.config.faults import LocatedProblem, listing, problem
+from zwidth.config.fields import LocatedProblem, listing, problem
 from zwidth.config.parts import SimulatedVelocityField, build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.values import NonNegative, Number, quantity_of
 from zwidth.parts.device import Device

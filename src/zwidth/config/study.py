@@ -9,8 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 from pydantic import BeforeValidator, ConfigDict, WrapValidator
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
-from zwidth.config.fields import Name, Strict, members
+from zwidth.config.fields import LocatedProblem, Name, Strict, listing, members, problem, unlisted
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
 from zwidth.words.formatting import describe

@@ -18,8 +18,7 @@ from zwidth.config.devices import (
     find_second_period,
     tell_rotary,
 )
-from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Strict, describe_parameter, members
+from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, listing, members, problem
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import HeldOnly, Study, register

@@ -17,8 +17,15 @@ import numpy as np
 from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from zwidth.config.faults import LocatedProblem, problem, problems_of, raise_problems, validation_error
-from zwidth.config.fields import Strict, repeated
+from zwidth.config.fields import (
+    LocatedProblem,
+    Strict,
+    problem,
+    problems_of,
+    raise_problems,
+    repeated,
+    validation_error,
+)
 from zwidth.parts.checks import Span, read_span
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range

@@ -11,8 +11,7 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import members, repeated
+from zwidth.config.fields import LocatedProblem, members, problem, repeated
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene
 from zwidth.config.study import DelayModels, HeldOnly, name_parts, register

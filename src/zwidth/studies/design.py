@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, listing, problem
+from zwidth.config.fields import LocatedProblem, listing, problem
 from zwidth.config.parts import locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register

@@ -13,8 +13,7 @@ from pydantic import WrapValidator
 from pydantic_core import PydanticCustomError
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import members
+from zwidth.config.fields import LocatedProblem, members, problem
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import (
     AnyDevice,

@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Strict
+from zwidth.config.fields import LocatedProblem, Strict, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
 from zwidth.config.study import HeldOnly, register

@@ -11,8 +11,7 @@ from pydantic import PrivateAttr, ValidationError
 
 from zwidth import figures
 from zwidth.config.device_table import DeviceTable, find_file, read_table
-from zwidth.config.faults import LocatedProblem, problem, problems_of
-from zwidth.config.fields import Strict
+from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of
 from zwidth.config.scenes import AnyScene, PhysicalScene
 from zwidth.config.study import register
 from zwidth.config.values import Delay, quantity_of

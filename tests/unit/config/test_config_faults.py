@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from zwidth.config.faults import ConfigFileError
+from zwidth.config.fields import ConfigFileError
 from zwidth.config.reader import _Tree, read_mapping
 from zwidth.studies.document import Config, load_config
 
