@@ -153,8 +153,16 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
 OutputName = Annotated[str, GetPydanticSchema(lambda _, handler: handler.generate_schema(Literal[tuple(OUTPUTS)]))]
 
 
-class _Swept(Study):
-    """What is swept."""
+_Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
+
+
+@register
+class SweepStudy(_Parts, Study):
+    """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
+
+    method = "Closed forms in float64; the same bits whatever the chunks and workers."
+    from_scene = ("delay_model",)
+    takes_parts = True
 
     kind: Literal["sweep"]
 
@@ -163,18 +171,6 @@ class _Swept(Study):
 
     device: DeviceForm | None = None
     """A linear system or a measured response in place of mass and damping; the scene's where left out."""
-
-
-_Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
-
-
-@register
-class SweepStudy(_Parts, _Swept):
-    """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
-
-    method = "Closed forms in float64; the same bits whatever the chunks and workers."
-    from_scene = ("delay_model",)
-    takes_parts = True
 
     rotary: Rotary = Field(default_factory=tell_rotary)
     """Whether its devices turn, as all of a file do where one quantity has a unit of rotation."""

@@ -40,7 +40,7 @@ _LABELLED = 0.1
 # Less than this cannot be seen.
 _SEEN = 0.003
 # The boundary where it is known.
-_EDGE: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.3, "zorder": 2.2, "under": 1.5}
+_EDGE: dict[str, Any] = {"color": style.BLACK, "linestyle": style.SOLID, "linewidth": 1.3, "zorder": 2.2}
 _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
 
 
@@ -91,20 +91,24 @@ def draw_plane(
     parts, columns = grid.panels(_add_peak(data, _select_drawn(data, name), x, y), dims, plane=dims, col=col)
     panels = panel_grid(axes, len(parts), columns)
     parts = [part.compute().transpose(y, x) for part in parts[: len(panels)]]
-    shown = [_read_panel(part, name, edges) for part in parts]
+    shown = [read_panel(part, name, edges) for part in parts]
     grid.name_panels(panels, parts)
     style.label_axes(panels, grid.axis_label(parts[0], x), grid.axis_label(parts[0], y), once=axes is None)
     draw_panels(panels, shown, name, grid.output_label(parts[0], name), outside=axes is None)
     return panels
 
 
-def _read_panel(part: xarray.Dataset, name: str, edges: Edges | None) -> Panel:
+def read_panel(part: xarray.Dataset, name: str, edges: Edges | None) -> Panel:
     """A part (y, x) of a dataset."""
-    y, x = (part[dim].values for dim in part[name].dims)
+    up, across = map(str, part[name].dims)
     variables = {str(each): np.ma.masked_invalid(values.values) for each, values in part.items() if values.ndim}
     peak = {str(each).removesuffix("_peak"): float(values) for each, values in part.items() if not values.ndim}
     inside = all(part[dim].min() <= value <= part[dim].max() for dim, value in peak.items())
-    return Panel(x, y, variables, find_outlines(part, edges), tuple(peak.values()) if inside else ())
+    # Outlines have the stiffness first.
+    turn, found = -1 if across in ("beta", "virtual_damping") else 1, edges(part) if edges else {}
+    outlines = {kind: [(points[:, ::turn], hole) for points, hole in each] for kind, each in found.items()}
+    axes = part[across].values, part[up].values
+    return Panel(*axes, variables, outlines, tuple(peak.values()) if inside else ())
 
 
 def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
@@ -139,14 +143,6 @@ def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndar
     rows = -(-count // columns)
     width, height = (5.9, 4.5) if count == 1 else (max(5.0, 0.9 + 2.5 * columns), 1.2 + 2.2 * rows)
     return style.panels(given, count, width, height, columns, sharex=True, sharey=True)
-
-
-def find_outlines(part: xarray.Dataset, edges: Edges | None) -> dict[str, stable_set.Outlines]:
-    """The exact outlines of a panel (y, x), with x first; none where nobody knows them."""
-    dims = [str(dim) for dim in reversed(next(iter(part.data_vars.values())).dims)]
-    found = edges(part) if edges else {}
-    turn = -1 if dims[0] in ("beta", "virtual_damping") else 1
-    return {name: [(points[:, ::turn], hole) for points, hole in each] for name, each in found.items()}
 
 
 def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str, *, outside: bool) -> None:
@@ -184,29 +180,32 @@ def _draw_regions(ax: Axes, panel: Panel, name: str) -> Any:
         shades = ListedColormap([outside, outside if whole else SHADES[each]])
         image = grid.draw_cells(ax, x, y, shown, cmap=shades, vmin=0, vmax=1)
         known = panel.outlines.get(each) if whole else None
-        if not stable_set.draw_exact(ax, known, x, y, shown.data > 0.5, SHADES[each], linestyle=dash, **_EDGE):
+        look = {**_EDGE, "linestyle": dash}
+        if not stable_set.draw_exact(ax, known, x, y, shown.data > 0.5, SHADES[each], **look):
             if whole and smooth.min() < level < smooth.max():
                 ends = [-np.inf, level] if OUTPUTS[edge].below else [level, np.inf]
                 ax.contourf(x, y, smooth, levels=ends, colors=[SHADES[each]])
             elif whole and np.all(shown):
                 ax.set_facecolor(SHADES[each])
                 image.set_cmap(ListedColormap([SHADES[each], SHADES[each]]))
-            _draw_line(ax, x, y, smooth, level, dash)
+            _draw_line(ax, panel, edge, look)
     return image
 
 
-def _draw_line(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, level: float, dash: Any = style.SOLID) -> Any:
+def _draw_line(ax: Axes, panel: Panel, name: str, look: Mapping[str, Any]) -> Any:
     """The boundary: the contour on which something changes, where the panel has one."""
+    values, level = panel.variables[name], boundary_level(name)
     if min(values.shape) < 2 or not values.count() or not values.min() < level < values.max():
         return None
-    return ax.contour(x, y, values, levels=[level], colors=style.BLACK, linewidths=1.3, linestyles=[dash])
+    plain: Any = {f"{key}s": [look[key]] for key in ("color", "linestyle", "linewidth")}
+    return ax.contour(panel.x, panel.y, values, levels=[level], **plain)
 
 
 def _draw_contours(ax: Axes, panel: Panel, name: str, norm: Any) -> None:
     """Labelled contours where a number is good, and the bold one at which it ceases to be."""
     values = panel.variables[name]
     if min(values.shape) > 1 and values.count():
-        others = _draw_edge(ax, panel, name)
+        others = draw_edge(ax, panel, name, **_EDGE)
         others += [np.array([panel.peak])] if panel.peak else []
         draw_contours(ax, panel.x, panel.y, values, OUTPUTS[name], norm, others)
 
@@ -228,18 +227,19 @@ def draw_contours(
         label_contours(ax, drawn, colors, shades, others)
 
 
-def _draw_edge(ax: Axes, panel: Panel, name: str) -> list[np.ndarray]:
-    """The edge of what is stable or passive, exactly where it is known; returns its lines."""
-    output, values = OUTPUTS[name], panel.variables[name]
-    if output.look != "diverging" and name not in _FINITE_IF_STABLE:
+def draw_edge(ax: Axes, panel: Panel, name: str, **look: Any) -> list[np.ndarray]:
+    """The edge of what is stable or passive, exactly where it is known, or as a contour; returns its lines."""
+    output, values, level = OUTPUTS[name], panel.variables[name], boundary_level(name)
+    crossed = output.look in ("diverging", "truth")
+    if not crossed and name not in _FINITE_IF_STABLE:
         return []
     known = panel.outlines.get("passive" if name == "passivity_margin" else "stable")
-    good = values < output.center if output.below else values > output.center
-    good = np.ma.filled(good, False) if output.look == "diverging" else ~np.ma.getmaskarray(values)
-    exact = stable_set.draw_exact(ax, known, panel.x, panel.y, good, linestyle=style.SOLID, **_EDGE)
+    good = np.ma.filled(values < level if output.below else values > level, False)
+    good = good if crossed else ~np.ma.getmaskarray(values)
+    exact = stable_set.draw_exact(ax, known, panel.x, panel.y, good, **look)
     if exact:
         return [points for points, _ in exact]
-    drawn = _draw_line(ax, panel.x, panel.y, values, output.center) if output.look == "diverging" else None
+    drawn = _draw_line(ax, panel, name, look) if crossed else None
     return drawn.get_paths()[0].to_polygons(closed_only=False) if drawn else []
 
 

@@ -35,13 +35,6 @@ _LETTER, _AROUND = 4.4, 0.8
 _DASHES = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED, "passive": style.DASH_DOTTED}
 
 
-def draw_region(ax: Axes, outlines: Outlines, face: Any, *, under: float = 1.0, **look: Any) -> None:
-    """Shade what lies within outlines, and draw these closed."""
-    shade_region(ax, outlines, face, zorder=under)
-    for points, _ in outlines:
-        ax.plot(*_close(points).T, **look)
-
-
 def shade_region(ax: Axes, outlines: Outlines, face: Any, *, alpha: float | None = None, zorder: float = 1.0) -> None:
     """Shade what lies within outlines, and not in their holes."""
     if outlines and face != "none":
@@ -134,7 +127,9 @@ def draw_exact(
     if outlines is None or not agrees(outlines, x, y, good):
         return []
     fitted = fit_axes(outlines, ax)
-    draw_region(ax, fitted, face, label="exact edge", **look)
+    shade_region(ax, fitted, face, zorder=1.5)
+    for points, _ in fitted:
+        ax.plot(*_close(points).T, label="exact edge", **look)
     return fitted
 
 

@@ -266,7 +266,7 @@ class FitStudy(ComputedStudy):
         )
 
     def _fit(self) -> list[_Fitted]:
-        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.to_part(), []
+        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.known, []
         period = self.period
         if self.log:
             options = {"max_delay": self.max_delay, "resample": self.resample}

@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import WrapValidator
-from pydantic_core import PydanticCustomError
 
 from zwidth import figures
 from zwidth.config.fields import LocatedProblem, members, problem
@@ -60,11 +59,6 @@ class ResponseStudy(ComputedStudy):
         """Each device with its wall; the wall is None where stiffness_fraction decides it."""
         raise NotImplementedError
 
-    def periods(self, device: AnyDevice) -> float:
-        """Length of the response of a device in sampling periods."""
-        # By plain division: seconds may be many more periods than the rounding of a delay is made for.
-        return self.duration.value / (device.period if self.duration.unit == "s" else 1.0)
-
     def respond(
         self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
     ) -> tuple[dict[str, Any], str]:
@@ -73,7 +67,7 @@ class ResponseStudy(ComputedStudy):
         Returns:
             Its columns, those in SI units with their unit; and what to say of one that has not settled at the end.
         """
-        periods = max(1, round(self.periods(device)))
+        periods = max(1, round(self.duration.periods(device.period)))
         raw = step_response(alpha, beta, device.delta, device.d, periods=periods, substeps=self.substeps)
         clock, length = (device.period, 1.0 / device.to_scene().units.stiffness) if physical else (1.0, 1.0)
         second, meter, speed, newton = ("_s", "_m", "_m_per_s", "_N") if physical else ("",) * 4
@@ -97,12 +91,8 @@ class ResponseStudy(ComputedStudy):
 
     @property
     def sizes(self) -> dict[str, int]:
-        periods = max((self.periods(device) for device, _ in self.pairs()), default=0.0)
-        return {
-            "responses": len(self.pairs()),
-            "periods": 1 + int(min(periods, 1e15)),
-            "points a period": self.substeps,
-        }
+        periods = [min(self.duration.periods(device.period), 1e15) for device, _ in self.pairs()]
+        return {"responses": len(periods), "periods": 1 + int(max(periods)), "points a period": self.substeps}
 
 
 @register
@@ -133,25 +123,13 @@ class StepStudy(WallsStudy, ResponseStudy):
         if self.duration.unit == "s" and any(isinstance(device, NormalizedDevice) for device in self.devices):
             allowed = "a normalized device has no period to measure seconds in"
             yield ("duration",), problem(f"got {self.duration}", allowed, "write it in periods, as in '100 periods'")
-        yield from self._wall_limits()
-
-    def _wall_limits(self) -> Iterable[LocatedProblem]:
-        """Walls that do not fit their device, each reported once."""
-        several = self.walls is not None and len(self.walls) > 1
-        faulty: dict[int, PydanticCustomError] = {}
-        for index, (device, wall) in enumerate(self.pairs()):
-            if wall is None:
-                continue
-            if isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall):
-                allowed = "a wall in SI units needs a device with mass and period"
-                fault = problem("got a wall in SI units", allowed, "write alpha and beta")
-            elif not all(math.isfinite(value) for value in normalized_wall(device, wall)):
-                allowed = "alpha and beta must be finite"
-                fault = problem("got a wall whose normalized values are beyond float64", allowed, "check the units")
-            else:
-                continue
-            faulty[index if several else 0] = fault
-        yield from ((("walls", index), fault) for index, fault in faulty.items())
+        pairs = [
+            isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall) for device, wall in self.pairs()
+        ]
+        # Each wall once.
+        for index in dict.fromkeys(k % sizes[1] for k, mixed in enumerate(pairs) if mixed):
+            allowed = "a wall in SI units needs a device with mass and period"
+            yield ("walls", index), problem("got a wall in SI units", allowed, "write alpha and beta")
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         walls = self.walls or (None,)

@@ -251,8 +251,7 @@ class WorkspaceStudy(ComputedStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         mass, damping = (self.poses.table.values(name) for name in ("mass", "damping"))
         rate = mass / self.period
-        d = self.delay.value / (self.period if self.delay.unit == "s" else 1.0)
-        delta = damping / rate
+        d, delta = self.delay.periods(self.period), damping / rate
         top = alpha_max(delta, d)
         stiffness, virtual_damping = top.alpha * rate / self.period, top.beta * rate
         coordinates = self.poses.tabulate()

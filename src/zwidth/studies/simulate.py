@@ -113,7 +113,7 @@ class Circumstances(Strict):
 
     def place(self, scene: Scene) -> Scene:
         """The scene with the velocity estimate of these circumstances."""
-        return scene if self.velocity is None else scene.replace(velocity=self.velocity.to_part())
+        return scene if self.velocity is None else scene.replace(velocity=self.velocity.known)
 
     def options(self, period: float) -> dict[str, Any]:
         names = [name for name in Circumstances.model_fields if name not in ("duration", "velocity", "jitter")]
