@@ -65,7 +65,6 @@ def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticC
     return problem(what, allowed, f"{kinds}, or {remedy}" if remedy else kinds)
 
 
-HeldOnly = Annotated[Literal["held"], BeforeValidator(_only_held)]
 DelayModels = Annotated[tuple[DelayModel, ...], WrapValidator(members("delay models"))]
 
 
@@ -120,12 +119,13 @@ class Study(Strict):
             "delay_model": scene.delay_model,
             "delay_models": [scene.delay_model],
         }
-        if "device" in cls.from_scene and isinstance(scene, PhysicalScene):
-            supplied["device"] = scene.without_wall(SimulatedDevice if cls.simulates else PhysicalDevice)
-            supplied |= {"stiffness": scene.stiffness} if scene.stiffness else {}
+        if isinstance(scene, PhysicalScene):
+            supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
+            if "device" in cls.from_scene:
+                supplied["device"] = scene.without_wall(SimulatedDevice if cls.simulates else PhysicalDevice)
         if "devices" in cls.from_scene:
             supplied["devices"] = [scene.bare]
-        return {**{name: supplied[name] for name in cls.from_scene if name in supplied}, **raw}
+        return {**{name: supplied[name] for name in cls.from_scene if supplied.get(name) is not None}, **raw}
 
     @classmethod
     def _list_taken(cls, raw: dict[str, Any]) -> list[str]:
@@ -179,3 +179,10 @@ class Study(Strict):
         what = f"{self.extent} is {self.points:.4g} points and {self.nbytes / 2**30:.3g} GiB"
         allowed = f"at most {MAX_POINTS:.4g} points and {MAX_BYTES / 2**30:g} GiB a study"
         yield (), problem(what, allowed, self.remedy_if_too_large)
+
+
+class HeldStudy(Study):
+    """What the studies have that need poles."""
+
+    delay_model: Annotated[Literal["held"], BeforeValidator(_only_held)] = "held"
+    """How a delay that is not whole is modeled: 'held', for poles, motions and passivity exist in no other model."""

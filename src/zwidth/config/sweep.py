@@ -21,7 +21,7 @@ from zwidth.config.devices import (
 from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, listing, members, problem
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
-from zwidth.config.study import HeldOnly, Study, register
+from zwidth.config.study import HeldStudy, register
 from zwidth.config.values import Axis, Quantity, axis_of
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.device import Device
@@ -157,7 +157,7 @@ _Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be ax
 
 
 @register
-class SweepStudy(_Parts, Study):
+class SweepStudy(_Parts, HeldStudy):
     """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
 
     method = "Closed forms in float64; the same bits whatever the chunks and workers."
@@ -187,9 +187,6 @@ class SweepStudy(_Parts, Study):
     nearly all digits whatever is asked for. Where no proof is found, next to double poles above all, the status is
     NOT_CONVERGED: the value is there if a larger error of at most 0.1 is proved, and NaN otherwise.
     """
-
-    delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:

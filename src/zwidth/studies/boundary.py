@@ -14,7 +14,7 @@ from zwidth import figures
 from zwidth.config.fields import LocatedProblem, members, problem, repeated
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene
-from zwidth.config.study import DelayModels, HeldOnly, name_parts, register
+from zwidth.config.study import DelayModels, HeldStudy, name_parts, register
 from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.figures.stable_set import Outlines, tabulate_sets
 from zwidth.figures.table import stack
@@ -249,7 +249,7 @@ _FUNCTIONS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive"
 
 
 @register
-class MapStudy(ComputedStudy):
+class MapStudy(ComputedStudy, HeldStudy):
     """Stability and passivity on a grid of alpha, beta, delta and d."""
 
     method = "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors."
@@ -272,9 +272,6 @@ class MapStudy(ComputedStudy):
 
     outputs: Annotated[tuple[MapOutput, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed at every point."""
-
-    delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
 
     @property
     def sizes(self) -> dict[str, int]:

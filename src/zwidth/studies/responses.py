@@ -24,7 +24,7 @@ from zwidth.config.scenes import (
     PhysicalWall,
     normalized_wall,
 )
-from zwidth.config.study import HeldOnly, refuse_parts, register
+from zwidth.config.study import HeldStudy, refuse_parts, register
 from zwidth.config.values import Duration, Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.style import WIDTH, house_style, new_figure
@@ -39,7 +39,7 @@ from zwidth.words.formatting import name_wall, plain, round_safely, tell_apart, 
 from zwidth.words.quantities import LONGEST_SETTLING, Range
 
 
-class ResponseStudy(ComputedStudy):
+class ResponseStudy(ComputedStudy, HeldStudy):
     """What the studies that compute responses share."""
 
     remedy_if_too_large = "shorten the duration, or lower substeps"
@@ -51,9 +51,6 @@ class ResponseStudy(ComputedStudy):
 
     substeps: Annotated[int, Quantity(allowed=Range(1, 10_000), whole=True)] = 10
     """Points computed per period."""
-
-    delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         """Each device with its wall; the wall is None where stiffness_fraction decides it."""

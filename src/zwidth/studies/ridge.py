@@ -13,8 +13,8 @@ from pydantic import PrivateAttr, ValidationError
 from zwidth import figures
 from zwidth.config.device_table import DeviceTable, find_file, read_table
 from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of
-from zwidth.config.scenes import AnyScene, PhysicalScene
-from zwidth.config.study import DelayModels, HeldOnly, register
+from zwidth.config.scenes import AnyScene
+from zwidth.config.study import DelayModels, HeldStudy, register
 from zwidth.config.values import Delay, quantity_of
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.table import SI_COLUMNS, stack
@@ -102,7 +102,7 @@ def slope_table(table: Table) -> Table:
 
 
 @register
-class PassivityStudy(CurvesStudy):
+class PassivityStudy(CurvesStudy, HeldStudy):
     """What passivity costs: the largest passive and the largest stable stiffness over delta."""
 
     method = "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms."
@@ -110,9 +110,6 @@ class PassivityStudy(CurvesStudy):
     reads_scene = True
 
     kind: Literal["passivity"]
-
-    delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modeled; passivity is known for the model 'held'."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         ridge, notes = ridge_table(self.delta.values(), self.d.values(), self.delay_model)
@@ -233,11 +230,6 @@ class WorkspaceStudy(ComputedStudy):
 
     delay: Delay
     """Delay t_d from a sample to the moment its force acts, in s or in periods; the scene's where left out."""
-
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        supplied = {"period": scene.period, "delay": scene.delay} if isinstance(scene, PhysicalScene) else {}
-        return {**supplied, **raw}
 
     @property
     def sizes(self) -> dict[str, int]:

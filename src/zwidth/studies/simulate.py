@@ -12,7 +12,7 @@ from zwidth import figures
 from zwidth.config.fields import LocatedProblem, Strict, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
-from zwidth.config.study import HeldOnly, register
+from zwidth.config.study import HeldStudy, register
 from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.checks import Span
@@ -122,7 +122,7 @@ class Circumstances(Strict):
         return {**given, "periods": periods, "jitter": self.jitter.seconds(period)}
 
 
-class SimulatedStudy(ComputedStudy):
+class SimulatedStudy(ComputedStudy, HeldStudy):
     """What the studies that simulate share."""
 
     from_scene = ("device", "delay_model")
@@ -131,9 +131,6 @@ class SimulatedStudy(ComputedStudy):
 
     device: SimulatedDevice
     """Device in SI units; the scene's where left out."""
-
-    delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modeled; a motion exists in the model 'held' only."""
 
 
 @register

@@ -50,6 +50,7 @@ FAULTS = {
     "control_character": [("3:15: got the character '\\x07'", "remove it")],
     "damping_beyond_float": [("5:12: scene.damping: got 1e+20, whose normalized value is delta = 1e+40", "check the")],
     "damping_unit": [("5:12: scene.damping: got '10 N/m'", "did you mean 'N s/m'?")],
+    "deep_keys": [(f"1:29: version{'.?' * 19}: the values are nested too deeply", "use fewer levels")],
     "deep_nesting": [(f"1:29: version{'[0]' * 19}: the values are nested too deeply", "use fewer levels")],
     "delay_axis_too_long": [("7:12: studies[0].d[1]: got 20000", "write a number in this range")],
     "delay_model_twice": [("8:26: studies[0].delay_models[1]: got 'held' twice, here and at", "remove it")],
