@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 from zwidth.config.fields import LocatedProblem, Name, Strict, listing, members, problem, unlisted
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
+from zwidth.config.values import Axis
 from zwidth.words.formatting import describe
 from zwidth.words.types import DELAY_MODELS, DelayModel
 
@@ -155,8 +156,9 @@ class Study(Strict):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """How many there are, by name, of what is combined with each other; or a kind says `points` and `extent`."""
-        return {}
+        """How many there are, by name, of what is combined with each other: values of the axes, or what a kind says."""
+        known = {name: getattr(self, name) for name in type(self).model_fields}
+        return {name: axis.size for name, axis in known.items() if isinstance(axis, Axis)}
 
     @property
     def points(self) -> int:

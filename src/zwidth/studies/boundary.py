@@ -274,10 +274,6 @@ class MapStudy(ComputedStudy, HeldStudy):
     """What is computed at every point."""
 
     @property
-    def sizes(self) -> dict[str, int]:
-        return {name: getattr(self, name).size for name in ("alpha", "beta", "delta", "d")}
-
-    @property
     def nbytes(self) -> int:
         # And a status code a point.
         return self.points * (1 + sum(np.dtype(_TYPES[name]).itemsize for name in self.outputs))

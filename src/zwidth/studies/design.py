@@ -141,10 +141,6 @@ class DesignStudy(ComputedStudy):
         return known | {"rate": 1.0 / known["period"]}
 
     @property
-    def sizes(self) -> dict[str, int]:
-        return {"stiffnesses": self.stiffness.size}
-
-    @property
     def draws(self) -> int:
         if self.tolerances is None:
             return 0

@@ -104,8 +104,7 @@ class CurvesStudy(ComputedStudy):
 
     @property
     def sizes(self) -> dict[str, int]:
-        models = getattr(self, "delay_models", ("held",))
-        return {"delta": self.delta.size, "d": self.d.size, "delay models": len(models)}
+        return super().sizes | {"delay models": len(getattr(self, "delay_models", ("held",)))}
 
 
 class WallsStudy(ComputedStudy):
