@@ -348,11 +348,6 @@ class SweepStudy(_Parts, HeldStudy):
     def sizes(self) -> dict[str, int]:
         return self.axes.sizes
 
-    @property
-    def nbytes(self) -> int:
-        # As they are in memory, with a status code.
-        return self.points * (1 + 8 * len(self.outputs))
-
 
 def _columns(raw: Any) -> set[str]:
     """The parameters of a table, as far as it can be read."""

@@ -42,8 +42,6 @@ Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 # Samples of a boundary over frequency; only an estimate of a result's size rests on it.
 _POINTS_PER_CURVE = 1000
 _RIDGE_POINTS = 101
-# An outline has some hundreds of points, of which an estimate of the size may rest on.
-_POINTS_PER_OUTLINE = 1000
 
 
 @register
@@ -185,7 +183,6 @@ class CompareStudy(ComputedStudy):
     method = "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge."
     from_scene = ()
     takes_parts = True
-    point_bytes = 64
 
     kind: Literal["compare"]
 
@@ -207,10 +204,6 @@ class CompareStudy(ComputedStudy):
     @property
     def sizes(self) -> dict[str, int]:
         return {"devices": len(self.devices)}
-
-    @property
-    def points(self) -> int:
-        return super().points * _POINTS_PER_OUTLINE
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         scenes = {device.label: device.to_scene() for device in self.devices}

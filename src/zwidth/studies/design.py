@@ -272,13 +272,12 @@ class FiltersStudy(ComputedStudy):
         if self.noise_limit is not None and self.resolution is None:
             what = "got a noise limit without a resolution"
             yield ("noise_limit",), problem(what, "noise comes from the counts of the position", "add 'resolution'")
-        if self.order > 2:
-            yield ("order",), problem(f"got {self.order}", "a low-pass has order 1 or 2", "write 1 or 2")
-        elif self.cutoff is not None:
+        if self.cutoff is not None:
             try:
                 LowPass(cutoff=self.cutoff.largest, order=self.order).estimate(self.device.period)
             except InputError as error:
-                yield ("cutoff",), locate_refusal(error)[1]
+                path, what = locate_refusal(error)
+                yield path[-1:], what
 
     @property
     def dampings(self) -> np.ndarray:

@@ -217,8 +217,6 @@ class WorkspaceStudy(ComputedStudy):
 
     method = "The stiffest wall of each pose as that of a rigid device, to some rounding errors."
     from_scene = ("period", "delay")
-    # Two coordinates, mass, damping and the wall.
-    point_bytes = 48
 
     kind: Literal["workspace"]
 
