@@ -353,13 +353,12 @@ def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | Non
         draw_contours(ax, columns, rows, values, OUTPUTS["stiffness_max"], norm, [np.array([[x[weakest], y[weakest]]])])
     else:
         image = ax.scatter(x, y, c=factor * stiffness, s=9.0, norm=norm, label="poses")
-    mark = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
-    ax.plot(x[weakest], y[weakest], linestyle="", label="weakest pose", clip_on=False, zorder=5, **mark)
+    ax.plot(x[weakest], y[weakest], linestyle="", label="weakest pose", clip_on=False, zorder=5, **_PEAK)
     ax.set(**{f"{which}label": _spell(name) for which, name in (("x", across), ("y", up))})
     label = rf"maximum stable stiffness  $K_{{\max}}$  in {unit}"
     bar = style.figure_of(panels).colorbar(image, ax=ax, label=label)
     style.use_logarithmic(bar.ax, "y", factor * stiffness)
-    style.legend(panels, [style.line("weakest pose", "", **mark)], outside=axes is None)
+    style.legend(panels, [style.line("weakest pose", "", **_PEAK)], outside=axes is None)
     return panels
 
 
