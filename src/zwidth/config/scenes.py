@@ -194,13 +194,8 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
         wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
         return replace(bare, timing=replace(bare.timing, delay_model=self.delay_model), wall=wall)
 
-    @property
-    def bare(self) -> PhysicalDevice:
-        """The scene without its wall, for studies that need a linear velocity estimate."""
-        return self.without_wall(PhysicalDevice)
-
-    def without_wall(self, kind: type[PhysicalDevice]) -> PhysicalDevice:
-        """The scene without its wall, as a device of a kind."""
+    def bare(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
+        """The scene without its wall, as a device of a kind; by default of one whose velocity estimate is linear."""
         own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay", "rotary")}
         return kind(**{name: value for name, value in own.items() if value is not None}, **list_parts(self))
 
@@ -228,7 +223,6 @@ class NormalizedScene(_NormalizedPlant, what="a scene"):
     delay_model: DelayModel = "held"
     """How a delay that is not whole is modeled."""
 
-    @property
     def bare(self) -> NormalizedDevice:
         """The scene without its wall."""
         return NormalizedDevice(delta=self.delta, d=self.d)

@@ -121,9 +121,9 @@ class Study(Strict):
         if isinstance(scene, PhysicalScene):
             supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
             if "device" in cls.from_scene:
-                supplied["device"] = scene.without_wall(SimulatedDevice if cls.simulates else PhysicalDevice)
+                supplied["device"] = scene.bare(SimulatedDevice if cls.simulates else PhysicalDevice)
         if "devices" in cls.from_scene:
-            supplied["devices"] = [scene.bare]
+            supplied["devices"] = [scene.bare()]
         return {**{name: supplied[name] for name in cls.from_scene if supplied.get(name) is not None}, **raw}
 
     @classmethod

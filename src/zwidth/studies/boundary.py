@@ -73,7 +73,7 @@ class BoundaryStudy(CurvesStudy):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         if "device" in raw or (scene.parts_beyond and not {"delta", "d"} & set(raw)):
-            return {"delay_models": [scene.delay_model], "device": scene.bare, **raw}
+            return {"delay_models": [scene.delay_model], "device": scene.bare(), **raw}
         return super().fill(raw, scene)
 
     @classmethod
