@@ -198,5 +198,5 @@ def test_the_explorer_has_its_sliders_and_writes_it_down(copied):
     assert slider == ["stiffness of the mount k_0", "N/m", 1.0, 1.0, 1000.0, False]
     assert choices == {"none": "none", "soft": "soft"}
     assert (shown["mount"], shown["mount.stiffness"]) == ("soft", 50.0)
-    assert 'mount: {"stiffness": "50 N/m", "damping": "1 N s/m"}' in yaml
+    assert "mount: {stiffness: 50 N/m, damping: 1 N s/m}" in yaml
     assert 'mount=zwidth.Mount(stiffness="50 N/m", damping="1 N s/m")' in python

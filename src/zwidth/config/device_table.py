@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
+from zwidth.config.fields import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.values import quantity_of, read_entries, share
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, read_rows, resembling, split_title, suggestion
@@ -22,6 +22,7 @@ from zwidth.words.units import looks_like_number
 
 LABEL = "label"
 MAX_ROWS = 100_000
+_KNOWN = (LABEL, *PARAMETERS)
 MAX_CSV_BYTES = 2**25
 
 _FORMS = "lists of equal length under the names of parameters, or {csv: FILE}"
@@ -79,13 +80,12 @@ def read_table(raw: Any) -> DeviceTable:
 
 
 def _read_lists(raw: dict[str, Any]) -> DeviceTable:
-    known = (LABEL, *PARAMETERS)
     found: list[LocatedProblem] = []
     columns: dict[str, tuple[Any, ...]] = {}
     in_periods = False
     for key, cells in raw.items():
-        if key not in known:
-            what = problem("unknown key", f"devices are {_FORMS}", suggestion(key, known, "remove it"), on_key=True)
+        if key not in _KNOWN:
+            what = problem("unknown key", f"devices are {_FORMS}", suggestion(key, _KNOWN, "remove it"), on_key=True)
             found.append(((key,), what))
         elif not isinstance(cells, list | tuple):
             what = problem(f"got {describe(cells)}", "a column of devices is a list", "write [value, value, ...]")
@@ -159,29 +159,29 @@ def _choose_columns(header: list[str], mapping: Any, name: str) -> dict[str, tup
     if mapping is not None:
         return _map_columns(header, mapping, name)
     chosen: dict[str, tuple[int, str]] = {}
-    known = (LABEL, *PARAMETERS)
     for index, title in enumerate(header):
         key, unit = split_title(title)
         if key in chosen:
             raise problem(f"{printable(name)}: the column {describe(key)} comes twice", "each once", "remove one")
-        if key in known:
+        if key in _KNOWN:
             chosen[key] = index, unit
-        elif resembling(key, known):
+        elif resembling(key, _KNOWN):
             # A misspelled column must not be taken for a remark; other ones, as a source, are the reader's own.
             what = f"{printable(name)}: got the column {describe(key)}"
-            raise problem(what, f"columns are {listing(known)}, and others", suggestion(key, known, "rename it"))
+            raise problem(what, f"columns are {listing(_KNOWN)}, and others", suggestion(key, _KNOWN, "rename it"))
     return chosen
 
 
 def _map_columns(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, str]]:
     """The same where the configuration says which column is what, as ``mass: "moving mass [g]"``."""
-    known = (LABEL, *PARAMETERS)
     if not isinstance(mapping, dict) or not mapping:
-        raise problem(f"got columns: {describe(mapping)}", f"a mapping from {listing(known)} to headers", "write one")
+        raise problem(f"got columns: {describe(mapping)}", f"a mapping from {listing(_KNOWN)} to headers", "write one")
     chosen = {}
     for key, title in mapping.items():
-        if key not in known:
-            raise problem(f"columns: got {describe(key)}", f"the keys are {listing(known)}", suggestion(key, known, ""))
+        if key not in _KNOWN:
+            raise problem(
+                f"columns: got {describe(key)}", f"the keys are {listing(_KNOWN)}", suggestion(key, _KNOWN, "")
+            )
         if not isinstance(title, str) or title.strip() not in header:
             allowed = f"the headers of {printable(name)} are {listing(header[:20])}"
             raise problem(f"columns: got {describe(title)}", allowed, suggestion(title, header, "write one of these"))

@@ -11,8 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.config.device_table import find_file
-from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
-from zwidth.config.fields import Strict
+from zwidth.config.fields import LocatedProblem, Strict, listing, problem, validation_error
 from zwidth.config.parts import PART_NAMES, PartSection, split_refusal
 from zwidth.config.values import Delay, Quantity, quantity_of
 from zwidth.parts.checks import Span
@@ -83,7 +82,7 @@ class SystemSection(PartSection, what="a linear system"):
     """The period of a system from sample to sample, that of the loop; a continuous one has none."""
 
     @cached_property
-    def _known(self) -> LinearDevice:
+    def known(self) -> LinearDevice:
         form = next(form for form in _OF_SYSTEM if getattr(self, form[-1]) is not None)
         names = {"numerator": "num", "denominator": "den"}
         known: dict[str, Any] = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
@@ -132,7 +131,7 @@ class ResponseSection(PartSection, what="a response"):
         return cls(**{name: column.tolist() for name, column in columns.items()})
 
     @cached_property
-    def _known(self) -> MeasuredDevice:
+    def known(self) -> MeasuredDevice:
         real, imag = (_to_array(part) for part in (self.real, self.imag))
         if real.shape != imag.shape:
             raise InputError(f"imag: got {imag.size} numbers beside {real.size} of real; give one a frequency")

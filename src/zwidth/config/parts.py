@@ -21,8 +21,7 @@ from pydantic import (
     create_model,
 )
 
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Strict, describe_parameter, find_kind
+from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, find_kind, problem
 from zwidth.config.values import Quantity, read_entries
 from zwidth.parts.checks import find_range
 from zwidth.parts.mode import Mode
@@ -56,18 +55,15 @@ class PartSection(Strict):
 
     part: ClassVar[Any]
 
-    def to_part(self) -> Any:
-        """The part itself."""
-        return self._known
-
     @cached_property
-    def _known(self) -> Any:
+    def known(self) -> Any:
+        """The part itself."""
         given = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return self.part(**given)
 
     def limits(self) -> Iterable[LocatedProblem]:
         try:
-            self.to_part()
+            self.known  # noqa: B018  (raises where the part refuses)
         except InputError as error:
             path, what = locate_refusal(error)
             # A whole part begins the path with its name; a field of the section is its own place.
@@ -175,6 +171,6 @@ def list_parts(owner: Any) -> dict[str, Any]:
 def build_parts(owner: Any) -> dict[str, Any]:
     """The same as parts of a scene."""
     return {
-        name: [each.to_part() for each in section] if isinstance(section, list) else section.to_part()
+        name: [each.known for each in section] if isinstance(section, list) else section.known
         for name, section in list_parts(owner).items()
     }

@@ -9,19 +9,20 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from yaml.composer import Composer
 from yaml.parser import Parser
 from yaml.reader import Reader
 from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
 from zwidth.config.device_table import files_relative_to
-from zwidth.config.faults import (
+from zwidth.config.fields import (
     ConfigFileError,
     Fault,
     FieldPath,
@@ -197,11 +198,12 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-class _Tree(Reader, Scanner, Parser, _Resolver):
-    """A file of a name and a text as plain Python values, with the places of all of them.
+class _Alias(yaml.Node):
+    """What an alias stands for, ``value``, at the place of the alias."""
 
-    What an alias stands for is read once more, from the events that its anchor was read from.
-    """
+
+class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
+    """A file of a name and a text as plain Python values, with the places of all of them."""
 
     def __init__(self, file: str, text: str) -> None:
         self.file = file
@@ -210,14 +212,17 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
         self.scalars: dict[FieldPath, tuple[str, int, int]] = {}  # as written, with the ends in the text
         self.faults: list[Fault] = []
         self._nodes = 0
-        self._anchors: dict[str, list[yaml.Event]] = {}
-        self._unfinished: dict[str, list[yaml.Event]] = {}
+        self._path: FieldPath = ()  # of the node that is being composed
+        self._unfinished: set[str] = set()  # anchors of what has not ended
         try:
             Reader.__init__(self, text)
-            Scanner.__init__(self)
-            Parser.__init__(self)
-            _Resolver.__init__(self)
-            self.data = self._read_document()
+            for base in (Scanner, Parser, Composer, _Resolver):
+                base.__init__(self)
+            node = self.get_single_node()
+            if node is None:
+                allowed = "a configuration has version, name and studies"
+                raise _fail(self.file, (1, 1), "the file is empty", allowed, "start with 'version: 1'")
+            self.data = self._read(node, ())
         except yaml.reader.ReaderError as error:
             what = f"got the character {describe(text[error.position])}"
             allowed, remedy = "YAML allows no control characters", "remove it"
@@ -231,85 +236,54 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
             what = "an escape or a number that does not exist"
             raise _fail(self.file, _mark_place(self.get_mark()), what, "", "correct or remove it") from error
 
-    def _read_document(self) -> Any:
-        """The one document of the file."""
-        self.get_event()
-        if self.check_event(yaml.StreamEndEvent):
-            allowed = "a configuration has version, name and studies"
-            raise _fail(self.file, (1, 1), "the file is empty", allowed, "start with 'version: 1'")
-        self.get_event()
-        data = self._read((), self._parse_events())
-        self.get_event()
-        if not self.check_event(yaml.StreamEndEvent):
-            place = _mark_place(self.peek_event().start_mark)
-            what = "a second document begins here"
-            raise _fail(self.file, place, what, "one document a file", "remove the '---' or split the file")
-        return data
-
-    def _parse_events(self) -> Iterator[yaml.Event]:
-        while True:
-            event = self.get_event()
-            for events in self._unfinished.values():
-                events.append(event)
-            yield event
-
     def _syntax_error(self, error: yaml.MarkedYAMLError) -> ConfigFileError:
         """PyYAML's account of a syntax error, with a remedy."""
         mark = error.problem_mark or error.context_mark
-        what = printable((error.problem or "unreadable").replace("\n", " "))
+        place = _mark_place(mark) if mark else (1, 1)
+        what, context = printable((error.problem or "unreadable").replace("\n", " ")), error.context or ""
+        if what == "but found another document":
+            remedy = "remove the '---' or split the file"
+            return _fail(self.file, place, "a second document begins here", "one document a file", remedy)
         remedy = "check the indentation, the colons and the quotes here"
         opened = "line {}, column {}".format(*_mark_place(error.context_mark)) if error.context_mark else ""
         if r"'\t'" in what:
             what, remedy = "got a tab where the line is indented", "indent with spaces"
-        elif opened and "flow" in (error.context or ""):
+        elif what.startswith("found undefined alias"):
+            remedy = "define it before with '&', or remove the '*'"
+        elif context.startswith("found duplicate anchor"):
+            what, remedy = context.partition(";")[0], "give each anchor its own name"
+        elif opened and "flow" in context:
             remedy = f"close the bracket opened at {opened}"
-        elif opened and "quoted" in (error.context or ""):
+        elif opened and "quoted" in context:
             remedy = f"check the quoted text that begins at {opened}"
-        return _fail(self.file, _mark_place(mark) if mark else (1, 1), "not valid YAML", what, remedy)
+        return _fail(self.file, place, "not valid YAML", what, remedy)
 
-    def _read(self, path: FieldPath, events: Iterator[Any], event: Any = None, in_alias: bool = False) -> Any:
-        """The value that begins with an event, the next one if none is given; places go to ``values`` and ``keys``."""
-        event = event or next(events)
-        # An alias comes before its target, so that a fault of the whole points at the alias.
-        self.values.setdefault(path, _mark_place(event.start_mark))
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """A node with all below it, where PyYAML has no limits and takes an alias for what it stands for."""
+        event, above, where = self.peek_event(), self._path, (parent, index)
+        place, anchor = _mark_place(event.start_mark), event.anchor
+        # A key is named by itself.
+        own = getattr(event if index is None else index, "value", index)
+        self._path = () if parent is None else (*above, own if isinstance(own, int | str) else "?")
         if isinstance(event, yaml.AliasEvent):
-            return self._read(path, iter(self._recall(event, path)), in_alias=True)
-        self._count_node(event, path, path, in_alias)
-        anchor = None if in_alias else event.anchor
-        if anchor is not None:
-            if anchor in self._anchors or anchor in self._unfinished:
-                what = f"the anchor {describe(anchor)} comes twice"
-                raise self._invalid(event, what, "give each anchor its own name")
-            self._unfinished[anchor] = [event]
-        if isinstance(event, yaml.SequenceStartEvent):
-            value: Any = []
-            while not isinstance(event := next(events), yaml.SequenceEndEvent):
-                value.append(self._read((*path, len(value)), events, event, in_alias))
-        elif isinstance(event, yaml.MappingStartEvent):
-            value = self._read_mapping(path, events, in_alias)
+            if anchor in self._unfinished:
+                what, allowed = "an alias of what it is part of", "aliases stand for values that have ended"
+                raise _fail(self.file, place, what, allowed, "write the values out", path=self._path)
+            node: Any = _Alias("", super().compose_node(*where), event.start_mark, event.end_mark)
         else:
-            self.scalars[path] = (event.value, event.start_mark.index, event.end_mark.index)
-            value = self._read_scalar(event)
-        if anchor is not None:
-            self._anchors[anchor] = self._unfinished.pop(anchor)
-        return value
+            self._count_node(place, self._path)
+            if event.tag is not None:
+                # A fault of its own; the value is read as if it were not there.
+                what = f"got the tag {describe(event.tag)}"
+                self._add_fault(place, self._path, what, "tags are not used", "remove the tag")
+            self._unfinished |= {anchor} - self.anchors.keys() - {None}
+            node = super().compose_node(*where)
+            self._unfinished -= {anchor}
+        self._path = above
+        return node
 
-    def _recall(self, alias: yaml.AliasEvent, path: FieldPath) -> list[yaml.Event]:
-        """What an alias stands for."""
-        if alias.anchor in self._unfinished:
-            what, allowed = "an alias of what it is part of", "aliases stand for values that have ended"
-            raise _fail(self.file, _mark_place(alias.start_mark), what, allowed, "write the values out", path=path)
-        if alias.anchor not in self._anchors:
-            what = f"found undefined alias {describe(alias.anchor)}"
-            raise self._invalid(alias, what, "define it before with '&', or remove the '*'")
-        return self._anchors[alias.anchor]
-
-    def _invalid(self, event: yaml.Event, what: str, remedy: str) -> ConfigFileError:
-        return _fail(self.file, _mark_place(event.start_mark), "not valid YAML", what, remedy)
-
-    def _count_node(self, event: Any, path: FieldPath, field: FieldPath, in_alias: bool) -> None:
-        """Refuse one that is too many, and its tag; PyYAML itself has no limits."""
-        place = self.values[path] if in_alias else _mark_place(event.start_mark)
+    def _count_node(self, place: tuple[int, int], path: FieldPath) -> None:
+        """Refuse one that is too many or too deep."""
         self._nodes += 1
         if self._nodes > MAX_NODES:
             what, allowed = "too many values", f"at most {MAX_NODES} values a file"
@@ -317,45 +291,45 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
         if len(path) >= MAX_DEPTH:
             what, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
             raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
-        if event.tag is not None and not in_alias:
-            # A fault of its own; the value is read as if it were not there.
-            self._add_fault(place, field, f"got the tag {describe(event.tag)}", "tags are not used", "remove the tag")
 
     def _add_fault(self, place: tuple[int, int], path: FieldPath, *parts: str) -> None:
         self.faults.append(Fault(self.file, *place, dotted(path), *parts))
 
-    def _read_mapping(self, path: FieldPath, events: Iterator[Any], in_alias: bool) -> dict[str, Any]:
+    def _read(self, node: Any, path: FieldPath, in_alias: bool = False) -> Any:
+        """The value of a node; places go to ``values`` and ``keys``, that of an alias before those within."""
+        self.values.setdefault(path, _mark_place(node.start_mark))
+        if isinstance(node, _Alias):
+            return self._read(node.value, path, in_alias=True)
+        if in_alias:
+            self._count_node(self.values[path], path)
+        if isinstance(node, yaml.SequenceNode):
+            return [self._read(each, (*path, k), in_alias) for k, each in enumerate(node.value)]
+        if isinstance(node, yaml.MappingNode):
+            return self._read_mapping(node, path, in_alias)
+        self.scalars[path] = (node.value, node.start_mark.index, node.end_mark.index)
+        return self._read_scalar(node)
+
+    def _read_mapping(self, node: Any, path: FieldPath, in_alias: bool) -> dict[str, Any]:
         """The keys and values of a mapping; a key that is no text or comes twice is a fault and left out."""
         found: dict[str, Any] = {}
-        first: dict[str, int] = {}
-        while not isinstance(event := next(events), yaml.MappingEndEvent):
-            place, key = _mark_place(event.start_mark), None
-            if isinstance(event, yaml.ScalarEvent):
-                if not in_alias:
-                    self._count_node(event, path, (*path, event.value), in_alias)
-                    self._anchors |= {event.anchor: [event]} if event.anchor else {}
-                key = self._read_scalar(event)
-                what = f"got the key {describe(key)}"
-            else:
-                self._read(path, events, event, in_alias)
-                what = "got a complex key"
-            if isinstance(key, str) and key not in first:
-                first[key] = place[0]
-                self.keys[*path, key] = place
-                found[key] = self._read((*path, key), events, in_alias=in_alias)
-                continue
-            if isinstance(key, str):
-                what = f"the key comes twice, first in line {first[key]}"
+        for name, value in node.value:
+            place = _mark_place(name.start_mark)
+            key = self._read_scalar(name) if isinstance(name, yaml.ScalarNode) else None
+            if not isinstance(key, str):
+                what = f"got the key {describe(key)}" if isinstance(name, yaml.ScalarNode) else "got a complex key"
+                self._add_fault(place, path, what, "keys are text", "write the name of a field")
+            elif key in found:
+                what = f"the key comes twice, first in line {self.keys[*path, key][0]}"
                 self._add_fault(place, (*path, key), what, "each key once", "remove one of them")
             else:
-                self._add_fault(place, path, what, "keys are text", "write the name of a field")
-            self._read((*path, str(key)), events, in_alias=in_alias)
+                self.keys[*path, key] = place
+                found[key] = self._read(value, (*path, key), in_alias)
         return found
 
-    def _read_scalar(self, event: yaml.ScalarEvent) -> Any:
+    def _read_scalar(self, node: Any) -> Any:
         """The value of a scalar by the core schema; a number beyond float64 becomes infinite."""
-        text = event.value
-        kind = self.resolve(yaml.ScalarNode, text, (event.style is None, True)).rpartition(":")[2]
+        text = node.value
+        kind = self.resolve(yaml.ScalarNode, text, (node.style is None, True)).rpartition(":")[2]
         if kind == "null":
             return None
         if kind == "bool":

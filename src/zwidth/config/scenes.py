@@ -12,7 +12,7 @@ from pydantic import ConfigDict, WrapValidator
 
 from zwidth.arrays.xp import within
 from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
-from zwidth.config.faults import LocatedProblem, listing, problem
+from zwidth.config.fields import LocatedProblem, listing, problem
 from zwidth.config.parts import SimulatedVelocityField, build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.values import NonNegative, Number, quantity_of
 from zwidth.parts.device import Device
@@ -33,10 +33,9 @@ class _PhysicalPlant(_Parts, SampledMass):
     """The same with the parts that it may have beside."""
 
     def limits(self) -> Iterable[LocatedProblem]:
-        delay = self.delay.value / (self.period if self.delay.unit == "s" else 1.0)
-        if not delay <= MAX_DELAY_PERIODS:
+        if not self.d <= MAX_DELAY_PERIODS:
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
-            yield ("delay",), problem(f"got {self.delay}, which is {short(delay)} periods", allowed, "check the units")
+            yield ("delay",), problem(f"got {self.delay}, which is {short(self.d)} periods", allowed, "check the units")
             return
         if self._is_double:
             # Its keys have told.
@@ -93,9 +92,6 @@ class _PhysicalPlant(_Parts, SampledMass):
 
     @cached_property
     def _scene(self) -> Scene:
-        return self._make_scene()
-
-    def _make_scene(self) -> Scene:
         timing = Timing(period=self.period, delay=self.delay.seconds(self.period))
         # A device that is given as a whole is one of the parts, and takes the place of this one.
         device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
@@ -191,19 +187,15 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
     delay_model: DelayModel = "held"
     """How a delay that is not whole is modeled."""
 
-    def _make_scene(self) -> Scene:
-        bare = super()._make_scene()
+    @cached_property
+    def _scene(self) -> Scene:
+        bare = super()._scene
         # One that is not given has no stiffness and no damping.
         wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
         return replace(bare, timing=replace(bare.timing, delay_model=self.delay_model), wall=wall)
 
-    @property
-    def bare(self) -> PhysicalDevice:
-        """The scene without its wall, for studies that need a linear velocity estimate."""
-        return self.without_wall(PhysicalDevice)
-
-    def without_wall(self, kind: type[PhysicalDevice]) -> PhysicalDevice:
-        """The scene without its wall, as a device of a kind."""
+    def bare(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
+        """The scene without its wall, as a device of a kind; by default of one whose velocity estimate is linear."""
         own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay", "rotary")}
         return kind(**{name: value for name, value in own.items() if value is not None}, **list_parts(self))
 
@@ -231,7 +223,6 @@ class NormalizedScene(_NormalizedPlant, what="a scene"):
     delay_model: DelayModel = "held"
     """How a delay that is not whole is modeled."""
 
-    @property
     def bare(self) -> NormalizedDevice:
         """The scene without its wall."""
         return NormalizedDevice(delta=self.delta, d=self.d)

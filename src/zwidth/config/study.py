@@ -9,12 +9,12 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 from pydantic import BeforeValidator, ConfigDict, WrapValidator
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
-from zwidth.config.fields import Name, Strict, members
+from zwidth.config.fields import LocatedProblem, Name, Strict, listing, members, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
+from zwidth.config.values import Axis
 from zwidth.words.formatting import describe
-from zwidth.words.types import DELAY_MODELS, DelayModel
+from zwidth.words.types import DelayModel
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30
@@ -40,17 +40,15 @@ def register(model: _Kind) -> _Kind:
     return model
 
 
-def _only_held(value: Any) -> str:
+def _only_held(value: Any) -> Any:
     """A validator for a study that needs poles."""
-    if value not in DELAY_MODELS:
-        raise unlisted(value, DELAY_MODELS)
     if value == "fractional_power":
         raise problem(
             f"got {describe(value)}, the study's own or that of scene.delay_model",
             "poles do not exist in this delay model, only the boundary and the ridge do; allowed is 'held'",
             "write 'delay_model: held' in this study, or use the kind 'boundary' or 'ridge'",
         )
-    return str(value)
+    return value
 
 
 def name_parts(parts: Iterable[str]) -> str:
@@ -66,7 +64,6 @@ def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticC
     return problem(what, allowed, f"{kinds}, or {remedy}" if remedy else kinds)
 
 
-HeldOnly = Annotated[Literal["held"], BeforeValidator(_only_held)]
 DelayModels = Annotated[tuple[DelayModel, ...], WrapValidator(members("delay models"))]
 
 
@@ -121,12 +118,13 @@ class Study(Strict):
             "delay_model": scene.delay_model,
             "delay_models": [scene.delay_model],
         }
-        if "device" in cls.from_scene and isinstance(scene, PhysicalScene):
-            supplied["device"] = scene.without_wall(SimulatedDevice if cls.simulates else PhysicalDevice)
-            supplied |= {"stiffness": scene.stiffness} if scene.stiffness else {}
+        if isinstance(scene, PhysicalScene):
+            supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
+            if "device" in cls.from_scene:
+                supplied["device"] = scene.bare(SimulatedDevice if cls.simulates else PhysicalDevice)
         if "devices" in cls.from_scene:
-            supplied["devices"] = [scene.bare]
-        return {**{name: supplied[name] for name in cls.from_scene if name in supplied}, **raw}
+            supplied["devices"] = [scene.bare()]
+        return {**{name: supplied[name] for name in cls.from_scene if supplied.get(name) is not None}, **raw}
 
     @classmethod
     def _list_taken(cls, raw: dict[str, Any]) -> list[str]:
@@ -156,8 +154,9 @@ class Study(Strict):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """How many there are, by name, of what is combined with each other; or a kind says `points` and `extent`."""
-        return {}
+        """How many there are, by name, of what is combined with each other: values of the axes, or what a kind says."""
+        known = {name: getattr(self, name) for name in type(self).model_fields}
+        return {name: axis.size for name, axis in known.items() if isinstance(axis, Axis)}
 
     @property
     def points(self) -> int:
@@ -180,3 +179,10 @@ class Study(Strict):
         what = f"{self.extent} is {self.points:.4g} points and {self.nbytes / 2**30:.3g} GiB"
         allowed = f"at most {MAX_POINTS:.4g} points and {MAX_BYTES / 2**30:g} GiB a study"
         yield (), problem(what, allowed, self.remedy_if_too_large)
+
+
+class HeldStudy(Study):
+    """What the studies have that need poles."""
+
+    delay_model: Annotated[Literal["held"], BeforeValidator(_only_held)] = "held"
+    """How a delay that is not whole is modeled: 'held', for poles, motions and passivity exist in no other model."""

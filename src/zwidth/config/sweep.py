@@ -18,11 +18,10 @@ from zwidth.config.devices import (
     find_second_period,
     tell_rotary,
 )
-from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Strict, describe_parameter, members
+from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, listing, members, problem
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
-from zwidth.config.study import HeldOnly, Study, register
+from zwidth.config.study import HeldStudy, register
 from zwidth.config.values import Axis, Quantity, axis_of
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.device import Device
@@ -154,8 +153,16 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
 OutputName = Annotated[str, GetPydanticSchema(lambda _, handler: handler.generate_schema(Literal[tuple(OUTPUTS)]))]
 
 
-class _Swept(Study):
-    """What is swept."""
+_Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
+
+
+@register
+class SweepStudy(_Parts, HeldStudy):
+    """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
+
+    method = "Closed forms in float64; the same bits whatever the chunks and workers."
+    from_scene = ("delay_model",)
+    takes_parts = True
 
     kind: Literal["sweep"]
 
@@ -164,18 +171,6 @@ class _Swept(Study):
 
     device: DeviceForm | None = None
     """A linear system or a measured response in place of mass and damping; the scene's where left out."""
-
-
-_Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
-
-
-@register
-class SweepStudy(_Parts, _Swept):
-    """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
-
-    method = "Closed forms in float64; the same bits whatever the chunks and workers."
-    from_scene = ("delay_model",)
-    takes_parts = True
 
     rotary: Rotary = Field(default_factory=tell_rotary)
     """Whether its devices turn, as all of a file do where one quantity has a unit of rotation."""
@@ -192,9 +187,6 @@ class SweepStudy(_Parts, _Swept):
     nearly all digits whatever is asked for. Where no proof is found, next to double poles above all, the status is
     NOT_CONVERGED: the value is there if a larger error of at most 0.1 is proved, and NaN otherwise.
     """
-
-    delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
@@ -355,11 +347,6 @@ class SweepStudy(_Parts, _Swept):
     @property
     def sizes(self) -> dict[str, int]:
         return self.axes.sizes
-
-    @property
-    def nbytes(self) -> int:
-        # As they are in memory, with a status code.
-        return self.points * (1 + 8 * len(self.outputs))
 
 
 def _columns(raw: Any) -> set[str]:

@@ -17,8 +17,15 @@ import numpy as np
 from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from zwidth.config.faults import LocatedProblem, problem, problems_of, raise_problems, validation_error
-from zwidth.config.fields import Strict, repeated
+from zwidth.config.fields import (
+    LocatedProblem,
+    Strict,
+    problem,
+    problems_of,
+    raise_problems,
+    repeated,
+    validation_error,
+)
 from zwidth.parts.checks import Span, read_span
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
@@ -164,7 +171,7 @@ class Axis:
 
     def values(self) -> np.ndarray:
         if self.form in _SPACINGS:
-            return _SPACINGS[self.form][0](*self.entries, self.size)
+            return _SPACINGS[self.form](*self.entries, self.size)
         return np.array(self.entries, dtype=np.float64)
 
     @property
@@ -184,8 +191,8 @@ def _read_end(raw: Any, info: ValidationInfo) -> float:
     return cast(Entry, info.context)(raw)
 
 
-class _EqualSteps(Strict, what="an axis with 'linear'"):
-    """The mapping below ``linear``."""
+class _Spaced(Strict, what="an axis of equal steps or ratios"):
+    """The mapping below ``linear`` or ``log``."""
 
     start: Annotated[float, BeforeValidator(_read_end)]
     stop: Annotated[float, BeforeValidator(_read_end)]
@@ -193,7 +200,7 @@ class _EqualSteps(Strict, what="an axis with 'linear'"):
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
-        return "an axis of equal steps or ratios has start, stop and num", f"add {name!r}"
+        return f"{cls.what} has start, stop and num", f"add {name!r}"
 
     def limits(self) -> list[LocatedProblem]:
         start, stop, num = self.start, self.stop, self.num
@@ -209,14 +216,7 @@ class _EqualSteps(Strict, what="an axis with 'linear'"):
         return []
 
 
-class _EqualRatios(_EqualSteps, what="an axis with 'log'"):
-    """The mapping below ``log``."""
-
-
-_SPACINGS: dict[str, tuple[Any, type[_EqualSteps]]] = {
-    "linear": (np.linspace, _EqualSteps),
-    "log": (np.geomspace, _EqualRatios),
-}
+_SPACINGS: dict[str, Callable[..., np.ndarray]] = {"linear": np.linspace, "log": np.geomspace}
 
 
 def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool = True) -> tuple[float, ...]:
@@ -274,7 +274,7 @@ class AxisOf:
 
         if form in self._forms:
             try:
-                spaced = _SPACINGS[form][1].model_validate(ends, context=entry)
+                spaced = _Spaced.model_validate(ends, context=entry)
             except ValidationError as error:
                 raise validation_error("axis", problems_of(error, form)) from None
             entries, size = (spaced.start, spaced.stop), spaced.num

@@ -1,8 +1,6 @@
 """Every name of `zwidth.figures`, once."""
 
 from . import plot as plot
-from .alpha_beta import draw_boundary as draw_boundary
-from .alpha_beta import draw_map as draw_map
 from .curves import draw_curves as draw_curves
 from .curves import draw_outlines as draw_outlines
 from .design import draw_filter_noise as draw_filter_noise
@@ -16,10 +14,12 @@ from .motion import draw_energy as draw_energy
 from .motion import draw_motion as draw_motion
 from .motion import draw_phase_plane as draw_phase_plane
 from .motion import draw_step as draw_step
-from .over_damping import draw_passivity_cost as draw_passivity_cost
-from .over_damping import draw_ridge as draw_ridge
-from .over_damping import draw_slope as draw_slope
-from .over_damping import draw_zero_stiffness as draw_zero_stiffness
+from .paper import draw_boundary as draw_boundary
+from .paper import draw_map as draw_map
+from .paper import draw_passivity_cost as draw_passivity_cost
+from .paper import draw_ridge as draw_ridge
+from .paper import draw_slope as draw_slope
+from .paper import draw_zero_stiffness as draw_zero_stiffness
 from .plane import draw_plane as draw_plane
 from .plane import draw_workspace as draw_workspace
 from .stable_set import draw_recommendation as draw_recommendation

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.figures import grid, style
-from zwidth.figures.plane import SMOOTH, Edges, boundary_level, find_outlines, panel_grid
-from zwidth.figures.stable_set import draw_exact
+from zwidth.figures.plane import SMOOTH, Edges, draw_edge, panel_grid, read_panel
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, VARIABLES, WALL
 
@@ -111,14 +110,7 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
         grid.scale_axis(ax, "y", part[y])
         for k, look in zip(picked, looks, strict=True):
             device = part.isel({family: k}).transpose(y, x)
-            shown = np.ma.masked_invalid(device[name].values)
-            level = boundary_level(name)
-            stable = np.ma.filled(shown < level if OUTPUTS[name].below else shown > level, False)
-            known = find_outlines(device, edges).get("stable")
-            exact = draw_exact(ax, known, part[x].values, part[y].values, stable, linewidth=1.4, **look)
-            if not exact and shown.count() and shown.min() < level < shown.max():
-                line = {"colors": [look["color"]], "linestyles": [look["linestyle"]], "linewidths": 1.4}
-                ax.contour(part[x].values, part[y].values, shown, levels=[level], **line)
+            draw_edge(ax, read_panel(device, name, edges), name, linewidth=1.4, **look)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
     grid.name_panels(panels, parts)
     style.label_axes(panels, grid.axis_label(data, x), grid.axis_label(data, y), once=axes is None)

@@ -46,7 +46,10 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     clock, unit = draw_positions(panels[0], table)
     responses = _read_responses(table)
     for ax in panels[1:]:
-        _draw_forces(ax, responses, clock)
+        for each in responses:
+            look = {**each.look, **_HELD, "label": f"wall_force, {each.label}"}
+            ax.plot(each.time * clock, each.wall_force, zorder=3, **look)
+        ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
         ax.set_ylabel(f"{_name_force()} in {own_unit('N')}" if unit else "wall force  in $F$")
     for ax in panels:
         # The last sample ends before the time that was asked for.
@@ -97,13 +100,6 @@ def _read_responses(table: Table) -> list[Any]:
             setattr(each, name, getattr(each, name)[0])
         each.settled = bool(each.settling_time <= each.time[-1]) if "settling_time" in columns else None
     return responses
-
-
-def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:
-    for each in responses:
-        look = {**each.look, **_HELD, "label": f"wall_force, {each.label}"}
-        ax.plot(each.time * clock, each.wall_force, zorder=3, **look)
-    ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
 
 
 @draws_tables

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import matplotlib
 import numpy as np
@@ -14,8 +14,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from zwidth.figures import grid, stable_set, style
-from zwidth.figures.alpha_beta import SHADES
 from zwidth.figures.grid import MISSING, label_contours
+from zwidth.figures.stable_set import SHADES
 from zwidth.figures.table import Table
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, Output
@@ -40,8 +40,18 @@ _LABELLED = 0.1
 # Less than this cannot be seen.
 _SEEN = 0.003
 # The boundary where it is known.
-_EDGE: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.3, "zorder": 2.2, "under": 1.5}
+_EDGE: dict[str, Any] = {"color": style.BLACK, "linestyle": style.SOLID, "linewidth": 1.3, "zorder": 2.2}
 _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
+
+
+class Panel(NamedTuple):
+    """What one panel shows: variables over y and x, masked where they are not known, and exact outlines, x first."""
+
+    x: np.ndarray
+    y: np.ndarray
+    variables: Mapping[str, np.ma.MaskedArray]
+    outlines: Mapping[str, stable_set.Outlines]
+    peak: tuple[float, ...] = ()  # the stiffest stable wall, where it is known and within the axes
 
 
 @style.house_style()
@@ -81,13 +91,24 @@ def draw_plane(
     parts, columns = grid.panels(_add_peak(data, _select_drawn(data, name), x, y), dims, plane=dims, col=col)
     panels = panel_grid(axes, len(parts), columns)
     parts = [part.compute().transpose(y, x) for part in parts[: len(panels)]]
-    norm, image = _norm(parts, name), None
-    for part, ax in zip(parts, panels, strict=True):
-        image = _draw_panel(ax, part, name, norm, find_outlines(part, edges))
+    shown = [read_panel(part, name, edges) for part in parts]
     grid.name_panels(panels, parts)
     style.label_axes(panels, grid.axis_label(parts[0], x), grid.axis_label(parts[0], y), once=axes is None)
-    _explain(panels, parts, name, image, outside=axes is None)
+    draw_panels(panels, shown, name, grid.output_label(parts[0], name), outside=axes is None)
     return panels
+
+
+def read_panel(part: xarray.Dataset, name: str, edges: Edges | None) -> Panel:
+    """A part (y, x) of a dataset."""
+    up, across = map(str, part[name].dims)
+    variables = {str(each): np.ma.masked_invalid(values.values) for each, values in part.items() if values.ndim}
+    peak = {str(each).removesuffix("_peak"): float(values) for each, values in part.items() if not values.ndim}
+    inside = all(part[dim].min() <= value <= part[dim].max() for dim, value in peak.items())
+    # Outlines have the stiffness first.
+    turn, found = -1 if across in ("beta", "virtual_damping") else 1, edges(part) if edges else {}
+    outlines = {kind: [(points[:, ::turn], hole) for points, hole in each] for kind, each in found.items()}
+    axes = part[across].values, part[up].values
+    return Panel(*axes, variables, outlines, tuple(peak.values()) if inside else ())
 
 
 def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
@@ -124,92 +145,69 @@ def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndar
     return style.panels(given, count, width, height, columns, sharex=True, sharey=True)
 
 
-def find_outlines(part: xarray.Dataset, edges: Edges | None) -> dict[str, stable_set.Outlines]:
-    """The exact outlines of a panel (y, x), with x first; none where nobody knows them."""
-    dims = [str(dim) for dim in reversed(next(iter(part.data_vars.values())).dims)]
-    found = edges(part) if edges else {}
-    turn = -1 if dims[0] in ("beta", "virtual_damping") else 1
-    return {name: [(points[:, ::turn], hole) for points, hole in each] for name, each in found.items()}
+def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str, *, outside: bool) -> None:
+    """Draw an output into panels, whose colors and axes mean the same, and explain it."""
+    norm, image = _norm(panels, name), None
+    for ax, panel in zip(axes, panels, strict=True):
+        ax.set_facecolor(MISSING)
+        grid.scale_axis(ax, "x", panel.x)
+        grid.scale_axis(ax, "y", panel.y)
+        if OUTPUTS[name].look == "truth":
+            image = _draw_regions(ax, panel, name)
+        else:
+            shown = panel.variables[name]
+            image = grid.draw_cells(ax, panel.x, panel.y, shown, cmap=_colors(OUTPUTS[name]), norm=norm)
+            _draw_contours(ax, panel, name, norm)
+            _draw_corners(ax, panel)
+        if panel.peak:
+            ax.plot(*panel.peak, linestyle="", zorder=5, clip_on=False, label="stiffest stable wall", **_PEAK)
+    _explain(axes, panels, name, image, label, outside=outside)
 
 
-def _draw_panel(
-    ax: Axes, part: xarray.Dataset, name: str, norm: Any, outlines: Mapping[str, stable_set.Outlines]
-) -> Any:
-    x, y = (part[dim].values for dim in reversed(part[name].dims))
-    output = OUTPUTS[name]
-    ax.set_facecolor(MISSING)
-    for which, values in (("x", x), ("y", y)):
-        grid.scale_axis(ax, which, values)
-    if output.look == "truth":
-        image = _draw_regions(ax, part, name, outlines)
-    else:
-        shown = np.ma.masked_invalid(part[name].values)
-        image = _draw_cells(ax, part, shown, cmap=_colors(output), norm=norm)
-        _draw_contours(ax, part, name, shown, norm, outlines)
-        _draw_corners(ax, x, y, part)
-    peak = _find_peak(part)
-    if peak is not None:
-        ax.plot(*peak, linestyle="", zorder=5, clip_on=False, label="stiffest stable wall", **_PEAK)
-    return image
-
-
-def _draw_cells(ax: Axes, part: xarray.Dataset, values: Any, **look: Any) -> Any:
-    y, x = (part[dim].values for dim in next(iter(part.data_vars.values())).dims)
-    return grid.draw_cells(ax, x, y, values, **look)
-
-
-def _find_peak(part: xarray.Dataset) -> list[float] | None:
-    peaks = {str(name)[: -len("_peak")]: float(value) for name, value in part.items() if str(name).endswith("_peak")}
-    inside = (part[dim].min() <= value <= part[dim].max() for dim, value in peaks.items())
-    return list(peaks.values()) if peaks and all(inside) else None
-
-
-def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, outlines: Mapping[str, stable_set.Outlines]) -> Any:
+def _draw_regions(ax: Axes, panel: Panel, name: str) -> Any:
     """Stable and passive walls as areas, each with its boundary."""
     image = None
-    x, y = (part[dim].values for dim in reversed(part[name].dims))
+    x, y, variables = panel.x, panel.y, panel.variables
     for each, dash in (("stable", style.SOLID), ("passive", style.DASH_DOTTED)):
-        if each not in part or (each != name and name != "stable"):
+        if each not in variables or (each != name and name != "stable"):
             continue
-        shown = np.ma.masked_invalid(part[each].values)
-        edge = next((edge for edge in _SMOOTH[each] if edge in part), each)
-        smooth, level = np.ma.masked_invalid(part[edge].values), boundary_level(edge)
+        shown = variables[each]
+        edge = next((edge for edge in _SMOOTH[each] if edge in variables), each)
+        smooth, level = variables[edge], boundary_level(edge)
         # Where a part is missing, its cells are all that says where.
         whole = min(smooth.shape) > 1 and shown.count() == smooth.count() == shown.size
         outside = "white" if image is None else (0, 0, 0, 0)
         shades = ListedColormap([outside, outside if whole else SHADES[each]])
-        image = _draw_cells(ax, part, shown, cmap=shades, vmin=0, vmax=1)
-        known = outlines.get(each) if whole else None
-        if not stable_set.draw_exact(ax, known, x, y, shown.data > 0.5, SHADES[each], linestyle=dash, **_EDGE):
+        image = grid.draw_cells(ax, x, y, shown, cmap=shades, vmin=0, vmax=1)
+        known = panel.outlines.get(each) if whole else None
+        look = {**_EDGE, "linestyle": dash}
+        if not stable_set.draw_exact(ax, known, x, y, shown.data > 0.5, SHADES[each], **look):
             if whole and smooth.min() < level < smooth.max():
                 ends = [-np.inf, level] if OUTPUTS[edge].below else [level, np.inf]
                 ax.contourf(x, y, smooth, levels=ends, colors=[SHADES[each]])
             elif whole and np.all(shown):
                 ax.set_facecolor(SHADES[each])
                 image.set_cmap(ListedColormap([SHADES[each], SHADES[each]]))
-            _draw_line(ax, x, y, smooth, level, dash)
+            _draw_line(ax, panel, edge, look)
     return image
 
 
-def _draw_line(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, level: float, dash: Any = style.SOLID) -> Any:
+def _draw_line(ax: Axes, panel: Panel, name: str, look: Mapping[str, Any]) -> Any:
     """The boundary: the contour on which something changes, where the panel has one."""
+    values, level = panel.variables[name], boundary_level(name)
     if min(values.shape) < 2 or not values.count() or not values.min() < level < values.max():
         return None
-    return ax.contour(x, y, values, levels=[level], colors=style.BLACK, linewidths=1.3, linestyles=[dash])
+    plain: Any = {f"{key}s": [look[key]] for key in ("color", "linestyle", "linewidth")}
+    return ax.contour(panel.x, panel.y, values, levels=[level], **plain)
 
 
-def _draw_contours(
-    ax: Axes, part: xarray.Dataset, name: str, values: Any, norm: Any, outlines: Mapping[str, stable_set.Outlines]
-) -> None:
+def _draw_contours(ax: Axes, panel: Panel, name: str, norm: Any) -> None:
     """Labelled contours where a number is good, and the bold one at which it ceases to be."""
-    x, y = (part[dim].values for dim in reversed(part[name].dims))
-    output = OUTPUTS[name]
-    if min(values.shape) < 2 or not values.count():
-        return
-    others = _draw_edge(ax, x, y, values, name, outlines)
-    peak = _find_peak(part)
-    others += [np.array([peak])] if peak else []
-    draw_contours(ax, x, y, values, output, norm, others)
+    values = panel.variables[name]
+    if min(values.shape) > 1 and values.count():
+        others = draw_edge(ax, panel, name, **_EDGE)
+        others += [np.array([panel.peak])] if panel.peak else []
+        draw_contours(ax, panel.x, panel.y, values, OUTPUTS[name], norm, others)
 
 
 def draw_contours(
@@ -229,20 +227,19 @@ def draw_contours(
         label_contours(ax, drawn, colors, shades, others)
 
 
-def _draw_edge(
-    ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, name: str, outlines: Mapping[str, stable_set.Outlines]
-) -> list[np.ndarray]:
-    """The edge of what is stable or passive, exactly where it is known; returns its lines."""
-    output = OUTPUTS[name]
-    if output.look != "diverging" and name not in _FINITE_IF_STABLE:
+def draw_edge(ax: Axes, panel: Panel, name: str, **look: Any) -> list[np.ndarray]:
+    """The edge of what is stable or passive, exactly where it is known, or as a contour; returns its lines."""
+    output, values, level = OUTPUTS[name], panel.variables[name], boundary_level(name)
+    crossed = output.look in ("diverging", "truth")
+    if not crossed and name not in _FINITE_IF_STABLE:
         return []
-    known = outlines.get("passive" if name == "passivity_margin" else "stable")
-    good = values < output.center if output.below else values > output.center
-    good = good if output.look == "diverging" else ~np.ma.getmaskarray(values)
-    exact = stable_set.draw_exact(ax, known, x, y, np.ma.filled(good, False), linestyle=style.SOLID, **_EDGE)
+    known = panel.outlines.get("passive" if name == "passivity_margin" else "stable")
+    good = np.ma.filled(values < level if output.below else values > level, False)
+    good = good if crossed else ~np.ma.getmaskarray(values)
+    exact = stable_set.draw_exact(ax, known, panel.x, panel.y, good, **look)
     if exact:
         return [points for points, _ in exact]
-    drawn = _draw_line(ax, x, y, values, output.center) if output.look == "diverging" else None
+    drawn = _draw_line(ax, panel, name, look) if crossed else None
     return drawn.get_paths()[0].to_polygons(closed_only=False) if drawn else []
 
 
@@ -263,12 +260,11 @@ def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
     return levels[(levels > low) & (levels < high)]
 
 
-def _draw_corners(ax: Axes, x: np.ndarray, y: np.ndarray, part: xarray.Dataset) -> None:
-    if "kind" not in part or min(x.size, y.size) < 2 or not (part["kind"] == 1).any():
-        return
-    corner = (part["kind"].values == 1).astype(float)
-    with matplotlib.rc_context({"hatch.linewidth": 0.5, "hatch.color": "#606060"}):
-        ax.contourf(x, y, corner, levels=[0.5, 1.5], colors="none", hatches=["////"])
+def _draw_corners(ax: Axes, panel: Panel) -> None:
+    corner = np.ma.filled(panel.variables.get("kind", np.zeros(1)) == 1, False)
+    if min(panel.x.size, panel.y.size) > 1 and corner.any():
+        with matplotlib.rc_context({"hatch.linewidth": 0.5, "hatch.color": "#606060"}):
+            ax.contourf(panel.x, panel.y, corner.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
 
 
 def _colors(output: Output) -> Any:
@@ -277,9 +273,9 @@ def _colors(output: Output) -> Any:
     return matplotlib.colormaps["viridis_r" if output.look == "steep" else "viridis"]
 
 
-def _norm(parts: list[xarray.Dataset], name: str) -> Any:
+def _norm(panels: Sequence[Panel], name: str) -> Any:
     output = OUTPUTS[name]
-    low, high = _range(parts, name) or (0.0, 1.0)
+    low, high = _range(panels, name) or (0.0, 1.0)
     if output.look == "diverging":
         # As far on the bad side as on the good one, where there is one: beyond, a color would tell no more.
         sides = [output.center - low, high - output.center]
@@ -293,24 +289,23 @@ def _norm(parts: list[xarray.Dataset], name: str) -> Any:
     return Normalize(low, high if high > low else low + 1.0)
 
 
-def _range(parts: list[xarray.Dataset], name: str) -> tuple[float, float] | None:
-    finite = np.concatenate([part[name].values[np.isfinite(part[name].values)] for part in parts])
+def _range(panels: Sequence[Panel], name: str) -> tuple[float, float] | None:
+    finite = np.concatenate([panel.variables[name].compressed() for panel in panels])
     return (float(finite.min()), float(finite.max())) if finite.size else None
 
 
-def _explain(axes: np.ndarray, parts: list[xarray.Dataset], name: str, image: Any, *, outside: bool) -> None:
+def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, label: str, *, outside: bool) -> None:
     handles: list[Any] = []
     output = OUTPUTS[name]
     if output.look == "truth":
         for each, dash in (("stable", "-"), ("passive", "-.")):
-            if each == name or each in parts[0]:
+            if each == name or each in panels[0].variables:
                 edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.8, "linestyle": dash}
                 handles.append(Patch(facecolor=SHADES[each], label=each, **edge))
     else:
-        low, high = _range(parts, name) or (image.norm.vmin, image.norm.vmax)
+        low, high = _range(panels, name) or (image.norm.vmin, image.norm.vmax)
         beyond = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
         extend = beyond[low < image.norm.vmin, high > image.norm.vmax]
-        label = grid.output_label(parts[0], name)
         bar = axes[0].figure.colorbar(image, ax=list(axes), label=label, extend=extend)
         bar.ax.tick_params(labelsize=8)
     exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
@@ -319,11 +314,11 @@ def _explain(axes: np.ndarray, parts: list[xarray.Dataset], name: str, image: An
         handles.append(style.line(f"edge of what is {what}", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):
         handles.append(Patch(facecolor=MISSING, label="unstable"))
-    elif any(part[name].isnull().any() for part in parts):
-        handles.append(Patch(facecolor=MISSING, label="not computed"))
-    if any("kind" in part and (part["kind"] == 1).mean() > _SEEN for part in parts):
+    elif any(np.ma.is_masked(panel.variables[name]) for panel in panels):
+        handles.append(Patch(facecolor=MISSING, label="no answer"))
+    if any(np.mean(panel.variables["kind"] == 1) > _SEEN for panel in panels if "kind" in panel.variables):
         handles.append(Patch(facecolor="white", hatch="////", edgecolor="#606060", linewidth=0, label="corner optimum"))
-    if any(_find_peak(part) is not None for part in parts):
+    if any(panel.peak for panel in panels):
         handles.append(Line2D([], [], linestyle="", label="stiffest stable wall", **_PEAK))
     style.legend(axes, handles, outside=outside, ncols=len(handles))
 
@@ -358,13 +353,12 @@ def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | Non
         draw_contours(ax, columns, rows, values, OUTPUTS["stiffness_max"], norm, [np.array([[x[weakest], y[weakest]]])])
     else:
         image = ax.scatter(x, y, c=factor * stiffness, s=9.0, norm=norm, label="poses")
-    mark = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
-    ax.plot(x[weakest], y[weakest], linestyle="", label="weakest pose", clip_on=False, zorder=5, **mark)
+    ax.plot(x[weakest], y[weakest], linestyle="", label="weakest pose", clip_on=False, zorder=5, **_PEAK)
     ax.set(**{f"{which}label": _spell(name) for which, name in (("x", across), ("y", up))})
     label = rf"maximum stable stiffness  $K_{{\max}}$  in {unit}"
     bar = style.figure_of(panels).colorbar(image, ax=ax, label=label)
     style.use_logarithmic(bar.ax, "y", factor * stiffness)
-    style.legend(panels, [style.line("weakest pose", "", **mark)], outside=axes is None)
+    style.legend(panels, [style.line("weakest pose", "", **_PEAK)], outside=axes is None)
     return panels
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # Points (x, y) of each closed line, and whether it surrounds a hole.
 Outlines: TypeAlias = Sequence[tuple[np.ndarray, bool]]
+# Light, so that labels and curves drawn over them stay legible; in gray, passive is the darker one.
+SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
 # So many points a step of an outline bend it as a logarithmic axis does.
 _BEND = 32
 # How walls that matter are marked, in a legend as well.
@@ -31,13 +33,6 @@ MARKS: dict[str, dict[str, Any]] = {
 # Of words beside them, in points; and what of a panel lies beside its axes, in inches.
 _LETTER, _AROUND = 4.4, 0.8
 _DASHES = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED, "passive": style.DASH_DOTTED}
-
-
-def draw_region(ax: Axes, outlines: Outlines, face: Any, *, under: float = 1.0, **look: Any) -> None:
-    """Shade what lies within outlines, and draw these closed."""
-    shade_region(ax, outlines, face, zorder=under)
-    for points, _ in outlines:
-        ax.plot(*_close(points).T, **look)
 
 
 def shade_region(ax: Axes, outlines: Outlines, face: Any, *, alpha: float | None = None, zorder: float = 1.0) -> None:
@@ -132,7 +127,9 @@ def draw_exact(
     if outlines is None or not agrees(outlines, x, y, good):
         return []
     fitted = fit_axes(outlines, ax)
-    draw_region(ax, fitted, face, label="exact edge", **look)
+    shade_region(ax, fitted, face, zorder=1.5)
+    for points, _ in fitted:
+        ax.plot(*_close(points).T, label="exact edge", **look)
     return fitted
 
 

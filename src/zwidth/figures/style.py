@@ -141,14 +141,14 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
         ax.set(xlabel=x, ylabel=y)
 
 
-def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: str = "upper", **keywords: Any) -> None:
-    """Explain what is drawn, above the panels (or below) in as many columns as fit, or within the first."""
+def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, **keywords: Any) -> None:
+    """Explain what is drawn, above the panels in as many columns as fit, or within the first."""
     if not outside or not handles:
         if handles:
             axes[0].legend(handles=handles)
         return
     figure, columns = figure_of(axes), keywords.pop("ncols", 1)
-    keywords |= {"handles": handles, "loc": f"outside {place} center"}
+    keywords |= {"handles": handles, "loc": "outside upper center"}
     drawn = figure.legend(ncols=columns, **keywords)
     while (share := drawn.get_window_extent().width / figure.bbox.width) > 1.0 and columns > 1:
         columns -= 1

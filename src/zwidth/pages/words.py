@@ -285,16 +285,12 @@ def list_slopes(scene: Scene) -> list[Slope]:
         # A delay is counted in periods, a damping one by one.
         size = scene.timing.period if path == "delay" else values[path]
         by_one = not size or (unit == "N s/m" and not is_rotary())
-        step = one_percent(float(size)) if not by_one else 1e-3 if is_rotary() else 1.0
+        # A power of ten near one percent, as people can picture it.
+        step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if is_rotary() else 1.0
         words = f"{with_unit(step, unit, 1)} more {describe_effect(value * step)}"
         words += " (same delay in seconds)" if path == "period" else ""
         found.append(Slope(path, value, f"N/m per {unit}", words))
     return found
-
-
-def one_percent(value: float) -> float:
-    """A power of ten near one percent of ``value``, as a step people can picture."""
-    return 10.0 ** (math.floor(math.log10(value) + 0.5) - 2)
 
 
 def describe_effect(change: float) -> str:

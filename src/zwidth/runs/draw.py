@@ -18,8 +18,8 @@ from zwidth.figures.style import Size, save, style_sheet
 from zwidth.parts.checks import check_number
 from zwidth.studies.ridge import find_edges
 from zwidth.sweep.dataset import open_dataset
-from zwidth.sweep.store import SUFFIX, Store, find_stores
-from zwidth.words.errors import InputError, StoreError
+from zwidth.sweep.store import SUFFIX, Store, list_stores
+from zwidth.words.errors import InputError
 from zwidth.words.formatting import short
 from zwidth.words.quantities import ANY, OUTPUTS, VARIABLES
 
@@ -119,9 +119,7 @@ def draw_stores(
             sweep has by more than half a step; the style sheet cannot be read.
     """
     folder = Path(os.fsdecode(path))
-    stores = find_stores(folder)
-    if not stores:
-        raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
+    stores = list_stores(folder)
     beside = folder.parent if stores == [folder] else folder
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))
     # As stores spell them.

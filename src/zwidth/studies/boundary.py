@@ -11,11 +11,10 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import members, repeated
+from zwidth.config.fields import LocatedProblem, members, problem, repeated
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene
-from zwidth.config.study import DelayModels, HeldOnly, name_parts, register
+from zwidth.config.study import DelayModels, HeldStudy, name_parts, register
 from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.figures.stable_set import Outlines, tabulate_sets
 from zwidth.figures.table import stack
@@ -43,8 +42,6 @@ Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 # Samples of a boundary over frequency; only an estimate of a result's size rests on it.
 _POINTS_PER_CURVE = 1000
 _RIDGE_POINTS = 101
-# An outline has some hundreds of points, of which an estimate of the size may rest on.
-_POINTS_PER_OUTLINE = 1000
 
 
 @register
@@ -76,7 +73,7 @@ class BoundaryStudy(CurvesStudy):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         if "device" in raw or (scene.parts_beyond and not {"delta", "d"} & set(raw)):
-            return {"delay_models": [scene.delay_model], "device": scene.bare, **raw}
+            return {"delay_models": [scene.delay_model], "device": scene.bare(), **raw}
         return super().fill(raw, scene)
 
     @classmethod
@@ -186,7 +183,6 @@ class CompareStudy(ComputedStudy):
     method = "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge."
     from_scene = ()
     takes_parts = True
-    point_bytes = 64
 
     kind: Literal["compare"]
 
@@ -208,10 +204,6 @@ class CompareStudy(ComputedStudy):
     @property
     def sizes(self) -> dict[str, int]:
         return {"devices": len(self.devices)}
-
-    @property
-    def points(self) -> int:
-        return super().points * _POINTS_PER_OUTLINE
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         scenes = {device.label: device.to_scene() for device in self.devices}
@@ -250,7 +242,7 @@ _FUNCTIONS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive"
 
 
 @register
-class MapStudy(ComputedStudy):
+class MapStudy(ComputedStudy, HeldStudy):
     """Stability and passivity on a grid of alpha, beta, delta and d."""
 
     method = "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors."
@@ -273,13 +265,6 @@ class MapStudy(ComputedStudy):
 
     outputs: Annotated[tuple[MapOutput, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed at every point."""
-
-    delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        return {name: getattr(self, name).size for name in ("alpha", "beta", "delta", "d")}
 
     @property
     def nbytes(self) -> int:
@@ -306,7 +291,8 @@ class MapStudy(ComputedStudy):
         names = outputs if min(alpha.size, beta.size) > 1 else ()
 
         def find_edge(name: str, delta: float, d: float) -> Outlines | None:
-            return find_edges(delta * (share if name == "passive" else 1.0), d).get(name)
+            passive = name == "passive"
+            return find_edges(delta * (share if passive else 1.0), d).get("passive" if passive else "stable")
 
         draw = partial(figures.draw_map, arrays)
         drawn = {f"_{name}": partial(draw, name, edges=partial(find_edge, name)) for name in names}

@@ -26,8 +26,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 import zwidth.config.sweep  # noqa: F401  (registers its kind)
 from zwidth.config.device_table import find_file
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Name, Strict, find_kind, members
+from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, members, problem
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register

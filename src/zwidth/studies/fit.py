@@ -14,8 +14,7 @@ from pydantic_core import CoreSchema
 
 from zwidth import figures
 from zwidth.config.device_table import find_file
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Strict, members
+from zwidth.config.fields import LocatedProblem, Strict, members, problem
 from zwidth.config.parts import VelocityField, locate_refusal, split_refusal
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
@@ -267,7 +266,7 @@ class FitStudy(ComputedStudy):
         )
 
     def _fit(self) -> list[_Fitted]:
-        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.to_part(), []
+        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.known, []
         period = self.period
         if self.log:
             options = {"max_delay": self.max_delay, "resample": self.resample}

@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import WrapValidator, create_model
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Strict, members, repeated
+from zwidth.config.fields import LocatedProblem, Strict, members, problem, repeated
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Axis, AxisOf, Quantity, axis_of

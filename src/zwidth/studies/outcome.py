@@ -14,8 +14,7 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import members
+from zwidth.config.fields import LocatedProblem, members, problem
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene, WallField
 from zwidth.config.study import Study
 from zwidth.config.values import Axis, DelayAxis, DeltaAxis
@@ -105,8 +104,7 @@ class CurvesStudy(ComputedStudy):
 
     @property
     def sizes(self) -> dict[str, int]:
-        models = getattr(self, "delay_models", ("held",))
-        return {"delta": self.delta.size, "d": self.d.size, "delay models": len(models)}
+        return super().sizes | {"delay models": len(getattr(self, "delay_models", ("held",)))}
 
 
 class WallsStudy(ComputedStudy):

@@ -207,10 +207,6 @@ class PublishedStudy(ComputedStudy):
 
     kind: Literal["published"]
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        return {"numbers of the paper": 22}
-
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         printed, sharpened = published_numbers(), sharpened_numbers()
         texts = {"md": as_markdown(printed, sharpened), "json": as_json(printed, sharpened)}

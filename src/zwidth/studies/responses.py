@@ -10,11 +10,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import WrapValidator
-from pydantic_core import PydanticCustomError
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import members
+from zwidth.config.fields import LocatedProblem, members, problem
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import (
     AnyDevice,
@@ -26,7 +24,7 @@ from zwidth.config.scenes import (
     PhysicalWall,
     normalized_wall,
 )
-from zwidth.config.study import HeldOnly, refuse_parts, register
+from zwidth.config.study import HeldStudy, refuse_parts, register
 from zwidth.config.values import Duration, Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.style import WIDTH, house_style, new_figure
@@ -41,7 +39,7 @@ from zwidth.words.formatting import name_wall, plain, round_safely, tell_apart, 
 from zwidth.words.quantities import LONGEST_SETTLING, Range
 
 
-class ResponseStudy(ComputedStudy):
+class ResponseStudy(ComputedStudy, HeldStudy):
     """What the studies that compute responses share."""
 
     remedy_if_too_large = "shorten the duration, or lower substeps"
@@ -54,17 +52,9 @@ class ResponseStudy(ComputedStudy):
     substeps: Annotated[int, Quantity(allowed=Range(1, 10_000), whole=True)] = 10
     """Points computed per period."""
 
-    delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
-
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         """Each device with its wall; the wall is None where stiffness_fraction decides it."""
         raise NotImplementedError
-
-    def periods(self, device: AnyDevice) -> float:
-        """Length of the response of a device in sampling periods."""
-        # By plain division: seconds may be many more periods than the rounding of a delay is made for.
-        return self.duration.value / (device.period if self.duration.unit == "s" else 1.0)
 
     def respond(
         self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
@@ -74,7 +64,7 @@ class ResponseStudy(ComputedStudy):
         Returns:
             Its columns, those in SI units with their unit; and what to say of one that has not settled at the end.
         """
-        periods = max(1, round(self.periods(device)))
+        periods = max(1, round(self.duration.periods(device.period)))
         raw = step_response(alpha, beta, device.delta, device.d, periods=periods, substeps=self.substeps)
         clock, length = (device.period, 1.0 / device.to_scene().units.stiffness) if physical else (1.0, 1.0)
         second, meter, speed, newton = ("_s", "_m", "_m_per_s", "_N") if physical else ("",) * 4
@@ -98,12 +88,8 @@ class ResponseStudy(ComputedStudy):
 
     @property
     def sizes(self) -> dict[str, int]:
-        periods = max((self.periods(device) for device, _ in self.pairs()), default=0.0)
-        return {
-            "responses": len(self.pairs()),
-            "periods": 1 + int(min(periods, 1e15)),
-            "points a period": self.substeps,
-        }
+        periods = [min(self.duration.periods(device.period), 1e15) for device, _ in self.pairs()]
+        return {"responses": len(periods), "periods": 1 + int(max(periods)), "points a period": self.substeps}
 
 
 @register
@@ -134,25 +120,13 @@ class StepStudy(WallsStudy, ResponseStudy):
         if self.duration.unit == "s" and any(isinstance(device, NormalizedDevice) for device in self.devices):
             allowed = "a normalized device has no period to measure seconds in"
             yield ("duration",), problem(f"got {self.duration}", allowed, "write it in periods, as in '100 periods'")
-        yield from self._wall_limits()
-
-    def _wall_limits(self) -> Iterable[LocatedProblem]:
-        """Walls that do not fit their device, each reported once."""
-        several = self.walls is not None and len(self.walls) > 1
-        faulty: dict[int, PydanticCustomError] = {}
-        for index, (device, wall) in enumerate(self.pairs()):
-            if wall is None:
-                continue
-            if isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall):
-                allowed = "a wall in SI units needs a device with mass and period"
-                fault = problem("got a wall in SI units", allowed, "write alpha and beta")
-            elif not all(math.isfinite(value) for value in normalized_wall(device, wall)):
-                allowed = "alpha and beta must be finite"
-                fault = problem("got a wall whose normalized values are beyond float64", allowed, "check the units")
-            else:
-                continue
-            faulty[index if several else 0] = fault
-        yield from ((("walls", index), fault) for index, fault in faulty.items())
+        pairs = [
+            isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall) for device, wall in self.pairs()
+        ]
+        # Each wall once.
+        for index in dict.fromkeys(k % sizes[1] for k, mixed in enumerate(pairs) if mixed):
+            allowed = "a wall in SI units needs a device with mass and period"
+            yield ("walls", index), problem("got a wall in SI units", allowed, "write alpha and beta")
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         walls = self.walls or (None,)

@@ -9,11 +9,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Strict
+from zwidth.config.fields import LocatedProblem, Strict, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
-from zwidth.config.study import HeldOnly, register
+from zwidth.config.study import HeldStudy, register
 from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.checks import Span
@@ -114,7 +113,7 @@ class Circumstances(Strict):
 
     def place(self, scene: Scene) -> Scene:
         """The scene with the velocity estimate of these circumstances."""
-        return scene if self.velocity is None else scene.replace(velocity=self.velocity.to_part())
+        return scene if self.velocity is None else scene.replace(velocity=self.velocity.known)
 
     def options(self, period: float) -> dict[str, Any]:
         names = [name for name in Circumstances.model_fields if name not in ("duration", "velocity", "jitter")]
@@ -123,7 +122,7 @@ class Circumstances(Strict):
         return {**given, "periods": periods, "jitter": self.jitter.seconds(period)}
 
 
-class SimulatedStudy(ComputedStudy):
+class SimulatedStudy(ComputedStudy, HeldStudy):
     """What the studies that simulate share."""
 
     from_scene = ("device", "delay_model")
@@ -132,9 +131,6 @@ class SimulatedStudy(ComputedStudy):
 
     device: SimulatedDevice
     """Device in SI units; the scene's where left out."""
-
-    delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modeled; a motion exists in the model 'held' only."""
 
 
 @register

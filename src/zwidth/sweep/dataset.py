@@ -18,7 +18,7 @@ from zwidth.sweep.store import (
     Store,
     check_installed,
     find_store,
-    find_stores,
+    list_stores,
     name_checksums,
     silence_zarr,
 )
@@ -191,11 +191,7 @@ def verify(
     Raises:
         StoreError: there is no store.
     """
-    folder = Path(os.fsdecode(path))
-    stores = find_stores(folder)
-    if not stores:
-        raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
-    return tuple(_verify_store(store, progress or (lambda done, total: None)) for store in stores)
+    return tuple(_verify_store(store, progress or (lambda done, total: None)) for store in list_stores(path))
 
 
 def _verify_store(path: Path, progress: Callable[[int, int], None]) -> Verification:

@@ -228,8 +228,8 @@ def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> Non
     changed = list(differences(old, new))
     if changed:
         lines = [
-            f"{where}: studies[{name}].{key}: the {what} was made with {_spell_value(before)}, the configuration has "
-            f"{_spell_value(after)}"
+            f"{where}: studies[{name}].{key}: the {what} was made with {describe(before)}, the configuration has "
+            f"{describe(after)}"
             for key, before, after in changed[:_SHOWN_DIFFERENCES]
         ]
         more = len(changed) - _SHOWN_DIFFERENCES
@@ -246,10 +246,6 @@ def refuse_versions(where: Path, old: dict[str, str]) -> None:
             f"{where}: made with {key} {old.get(key)}, now there is {now[key]}; install the same release, or choose "
             "another folder with --out DIR"
         )
-
-
-def _spell_value(value: Any) -> str:
-    return "nothing" if value is None else describe(value)
 
 
 def repair(store: Store, tasks: Iterable[Task]) -> list[str]:

@@ -98,11 +98,8 @@ class Grid:
             labels = table.labels or tuple(str(row) for row in range(1, table.size + 1))
             found["device"] = (("device",), np.array(labels), {"long_name": f"{LABEL} of the device"})
         for name, values in self._values.items():
-            units = (
-                "sampling periods"
-                if name == "delay" and self.axes.delay_in_periods
-                else own_unit(PARAMETERS[name].unit)
-            )
+            in_periods = name == "delay" and self.axes.delay_in_periods
+            units = "sampling periods" if in_periods else own_unit(PARAMETERS[name].unit)
             attributes = {"long_name": PARAMETERS[name].long_name, "units": units}
             variable, dim = PARAMETERS[name].variable, self._dim_of(name)
             dims = () if dim is None else (dim.replace(".", "_"),)

@@ -308,12 +308,18 @@ def find_stores(path: Path) -> list[Path]:
     return sorted(found for found in path.glob(f"*{SUFFIX}") if not found.name.startswith("."))
 
 
-def find_store(path: str | os.PathLike[str]) -> Store:
+def list_stores(path: str | os.PathLike[str]) -> list[Path]:
+    """The same, one at least."""
     folder = Path(os.fsdecode(path))
     found = find_stores(folder)
-    if len(found) != 1:
-        names = ", ".join(store.name for store in found)
-        raise StoreError(
-            f"{folder}: holds several stores; name one of {names}" if found else f"{folder}: holds no store of a sweep"
-        )
-    return Store(found[0])
+    if not found:
+        raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
+    return found
+
+
+def find_store(path: str | os.PathLike[str]) -> Store:
+    first, *others = list_stores(path)
+    if others:
+        names = ", ".join(store.name for store in (first, *others))
+        raise StoreError(f"{os.fsdecode(path)}: holds several stores; name one of {names}")
+    return Store(first)

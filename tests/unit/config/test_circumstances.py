@@ -6,7 +6,7 @@ import math
 import pytest
 
 import zwidth
-from zwidth.config.faults import ConfigFileError
+from zwidth.config.fields import ConfigFileError
 from zwidth.studies.document import Config
 from zwidth.studies.simulate import Circumstances
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from zwidth.config.faults import ConfigFileError
+from zwidth.config.fields import ConfigFileError
 from zwidth.config.reader import _Tree, read_mapping
 from zwidth.studies.document import Config, load_config
 
@@ -26,7 +26,7 @@ FILES = {name: text.encode() for name, text in zip(_PARTS[1::2], _PARTS[2::2], s
 # and how its remedy begins.
 FAULTS = {
     "a_list": [("1:1: got a list of 2 items", "write 'key: value' lines, or {key: value}")],
-    "alias_bomb": [("1:23: e[5][5][7][4][5]: too many values", "write long axes as linear or log")],
+    "alias_bomb": [("1:29: e[5][5][7][3][7]: too many values", "write long axes as linear or log")],
     "alias_of_itself": [("4:5: studies[0]: an alias of what it is part of", "write the values out")],
     "alias_undefined": [("3:10: not valid YAML", "define it before with '&', or remove the '*'")],
     "axis_boolean": [("7:16: studies[0].delta[1]: got true", "write a number such as 0.5")],
@@ -50,6 +50,7 @@ FAULTS = {
     "control_character": [("3:15: got the character '\\x07'", "remove it")],
     "damping_beyond_float": [("5:12: scene.damping: got 1e+20, whose normalized value is delta = 1e+40", "check the")],
     "damping_unit": [("5:12: scene.damping: got '10 N/m'", "did you mean 'N s/m'?")],
+    "deep_keys": [(f"1:29: version{'.?' * 19}: the values are nested too deeply", "use fewer levels")],
     "deep_nesting": [(f"1:29: version{'[0]' * 19}: the values are nested too deeply", "use fewer levels")],
     "delay_axis_too_long": [("7:12: studies[0].d[1]: got 20000", "write a number in this range")],
     "delay_model_twice": [("8:26: studies[0].delay_models[1]: got 'held' twice, here and at", "remove it")],

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from sweeping import main_of
 
-from zwidth.config.faults import ConfigFileError, dotted
+from zwidth.config.fields import ConfigFileError, dotted
 from zwidth.config.reader import MAX_DEPTH, MAX_NODES
 from zwidth.studies.document import Config, load_config
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.config.faults import ConfigFileError
+from zwidth.config.fields import ConfigFileError
 from zwidth.studies.document import Config
 
 STUDIES = "studies: [{kind: recommend, name: r}]\n"

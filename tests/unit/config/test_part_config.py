@@ -5,7 +5,7 @@ import json
 import pytest
 
 import zwidth
-from zwidth.config.faults import ConfigFileError
+from zwidth.config.fields import ConfigFileError
 from zwidth.config.study import KINDS
 from zwidth.studies.document import Config
 

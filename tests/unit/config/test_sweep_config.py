@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zwidth.config.faults import ConfigFileError
+from zwidth.config.fields import ConfigFileError
 from zwidth.loops.normalization import normalize
 from zwidth.studies.document import Config, config_json_schema
 from zwidth.sweep.grid import Grid

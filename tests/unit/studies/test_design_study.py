@@ -111,7 +111,7 @@ def test_the_figure_marks_what_is_needed_on_the_curve():
 REFUSED = {
     "find: dampin": "did you mean 'damping'",
     "find: velocity.cutoff": "this device has",
-    "find: velocity.samples": "a parameter of the scene by its path",
+    "find: velocity.samples": "allowed are 'period'",
     "find: delay": "add 'within: [0.1, 100]'",
     "find: damping, within: [2, 1]": "write the lower end first",
     "find: damping, within: [1 kg, 2 kg]": "kg",

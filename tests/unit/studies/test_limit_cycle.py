@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 import zwidth
 from zwidth import figures
-from zwidth.config.faults import problems_of
+from zwidth.config.fields import problems_of
 from zwidth.studies.limit_cycle import LimitCycleStudy
 
 DEVICE = {"mass": 0.1, "damping": 0.1, "period": 1e-3, "delay": "1 periods"}

@@ -6,7 +6,7 @@ from independent_scenes import closed_loop_matrix
 from sweeping import config_of, run_sweeps, study
 
 import zwidth
-from zwidth.config.faults import ConfigFileError
+from zwidth.config.fields import ConfigFileError
 from zwidth.config.sweep import SweepStudy
 from zwidth.runs.draw import draw_stores
 from zwidth.studies.document import Config

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
 from zwidth.config.devices import ResponseSection
-from zwidth.config.reader import read_mapping
+from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.scenes import NormalizedScene
 from zwidth.pages.words import unit_of
 from zwidth.parts.device import Device
@@ -341,11 +341,7 @@ def to_yaml(controls: Controls) -> str:
     if not scene.parts_beyond:
         studies[0] |= {"passivity": True} if scene.operator is None else {}
         studies.append({"kind": "step", "name": "response"})
-    # JSON is YAML of one line, and a quantity needs no quotes.
-    lines = ["version: 1", "name: explored", "scene:"]
-    for name, value in _spell_section(controls).items():
-        lines.append(f"  {name}: {value if isinstance(value, str) else json.dumps(value)}")
-    return "\n".join([*lines, "studies:", *(f"  - {json.dumps(study)}" for study in studies)]) + "\n"
+    return write_yaml({"version": 1, "name": "explored", "scene": _spell_section(controls), "studies": studies})
 
 
 def to_python(controls: Controls) -> str:

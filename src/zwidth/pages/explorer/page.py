@@ -198,11 +198,10 @@ class Page:
         self.plots["plane"].legend.label_text_color = inks["ink"]
 
     def _name_axes(self) -> None:
-        spring, damper, torque = own_unit("N/m"), own_unit("N s/m"), own_unit("N")
+        spring, damper = own_unit("N/m"), own_unit("N s/m")
         hertz, time, walls = "frequency in Hz", "time in s", (f"stiffness K in {spring}", f"damping B in {damper}")
-        place, step, force = "position in mm", "position in mm/N", f"wall force in {torque}"
-        if is_rotary():
-            place, step, force = "position in mrad", f"position in mrad/({torque})", f"wall torque in {torque}"
+        place, step = (f"position in m{own_unit(unit)}" for unit in ("m", "m/N"))
+        force = f"wall {'torque' if is_rotary() else 'force'} in {own_unit('N')}"
         if self.controls.normalized:
             hertz, time, walls = "cycles per period", "time in periods", ("alpha", "beta")
             place, step, force = "position", "position", "wall force"

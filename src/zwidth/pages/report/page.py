@@ -229,13 +229,15 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
         else f"{low:.4g} to {content['high']:.4g} {_unit(thin)}".rstrip()
     )
     thinned = "" if thin.size == values.size else f" Shown are {thin.size:,} of {values.size:,} values."
+    # As JSON that ends no script element.
+    embedded = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
     return (
         f'<div class="slices"><h3>{escape(name)}</h3><p class="soft">{escape(words)}. '
         f"Dark to bright: {ends}; gray: {_GRAY}. Lines, if any: exact edges of the stable walls, dashed of the passive "
         f"ones.{thinned} "
         "Point, or focus the map and use the arrow keys, to read a value.</p>"
         f'{sliders}<canvas tabindex="0" role="img" aria-label="{escape(words)}"></canvas><output aria-live="polite">'
-        f'</output><script type="application/json">{_embed(content)}</script></div>'
+        f'</output><script type="application/json">{embedded}</script></div>'
     )
 
 
@@ -266,8 +268,3 @@ def _unit(values: xarray.DataArray) -> str:
 
 def _words(dim: str) -> str:
     return VARIABLES[dim].words if dim in VARIABLES else dim
-
-
-def _embed(content: dict[str, Any]) -> str:
-    """JSON that ends no script element."""
-    return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
