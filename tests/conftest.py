@@ -59,6 +59,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_finish() -> None:
     """Python looks for garbage less often: tracing makes so many objects that every sixth second went into it."""
     gc.collect()
+    gc.freeze()
     gc.set_threshold(50_000, 20, 20)
 
 
