@@ -71,7 +71,8 @@ def calls_of(root, script, *arguments, cwd=None, path=None):
 def test_every_listed_test_exists(listed):
     lines = listed.read_text(encoding="utf-8").splitlines()
     for line in lines:
-        file, _, test = line.partition("::")
+        # Of a test that has cases one may be listed, and one of a file may be left out.
+        file, _, test = line.removeprefix("--deselect=").partition("[")[0].partition("::")
         assert (ROOT / file).exists(), line
         assert not test or f"def {test}(" in (ROOT / file).read_text(encoding="utf-8"), line
     assert len(lines) == len(set(lines)) > 0

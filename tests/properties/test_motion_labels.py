@@ -68,8 +68,8 @@ def draw_motion(kind: Kind, rng: np.random.Generator) -> tuple[Any, dict[str, An
             return motion.scene, arguments
 
 
-def simulate(drawn: list[tuple[Any, dict[str, Any]]], periods: int) -> list[zwidth.Motion]:
-    """Each motion, the tail as long whatever the periods; those of one contact together."""
+def simulate(drawn: list[tuple[Any, dict[str, Any]]], periods: int, tail: int) -> list[zwidth.Motion]:
+    """Each motion; those of one contact together."""
     told: dict[int, zwidth.Motion] = {}
     for contact in {arguments["contact"] for _, arguments in drawn}:
         those = [k for k, (_, arguments) in enumerate(drawn) if arguments["contact"] == contact]
@@ -78,7 +78,7 @@ def simulate(drawn: list[tuple[Any, dict[str, Any]]], periods: int) -> list[zwid
         }
         found = zwidth.simulate(
             [drawn[k][0] for k in those],
-            **columns, contact=contact, periods=periods, tail=PERIODS // 4, record=False,
+            **columns, contact=contact, periods=periods, tail=tail, record=False,
         )  # fmt: skip
         for place, k in enumerate(those):
             told[k] = found.__class__(
@@ -120,11 +120,12 @@ class Label(NamedTuple):
     later: Any
 
 
-def label_motions(kind: str, count: int, seed: int) -> list[Label]:
-    """The labels of so many motions of a kind."""
+def label_motions(kind: str, count: int, seed: int, periods: int = PERIODS) -> list[Label]:
+    """The labels of so many motions of a kind; the longer ones have a tail as long."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     drawn = [draw_motion(KINDS[kind], rng) for _ in range(count)]
-    pairs = zip(drawn, simulate(drawn, PERIODS), simulate(drawn, LONGER * PERIODS), strict=True)
+    short, long = (simulate(drawn, many * periods, periods // 4) for many in (1, LONGER))
+    pairs = zip(drawn, short, long, strict=True)
     return [
         Label(kind, MotionKind(int(now.outcome)), is_wrong(now, later, arguments), scene, arguments, now, later)
         for (scene, arguments), now, later in pairs
@@ -145,7 +146,9 @@ def tabulate(labels: list[Label]) -> Iterator[str]:
 
 def test_a_longer_motion_belies_no_label():
     labels = [
-        label for kind in ("linear", "contact and encoder", "friction") for label in label_motions(kind, 12, SEED)
+        label
+        for kind in ("linear", "contact and encoder", "friction")
+        for label in label_motions(kind, 12, SEED, PERIODS // 2)
     ]
     assert [label for label in labels if label.wrong] == []
     assert not any(label.label == MotionKind.UNCLEAR for label in labels if label.kind == "linear")

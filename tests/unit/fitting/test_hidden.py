@@ -111,13 +111,13 @@ def test_a_filter_in_the_logger_is_told_from_a_device(top, bottom):
 def test_logs_of_rigid_devices_have_no_parts_and_keep_their_walls():
     scene = zwidth.Scene(zwidth.Device(MASS, DAMPING), zwidth.Timing(period=PERIOD, delay=DELAY))
     true = float(scene.max_stiffness().stiffness)
-    logs = [record(RIGID, seed) for seed in range(20)]
+    logs = [record(RIGID, seed) for seed in range(12)]
     fits = [zwidth.fit_log(PERIOD, position, force) for force, position in logs]
-    assert [(fit.status, fit.doubts, fit.is_structured) for fit in fits] == 20 * [(Status.OK, (), False)]
+    assert [(fit.status, fit.doubts, fit.is_structured) for fit in fits] == 12 * [(Status.OK, (), False)]
     assert all(fit.response is not None for fit in fits)
     held = [fit.intervals["stiffness_max"].low <= true <= fit.intervals["stiffness_max"].high for fit in fits]
-    # Of 20 intervals of 95 % fewer than 16 hold by chance in 3 of 1,000 cases.
-    assert sum(held) >= 16
+    # Of 12 intervals of 95 % fewer than 9 hold by chance in 2 of 1,000 cases.
+    assert sum(held) >= 9
     # What may hide costs a fifth of the stiffest wall, and a rigid device nothing.
     shares = [[fit.safe_wall(rigid=rigid).stiffness / true for rigid in (False, True)] for fit in fits[:3]]
     assert np.all((np.array(shares) > 0.7) & (np.array(shares) < [0.9, 1.0]))
@@ -152,7 +152,7 @@ def test_a_hidden_resonance_lies_within_the_radius_of_the_response():
     assert 0.2 < shares.max() < 1.0
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(5))
 def test_no_safe_wall_is_unstable_on_a_device_with_resonances(seed):
     rng = np.random.default_rng([5, seed])
     true = TrueDevice.draw(rng)

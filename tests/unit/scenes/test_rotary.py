@@ -75,8 +75,10 @@ def test_a_rotary_scene_has_the_numbers_of_the_linear_one(seed):
     walls = [scene.replace(stiffness=K[0], virtual_damping=B[0]) for scene in (linear, rotary)]
     first, second = (dataclasses.asdict(zwidth.assess(scene)) for scene in walls)
     np.testing.assert_equal(first, second)
-    one, other = (scene.simulate(K[0], B[0], start_position=1e-3, periods=200).amplitude for scene in walls)
-    np.testing.assert_array_equal(one, other)
+    # One of each: a program is compiled.
+    if seed <= 3:
+        one, other = (scene.simulate(K[0], B[0], start_position=1e-3, periods=200).amplitude for scene in walls)
+        np.testing.assert_array_equal(one, other)
 
 
 def test_results_are_shown_in_the_units_of_their_device():

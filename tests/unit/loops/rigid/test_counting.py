@@ -102,10 +102,10 @@ def haptic_loop(rng, lag):
 @pytest.mark.parametrize("conjugate", [True, False])
 def test_random_loops(conjugate):
     rng = np.random.default_rng(81)
-    compared, distances = compare(random_loop(rng, conjugate) for _ in range(1000))
+    compared, distances = compare(random_loop(rng, conjugate) for _ in range(600))
     # Undecided are poles exactly on the circle (both products vanish at 1 or -1), and few others that nearly are.
-    assert compared > 900
-    assert len(distances) < 60
+    assert compared > 540
+    assert len(distances) < 36
     assert (distances < 1e-7).all()
 
 

@@ -8,7 +8,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import tolerances as tol
-from compiling import QUICKLY
+from compiling import QUICKLY, compile_bends
 from scipy.optimize import linprog
 
 import zwidth
@@ -37,21 +37,27 @@ def test_no_delay_is_eq_21():
 
 
 def needed_by_scan(alpha, beta, d, frequencies=100_000):
-    """The damping that the printed conditions ask for, at evenly spaced frequencies, in extended precision."""
+    """The damping that the printed conditions ask for, at evenly spaced frequencies, in extended precision.
+
+    That is slow, and asked of the hundredth where float64 finds most.
+    """
     w = np.linspace(0, math.pi, frequencies + 1, dtype=np.longdouble)[1:]
+    most = np.argsort(needed_at(w.astype(float), alpha, beta, d))[-(frequencies // 100) :]
+    return max(float(needed_at(w[most], alpha, beta, d).max()), 0.0)
+
+
+def needed_at(w, alpha, beta, d):
     n = math.floor(d)
-    f = np.longdouble(d) - n
+    f = w.dtype.type(d) - n
     z = np.exp(1j * w)
     wall = alpha + beta * (1 - 1 / z)
     twice = 4 * np.sin(w / 2) ** 2  # 2 (1 - cos w)
     if f == 0:
-        needed = np.real((1 - 1 / z) * wall * z**-n) / twice
-    else:
-        # 2 (1 - cos w) delta^2 + 2 delta Re{((1 - f) + f z) g} - f (1 - f) |g|^2 > 0
-        g = np.conj(wall) * (z - 1) * z**n / 2
-        half_b = np.real(((1 - f) + f * z) * g)
-        needed = (np.sqrt(half_b**2 + twice * f * (1 - f) * np.abs(g) ** 2) - half_b) / twice
-    return max(float(needed.max()), 0.0)
+        return np.real((1 - 1 / z) * wall * z**-n) / twice
+    # 2 (1 - cos w) delta^2 + 2 delta Re{((1 - f) + f z) g} - f (1 - f) |g|^2 > 0
+    g = np.conj(wall) * (z - 1) * z**n / 2
+    half_b = np.real(((1 - f) + f * z) * g)
+    return (np.sqrt(half_b**2 + twice * f * (1 - f) * np.abs(g) ** 2) - half_b) / twice
 
 
 @pytest.mark.parametrize("d", DELAYS)
@@ -113,9 +119,16 @@ def slope_by_linear_program(d, frequencies=20_000):
     dirichlet = np.sin((d + 0.5) * w) / np.sin(w / 2)
     constraints = np.column_stack([dirichlet / 2, -np.cos((d + 1) * w)])
     limit = np.array([d + 0.5, -1.0])  # w -> 0
-    solved = linprog([-1, 0], A_ub=np.vstack([constraints, limit]), b_ub=np.ones(frequencies + 1), bounds=(None, None))
-    assert solved.success
-    return solved.x
+    # Of some, and of what is broken most beside them until that is one of them: the optimum of all.
+    some = set(range(0, frequencies, frequencies // 100))
+    while True:
+        rows = np.vstack([constraints[sorted(some)], limit])
+        solved = linprog([-1, 0], A_ub=rows, b_ub=np.ones(len(rows)), bounds=(None, None))
+        assert solved.success
+        most = int(np.argmax(constraints @ solved.x))
+        if most in some:
+            return solved.x
+        some.add(most)
 
 
 @pytest.mark.parametrize(
@@ -187,14 +200,14 @@ def test_second_derivatives(x64):
 
     d = np.array([0.001, 1.001, 2.3, 0.1, 0.5, 300.2])
     walls = np.stack([0.3 / (d + 0.5), 0.4 + 0 * d, 1.0 + 0 * d, d], axis=-1)
-    hessian = np.asarray(jax.jit(jax.vmap(jax.hessian(margin)), compiler_options=QUICKLY)(walls))
-    gradient = jax.jit(jax.vmap(jax.grad(margin)), compiler_options=QUICKLY)
+    differentiate = compile_bends(jax.grad(margin))
+    _, hessian = differentiate(walls)
     for k in range(4):
         step = np.zeros_like(walls)
         step[:, k] = 1e-5 / (d + 0.5) if k == 0 else 1e-5
-        expected = (np.asarray(gradient(walls + step)) - np.asarray(gradient(walls - step))) / (2 * step[:, k, None])
+        expected = (differentiate(walls + step)[0] - differentiate(walls - step)[0]) / (2 * step[:, k, None])
         largest = np.abs(hessian).max(axis=(1, 2))[:, None]
-        assert (np.abs(hessian[:, k] - expected) <= 1e-5 * largest).all()
+        assert (np.abs(hessian[..., k] - expected) <= 1e-5 * largest).all()
 
 
 def test_the_derivative_where_stiffness_and_damping_balance():
@@ -269,10 +282,11 @@ def directions_to_judge(random, d):
 def test_all_angles_against_mpmath(d):
     ratio = directions_to_judge(np.random.default_rng(7), d)
     alpha, beta = 1 / (1 + np.abs(ratio)), ratio / (1 + np.abs(ratio))
+    needed = [needed_in_mpmath(a, b, d) for a, b in zip(alpha, beta, strict=True)]
     for method, allowed in ((zwidth.passivity_margin, EXACT), (margin_at_one_delay, ON_A_MAP)):
         margin = method(alpha, beta, np.zeros_like(alpha), d=d)
-        for a, b, got in zip(alpha, beta, margin, strict=True):
-            assert abs(float(-got / needed_in_mpmath(a, b, d) - 1)) <= allowed, (a, b)
+        for a, b, got, exact in zip(alpha, beta, margin, needed, strict=True):
+            assert abs(float(-got / exact - 1)) <= allowed, (a, b)
 
 
 @pytest.mark.parametrize("d", [10_000.0, 10_000.3])

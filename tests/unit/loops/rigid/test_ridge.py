@@ -11,7 +11,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import tolerances as tol
-from compiling import QUICKLY
+from compiling import QUICKLY, compile_bends
 
 import zwidth
 from zwidth.loops.rigid.poles import radius_by_companion
@@ -38,27 +38,23 @@ def reference(model):
 
 @cache
 def compiled_derivatives(model):
-    def three(point):
-        return jnp.stack(ridge_kernel(point[0], point[1], model)[:3])
+    def slopes(point):
+        def three(point):
+            values = jnp.stack(ridge_kernel(point[0], point[1], model)[:3])
+            return values[0], values
 
-    def alpha(point):
-        return ridge_kernel(point[0], point[1], model).alpha
+        gradient, values = jax.grad(three, has_aux=True)(point)
+        return jnp.concatenate([gradient, values])
 
-    def everything(point):
-        # One reverse sweep, and its change in both directions.
-        gradient, hessian = jax.vmap(lambda side: jax.jvp(jax.grad(alpha), (point,), (side,)), out_axes=(None, 0))(
-            jnp.eye(2)
-        )
-        return jax.jacfwd(three)(point), gradient, hessian
-
-    return jax.jit(jax.vmap(everything), compiler_options=QUICKLY)
+    return compile_bends(slopes)
 
 
 def derivatives(model, delta, d):
     """Jacobian of (alpha, beta, omega), gradient and Hessian of alpha in (delta, d), at every point."""
     with jax.enable_x64(True):
         points = np.resize(np.stack(np.broadcast_arrays(delta, d), axis=1), (SIZE, 2))
-        return [np.asarray(leaf)[: np.size(delta)] for leaf in compiled_derivatives(model)(points)]
+        values, changes = (each[: np.size(delta)] for each in compiled_derivatives(model)(points))
+        return changes[:, 2:], values[:, :2], changes[:, :2]
 
 
 def excess(got, exact, relative, floor):
