@@ -73,9 +73,7 @@ def measure_all(points: int, runs: int) -> str:
     """The table as a page."""
     devices = {device.platform: device for kind in ("cpu", jax.default_backend()) for device in jax.devices(kind)[:1]}
     walls = draw_walls(points)
-    head = [
-        f"{name_of(device)}: {what}" for device in devices.values() for what in ("M walls/s", "s to compile", "apart")
-    ]
+    head = [part for device in devices.values() for part in (f"{name_of(device)}: M walls/s", "s to compile", "apart")]
     lines = [
         "# Inside `jit`, by device",
         "",
@@ -90,7 +88,8 @@ def measure_all(points: int, runs: int) -> str:
         cells = []
         for device in devices.values():
             compiling, speed, apart = measure(function, walls, device, runs)
-            cells += [f"{speed / 1e6:.3g}", f"{compiling:.1f}", f"{apart:.0e}"]
+            rounded = float(f"{speed / 1e6:.3g}")
+            cells += [f"{rounded:,.10g}", f"{compiling:.1f}", f"{apart:.0e}" if apart else "0"]
         lines.append(f"| {name} | {' | '.join(cells)} |")
         print(lines[-1], flush=True)
     return "\n".join([*lines, ""])

@@ -170,7 +170,9 @@ def test_many_walls_inside_jit_are_those_called_directly(labels):
     # They are taken in parts of 512, the last one shorter, and more are left over than the search takes at one time.
     walls = [np.tile(labels[name], 3) for name in ("alpha", "beta", "delta", "d")]
     with np.errstate(all="ignore"):
-        left = np.flatnonzero(~quick_kernel(*walls, np.full(walls[0].size, 3e-10), fractional=True).proved)
+        alpha, beta, delta, d = walls
+        found = quick_kernel(alpha, beta, delta, d, np.full(alpha.size, 3e-10), fractional=True)
+    left = np.flatnonzero(~found.proved)
     walls = [np.concatenate([column[:1300], np.resize(column[left], 700)]) for column in walls]
     walls[0][::97], walls[3][1::97] = np.nan, -1.0
     direct = zwidth.spectral_radius(*walls)
