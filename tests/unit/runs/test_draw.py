@@ -73,6 +73,13 @@ def test_every_sweep_is_drawn(folder, tmp_path, monkeypatch):
     assert {file.suffix for file in files} == {".png", ".svg"}
 
 
+def test_panels_whose_values_lie_close_together_have_titles_of_their_own(plane):
+    close = plane.assign_coords(d=[1.0, 1.00001], delta=[0.1, 0.100002, 0.5, 1.0])
+    told = titles(draw_plane(close, "margin"))
+    assert told[0] == r"$d = 1$,  $\delta = 0.1$"
+    assert len(set(told)) == len(told)
+
+
 def test_a_plane_holds_the_values_of_the_store(plane):
     axes = draw_plane(plane, "margin")
     # Two delays, and three of the four dampings.
