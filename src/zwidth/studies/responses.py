@@ -38,7 +38,7 @@ from zwidth.parts.device import Device
 from zwidth.scenes.recommendation import RANGES, Recommendation
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, round_safely, tell_apart, to_json, with_unit
-from zwidth.words.quantities import LONGEST_SETTLING, Range
+from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range
 
 
 class ResponseStudy(ComputedStudy):
@@ -138,7 +138,7 @@ class StepStudy(WallsStudy, ResponseStudy):
 
     def _wall_limits(self) -> Iterable[LocatedProblem]:
         """Walls that do not fit their device, each reported once."""
-        several = self.walls is not None and len(self.walls) > 1
+        several, (least, most) = self.walls is not None and len(self.walls) > 1, WALL_RANGE
         faulty: dict[int, PydanticCustomError] = {}
         for index, (device, wall) in enumerate(self.pairs()):
             if wall is None:
@@ -146,9 +146,9 @@ class StepStudy(WallsStudy, ResponseStudy):
             if isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall):
                 allowed = "a wall in SI units needs a device with mass and period"
                 fault = problem("got a wall in SI units", allowed, "write alpha and beta")
-            elif not all(math.isfinite(value) for value in normalized_wall(device, wall)):
-                allowed = "alpha and beta must be finite"
-                fault = problem("got a wall whose normalized values are beyond float64", allowed, "check the units")
+            elif not all(value == 0 or least <= abs(value) <= most for value in normalized_wall(device, wall)):
+                allowed = f"alpha and beta must be 0 or {least:g} to {most:g} in magnitude"
+                fault = problem("got a wall that is out of range", allowed, "check the units")
             else:
                 continue
             faulty[index if several else 0] = fault
