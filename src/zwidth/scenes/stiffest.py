@@ -239,7 +239,8 @@ class SceneOptima(SceneAnswers):
             ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
             "operator.mass", ...) in N/m per SI unit, each with all others held fixed; ``status``, NOT_CONVERGED where
             one of them is NaN, as all are without a K_max. Whole numbers and coefficients of a filter have none. At
-            zero they are those from the right, at a whole delay both sides agree.
+            zero they are those of a little more, as at a whole delay of a linear system without inertia; of all others
+            both sides agree there.
 
         Numerics:
             Closed form for a rigid device; otherwise implicit derivatives of the conditions that bind, some ms a

@@ -304,7 +304,9 @@ def _slope(scene: Any, found: BoundRidge, path: str) -> float:
     rates of the chain and the velocity estimate, which are smooth over its own size (docs/theory/scenes.md, V21).
     """
     held = _conditions(scene.loop.roots, found)
-    at, whole = circle(np.array([found.w1, found.w2])), scene.whole_delay
+    at = circle(np.array([found.w1, found.w2]))
+    # Longer periods are fewer in a delay: from a whole number of them on, a fraction of one less.
+    whole = scene.whole_delay - (path == "period" and scene.d == scene.whole_delay > 0)
     for weights in _stencils(scene, path):
         try:
             states = [
@@ -317,7 +319,7 @@ def _slope(scene: Any, found: BoundRidge, path: str) -> float:
         by_unit, by_delay, by_rate, by_push, by_f, by_f_slope = (
             np.sum(part, axis=0) for part in zip(*states, strict=True)
         )
-        q, q_slope = _needed_slopes(scene, at, by_rate, by_push, by_delay)
+        q, q_slope = _needed_slopes(scene, whole, at, by_rate, by_push, by_delay)
         rest, slope = found.beta * by_f - q, found.beta * by_f_slope - q_slope
         try:
             by_alpha = -np.linalg.solve(held.matrix, _list_conditions(rest, slope)[held.rows])[0]
@@ -338,7 +340,7 @@ def _inputs(scene: Any, whole: int, at: CirclePoints) -> tuple[Any, ...]:
 
 
 def _needed_slopes(
-    scene: Any, at: CirclePoints, by_rate: np.ndarray, by_push: np.ndarray, by_delay: float
+    scene: Any, whole: int, at: CirclePoints, by_rate: np.ndarray, by_push: np.ndarray, by_delay: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The derivatives of ``q = -1/G`` and of dq/dw in a parameter, by those of the chain's rates and of the delay.
 
@@ -347,10 +349,10 @@ def _needed_slopes(
     chain = scene.loop.chain
     # An imaginary step so short that its square is nothing is a derivative without a difference, here of e^A.
     rate, push = (value + 1j * _TINY * by for value, by in zip(chain.realize(), (by_rate, by_push), strict=False))
-    fraction = chain.d - chain.whole + 1j * _TINY * by_delay
+    fraction = chain.d - whole + 1j * _TINY * by_delay
     steps = (*hold(chain, rate, push, 1.0), hold(chain, rate, push, 1.0 - fraction)[1])
     (psi, full, late), (by_psi, by_full, by_late) = ([f(x) for x in steps] for f in (np.real, lambda x: x.imag / _TINY))
-    turns, slopes = chain.whole + 1, np.full((2, at.w.size), complex(np.nan, np.nan))
+    turns, slopes = whole + 1, np.full((2, at.w.size), complex(np.nan, np.nan))
     exact, lag = scene.loop.roots.required_wall(at).value, lag_jet(at, turns)
     for k, (zeta, turn) in enumerate(zip(at.before, 1j * at.z, strict=True)):
         with np.errstate(all="ignore"):
