@@ -22,6 +22,7 @@ from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
+from zwidth.words.units import to_float
 
 # By what share a row may end below the stiffest wall that is on it.
 _ROUNDED = 1e-6
@@ -98,7 +99,7 @@ class RequiredValue(NamedTuple):
 def _read_stiffness(given: Any) -> float:
     """A stiffness that is wanted, in N/m."""
     stiffness = read_texts("stiffness", given, "N/m")
-    if not (isinstance(stiffness, int | float | np.number) and math.isfinite(stiffness) and stiffness > 0):
+    if not (isinstance(stiffness, int | float | np.number) and math.isfinite(to_float(stiffness)) and stiffness > 0):
         raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in {own_unit('N/m')})")
     return float(stiffness)
 
@@ -119,7 +120,7 @@ def _range(parameter: str, now: float, within: tuple[Any, Any] | None) -> tuple[
         if not now > 0:
             raise InputError(f"within: {parameter} is 0 now; give the range to search, as within=(0.1, 10)")
         return now / _REACH, now * _REACH
-    low, high = (float(end) for end in read_texts("within", within, FIELDS[parameter].unit))
+    low, high = (to_float(end) for end in read_texts("within", within, FIELDS[parameter].unit))
     if not 0 < low < high < math.inf:
         raise InputError(f"within: got {within!r}; two finite numbers with 0 < low < high are needed")
     return low, high
