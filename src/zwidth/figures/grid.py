@@ -123,7 +123,8 @@ def spell(value: xarray.DataArray) -> str:
     if value.name == "device":
         return style.literal(value.values)
     unit = {"1": "", "sampling periods": "periods"}.get(value.attrs["units"], value.attrs["units"])
-    unit = rf"\,\mathrm{{{unit.replace(' ', '~')}}}" if unit else ""
+    # Within mathematics as it is.
+    unit = rf"\,\mathrm{{{unit.replace(' ', '~').replace('$', '')}}}" if unit else ""
     return rf"${VARIABLES[str(value.name)].symbol} = {float(value):.{value.attrs['digits']}g}{unit}$"
 
 

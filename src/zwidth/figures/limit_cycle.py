@@ -137,7 +137,8 @@ def draw_limit_cycle_curves(
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
                 _name_silent(ax, looks, cycles[name][column] < bounds[0])
-                style.use_logarithmic(ax, "y", amplitudes)
+                if amplitudes.size:
+                    style.use_logarithmic(ax, "y", amplitudes)
                 ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
             else:
                 ax.set_xlabel(f"{_AXES[over][0]}  ${_AXES[over][1]}$  in {unit}")
