@@ -87,7 +87,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("ask", REFUSED.values(), ids=REFUSED)
 def test_whole_numbers_beyond_float64_are_refused(ask):
-    with pytest.raises(zwidth.InputError, match="got|is needed"):
+    with pytest.raises(zwidth.InputError, match=r"got|is needed"):
         ask(zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3)))
 
 

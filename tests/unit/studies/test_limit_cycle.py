@@ -115,7 +115,7 @@ def test_where_every_wall_is_silent_the_figure_says_so():
     silent = study_of(axes, start_position="0.1 mm", coulomb="10 N", duration="200 periods").compute(None, True)
     assert (silent.arrays["amplitude_m"] < 1e-6).all()
     (draw,) = silent.figures.values()
-    upper, lower = draw()
+    upper, _ = draw()
     upper.figure.draw_without_rendering()
     assert upper.texts[0].get_text().startswith("silent everywhere")
 
