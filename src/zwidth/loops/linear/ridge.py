@@ -36,7 +36,7 @@ _MOST_STEPS, _HOLDS, _NEAR = 12, 1e-11, 1e-5
 # By what share rounding may make a row's wall stiffer.
 _ABOVE = 1e-7
 # Rows next to a top, as shares of the plane, that must reach nearly as high; and how many tops are looked at.
-_BESIDE, _NEARLY = np.array([0.0, 1e-3, -1e-3, 1e-5, -1e-5, 1e-7, -1e-7]), 0.99
+_BESIDE, _NEARLY = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3]), 0.99
 _MOST_TOPS = 32
 
 
@@ -80,15 +80,14 @@ def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     tops = _tops(border, least) if border.curved else []
     for top in tops[:_MOST_TOPS]:
         # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
-        if not border.pieces.is_main(border.pieces.piece_at(top.beta, top.place)) or not _is_reached(
-            border, top, least
-        ):
+        if not _is_reached(border, top, least):
             continue
         found = _describe(border, top, negative_damping)
-        _refuse_stiffer(border, found, least)
+        _refuse_stiffer(border, found.alpha, least)
         return found
     if len(tops) > _MOST_TOPS:
         raise ArithmeticError(f"none of the {_MOST_TOPS} highest of {len(tops)} tops holds")
+    _refuse_stiffer(border, 0.0, least)
     return None
 
 
@@ -225,19 +224,21 @@ def _list_conditions(rest: np.ndarray, slope: np.ndarray) -> np.ndarray:
 
 
 def _is_reached(border: Border, top: _Top, least: float) -> bool:
-    """Whether rows next to a top are stable nearly up to it."""
+    """Whether rows next to a top are stable nearly up to it, the nearest of them in a piece with soft walls."""
     size = float(np.ptp(border.pieces.corners)) + abs(top.beta)
-    found = bound_intervals(border.boundary, np.maximum(top.beta + size * _BESIDE, least))
+    rows = np.maximum(top.beta + size * _BESIDE, least)
+    found = bound_intervals(border.boundary, rows)
     own = (found.above == top.place) | (found.below == top.place)
-    return bool(np.any(own & (found.high >= _NEARLY * top.alpha)))
+    reached = np.flatnonzero(np.any(own & (found.high >= _NEARLY * top.alpha), axis=1))
+    return any(border.pieces.is_main(border.pieces.piece_at(float(rows[k]), top.place)) for k in reached[:1])
 
 
-def _refuse_stiffer(border: Border, found: BoundRidge, least: float) -> None:
+def _refuse_stiffer(border: Border, alpha: float, least: float) -> None:
     """Refuse a ridge above which rows of its piece hold a stable wall."""
     rows, high = border.pieces.main_intervals()
     highest = float(np.nanmax(high[rows >= least], initial=-np.inf))
-    if highest > found.alpha * (1.0 + _ABOVE):
-        raise ArithmeticError(f"rows reach {highest!r}, the ridge {found.alpha!r}")
+    if highest > alpha * (1.0 + _ABOVE):
+        raise ArithmeticError(f"rows reach {highest!r}, the ridge {alpha!r}")
 
 
 # The step of a difference, as a share of the parameter; its sixth power is rounding. And that of an imaginary step.
