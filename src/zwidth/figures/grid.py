@@ -125,7 +125,7 @@ def spell(value: xarray.DataArray) -> str:
     unit = {"1": "", "sampling periods": "periods"}.get(value.attrs["units"], value.attrs["units"])
     # Within mathematics as it is.
     unit = rf"\,\mathrm{{{unit.replace(' ', '~').replace('$', '')}}}" if unit else ""
-    return rf"${VARIABLES[str(value.name)].symbol} = {float(value):.{value.attrs['digits']}g}{unit}$"
+    return rf"${VARIABLES[str(value.name)].symbol} = {float(value):.{value.attrs.get('digits', 4)}g}{unit}$"
 
 
 def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
