@@ -59,7 +59,7 @@ def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
         size = abs(number) if least else number
         if 0 < size < least or most < size < math.inf:
             allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"0 to {most:g}"
-            raise InputError(f"{name}: got {value!r}; it must be {allowed}")
+            raise InputError(f"{name}: got {number!r}; it must be {allowed}")
 
 
 def as_float64(name: str, value: ArrayLike) -> np.ndarray:

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.contour import ContourSet
 
 from zwidth.figures import style
+from zwidth.words.formatting import count_digits_apart
 from zwidth.words.quantities import NOT_COMPUTED, OF_PARTS, OUTPUTS, STATUS_OF, VARIABLES, WALL
 
 if TYPE_CHECKING:
@@ -86,7 +87,9 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
             known = np.sqrt(known.min() * known.max()) if logarithmic(known) else known
             factor, unit = style.si_unit(known, str(values.attrs.get("units", "1")))
             # Without the coordinates of its own, which would bring back those that are scaled already.
-            scaled = (values.dims, values.values * factor, {**values.attrs, "units": unit, "factor": factor})
+            numbers = values.values * factor
+            digits = count_digits_apart(numbers.ravel().tolist())
+            scaled = (values.dims, numbers, {**values.attrs, "units": unit, "factor": factor, "digits": digits})
             data = data.assign_coords({name: scaled})
     return data.drop_vars(status)
 
@@ -116,12 +119,13 @@ def panels(
 
 
 def spell(value: xarray.DataArray) -> str:
-    """A single value of a parameter, with symbol and unit."""
+    """A single value of a parameter, with symbol and unit, and as many digits as tell it from the others."""
     if value.name == "device":
         return style.literal(value.values)
     unit = {"1": "", "sampling periods": "periods"}.get(value.attrs["units"], value.attrs["units"])
-    unit = rf"\,\mathrm{{{unit.replace(' ', '~')}}}" if unit else ""
-    return rf"${VARIABLES[str(value.name)].symbol} = {float(value):.4g}{unit}$"
+    # Within mathematics as it is.
+    unit = rf"\,\mathrm{{{unit.replace(' ', '~').replace('$', '')}}}" if unit else ""
+    return rf"${VARIABLES[str(value.name)].symbol} = {float(value):.{value.attrs.get('digits', 4)}g}{unit}$"
 
 
 def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
@@ -193,7 +197,7 @@ def draw_cells(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, **look: Any)
 def label_contours(
     ax: Axes, drawn: ContourSet, colors: Sequence[Any], shades: Sequence[Any], others: Sequence[np.ndarray] = ()
 ) -> None:
-    """Write the level of each contour on its longest line where there is room, once.
+    """Write the level of each contour, a round number, on its longest line where there is room, once.
 
     The range and the spacing of the axes must be set: where lines are on the page decides on what has room. Each label
     covers its line with the shade behind it, and keeps away from the points (x, y) of other lines and marks.
@@ -206,7 +210,7 @@ def label_contours(
     taken = _list_lines(ax, [np.atleast_2d(points) for points in others if len(points)])
     placed: list[tuple[np.ndarray, np.ndarray]] = []
     for k, (level, own) in enumerate(zip(drawn.levels, lines, strict=True)):
-        text = f"{level:.4g}"
+        text = f"{level:.12g}"
         dots = ax.figure.dpi / 72.0 / _LEFT
         size = dots * _LABEL_FONT * np.array([0.62 * len(text) + 0.4, 1.3])
         if not own:

@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter
 
 from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables
-from zwidth.words.formatting import with_unit
+from zwidth.words.formatting import count_digits_apart, with_unit
 
 _AXES = {
     SI_COLUMNS[0]: ("stiffness", "K", "N/m"),
@@ -137,7 +137,8 @@ def draw_limit_cycle_curves(
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
                 _name_silent(ax, looks, cycles[name][column] < bounds[0])
-                style.use_logarithmic(ax, "y", amplitudes)
+                if amplitudes.size:
+                    style.use_logarithmic(ax, "y", amplitudes)
                 ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
             else:
                 ax.set_xlabel(f"{_AXES[over][0]}  ${_AXES[over][1]}$  in {unit}")
@@ -167,7 +168,8 @@ def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarra
     times, unit = style.si_unit(values, unit)
     colors = style.ordered_colors(values.size)
     unstable = [not np.any(stable[:, k]) for k in range(values.size)]
-    texts = [f"${symbol} = {value * times:.4g}$ {unit}" for value in values]
+    digits = count_digits_apart((values * times).tolist())
+    texts = [f"${symbol} = {value * times:.{digits}g}$ {unit}" for value in values]
     return [
         {**style.look(k), "color": color, "label": text + (", unstable" if lost else "")}
         for k, (color, text, lost) in enumerate(zip(colors, texts, unstable, strict=True))

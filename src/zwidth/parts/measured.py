@@ -156,7 +156,7 @@ def _as_line(name: str, values: Any, kind: type) -> np.ndarray:
         with np.errstate(all="ignore"):
             line = np.array(values)
             line = line.astype(kind, casting="safe" if line.dtype.kind in "iufcb" else "unsafe")
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name}: got {type(values).__name__} that holds no {kind.__name__} numbers") from None
     if line.ndim != 1:
         raise InputError(f"{name}: got shape {line.shape}; a list of numbers, one a frequency, is needed")

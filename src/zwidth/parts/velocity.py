@@ -202,7 +202,7 @@ class VelocityFilter(Part):
         for name in ("numerator", "denominator"):
             try:
                 values = np.atleast_1d(np.asarray(getattr(self, name), float))
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise InputError(f"velocity.{name}: a list of real coefficients is needed") from error
             values = np.trim_zeros(values, "f") if values.ndim == 1 else values
             if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):

@@ -8,6 +8,7 @@ from typing import Any
 from zwidth.parts.checks import Part, read_texts
 from zwidth.words.errors import InputError
 from zwidth.words.rotation import is_rotary, own_unit, use_kind
+from zwidth.words.units import to_float
 
 
 @dataclass(frozen=True, repr=False)
@@ -40,6 +41,9 @@ def resolve_wall(
     without a wall; where there is one it could as well mean that wall's B, and is refused. Texts have a unit, of a
     rotary device or not, or of the kind of device in question.
     """
+    # Whole numbers beyond float64 are infinite.
+    both = stiffness, virtual_damping
+    stiffness, virtual_damping = (to_float(v) if isinstance(v, int) and v.bit_length() > 1023 else v for v in both)
     # Most questions are of numbers, in which there is no text to look for.
     if not (isinstance(stiffness, int | float) and isinstance(virtual_damping, int | float | None)):
         with use_kind(is_rotary() if rotary is None else rotary):

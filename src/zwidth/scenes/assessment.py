@@ -107,12 +107,13 @@ def assess(scene: SceneOptima) -> Assessment:
         (True, False)
     """
     check_held(scene)
+    # First of all, for it refuses more poles than can be computed at once.
+    slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
     stands, best, known = scene.margins(), scene.max_stiffness(), not find_obstacle(**vars(scene.device))
     margin = float(scene.passivity_margin()) if known else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
     row, column = (tuple(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
     lower, upper = nearest_interval(column, scene.wall.virtual_damping)
-    slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
     stable = bool(scene.is_stable())
     return Assessment(
         **{name: float(value) for name, value in scene.normalized._asdict().items()},

@@ -33,6 +33,7 @@ from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
+from zwidth.words.units import to_float
 
 # Dampings tried at a stiffness, and steps of golden section round the best of them.
 _SAMPLES, _STEPS = 18, 14
@@ -69,7 +70,7 @@ class Wanted(NamedTuple):
         given = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
         for name, value in given.items():
             number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if value is not None and not (number and math.isfinite(value) and ranges[name].holds(value)):
+            if value is not None and not (number and math.isfinite(to_float(value)) and ranges[name].holds(value)):
                 raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, as {_EXAMPLES[name]}")
         if not isinstance(passive, bool | np.bool_):
             raise InputError(f"passive: got {passive!r}; True or False is needed")

@@ -22,6 +22,7 @@ from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
+from zwidth.words.units import to_float
 
 # By what share a row may end below the stiffest wall that is on it.
 _ROUNDED = 1e-6
@@ -100,7 +101,7 @@ class RequiredValue(NamedTuple):
 def _read_stiffness(given: Any) -> float:
     """A stiffness that is wanted, in N/m."""
     stiffness = read_texts("stiffness", given, "N/m")
-    if not (isinstance(stiffness, int | float | np.number) and math.isfinite(stiffness) and stiffness > 0):
+    if not (isinstance(stiffness, int | float | np.number) and math.isfinite(to_float(stiffness)) and stiffness > 0):
         raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in {own_unit('N/m')})")
     return float(stiffness)
 
@@ -131,7 +132,7 @@ def _range(scene: SceneAnswers, parameter: str, within: tuple[Any, Any] | None) 
         }
         low, high = ends.get(parameter, (0.0, math.inf))
         return max(now / _REACH, float(low)), min(now * _REACH, float(high))
-    low, high = (float(end) for end in read_texts("within", within, FIELDS[parameter].unit))
+    low, high = (to_float(end) for end in read_texts("within", within, FIELDS[parameter].unit))
     if not 0 < low < high < math.inf:
         raise InputError(f"within: got {within!r}; two finite numbers with 0 < low < high are needed")
     return low, high
@@ -251,7 +252,8 @@ class SceneOptima(SceneAnswers):
             ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
             "operator.mass", ...) in N/m per SI unit, each with all others held fixed; ``status``, NOT_CONVERGED where
             one of them is NaN, as all are without a K_max. Whole numbers and coefficients of a filter have none. At
-            zero they are those from the right, at a whole delay both sides agree.
+            zero they are those of a little more, as at a whole delay of a linear system without inertia; of all others
+            both sides agree there.
 
         Numerics:
             Closed form for a rigid device; otherwise implicit derivatives of the conditions that bind, some ms a

@@ -36,7 +36,7 @@ from zwidth.parts.device import Device
 from zwidth.scenes.recommendation import RANGES, Recommendation
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, round_safely, tell_apart, to_json, with_unit
-from zwidth.words.quantities import LONGEST_SETTLING, Range
+from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range
 
 
 class ResponseStudy(ComputedStudy, HeldStudy):
@@ -120,13 +120,114 @@ class StepStudy(WallsStudy, ResponseStudy):
         if self.duration.unit == "s" and any(isinstance(device, NormalizedDevice) for device in self.devices):
             allowed = "a normalized device has no period to measure seconds in"
             yield ("duration",), problem(f"got {self.duration}", allowed, "write it in periods, as in '100 periods'")
-        pairs = [
-            isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall) for device, wall in self.pairs()
-        ]
-        # Each wall once.
-        for index in dict.fromkeys(k % sizes[1] for k, mixed in enumerate(pairs) if mixed):
-            allowed = "a wall in SI units needs a device with mass and period"
-            yield ("walls", index), problem("got a wall in SI units", allowed, "write alpha and beta")
+        yield from self._wall_limits()
+
+    def _wall_limits(self) -> Iterable[LocatedProblem]:
+        """Walls that do not fit their device, each reported once."""
+        least, most = WALL_RANGE
+        told: set[int] = set()
+        for number, (device, wall) in enumerate(self.pairs()):
+            index = number % len(self.walls or (None,))
+            if wall is None or index in told:
+                continue
+            if isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall):
+                allowed = "a wall in SI units needs a device with mass and period"
+                fault = problem("got a wall in SI units", allowed, "write alpha and beta")
+            elif not all(value == 0 or least <= abs(value) <= most for value in normalized_wall(device, wall)):
+                allowed = f"alpha and beta must be 0 or {least:g} to {most:g} in magnitude"
+                fault = problem("got a wall that is out of range", allowed, "check the units")
+            else:
+                continue
+            told.add(index)
+            yield ("walls", index), fault
+
+    def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
+        """Each device with its wall; the wall is None where stiffness_fraction decides it."""
+        raise NotImplementedError
+
+    def respond(
+        self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
+    ) -> tuple[dict[str, Any], str]:
+        """The response of one device to 1 N, or to a unit force where normalized.
+
+        Returns:
+            Its columns, those in SI units with their unit; and what to say of one that has not settled at the end.
+        """
+        periods = max(1, round(self.duration.periods(device.period)))
+        raw = step_response(alpha, beta, device.delta, device.d, periods=periods, substeps=self.substeps)
+        clock, length = (device.period, 1.0 / device.to_scene().units.stiffness) if physical else (1.0, 1.0)
+        second, meter, speed, newton = ("_s", "_m", "_m_per_s", "_N") if physical else ("",) * 4
+        time, settling_time = raw.time * clock, raw.settling_time * clock
+        columns = {
+            **{"label": label, "alpha": alpha, "beta": beta, "delta": device.delta, "d": device.d},
+            f"time{second}": time,
+            f"position{meter}": raw.position * length,
+            f"velocity{speed}": raw.velocity * length / clock,
+            f"wall_force{newton}": raw.wall_force,
+            f"final_position{meter}": raw.final_position * length,
+            f"settling_time{second}": settling_time,
+        }
+        if np.isnan(settling_time):
+            longest = f"the delay exceeds {LONGEST_SETTLING} periods"
+            unknown = f"the wall is not stable, its poles nearly coincide, or {longest}"
+            return columns, f"no settling time: {unknown}"
+        after = with_unit(settling_time, "s", 3) if physical else f"{plain(settling_time)} periods"
+        late = settling_time > time[-1]
+        return columns, f"the response settles after {after}, later than the time shown" if late else ""
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        periods = [min(self.duration.periods(device.period), 1e15) for device, _ in self.pairs()]
+        return {"responses": len(periods), "periods": 1 + int(max(periods)), "points a period": self.substeps}
+
+
+@register
+class StepStudy(WallsStudy, ResponseStudy):
+    """Response of the position to a step of force, for one or more devices."""
+
+    method = "Exact solution between the instants at which a force changes; rounding alone."
+    from_scene = ("devices", "delay_model")
+
+    kind: Literal["step"]
+
+    devices: Annotated[tuple[DeviceField, ...], WrapValidator(members("devices"))]
+    """Devices; the scene's where left out."""
+
+    stiffness_fraction: Fraction | None = None
+    """Stiffness as a share of alpha_max, with beta as at the ridge; give this or walls."""
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        for index, device in enumerate(self.devices):
+            if device.parts_beyond:
+                yield ("devices", index), refuse_parts("step", list_parts(device))
+        sizes = len(self.devices), len(self.walls or (None,))
+        if min(sizes) > 1 and sizes[0] != sizes[1]:
+            allowed = "one wall for all devices, one for each, or one device for all walls"
+            yield ("walls",), problem(f"got {sizes[1]} walls for {sizes[0]} devices", allowed, "make the numbers equal")
+            return
+        if self.duration.unit == "s" and any(isinstance(device, NormalizedDevice) for device in self.devices):
+            allowed = "a normalized device has no period to measure seconds in"
+            yield ("duration",), problem(f"got {self.duration}", allowed, "write it in periods, as in '100 periods'")
+        yield from self._wall_limits()
+
+    def _wall_limits(self) -> Iterable[LocatedProblem]:
+        """Walls that do not fit their device, each reported once."""
+        several, (least, most) = self.walls is not None and len(self.walls) > 1, WALL_RANGE
+        faulty: dict[int, PydanticCustomError] = {}
+        for index, (device, wall) in enumerate(self.pairs()):
+            if wall is None:
+                continue
+            if isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall):
+                allowed = "a wall in SI units needs a device with mass and period"
+                fault = problem("got a wall in SI units", allowed, "write alpha and beta")
+            elif not all(value == 0 or least <= abs(value) <= most for value in normalized_wall(device, wall)):
+                allowed = f"alpha and beta must be 0 or {least:g} to {most:g} in magnitude"
+                fault = problem("got a wall that is out of range", allowed, "check the units")
+            else:
+                continue
+            faulty[index if several else 0] = fault
+        yield from ((("walls", index), fault) for index, fault in faulty.items())
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         walls = self.walls or (None,)

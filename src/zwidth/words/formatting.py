@@ -88,6 +88,11 @@ def count_digits(holds: Callable[[int], Any]) -> int:
     return next((digits for digits in range(4, 17) if holds(digits)), 17)
 
 
+def count_digits_apart(values: list[float]) -> int:
+    """The fewest digits, from 4 on, that tell different numbers apart."""
+    return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)))
+
+
 def spell_stiffness(value: float, digits: int = 4) -> str:
     """A stiffness with its unit, rounded down: most are the largest of which something holds.
 

@@ -167,6 +167,7 @@ FAULTS = {
     "version_text": [("1:10: version: got '1'", "drop the quotes")],
     "version_true": [("1:10: version: got true", "write 'version: 1'")],
     "wall_in_si_units": [("7:27: studies[0].walls[1]: got a wall in SI units", "write alpha and beta")],
+    "wall_out_of_range": [("7:27: studies[0].walls[1]: got a wall that is out of range", "check the units")],
     "walls_for_devices": [("7:12: studies[0].walls: got 3 walls for 2 devices", "make the numbers equal")],
 }
 

@@ -17,9 +17,9 @@ SURFACES = {
 }
 
 
-def labelled(values, others=(), count=4, columns=2):
+def labelled(values, others=(), count=4, columns=2, decimals=3):
     figure, axes = new_figure(6.4, 3.2, 1, columns)
-    levels = np.linspace(values.min(), values.max(), count + 2)[1:-1]
+    levels = np.linspace(values.min(), values.max(), count + 2)[1:-1].round(decimals)
     for ax in axes.flat:
         ax.set(xlim=(-1, 1), ylim=(-2, 2), title="a panel")
         drawn = ax.contour(X, Y, values, levels=levels)
@@ -45,9 +45,16 @@ def test_a_label_says_the_level_of_the_line_that_it_is_on(name):
     _, (ax, _) = labelled(SURFACES[name])
     (drawn,) = ax.collections
     for text in ax.texts:
-        (k,) = (k for k, level in enumerate(drawn.levels) if f"{level:.4g}" == text.get_text())
+        (k,) = (k for k, level in enumerate(drawn.levels) if f"{level:g}" == text.get_text())
         off = np.hypot(*(drawn.get_paths()[k].interpolated(8).vertices - text.get_position()).T)
         assert off.min() < 0.02
+
+
+def test_levels_that_lie_close_together_are_written_in_full():
+    _, (ax, _) = labelled(1.0 - 1e-6 * (3.0 + SURFACES["steep"]), count=2, decimals=8)
+    written = {float(text.get_text()) for text in ax.texts}
+    assert len(written) >= 2
+    assert written <= set(ax.collections[0].levels.tolist())
 
 
 def test_labels_keep_away_from_other_lines():

@@ -98,6 +98,14 @@ def random_system(generator: np.random.Generator, period: float) -> tuple[list[c
     return zeros, poles, float(10 ** generator.uniform(-5, -3) / answer)
 
 
+@pytest.mark.parametrize("path", ["delay", "period"])
+def test_without_inertia_slopes_at_a_whole_delay_are_those_of_a_little_more(path):
+    scene = zwidth.Scene(zwidth.LinearDevice(([-2000.0], [-30.0, 0.0], 0.02)), zwidth.Timing(1e-3, 2e-3))
+    more = scene.replace(**{path: scene.parameters()[path] + 1e-9}).max_stiffness().stiffness
+    slope = (more - scene.max_stiffness().stiffness) / 1e-9
+    assert scene.sensitivities().per[path] == pytest.approx(slope, rel=1e-3)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_random_systems_are_judged_as_balls_do(seed):
     generator, judged = np.random.default_rng(seed), 0

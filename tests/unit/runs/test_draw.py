@@ -8,6 +8,7 @@ from chunks import failing_on_2
 from matplotlib.figure import Figure
 from sweeping import config_of, main_of, run_sweeps, study
 
+import zwidth
 from zwidth.figures import draw_curves, draw_outlines, draw_plane
 from zwidth.runs import draw
 from zwidth.runs.draw import draw_stores
@@ -71,6 +72,24 @@ def test_every_sweep_is_drawn(folder, tmp_path, monkeypatch):
         *("plane_boundaries", "surface_alpha_max", "devices_stiffness_max", "devices_virtual_damping_at_max"),
     }
     assert {file.suffix for file in files} == {".png", ".svg"}
+
+
+def test_panels_whose_values_lie_close_together_have_titles_of_their_own(plane):
+    close = plane.assign_coords(d=[1.0, 1.00001], delta=[0.1, 0.100002, 0.5, 1.0])
+    told = titles(draw_plane(close, "margin"))
+    assert told[0] == r"$d = 1$,  $\delta = 0.1$"
+    assert len(set(told)) == len(told)
+
+
+def test_panels_of_inertias_have_their_unit(tmp_path):
+    walls = {"stiffness": ["10 N m/rad", "100 N m/rad"], "virtual_damping": ["0 N m s/rad", "0.1 N m s/rad"]}
+    inertias = {"mass": ["2000 g cm^2", "4500 g cm^2"], "damping": "1 mN m s/rad", "period": "1 ms"}
+    config = {"version": 1, "name": "turning", "studies": [study("turned", axes=walls | inertias, outputs=("margin",))]}
+    zwidth.run(config, out=tmp_path)
+    axes = draw_plane(open_dataset(tmp_path / "turned.zarr"), "margin")
+    axes[0].figure.draw_without_rendering()
+    for title, inertia in zip(titles(axes), (2000, 4500), strict=True):
+        assert rf"$m = {inertia}\,\mathrm{{g~cm^2}}$" in title
 
 
 def test_a_plane_holds_the_values_of_the_store(plane):

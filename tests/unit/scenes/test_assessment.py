@@ -178,3 +178,11 @@ def test_a_scene_without_a_wall_has_none_to_judge():
     with pytest.raises(InputError, match="the scene has no wall"):
         zwidth.assess(zwidth.Scene(DEVICE, TIMING))
     assert zwidth.assess_many([zwidth.Scene(DEVICE, TIMING)])[0]["status"] == "INVALID_INPUT"
+
+
+def test_too_many_poles_are_refused_before_minutes_are_spent(monkeypatch):
+    late = zwidth.Scene(DEVICE, zwidth.Timing(1e-3, 5.0), WALL, SLOW)
+    monkeypatch.setattr(zwidth.Scene, "max_stiffness", lambda scene: pytest.fail("the boundary is laid out"))
+    (row,) = zwidth.assess_many([late])
+    assert row["status"] == "INVALID_INPUT"
+    assert "poles" in row["message"]

@@ -72,3 +72,27 @@ def test_single_devices_need_no_jax():
         "assert 'jax' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+HUGE = 10**400
+REFUSED = {
+    "required": lambda scene: scene.required("mass", HUGE),
+    "within": lambda scene: scene.required("mass", 1e4, within=(1, HUGE)),
+    "recommend": lambda scene: scene.recommend(phase_margin=HUGE),
+    "filter": lambda scene: zwidth.VelocityFilter([HUGE, 1], [1, 0]),
+    "response": lambda scene: zwidth.MeasuredDevice([HUGE] * 9, [1] * 9),
+    "delay": lambda scene: zwidth.is_passive(0.1, 0.1, 0.1, HUGE),
+}
+
+
+@pytest.mark.parametrize("ask", REFUSED.values(), ids=REFUSED)
+def test_whole_numbers_beyond_float64_are_refused(ask):
+    with pytest.raises(zwidth.InputError, match=r"got|is needed"):
+        ask(zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3)))
+
+
+@pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=100)])
+def test_a_wall_beyond_float64_is_one_of_infinite_stiffness(velocity):
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3), velocity=velocity)
+    assert scene.decide_stability(HUGE, 1) == scene.decide_stability(np.inf, 1)
+    assert np.isnan(scene.spectral_radius(HUGE, 1))

@@ -110,6 +110,16 @@ def test_a_curve_without_a_point_is_named_and_explained():
     assert [text.get_text() for text in legend.get_texts()][-1] == "gap: silent, or beyond 1 mm"
 
 
+def test_where_every_wall_is_silent_the_figure_says_so():
+    axes = {"stiffness": ["1 kN/m", "2 kN/m", "5 kN/m"], "virtual_damping": 42.5}
+    silent = study_of(axes, start_position="0.1 mm", coulomb="10 N", duration="200 periods").compute(None, True)
+    assert (silent.arrays["amplitude_m"] < 1e-6).all()
+    (draw,) = silent.figures.values()
+    upper, _ = draw()
+    upper.figure.draw_without_rendering()
+    assert upper.texts[0].get_text().startswith("silent everywhere")
+
+
 def test_a_limited_motor_swings_as_the_describing_function_says(curves):
     """Harmonic balance: where the loop's phase is 180 degrees, the gain left of the limit is one over the loop's."""
     stiffness, damping = 16e3, 42.5

@@ -24,6 +24,8 @@ from zwidth.loops.rigid.device import Plant, factor_numerator, held_plant
 
 # Continuous zeros slower than this a period lead to sampled ones; Aberth's steps at most, and the last one's share.
 _SLOW, _MOST_STEPS, _ARRIVED = 0.1, 30, 1e-13
+# The inverse of how far a zero is at most that is kept.
+_FAR = 1e-17
 # A rate that `Chain.check` allows is below 2^35.
 _DOUBLINGS = 36
 
@@ -141,8 +143,12 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         top = np.polyadd(np.append(_numerator(parts, parts.late, den), 0.0), top)
         lag += 1
     top = np.trim_zeros(top, "f")
+    if top.size > 1 and abs(top[0]) < _FAR * abs(top[1]):
+        # Just before a whole delay: a zero so far off moves nothing on the circle, and no step would find it.
+        top = top[1:]
     # Zeros beside a soft mode's poles are lost in ``top``; they are nearly those of the continuous motion.
-    slow = np.expm1(seen)
+    with np.errstate(all="ignore"):
+        slow = np.expm1(seen)
     slow = slow[np.abs(slow) < _SLOW]
     zeros = np.roots(top).astype(complex)
     zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow

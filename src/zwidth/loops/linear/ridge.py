@@ -36,7 +36,7 @@ _MEETS, _NEAR = 1e-8, 1e-5
 # By what share rounding may make a row's wall stiffer.
 _ABOVE = 1e-7
 # Rows next to a top, as shares of the plane, that must reach nearly as high; and how many tops are looked at.
-_BESIDE, _NEARLY = np.array([0.0, 1e-3, -1e-3, 1e-5, -1e-5, 1e-7, -1e-7]), 0.99
+_BESIDE, _NEARLY = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3]), 0.99
 _MOST_TOPS = 32
 
 
@@ -80,15 +80,14 @@ def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     tops = _tops(border, least) if border.curved else []
     for top in tops[:_MOST_TOPS]:
         # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
-        if not border.pieces.is_main(border.pieces.piece_at(top.beta, top.place)) or not _is_reached(
-            border, top, least
-        ):
+        if not _is_reached(border, top, least):
             continue
         found = _describe(border, top, negative_damping)
-        _refuse_stiffer(border, found, least)
+        _refuse_stiffer(border, found.alpha, least)
         return found
     if len(tops) > _MOST_TOPS:
         raise ArithmeticError(f"none of the {_MOST_TOPS} highest of {len(tops)} tops holds")
+    _refuse_stiffer(border, 0.0, least)
     return None
 
 
@@ -189,19 +188,21 @@ def _list_conditions(rest: np.ndarray, slope: np.ndarray) -> np.ndarray:
 
 
 def _is_reached(border: Border, top: _Top, least: float) -> bool:
-    """Whether rows next to a top are stable nearly up to it."""
+    """Whether rows next to a top are stable nearly up to it, the nearest of them in a piece with soft walls."""
     size = float(np.ptp(border.pieces.corners)) + abs(top.beta)
-    found = bound_intervals(border.boundary, np.maximum(top.beta + size * _BESIDE, least))
+    rows = np.maximum(top.beta + size * _BESIDE, least)
+    found = bound_intervals(border.boundary, rows)
     own = (found.above == top.place) | (found.below == top.place)
-    return bool(np.any(own & (found.high >= _NEARLY * top.alpha)))
+    reached = np.flatnonzero(np.any(own & (found.high >= _NEARLY * top.alpha), axis=1))
+    return any(border.pieces.is_main(border.pieces.piece_at(float(rows[k]), top.place)) for k in reached[:1])
 
 
-def _refuse_stiffer(border: Border, found: BoundRidge, least: float) -> None:
+def _refuse_stiffer(border: Border, alpha: float, least: float) -> None:
     """Refuse a ridge above which rows of its piece hold a stable wall."""
     rows, high = border.pieces.main_intervals()
     highest = float(np.nanmax(high[rows >= least], initial=-np.inf))
-    if highest > found.alpha * (1.0 + _ABOVE):
-        raise ArithmeticError(f"rows reach {highest!r}, the ridge {found.alpha!r}")
+    if highest > alpha * (1.0 + _ABOVE):
+        raise ArithmeticError(f"rows reach {highest!r}, the ridge {alpha!r}")
 
 
 # The step of a difference, as a share of the parameter; its sixth power is rounding. And that of an imaginary step.
@@ -268,7 +269,9 @@ def _slope(scene: Any, found: BoundRidge, path: str) -> float:
     rates of the chain and the velocity estimate, which are smooth over its own size (docs/theory/scenes.md, V21).
     """
     matrix, rows = _conditions(scene.loop.roots, found)
-    at, whole = circle(np.array([found.w1, found.w2])), scene.whole_delay
+    at = circle(np.array([found.w1, found.w2]))
+    # Longer periods are fewer in a delay: from a whole number of them on, a fraction of one less.
+    whole = scene.whole_delay - (path == "period" and scene.d == scene.whole_delay > 0)
     for weights in _stencils(scene, path):
         try:
             states = [
@@ -281,7 +284,7 @@ def _slope(scene: Any, found: BoundRidge, path: str) -> float:
         by_unit, by_delay, by_rate, by_push, by_f, by_f_slope = (
             np.sum(part, axis=0) for part in zip(*states, strict=True)
         )
-        q, q_slope = _needed_slopes(scene, at, by_rate, by_push, by_delay)
+        q, q_slope = _needed_slopes(scene, whole, at, by_rate, by_push, by_delay)
         rest, slope = found.beta * by_f - q, found.beta * by_f_slope - q_slope
         try:
             by_alpha = -np.linalg.solve(matrix, _list_conditions(rest, slope)[rows])[0]
@@ -302,7 +305,7 @@ def _inputs(scene: Any, whole: int, at: CirclePoints) -> tuple[Any, ...]:
 
 
 def _needed_slopes(
-    scene: Any, at: CirclePoints, by_rate: np.ndarray, by_push: np.ndarray, by_delay: float
+    scene: Any, whole: int, at: CirclePoints, by_rate: np.ndarray, by_push: np.ndarray, by_delay: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The derivatives of ``q = -1/G`` and of dq/dw in a parameter, by those of the chain's rates and of the delay.
 
@@ -311,10 +314,10 @@ def _needed_slopes(
     chain = scene.loop.chain
     # An imaginary step so short that its square is nothing is a derivative without a difference, here of e^A.
     rate, push = (value + 1j * _TINY * by for value, by in zip(chain.realize(), (by_rate, by_push), strict=False))
-    fraction = chain.d - chain.whole + 1j * _TINY * by_delay
+    fraction = chain.d - whole + 1j * _TINY * by_delay
     steps = (*hold(chain, rate, push, 1.0), hold(chain, rate, push, 1.0 - fraction)[1])
     (psi, full, late), (by_psi, by_full, by_late) = ([f(x) for x in steps] for f in (np.real, lambda x: x.imag / _TINY))
-    turns, slopes = chain.whole + 1, np.full((2, at.w.size), complex(np.nan, np.nan))
+    turns, slopes = whole + 1, np.full((2, at.w.size), complex(np.nan, np.nan))
     exact, lag = scene.loop.roots.required_wall(at).value, lag_jet(at, turns)
     for k, (zeta, turn) in enumerate(zip(at.before, 1j * at.z, strict=True)):
         with np.errstate(all="ignore"):

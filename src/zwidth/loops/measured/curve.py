@@ -128,9 +128,13 @@ def _is_odd(w: np.ndarray, G: np.ndarray, r: np.ndarray) -> bool:
     if r[0] >= abs(G[0]) or not np.all(G[:few]):
         return True
     power = np.polyfit(np.log(w[:few]), np.log(np.abs(G[:few])), 1)[0]
-    phase = np.angle(1j * G[0]) - 0.5 * np.pi
-    away = abs(phase - 0.5 * np.pi * np.clip(power, -2.0, 0.0)) + np.arcsin(r[0] / abs(G[0]))
-    return bool(away > _PHASE)
+    phase, uncertain = np.angle(1j * G[0]) - 0.5 * np.pi, np.arcsin(np.minimum(r[:few] / np.abs(G[:few]), 1.0))
+    away = abs(phase - 0.5 * np.pi * np.clip(power, -2.0, 0.0)) + uncertain[0]
+    # Whole turns of a long delay are in no phase, but in how it turns from line to line.
+    share = w[:few] - np.mean(w[:few])
+    share *= w[0] / np.sum(share**2)
+    turned = abs(share @ np.unwrap(np.angle(G[:few]))) + np.abs(share) @ uncertain
+    return bool(max(away, turned) > _PHASE)
 
 
 def _bound_beyond(w: np.ndarray, size: np.ndarray, r: np.ndarray) -> float:

@@ -22,6 +22,7 @@ from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.files import write_whole
 from zwidth.sweep.store import SUFFIX, Store
 from zwidth.words.errors import StoreError
+from zwidth.words.formatting import tell_apart
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, VARIABLES
 from zwidth.words.status import Status
 
@@ -226,7 +227,7 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
     ends = (
         f"not {name}, {name}"
         if output.dtype == "bool"
-        else f"{low:.4g} to {content['high']:.4g} {_unit(thin)}".rstrip()
+        else f"{' to '.join(tell_apart(low, content['high']))} {_unit(thin)}".rstrip()
     )
     thinned = "" if thin.size == values.size else f" Shown are {thin.size:,} of {values.size:,} values."
     # As JSON that ends no script element.

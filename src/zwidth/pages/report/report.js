@@ -3,7 +3,7 @@
 (() => {
   const VIRIDIS = ["440154", "482878", "3e4a89", "31688e", "26828e", "1f9e89", "35b779", "6dcd59", "b4de2c", "fde725"]
     .map((hex) => [0, 2, 4].map((k) => parseInt(hex.slice(k, k + 2), 16)));
-  const spell = (value) => typeof value === "string" ? value : Number(value.toPrecision(5)).toString();
+  const spell = (value, digits = 6) => typeof value === "string" ? value : Number(value.toPrecision(digits)).toString();
 
   function color(share) {
     const place = Math.min(Math.max(share, 0), 1) * (VIRIDIS.length - 1), k = Math.min(Math.floor(place), VIRIDIS.length - 2);
@@ -59,15 +59,14 @@
         const decades = Array.from({ length: 700 }, (_, k) => [1, 2, 5].map((n) => Number(`${n}e${k - 350}`))).flat();
         const round = decades.filter((value) => value >= low * 0.999 && value <= (low + span) * 1.001), tens = round.filter((_, k) => decades.indexOf(round[k]) % 3 === 0);
         const chosen = round.length <= most ? round : tens.filter((_, k) => k % Math.ceil(tens.length / most) === 0);
-        return chosen.map((value) => [place(steps, value), shorten(value)]);
+        return chosen.map((value) => [place(steps, value), spell(value)]);
       }
       if (!alike((value, before) => Math.abs(Math.abs(value - before) - step) <= 0.01 * step))
-        return [...new Set(Array.from({ length: most }, (_, k) => Math.round(k * last / (most - 1))))].map((k) => [k + 0.5, shorten(steps[k])]);
+        return [...new Set(Array.from({ length: most }, (_, k) => Math.round(k * last / (most - 1))))].map((k) => [k + 0.5, spell(steps[k]).slice(0, 12)]);
       const size = 10 ** Math.floor(Math.log10(span / most)), unit = [1, 2, 5, 10].find((n) => n * size >= span / most) * size;
       const first = Math.ceil(low / unit - 1e-9), count = Math.floor((low + span) / unit + 1e-9) - first;
-      return Array.from({ length: count + 1 }, (_, k) => unit * (first + k)).map((value) => [place(steps, value), shorten(value)]);
+      return Array.from({ length: count + 1 }, (_, k) => unit * (first + k)).map((value) => [place(steps, value), spell(value, 12)]);
     }
-    const shorten = (value) => typeof value === "string" ? value.slice(0, 12) : Number(value.toPrecision(3)).toString();
     function draw() {
       const scale = window.devicePixelRatio || 1, style = getComputedStyle(canvas);
       const wide = canvas.clientWidth, high = Math.round(0.66 * wide);
@@ -97,8 +96,10 @@
       for (let k = 0; k < up; k++) { pen.fillStyle = `rgb(${color(data.truth ? +(k < up / 2) : 1 - k / up)})`; pen.fillRect(bar, top + k, 12, 1.5); }
       pen.fillStyle = style.color;
       const valueAt = (share) => logarithmic ? data.low * (data.high / data.low) ** share : data.low + share * (data.high - data.low);
+      // So few digits as leave each where it is between the ends.
+      const digits = [3, 4, 5, 6, 7].find((most) => [0, 0.5, 1].every((share) => Math.abs(spell(valueAt(share), most) - valueAt(share)) <= 0.01 * (data.high - data.low)));
       for (const share of data.truth ? [0.25, 0.75] : [0, 0.5, 1])
-        write(data.truth ? (share > 0.5 ? "yes" : "no") : shorten(valueAt(share)), bar + 16, top + Math.min(Math.max(up * (1 - share), 6), up - 6), "left", box.right - 30);
+        write(data.truth ? (share > 0.5 ? "yes" : "no") : spell(valueAt(share), digits), bar + 16, top + Math.min(Math.max(up * (1 - share), 6), up - 6), "left", box.right - 30);
       pen.save(); pen.beginPath(); pen.rect(left, top, across, up); pen.clip();
       for (const [name, rings] of Object.entries(data.edges[offset() / rows / columns])) for (const ring of rings) {
         pen.setLineDash(name === "passive" ? [7, 4] : []);

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import zwidth
+from zwidth.arrays.circle import circle
 from zwidth.loops.linear.curve import curve_at
+from zwidth.loops.linear.held import required_wall, sampled
 
 T = 1e-3
 Draw = Callable[[float, float], float]
@@ -97,6 +99,18 @@ def test_every_row_s_crossings_lead_from_the_count_below_to_the_one_above(name):
     assert found.sound.all()
     crossed = np.where(np.isfinite(found.alpha), found.leaving, 0.0).sum(1)
     np.testing.assert_array_equal(boundary.base + crossed, boundary.top)
+
+
+@pytest.mark.parametrize("before", [1e-5, 1e-7, 1e-8, 1e-9, 1e-11, 1e-13])
+@pytest.mark.parametrize("parts", ["lag", "tip and lag"])
+def test_roots_just_before_a_whole_delay_are_those_of_the_exact_response(before, parts):
+    tip = tied(0.02, 0.02, "tip", 0.5) if parts != "lag" else None
+    driven = zwidth.Device(1.0, 5.0 / T, tip, zwidth.Actuator(cutoff=30.0, order=2))
+    loop = scene(driven, 2.0 - before).loop
+    response = sampled(loop.chain)
+    for w in (1e-3, 0.1, 1.0, 3.0):
+        exact = required_wall(loop.chain, w, response)
+        np.testing.assert_allclose(loop.roots.required_wall(circle(w)).value, exact, rtol=1e-11)
 
 
 def test_a_device_without_any_damping_is_not_stable_behind_a_spring_alone():

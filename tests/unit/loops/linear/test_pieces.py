@@ -92,6 +92,17 @@ def test_the_stiffest_wall_is_the_top_of_what_a_flood_from_soft_walls_reaches(na
         assert islands[0].stiffness[1] == pytest.approx(other, abs=2.0 * step)
 
 
+@pytest.mark.parametrize("share", [1.0, 1.000001, 1.001])
+def test_a_corner_whose_edges_tell_two_dampings_is_found(share):
+    # Of the corner that both meet in each edge tells a damping of its own, 1e-7 of it apart.
+    tip = zwidth.Coupling(2.2583072897267993 * share, 4608848.735088809, 0.46886219337213614)
+    slow = zwidth.LowPass(cutoff=12.558130981789532, coded_period=0.0002658533987553419)
+    timing = zwidth.Timing(0.0003469063541584205)
+    top = zwidth.Scene(zwidth.Device(1.3434767231708333, 0.0, tip), timing, velocity=slow).max_stiffness()
+    assert top.status == zwidth.Status.OK
+    assert top.stiffness == pytest.approx(7151.5 - 5400 * (share - 1.0), rel=1e-5)
+
+
 def test_the_island_of_a_window_of_21_samples_is_apart():
     scene = SCENES["an island 47 N/m high"][0]
     wall = scene.max_stiffness()

@@ -215,6 +215,14 @@ def test_a_wrong_sign_decides_nothing(scene):
     assert "first line" in turned.explain_undecided(5e3, 10.0)[0]
 
 
+def test_a_first_line_behind_nearly_a_turn_of_delay_decides_nothing():
+    late = zwidth.Scene(zwidth.Device(0.8, 0.0), zwidth.Timing(PERIOD, 19.7 * PERIOD))
+    scene = measured(late, np.geomspace(43.6, 400.0, 200))
+    assert scene.max_stiffness().status == Status.UNDECIDED
+    assert "first line" in scene.explain_undecided(5e3, 10.0)[0]
+    assert measured(late, np.geomspace(0.5, 400.0, 3000)).max_stiffness().status == Status.OK
+
+
 def test_a_device_on_a_spring_is_one_too():
     hand = zwidth.Operator(mass=0.05, damping=2.0, stiffness=4e3)
     scene = zwidth.Scene(zwidth.Device(0.1, 1.0), zwidth.Timing(PERIOD, 1e-3), operator=hand)
