@@ -68,7 +68,7 @@ FAULTS = {
     "velocity: {kind: low_pass, cutoff: 10, time_constant: 1 ms}": ("velocity", "only one of them"),
     "velocity: {kind: low_pass, cutoff: 10 ms}": ("velocity.cutoff", "units allowed are Hz"),
     "velocity: {kind: low_pass, cutoff: 500 Hz}": ("velocity.cutoff", "below half the sampling rate"),
-    "velocity: {kind: low_pass, cutoff: 10, order: 3}": ("velocity.order", "from 1 to 2"),
+    "velocity: {kind: low_pass, cutoff: 10, order: 3}": ("velocity.order", "at least 1 and at most 2"),
     "velocity: {kind: windowed_difference, samples: 2.5}": ("velocity.samples", "whole number"),
     "velocity: {kind: windowed_difference, samples: 2, cutoff: 3}": ("velocity.cutoff", "unknown key"),
     "velocity: {kind: filter, numerator: [1, 0], denominator: [1]}": ("velocity.numerator", "samples of the future"),
