@@ -90,12 +90,6 @@ def as_number(name: str, value: Any, least: float = -math.inf) -> float:
     return float(number)
 
 
-def check_count(name: str, value: Any, least: int) -> None:
-    """Raise `InputError` unless a count is a whole number and large enough."""
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        raise InputError(f"{name}: got {value!r}; a whole number of at least {least} is needed")
-
-
 def broadcast(arguments: Mapping[str, ArrayLike]) -> list[np.ndarray]:
     """Convert concrete arguments to float64 arrays of one common shape."""
     arrays = {name: as_float64(name, value) for name, value in arguments.items()}

@@ -7,13 +7,14 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_number, check_count, check_scalars, evaluate
+from zwidth.arrays.evaluate import as_number, check_scalars, evaluate
 from zwidth.arrays.roots import follow_root, integrate
 from zwidth.arrays.xp import frozen, namespace, nan_with_nan_slopes, store_once, tree_map
 from zwidth.loops.rigid.curve import column_end, creeps, frequency, lobe, on_line, peak, row_end, wall
 from zwidth.loops.rigid.device import DelayClasses, classify_delays, valid_device, wall_status
 from zwidth.loops.rigid.polynomial import Wall, check_delay_model, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.ridge import ridge_kernel
+from zwidth.parts.checks import check_whole
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
@@ -217,7 +218,7 @@ def sample_lobe(
     check_delay_model(delay)
     known = {"delta": as_number("delta", delta, 0.0), "d": as_number("d", d, 0.0)}
     check_scalars(known)
-    check_count("points", points, 8)
+    points = check_whole("points", points, 8, 10**7)
     kind = classify_delays(d)
     with np.errstate(all="ignore"):
         whole = lobe(np.float64(known["delta"]), np.float64(known["d"]), delay, kind)
@@ -242,7 +243,7 @@ def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points:
         delta: normalized physical damping b T/m, >= 0, a single number.
         d: delay in periods, >= 0, a single number.
         delay: "held" or "fractional_power".
-        points: how many points of the curve to take, >= 8.
+        points: how many points of the curve to take, 8 to 10,000,000.
 
     Returns:
         StableRegion: ``alpha``, ``beta``, ``omega`` (0 and pi on the straight parts), ``piece`` (see `Piece`); ``area``

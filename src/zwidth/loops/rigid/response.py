@@ -20,13 +20,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_number, check_count
+from zwidth.arrays.evaluate import as_number
 from zwidth.arrays.roots import bisect
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import phi_functions
 from zwidth.loops.rigid.folding import find_degree
 from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.polynomial import coefficients
+from zwidth.parts.checks import check_whole
 from zwidth.words.quantities import LONGEST_SETTLING
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, Samples
@@ -228,8 +229,8 @@ def step_response(
         beta: normalized virtual damping B T/m.
         delta: normalized physical damping b T/m, >= 0.
         d: delay in periods, >= 0, whole or not. All four single numbers.
-        periods: how many sampling periods to simulate, >= 1.
-        substeps: instants in each period, >= 1; 1 gives the samples alone.
+        periods: how many sampling periods to simulate, 1 to 10,000,000.
+        substeps: instants in each period, 1 to 10,000; 1 gives the samples alone.
         force: the constant force in units of m/T^2 times a length unit.
 
     Returns:
@@ -253,11 +254,11 @@ def step_response(
     """
     alpha, beta, force = as_number("alpha", alpha), as_number("beta", beta), as_number("force", force)
     delta, d = as_number("delta", delta, 0.0), as_number("d", d, 0.0)
-    check_count("periods", periods, 1)
-    check_count("substeps", substeps, 1)
+    periods = check_whole("periods", periods, 1, 10**7)
+    substeps = check_whole("substeps", substeps, 1, 10_000)
     fractions = np.arange(substeps) / substeps
     with np.errstate(all="ignore"):
-        samples = _run(alpha, beta, delta, d, force, int(periods))
+        samples = _run(alpha, beta, delta, d, force, periods)
         x, v, older, newer = samples[:, :, None]
         f = d - math.floor(d)
         x, v = move(x, v, force + older, force + newer, fractions, delta, f)
