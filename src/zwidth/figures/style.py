@@ -145,7 +145,8 @@ def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, **keyword
     """Explain what is drawn, above the panels in as many columns as fit, or within the first."""
     if not outside or not handles:
         if handles:
-            axes[0].legend(handles=handles)
+            # Said, or matplotlib warns on a busy machine that it looks for the place.
+            axes[0].legend(handles=handles, loc="best")
         return
     figure, columns = figure_of(axes), keywords.pop("ncols", 1)
     keywords |= {"handles": handles, "loc": "outside upper center"}
