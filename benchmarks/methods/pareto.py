@@ -61,7 +61,7 @@ def draw_pareto(marks: Sequence[Mark], axes: style.AnyAxes | None = None) -> np.
         lowest.set_xlabel("worst error seen")
     for ax in panels[::columns]:
         ax.set_ylabel("points per second")
-    style.legend(panels, _legend(marks), outside=axes is None, place="lower", ncols=4)
+    style.legend(panels, _legend(marks), outside=axes is None, loc="outside lower center", ncols=4)
     return panels
 
 

@@ -149,7 +149,7 @@ def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, **keyword
             axes[0].legend(handles=handles, loc="best")
         return
     figure, columns = figure_of(axes), keywords.pop("ncols", 1)
-    keywords |= {"handles": handles, "loc": "outside upper center"}
+    keywords = {"loc": "outside upper center"} | keywords | {"handles": handles}
     drawn = figure.legend(ncols=columns, **keywords)
     while (share := drawn.get_window_extent().width / figure.bbox.width) > 1.0 and columns > 1:
         columns -= 1
