@@ -31,9 +31,6 @@ from hypothesis import HealthCheck, settings
 from leftovers import what_is_open
 from waiting import wait_for
 
-# Python looks for garbage less often: collecting tests and tracing make so many objects that every sixth second went
-# into it.
-gc.set_threshold(50_000, 20, 20)
 # Silent broadcasting across ranks hides transposed axes.
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -60,9 +57,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What thousands of tests are made of stays: to look through all of it takes as long as many tests."""
+    """Python looks for garbage less often: tracing makes so many objects that every sixth second went into it."""
     gc.collect()
-    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 @pytest.hookimpl(wrapper=True)
