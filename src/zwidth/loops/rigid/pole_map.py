@@ -170,7 +170,7 @@ class _Canvas:
         # Walls at which two groups were compared may be there twice.
         noted = np.zeros(radius.shape, bool)
         noted[tuple(places[:, inside])] = True
-        return FollowedPoles(radius, rate, np.nonzero(noted))
+        return FollowedPoles(radius, rate, np.unravel_index(np.flatnonzero(noted), radius.shape))
 
 
 def _sides(rows: int, columns: int) -> list[tuple[int, int]]:
