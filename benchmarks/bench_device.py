@@ -9,11 +9,9 @@ each speed stands the largest difference from what the same function says when i
 
 from __future__ import annotations
 
-import argparse
 import os
 import platform
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -22,6 +20,7 @@ import numpy as np
 
 import zwidth
 from methods.clock import time_calls
+from methods.page import hand_out, page_parser
 
 SEED, SAMPLE = 20060901, 20_000
 
@@ -97,17 +96,12 @@ def measure_all(points: int, runs: int) -> str:
 
 def main() -> None:
     """Measure, and print or write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = page_parser(__doc__)
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--write", type=Path, help="the page to write")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    text = measure_all(given.points, given.runs)
-    if given.write is None:
-        print(text)
-    else:
-        given.write.write_text(text, encoding="utf-8")
+    hand_out(measure_all(given.points, given.runs), given.write)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ wall step by step. Those of devices with lags and resonances are of `tests/oracl
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -30,6 +29,8 @@ from zwidth.fitting.structure import Recordings
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 
 import measured_devices
+
+from methods.page import hand_out, page_parser
 
 PERIOD, SKIP = 1e-3, 22
 NAMES = ("mass", "damping", "delay", "friction")
@@ -384,16 +385,12 @@ def report(count: int, parts: int, processes: int) -> str:
 
 def main() -> None:
     """Measure, and print or write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = page_parser(__doc__)
     parser.add_argument("--logs", type=int, default=1000)
     parser.add_argument("--devices", type=int, default=1000, help="logs of devices with lags and resonances")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--write", type=Path, help="file for the tables, in Markdown")
     given = parser.parse_args()
-    text = report(given.logs, given.devices, given.processes)
-    print(text)
-    if given.write:
-        given.write.write_text(text)
+    hand_out(report(given.logs, given.devices, given.processes), given.write)
 
 
 if __name__ == "__main__":

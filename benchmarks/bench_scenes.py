@@ -14,15 +14,14 @@ import os
 # Before NumPy is loaded: one thread serves both sides of every comparison.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import argparse
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import zwidth
 from methods.clock import time_calls
+from methods.page import hand_out, page_parser
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
 
@@ -143,14 +142,8 @@ def _rigid_ratio(scene: zwidth.Scene) -> float:
 
 def main() -> None:
     """Measure, and print or write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", type=Path, help="the page to write")
-    given = parser.parse_args()
-    text = report()
-    if given.write is None:
-        print(text)
-    else:
-        given.write.write_text(text, encoding="utf-8")
+    given = page_parser(__doc__).parse_args()
+    hand_out(report(), given.write)
 
 
 if __name__ == "__main__":

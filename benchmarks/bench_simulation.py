@@ -9,10 +9,8 @@ largest difference of the positions from those of the loop and of dlsim, relativ
 
 from __future__ import annotations
 
-import argparse
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,7 @@ import scipy.signal
 
 import zwidth
 from methods.clock import time_calls
+from methods.page import hand_out, page_parser
 
 SCENES, PERIODS, BESIDE = 10_000, 1000, 20
 PUSH = 0.5
@@ -139,13 +138,8 @@ def report_parts() -> list[str]:
 
 def main() -> None:
     """Measure, and print or write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", type=Path, help="file for the tables, in Markdown")
-    write = parser.parse_args().write
-    text = report()
-    print(text)
-    if write:
-        write.write_text(text)
+    given = page_parser(__doc__).parse_args()
+    hand_out(report(), given.write)
 
 
 if __name__ == "__main__":

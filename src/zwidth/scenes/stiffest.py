@@ -117,9 +117,9 @@ def _present_value(scene: SceneAnswers, parameter: str) -> float:
     return float(known[parameter])
 
 
-def _range(scene: SceneAnswers, parameter: str, within: tuple[Any, Any] | None) -> tuple[float, float]:
+def _range(scene: SceneAnswers, parameter: str, now: float, within: tuple[Any, Any] | None) -> tuple[float, float]:
     if within is None:
-        now, timing = _present_value(scene, parameter), scene.timing
+        timing = scene.timing
         if not now > 0:
             raise InputError(f"within: {parameter} is 0 now; give the range to search, as within=(0.1, 10)")
         # The cost grows with the square of the delay in periods, and a filter has no cut-off from half its rate on.
@@ -304,7 +304,7 @@ class SceneOptima(SceneAnswers):
         """
         stiffness = _read_stiffness(stiffness)
         now = _present_value(self, parameter)
-        low, high = _range(self, parameter, within)
+        low, high = _range(self, parameter, now, within)
 
         def surplus(value: float) -> float:
             """How K_max compares with the wanted stiffness, in logarithms; NaN where it cannot be computed."""
