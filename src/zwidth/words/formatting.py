@@ -103,17 +103,17 @@ def spell_stiffness(value: float, digits: int = 4) -> str:
     return f"{text} ({plain(turned, digits)} mN m/deg)" if is_rotary() and math.isfinite(value) else text
 
 
-def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
+def tell_apart(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
     """Two ends with a unit or plain, rounded into what lies between, with as many digits as it takes to leave some."""
 
     def spell(end: float, digits: int) -> str:
         return with_unit(end, unit, digits) if unit else plain(end, digits)
 
-    for digits in range(4, 18):
+    for digits in range(least, 18):
         ends = round_safely(low, "above", digits), round_safely(high, "below", digits)
         if ends[0] < ends[1]:
             return spell(ends[0], digits), spell(ends[1], digits)
-    return spell(low, 4), spell(high, 4)
+    return spell(low, least), spell(high, least)
 
 
 def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, digits: int = 4) -> str:
@@ -122,9 +122,7 @@ def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, 
     beyond = [side * other for other in others if side * other > side * value]
     if beyond:
         low, high = sorted((value, side * min(beyond)))
-        # Inwards, where there is enough, unless nothing is left between them.
-        inner = round_safely(low, "above", digits), round_safely(high, "below", digits)
-        return " to ".join(tell_apart(*(inner if inner[0] < inner[1] else (low, high)), unit))
+        return " to ".join(tell_apart(low, high, unit, digits))
     value = round_safely(value, enough, digits)
     return f"{with_unit(value, unit, digits) if unit else plain(value, digits)} {ENOUGH[enough]}"
 
