@@ -71,16 +71,21 @@ _GOLDEN = 0.3819660112501051
 def narrow_dips(
     cost: Function, left: Array, middle: Array, right: Array, value: Array, steps: int
 ) -> tuple[Array, Array]:
-    """Lowest places of a function between two others, and its values there, by golden section; in NumPy."""
-    for _ in range(steps):
+    """Lowest places of a function between two others, and its values there, by golden section."""
+    xp = namespace(left, value)
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        left, middle, right, value = state
         upwards = right - middle > middle - left
-        trial = middle + _GOLDEN * np.where(upwards, right - middle, left - middle)
+        trial = middle + _GOLDEN * xp.where(upwards, right - middle, left - middle)
         reached = cost(trial)
         # Of the trial and the middle the lower one becomes the middle, the other one an end.
         better = reached < value
-        end, is_right = np.where(better, middle, trial), better ^ (trial > middle)
-        left, right = np.where(is_right, left, end), np.where(is_right, end, right)
-        middle, value = np.where(better, trial, middle), np.where(better, reached, value)
+        end, is_right = xp.where(better, middle, trial), better ^ (trial > middle)
+        left, right = xp.where(is_right, left, end), xp.where(is_right, end, right)
+        return left, xp.where(better, trial, middle), right, xp.where(better, reached, value)
+
+    _, middle, _, value = repeat(steps, step, (left, middle, right, value), xp)
     return middle, value
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.roots import false_position, follow_root
+from zwidth.arrays.roots import false_position, follow_root, narrow_dips
 from zwidth.arrays.xp import along, apply_each, epsilon, frozen, horner, namespace, nan_with_nan_slopes, store_once
 from zwidth.loops.rigid.crossover import stable_at
 from zwidth.loops.rigid.device import ANY, DeviceTerms, device, short_curve, split_delay, valid_wall
@@ -21,8 +21,9 @@ from zwidth.words.types import Array, ArrayLike
 
 # Steps of false position at most; every sixth one halves the bracket.
 _STEPS = 240
-# Samples of the fraction of a delay, between which the verdict is taken to change once at most.
-_FRACTIONS = 64
+# Samples of the fraction of a delay, and by how much closer than 1/delta, in which the held force of a strongly damped
+# device changes, they lie to whole delays; a damping as good as none for that; steps to the lowest place they show.
+_FRACTIONS, _GRADED, _LIGHT, _NARROWED = 64, 50.0, 1e-3, 24
 # alpha, beta, delta, d and any phase.
 _STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
 # Of a stable wall whose margins vanish in rounding.
@@ -75,8 +76,9 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
 
     Numerics:
         Phase margin and gain crossover are in closed form, the others are found to about 1e-14, at a cost that does not
-        grow with d. The fraction of the delay is sampled 64 times a period, and the last change looked for between two
-        samples. Traceable: `jit`, `vmap`, `grad`. A margin that is NaN has NaN derivatives; where it is one of those of
+        grow with d. The fraction of the delay is sampled 64 times a period, closest to whole delays, and the lowest place
+        that the samples show is looked for: a strongly damped device may bear less for a moment just before a whole
+        delay. Traceable: `jit`, `vmap`, `grad`. A margin that is NaN has NaN derivatives; where it is one of those of
         which `jax.jacrev` takes all at a time, so have the wall's others, unlike in `jax.jacfwd` or one by one.
 
     References:
@@ -186,24 +188,30 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     """
     still = tuple(frozen(value, xp) for value in wall)
     whole, fraction = split_delay(d)
-    nodes = along(np.minimum(np.arange(_FRACTIONS + 1) / _FRACTIONS, 1.0 - epsilon(d)), xp.asarray(d))
-    grid = nodes + 0.0 * d[..., None]
+    grid = _grade_fractions(still[2], xp)
     crossings, phases, exist = _bound_undelayed(grid, *(value[..., None] + 0.0 * grid for value in still))
     periods = xp.where(exist, phases / crossings, -xp.inf)
+
+    def sample(of: Array, at: Array) -> Array:
+        return xp.take_along_axis(of, at, axis=-1)[..., 0][()]
+
+    # Just before a whole delay a strongly damped device may bear less than at it: there is one such dip at most.
+    dips = (periods[..., 1:-1] <= periods[..., :-2]) & (periods[..., 1:-1] < periods[..., 2:])
+    if xp is not np or dips.any():
+        place = xp.argmax(dips, axis=-1)[..., None] + 1
+        around = [sample(grid, place + k) for k in (-1, 0, 1)]
+        deepest = narrow_dips(lambda f: _periods_borne(f, *still), *around, sample(periods, place), _NARROWED)
+        dips = xp.any(dips, axis=-1)[..., None] & (np.arange(_FRACTIONS + 1) == place)
+        grid, periods = (xp.where(dips, at[..., None], all) for at, all in zip(deepest, (grid, periods), strict=True))
     # One period on, f = 0 again, but for n: exactly so, whatever the rounding.
     periods = xp.concatenate([periods[..., :-1], periods[..., :1] - 1.0], axis=-1)
     now, part = frozen((whole, fraction), xp)
     ahead = (grid > part[..., None]) & (periods <= now[..., None])
     soon = xp.any(ahead, axis=-1)
-    there = xp.where(soon, now, xp.maximum(now + 1.0, xp.ceil(xp.min(periods, axis=-1))))
+    there = xp.where(soon, now, xp.maximum(now + 1.0, xp.ceil(xp.min(periods, axis=-1))))[()]
     lost = xp.where(soon[..., None], ahead, periods <= there[..., None])
     place = xp.maximum(xp.argmax(lost, axis=-1), 1)[..., None]
-
-    def sample(of: Array, at: Array) -> Array:
-        return xp.take_along_axis(of, at, axis=-1)[..., 0][()]
-
-    there = there[()]
-    excess_of = xp.where(exist, phases - there[..., None] * crossings, _NO_CROSSOVER)
+    excess_of = xp.where(exist, (periods - there[..., None]) * crossings, _NO_CROSSOVER)
     low, at_low = sample(grid, place - 1), sample(excess_of, place - 1)
     here_first = soon & (low < part)
     low = xp.where(here_first, part, low)[()]
@@ -218,6 +226,21 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     width = 4e-16 * (1.0 + there)
     f = false_position(lambda f: excess(f, there, *still), low, high, at_low, at_high, _STEPS, width)
     return there + follow_root(excess, f, _falling, there, *wall) - d
+
+
+def _grade_fractions(delta: Array, xp: Any) -> Array:
+    """Fractions from 0 to almost 1, along a last axis: at both ends in equal ratios, evenly where damping is light."""
+    share = along(np.arange(_FRACTIONS + 1) / _FRACTIONS, xp.asarray(delta))
+    growth = xp.log1p(_GRADED * xp.maximum(delta, _LIGHT))[..., None]
+    from_end = 0.5 * xp.expm1(2.0 * xp.minimum(share, 1.0 - share) * growth) / xp.expm1(growth)
+    return xp.minimum(xp.where(share <= 0.5, from_end, 1.0 - from_end), 1.0 - epsilon(delta))
+
+
+def _periods_borne(f: Array, alpha: Array, beta: Array, delta: Array) -> Array:
+    """nu of `_delay_margin`."""
+    w, phase, exists = _bound_undelayed(f, alpha, beta, delta)
+    xp = namespace(f)
+    return xp.where(exists, phase / w, -xp.inf)
 
 
 def _bound_undelayed(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:

@@ -96,6 +96,31 @@ def test_delay_is_borne_up_to_its_margin():
         assert verdict(alpha, beta, delta, d + part * np.maximum(margin - room, 0)).all()
 
 
+def test_a_delay_that_a_strongly_damped_wall_does_not_bear_for_a_moment_ends_its_margin():
+    # Just before a whole delay, within ln 2/delta of it, such devices bear less than at it.
+    rng = np.random.default_rng(7)
+    delta = 10 ** np.append(rng.uniform(1, 2, 600), rng.uniform(0, 6, 200))
+    d = np.where(rng.random(800) < 0.5, rng.integers(0, 6, 800), rng.uniform(0, 6, 800))
+    alpha = zwidth.alpha_max(delta, d).alpha * 10 ** rng.uniform(-6, -0.3, 800)
+    low, high = (zwidth.boundary_point(delta, d, alpha=alpha, side=side).beta for side in ("lower", "upper"))
+    beta = low + (high - low) * rng.choice([0.1, 0.5, 0.9, 0.999], 800)
+    walls = np.stack([alpha, beta, delta, d])[:, np.asarray(zwidth.is_stable(alpha, beta, delta, d))]
+    margin = np.asarray(zwidth.margins(*walls).delay_margin)
+    alpha, beta, delta, d = walls[:, :, None]
+    early = np.floor(d)[..., None] + np.arange(1, 8)[:, None] - np.geomspace(1e-3, 1.5, 60) / delta[..., None]
+    delays = np.concatenate([early.reshape(d.size, -1), d + margin[:, None] * np.linspace(0, 1, 100)[:-1]], axis=1)
+    ahead = (delays > d) & (delays < np.minimum(d + margin[:, None] * (1 - 1e-9), 1e5))
+    stable = np.asarray(zwidth.is_stable(alpha, beta, delta, np.where(ahead, delays, d)))
+    assert walls.shape[1] > 700
+    np.testing.assert_array_equal(stable, True)
+    ends = d[:, 0] + margin < 9e4
+    beyond = (d[:, 0] + margin)[ends] * (1 + 1e-12)
+    assert not np.asarray(zwidth.is_stable(*walls[:3, ends], beyond)).any()
+    # Lost 0.99 periods before the margin that 64 even samples of a period tell.
+    wall = 0.02576018862704622, 20.408868144027153, 19.712750549766938, 0.9656786317506585
+    assert zwidth.margins(*wall).delay_margin < 3.1e-4
+
+
 def test_a_shorter_delay_may_be_worse_and_only_what_lies_ahead_counts():
     # The line of z = -1 binds at d = 0 only: beyond, the wall becomes stable, and later unstable for good.
     d = np.linspace(0, 3, 3001)
