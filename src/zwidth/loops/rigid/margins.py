@@ -199,8 +199,10 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     dips = (periods[..., 1:-1] <= periods[..., :-2]) & (periods[..., 1:-1] < periods[..., 2:])
     if xp is not np or dips.any():
         place = xp.argmax(dips, axis=-1)[..., None] + 1
-        around = [sample(grid, place + k) for k in (-1, 0, 1)]
-        deepest = narrow_dips(lambda f: _periods_borne(f, *still), *around, sample(periods, place), _NARROWED)
+        left, middle, right = (sample(grid, place + k) for k in (-1, 0, 1))
+        deepest = narrow_dips(
+            lambda f: _periods_borne(f, *still), left, middle, right, sample(periods, place), _NARROWED
+        )
         dips = xp.any(dips, axis=-1)[..., None] & (np.arange(_FRACTIONS + 1) == place)
         grid, periods = (xp.where(dips, at[..., None], all) for at, all in zip(deepest, (grid, periods), strict=True))
     # One period on, f = 0 again, but for n: exactly so, whatever the rounding.

@@ -115,7 +115,8 @@ def test_a_delay_that_a_strongly_damped_wall_does_not_bear_for_a_moment_ends_its
     np.testing.assert_array_equal(stable, True)
     ends = d[:, 0] + margin < 9e4
     beyond = (d[:, 0] + margin)[ends] * (1 + 1e-12)
-    assert not np.asarray(zwidth.is_stable(*walls[:3, ends], beyond)).any()
+    a, b, damping = walls[:3, ends]
+    assert not np.asarray(zwidth.is_stable(a, b, damping, beyond)).any()
     # Lost 0.99 periods before the margin that 64 even samples of a period tell.
     wall = 0.02576018862704622, 20.408868144027153, 19.712750549766938, 0.9656786317506585
     assert zwidth.margins(*wall).delay_margin < 3.1e-4
