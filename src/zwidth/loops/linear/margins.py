@@ -6,15 +6,16 @@ sign, or as a dip that the tangents at both ends announce, and is polished from 
 
 One period more of delay changes nothing but the phase of L, by the angle w itself: at a gain crossover of phase
 ``p = arg(-L)`` a pole is on the circle m periods later if ``p - m w`` is a multiple of 2 pi. So the loops of delays
-within one period serve all longer ones: where the m of one of them is nearly whole, the delay is found by Newton's
-method, each step with the exact loop of its own. Real poles come to z = -1 where ``|L(-1)|`` passes 1. Poles counted
-before and beyond must confirm the first of these delays.
+within one period serve all longer ones: where m passes a whole number from one of them to the next, the delay is found
+by Newton's method, each step with the exact loop of its own. Real poles come to z = -1 where ``|L(-1)|`` passes 1. Poles
+counted before and beyond must confirm the first of these delays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -184,6 +185,9 @@ def find_nearest(
 
 # Parts of a period at whose ends crossovers are looked for, and by how many of them a start may miss its own.
 _PARTS, _SPARE = 8, 1.5
+# And how long before a whole delay, in time constants of the fastest pole: within ln 2 of them a strongly damped device
+# bears less than at it. Slower ones than this the parts resolve.
+_EARLY, _FAST = np.array([1.0, 0.5, 0.25, 0.1]), 2.0
 # The longest delay that is looked for, in periods; the step of a derivative in it.
 _LONGEST, _STEP = 1 << 17, 1e-5
 # Newton steps at most, and a logarithm of L that is rounding.
@@ -201,9 +205,12 @@ class DelayedLoop(NamedTuple):
 
 
 def lay_delays(chain: AnyChain) -> list[DelayedLoop]:
-    """The loops at the chain's own delay and at every eighth of a period, whole ones among them, up to one more."""
+    """The loops at delays up to a period longer than the chain's own: its own, every eighth, just before a whole one."""
     own = float(chain.d)
-    grid = (np.floor(own * _PARTS) + 1.0 + np.arange(_PARTS)) / _PARTS
+    fastest = -float(np.linalg.eigvals(chain.realize().A).real.min())
+    early = 1.0 - _EARLY / fastest if fastest > _FAST else np.empty(0)
+    grid = np.floor(own) + np.union1d(np.arange(_PARTS) / _PARTS, early)
+    grid = np.concatenate([grid, grid + 1.0])
     delays = np.concatenate([[own], grid[(grid > own + 1e-9) & (grid < own + 1.0 - 1e-9)], [own + 1.0]])
     return [DelayedLoop(delay, loop := loop_at(chain, delay), nodes_of(loop)) for delay in delays]
 
@@ -218,13 +225,9 @@ def delay_margin(chain: AnyChain, delayed: list[DelayedLoop], alpha: float, beta
     wall = alpha, beta
     laid = [OpenLoop.lay_out(each.loop, *wall, each.nodes) for each in delayed]
     crossed = [each.gain_crossovers() for each in laid]
-    ends = []
-    for (delay, *_), each, w in zip(delayed, laid, crossed, strict=True):
-        # So many periods more turn L to -1; whole ones leave its size as it is.
-        more = np.mod(np.angle(-each.at(w).value), 2.0 * np.pi) / w
-        near = (np.abs(more - np.round(more)) <= _SPARE / _PARTS) & (more < _LONGEST)
-        starts = zip(w[near].tolist(), (delay + more[near]).tolist(), strict=True)
-        ends += [_follow(chain, wall, w, delay) for w, delay in starts]
+    turns = [np.mod(np.angle(-each.at(w).value), 2.0 * np.pi) for each, w in zip(laid, crossed, strict=True)]
+    starts = _find_starts([float(each.delay) for each in delayed], crossed, turns)
+    ends = [_follow(chain, wall, w, delay) for w, delay in starts]
     last = np.array([each.L.value[-1].real for each in laid])
     for k in np.flatnonzero((np.abs(last[1:]) > 1.0) != (np.abs(last[:-1]) > 1.0)):
         low, high = delayed[k].delay, delayed[k + 1].delay
@@ -241,6 +244,37 @@ def delay_margin(chain: AnyChain, delayed: list[DelayedLoop], alpha: float, beta
     if not ends:
         return np.nan if any(w.size for w in crossed) else np.inf
     return min(ends) if _is_first_loss(chain, alpha, beta, min(ends)) else np.nan
+
+
+def _find_starts(
+    delays: list[float], crossed: list[np.ndarray], turns: list[np.ndarray]
+) -> Iterator[tuple[float, float]]:
+    """Angles and delays next to which a pole is on the circle, by the gain crossovers of laid delays and their phases.
+
+    So many periods more as the phase is of the angle turn L to -1, and whole ones leave its size as it is: between two
+    delays each whole number is looked for that this passes, and beside a lowest one that below it.
+    """
+    more = [phases / w for phases, w in zip(turns, crossed, strict=True)]
+    for k, (w, after) in enumerate(pairwise(crossed)):
+        if w.size != after.size:
+            # Two crossovers have met in between.
+            for i in (k, k + 1):
+                near = (np.abs(more[i] - np.round(more[i])) <= _SPARE / _PARTS) & (more[i] < _LONGEST)
+                yield from zip(crossed[i][near].tolist(), (delays[i] + more[i][near]).tolist(), strict=True)
+            continue
+        rise = np.mod(turns[k + 1] - turns[k] + np.pi, 2.0 * np.pi) - np.pi
+        for turn in (0.0, 2.0 * np.pi):
+            first, last = (turns[k] - turn) / w, (turns[k] + rise - turn) / after
+            whole = np.maximum(np.ceil(np.minimum(first, last)), 0.0)
+            for j in np.flatnonzero((whole <= np.maximum(first, last)) & (whole < _LONGEST)):
+                share = (whole[j] - first[j]) / (last[j] - first[j]) if first[j] != last[j] else 0.0
+                at = delays[k] + share * (delays[k + 1] - delays[k])
+                yield float(w[j] + share * (after[j] - w[j])), float(at + whole[j])
+    for k, (before, here, after) in enumerate(zip(more, more[1:], more[2:], strict=False), 1):
+        if before.size == here.size == after.size:
+            lowest = (here <= before) & (here <= after) & (here < _LONGEST)
+            for j in np.flatnonzero(lowest & (here - np.floor(here) <= np.maximum(before, after) - here)):
+                yield float(crossed[k][j]), float(delays[k] + here[j])
 
 
 def _follow(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) -> float:

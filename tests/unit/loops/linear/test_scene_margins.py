@@ -86,6 +86,24 @@ def test_the_delay_margin_ends_where_an_eigenvalue_first_leaves_the_circle(stiff
     assert FILTERED.margins(stiffness, damping).delay_margin == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.parametrize(
+    "damping, periods, cutoff, wall",
+    [
+        (1216.5, 1.99, 373.3895, (18852.96595750567, 1284.5443335840655)),
+        (2816.9, 3.0, 366.5891, (1068.6242229434915, 2880.773414737671)),
+    ],
+)
+def test_a_delay_that_a_strongly_damped_wall_does_not_bear_for_a_while_ends_its_margin(damping, periods, cutoff, wall):
+    # Beyond it the wall is stable once more, nearly a period on.
+    device, timing = zwidth.Device(mass=0.1, damping=damping), zwidth.Timing(period=1e-3, delay=periods * 1e-3)
+    scene = zwidth.Scene(device, timing, velocity=zwidth.LowPass(cutoff=cutoff))
+    found = scene.margins(*wall).delay_margin
+    shares, (K, B) = (*np.linspace(0, 0.999, 40), 1.001), wall
+    radii = [radius_at(scene, K, B, timing.delay + share * found) for share in shares]
+    assert max(radii[:-1]) < 1 < radii[-1]
+    assert radius_at(scene, K, B, np.ceil(periods) * 1e-3 + 1.2e-3) < 1
+
+
 def test_python_control_agrees():
     control = pytest.importorskip("control")
     # Its polynomials lose their digits in discrete time: it is given the frequency response.
