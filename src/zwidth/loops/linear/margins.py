@@ -192,20 +192,12 @@ _TRIALS, _ROUNDED = 30, 1e-9
 _WITNESSES, _BEYOND = (0.25, 0.5, 0.75, 1.0 - 1e-5), 1.0 + 1e-5
 
 
-class DelayedLoop(NamedTuple):
-    """The loop of a chain at another delay, and the nodes of its curve."""
-
-    delay: np.float64
-    loop: LoopRoots
-    nodes: np.ndarray
-
-
-def lay_delays(chain: AnyChain) -> list[DelayedLoop]:
-    """The loops at the chain's own delay and at every eighth of a period, whole ones among them, up to one more."""
+def lay_delays(chain: AnyChain) -> list[tuple[np.float64, LoopRoots, np.ndarray]]:
+    """The loops at the chain's own delay and every eighth of a period up to one more, each with its curve's nodes."""
     own = float(chain.d)
     grid = (np.floor(own * _PARTS) + 1.0 + np.arange(_PARTS)) / _PARTS
     delays = np.concatenate([[own], grid[(grid > own + 1e-9) & (grid < own + 1.0 - 1e-9)], [own + 1.0]])
-    return [DelayedLoop(delay, loop := loop_at(chain, delay), nodes_of(loop)) for delay in delays]
+    return [(delay, loop := loop_at(chain, delay), nodes_of(loop)) for delay in delays]
 
 
 def loop_at(chain: AnyChain, delay: float) -> LoopRoots:
@@ -213,13 +205,16 @@ def loop_at(chain: AnyChain, delay: float) -> LoopRoots:
     return find_roots(replace(chain, d=float(delay), whole=int(np.floor(delay))))
 
 
-def delay_margin(chain: AnyChain, delayed: list[DelayedLoop], alpha: float, beta: float) -> float:
+def delay_margin(
+    chain: AnyChain, delayed: list[tuple[np.float64, LoopRoots, np.ndarray]], alpha: float, beta: float
+) -> float:
     """Periods of delay that a stable wall bears; infinite where no delay is too long, NaN where that is in doubt."""
     wall = alpha, beta
-    laid = [OpenLoop.lay_out(each.loop, *wall, each.nodes) for each in delayed]
+    delays, loops, nodes = zip(*delayed, strict=True)
+    laid = [OpenLoop.lay_out(loop, *wall, w) for loop, w in zip(loops, nodes, strict=True)]
     crossed = [each.gain_crossovers() for each in laid]
     ends = []
-    for (delay, *_), each, w in zip(delayed, laid, crossed, strict=True):
+    for delay, each, w in zip(delays, laid, crossed, strict=True):
         # So many periods more turn L to -1; whole ones leave its size as it is.
         more = np.mod(np.angle(-each.at(w).value), 2.0 * np.pi) / w
         near = (np.abs(more - np.round(more)) <= _SPARE / _PARTS) & (more < _LONGEST)
@@ -227,7 +222,7 @@ def delay_margin(chain: AnyChain, delayed: list[DelayedLoop], alpha: float, beta
         ends += [_follow(chain, wall, w, delay) for w, delay in starts]
     last = np.array([each.L.value[-1].real for each in laid])
     for k in np.flatnonzero((np.abs(last[1:]) > 1.0) != (np.abs(last[:-1]) > 1.0)):
-        low, high = delayed[k].delay, delayed[k + 1].delay
+        low, high = delays[k], delays[k + 1]
         sign = 1.0 if abs(last[k]) > 1.0 else -1.0
         at_low, at_high = sign * np.log(np.abs(last[k : k + 2]))
 
@@ -276,7 +271,7 @@ def linear_margins(
     """All margins of walls of one shape, periods and radians a period; NaN where a wall is out of range."""
     stable = label_walls(boundary, alpha, beta)
     inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
-    delayed: list[DelayedLoop] = []
+    delayed: list[tuple[np.float64, LoopRoots, np.ndarray]] = []
     # What a sampled device does between its samples is not known.
     with_delay = with_delay and not chain.sampled
     out = np.full((len(Margins._fields), *alpha.shape), np.nan)
