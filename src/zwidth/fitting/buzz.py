@@ -115,7 +115,8 @@ def fit_buzz(
     onsets = Onsets(kappa, rub, w, velocity, period)
     weights = 1.0 / np.array(share or (1.0, 1.0))
     chosen, others = choose_device(onsets, weights, share is not None)
-    onsets, best, scale, equals, _ = chosen
+    onsets, best, equals, _ = chosen
+    scale = chosen.scale
     against = None
     if share and best.squares > chdtri(chosen.freedom, _CHANCE):
         far = plain(np.sqrt(best.squares / chosen.freedom), 2)

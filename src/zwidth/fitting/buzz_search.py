@@ -163,16 +163,20 @@ def _solve(
 
 
 class FittedKind(NamedTuple):
-    """A kind of device at its best: the variance in units of the weights, and all devices of it that fit as well.
+    """A kind of device at its best, and all devices of it that fit as well.
 
     None are equal where no device has the walls on the edge of its stable set.
     """
 
     onsets: Onsets
     best: Candidate
-    scale: float
     equals: list[Candidate]
     known_noise: bool
+
+    @property
+    def scale(self) -> float:
+        """The variance of the walls in units of the weights."""
+        return 1.0 if self.known_noise else max(self.best.squares / self.freedom, EXACT**2)
 
     @property
     def equations(self) -> int:
@@ -238,12 +242,11 @@ def choose_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> tup
 def _try(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> FittedKind:
     """The best device of a kind, and all that fit as well."""
     nothing = Candidate(np.zeros(onsets.unknowns), np.inf, np.full((onsets.w.size, 2), np.nan), (), False)
-    freedom = 2 * onsets.w.size - onsets.unknowns
-    kind, found, scale = FittedKind(onsets, nothing, 1.0, [], known_noise), [], 1.0
+    kind, found = FittedKind(onsets, nothing, [], known_noise), []
     # Parts are found where the walls tell their numbers; of a rigid device it is said which wall is missing.
     parts = onsets.lag + onsets.modes > 0
     for near, start in look_around(onsets, weights):
-        most = _HOPELESS * (kind.equals[0].squares + AS_GOOD * scale) if kind.equals else np.inf
+        most = _HOPELESS * (kind.best.squares + AS_GOOD * kind.scale)
         known = any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found)
         # Where slopes promise much the search got stuck, and says nothing yet.
         if near.found and (known or near.ahead > max(most, _STUCK * near.squares)):
@@ -255,11 +258,10 @@ def _try(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> FittedKind:
             if not (parts and is_blind(weigh(onsets.follow(fit.theta).slopes(), weights))):
                 kind.equals.append(fit)
                 kind.equals.sort(key=lambda each: each.squares)
-                scale = 1.0 if known_noise else max(kind.equals[0].squares / freedom, EXACT**2)
-    as_good = [fit for fit in kind.equals if fit.squares - kind.equals[0].squares < AS_GOOD * scale]
+                kind = kind._replace(best=kind.equals[0])
+    as_good = [fit for fit in kind.equals if fit.squares - kind.best.squares < AS_GOOD * kind.scale]
     best = (as_good or sorted(found, key=lambda fit: (not fit.found, fit.squares)) or [nothing])[0]
-    scale = 1.0 if known_noise else max(best.squares / freedom, EXACT**2)
-    return kind._replace(best=best, scale=scale, equals=as_good)
+    return kind._replace(best=best, equals=as_good)
 
 
 @np.errstate(all="ignore")  # Of parts that no device has, zeros overflow.

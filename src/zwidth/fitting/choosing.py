@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,20 +28,6 @@ _LAGS, _RATIO = (0.3, 1.5), 0.7
 _PARTED, _APART = 2, float(np.exp(0.2))
 
 _Looked = tuple[FittedModel, HiddenPole | None, list[PoleBank], LagTest | None]
-
-
-class _Trial(NamedTuple):
-    """A device that was compared: -2 times its logarithmic likelihood, what a number costs, and its theta."""
-
-    misfit: float
-    price: float
-    model: Recordings
-    theta: np.ndarray
-
-    @property
-    def cost(self) -> float:
-        """By Schwarz's criterion."""
-        return self.misfit + self.theta.size * self.price
 
 
 def choose_structure(best: FittedModel) -> _Looked:
@@ -92,18 +77,19 @@ def _grow(best: FittedModel, banks: list[PoleBank]) -> tuple[FittedModel | None,
     tried = []
     for _, model, start in begun.values():
         theta, squares = follow_start(model, start, _COMPARED)
-        tried.append(_Trial(model.measured.size * np.log(squares), np.log(model.measured.size), model, theta))
-    likeliest = min(tried, key=lambda trial: trial.cost)
-    model = replace(likeliest.model, logs=best.model.logs)
-    found = settle(model, likeliest.theta, (), NEARLY)
+        # -2 times its logarithmic likelihood, and Schwarz's criterion.
+        misfit = model.measured.size * np.log(squares)
+        tried.append((misfit + theta.size * np.log(model.measured.size), misfit, model, theta))
+    _, least, model, theta = min(tried, key=lambda trial: trial[0])
+    model = replace(model, logs=best.model.logs)
+    found = settle(model, theta, (), NEARLY)
     if model.resolution:
         found = settle(replace(model, noise=found.noise), found.theta, (), NEARLY)
     if best.lag_behind(found) <= (found.theta.size - best.theta.size) * np.log(best.count):
         return None, None
-    for trial in tried:
-        if trial.model.modes > model.modes and trial.misfit < likeliest.misfit - _BY_CHANCE:
-            turns = float(trial.theta[trial.model.parts.stop - 3]) / (2.0 * np.pi)
-            return found, HiddenPole(turns, True, instead=True)
+    for _, misfit, other, theta in tried:
+        if other.modes > model.modes and misfit < least - _BY_CHANCE:
+            return found, HiddenPole(float(theta[other.parts.stop - 3]) / (2.0 * np.pi), True, instead=True)
     return found, None
 
 

@@ -265,6 +265,12 @@ def read_step(resolution: Any) -> tuple[float, bool | None]:
             ) from None
 
 
+def list_columns(motions: Sequence[LoggedMotion], period: float | None) -> tuple[Any, Any, Any]:
+    """The times of logs, their period in place of those that were not read, their positions, and their forces."""
+    times = [period if motion.time is None else motion.time for motion in motions]
+    return times, [motion.position for motion in motions], [motion.force for motion in motions]
+
+
 def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None, **options: Any) -> DeviceFit:
     """`zwidth.fit_log` of logs that are read, all of one axis.
 
@@ -276,7 +282,4 @@ def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None,
     steps = {motion.resolution for motion in motions}
     if len(steps) > 1:
         raise InputError("resolution: the logs have several; give all of them the same, or fit them apart")
-    times = [motion.time for motion in motions]
-    when = period if times[0] is None else times
-    positions, forces = [motion.position for motion in motions], [motion.force for motion in motions]
-    return fit_log(when, positions, forces, resolution=steps.pop(), rotary=motions[0].rotary, **options)  # pyright: ignore[reportArgumentType]
+    return fit_log(*list_columns(motions, period), resolution=steps.pop(), rotary=motions[0].rotary, **options)

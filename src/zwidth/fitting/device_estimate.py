@@ -151,11 +151,6 @@ class DeviceEstimate:
         return self.scene.device.modes
 
     @property
-    def lag_order(self) -> int:
-        """Of the amplifier; 0 without a lag."""
-        return 0 if self.actuator is None else self.actuator.order
-
-    @property
     def is_structured(self) -> bool:
         """Whether it is more than a rigid mass: by an amplifier, or by resonances."""
         return self.actuator is not None or bool(self.modes)
@@ -176,13 +171,10 @@ class DeviceEstimate:
         """How many standard errors the intervals reach."""
         return reach_of(self.freedom)
 
-    def vary(self, values: Iterable[float]) -> Scene:
-        """The scene with other values of ``numbers``."""
-        return scene_of(values, self.period, self.velocity, self.lag_order)
-
     def normalize(self, drawn: np.ndarray) -> DimensionlessDevice:
         """Devices of other values of ``numbers``, a row each."""
-        return DimensionlessDevice.of_numbers(np.moveaxis(drawn, 1, 0), self.period, self.lag_order)
+        lag = 0 if self.actuator is None else self.actuator.order
+        return DimensionlessDevice.of_numbers(np.moveaxis(drawn, 1, 0), self.period, lag)
 
     def differ(self, ask: Callable[[Scene], Any]) -> np.ndarray:
         """By how much an answer changes along each axis of the covariance, one standard deviation far: a row each."""
@@ -191,7 +183,8 @@ class DeviceEstimate:
             step = _STEP * axis
             # Where damping or delay would be negative, to one side.
             sides = [side for side in (-1.0, 1.0) if np.all((values + side * step) * np.where(values < 0, -1, 1) >= 0)]
-            ends = [ask(self.vary(values + side * step)) for side in sides]
+            moved = [dict(zip(self.numbers, (values + side * step).tolist(), strict=True)) for side in sides]
+            ends = [ask(self.scene.replace(**each)) for each in moved]
             if len(sides) == 1:
                 sides, ends = [0.0, *sides], [middle, *ends]
             change = (ends[-1] - ends[0]) / (_STEP * (sides[-1] - sides[0])) if sides else np.nan * middle

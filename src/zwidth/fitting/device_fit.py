@@ -205,9 +205,10 @@ class DeviceFit(DeviceEstimate):
         """
         errors = self.errors | {"stiffness_max": self.stiffness_error}
         reaches = {name: (self.value_of(name), self.reach * error) for name, error in errors.items()}
+        signed = [name for name in errors if name == "offset" or (name.startswith("modes") and name.endswith("mass"))]
         # A NaN stays one; a constant force and the mass of a mode may be negative.
         bars = {
-            name: ErrorBar(float(value - far if _may_be_negative(name) else np.maximum(0.0, value - far)), value + far)
+            name: ErrorBar(float(value - far if name in signed else np.maximum(0.0, value - far)), value + far)
             for name, (value, far) in reaches.items()
         }
         if self.hidden is not None and self.stiffness_error > 0:
@@ -307,14 +308,10 @@ class DeviceFit(DeviceEstimate):
             "virtual_damping": self.virtual_damping,
             "errors": self.errors
             | {"stiffness_max": self.stiffness_error, "virtual_damping": self.virtual_damping_error},
-            "intervals": {name: list(bar) for name, bar in self.intervals.items()},
+            "intervals": self.intervals,
             "covariance": self.covariance.tolist(),
-            "noise": list(self.noise) if isinstance(self.noise, tuple) else self.noise,
-            "offset": self.offset,
-            "friction": self.friction,
-            "resolution": self.resolution,
-            "period": self.period,
-            "doubts": list(self.doubts),
+            "noise": self.noise,
+            **{name: getattr(self, name) for name in ("offset", "friction", "resolution", "period", "doubts")},
             "status": int(self.status),
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),
@@ -322,10 +319,6 @@ class DeviceFit(DeviceEstimate):
             "lag": None if self.lag is None else self.lag._asdict(),
         }
         return to_json(numbers)
-
-
-def _may_be_negative(name: str) -> bool:
-    return name == "offset" or (name.startswith("modes") and name.endswith("mass"))
 
 
 def _doubt_period(period: float) -> list[str]:

@@ -232,7 +232,7 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
     """Raise `InputError` where the force explains nothing of the motion, the contrary of it, or too little."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
     # What there would be without any force, not even friction.
-    alone = model.predict(np.append(theta[:-2], [0.0, 0.0]))[1][:, model.parts.stop : -2]
+    alone = model.follow(np.append(theta[:-2], [0.0, 0.0])).slopes[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
     if float(rest @ rest) - squares <= _SEEN**2 * squares / model.measured.size:
@@ -295,12 +295,9 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
 
 def _place(best: FittedModel, logs: tuple[Recording, ...], skip: int, period: float) -> tuple[FittedMotion, ...]:
     """Every log beside its fit, NaN at its first samples and where it is too long."""
-    places = []
-    for log, part in zip(logs, best.model.split(best.moved[0]), strict=True):
-        place = np.full(log.force.size, np.nan)
-        place[skip : skip + part.size] = part
-        places.append(place)
-    return tuple(
-        FittedMotion(period * np.arange(place.size), log.force, log.position, place)
-        for log, place in zip(logs, places, strict=True)
-    )
+    motions = []
+    for log, part in zip(logs, best.model.split(best.motion.position), strict=True):
+        modelled = np.full(log.force.size, np.nan)
+        modelled[skip : skip + part.size] = part
+        motions.append(FittedMotion(period * np.arange(modelled.size), log.force, log.position, modelled))
+    return tuple(motions)

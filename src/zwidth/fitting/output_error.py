@@ -76,14 +76,14 @@ class FittedModel:
         return self.model.measured.size if self.model.noise is None else self.model.noise.count
 
     @cached_property
-    def moved(self) -> tuple[np.ndarray, np.ndarray]:
+    def motion(self) -> ModelledMotion:
         """Positions and their derivatives in theta."""
-        return self.model.predict(self.theta)
+        return self.model.follow(self.theta)
 
     @cached_property
     def residuals(self) -> np.ndarray:
         """Measured less modelled."""
-        return self.model.measured - self.moved[0]
+        return self.model.measured - self.motion.position
 
     @property
     def variance(self) -> float:
@@ -94,12 +94,12 @@ class FittedModel:
     def noise(self) -> MeasurementNoise:
         """That of its positions; at rest, x0 takes up an encoder's error, and the residuals show less than there is."""
         step = self.model.resolution
-        return MeasurementNoise(self.moved[0], max(self.variance, step**2 / 12.0), step)
+        return MeasurementNoise(self.motion.position, max(self.variance, step**2 / 12.0), step)
 
     @cached_property
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
         """The derivatives, each of size 1 or, as that in the v0 of a mass that sticks, 0; and their sizes."""
-        columns = self.model.weigh(self.moved[1])
+        columns = self.model.weigh(self.motion.slopes)
         sizes = np.linalg.norm(columns, axis=0)
         sizes = np.where(sizes > 0, sizes, 1.0)
         return columns / sizes, sizes
@@ -180,7 +180,7 @@ def fit_model(model: Recordings) -> FittedModel:
         best = _fit(model, best.theta)
     # Of a mass that slides one way only, and rests before or after, how much is of which stays open: one of them is
     # none. Beside that device others fit that slide back a little within the noise.
-    steps = np.diff(best.moved[0])
+    steps = np.diff(best.motion.position)
     way = float(np.sign(steps.sum()))
     if -np.sum(steps, where=way * steps < 0) * way < _BACK * np.abs(steps).sum():
         g, pull = best.theta[0], best.theta[-2] - way * best.theta[-1]
@@ -249,8 +249,8 @@ def _start(model: Recordings) -> list[np.ndarray]:
 
 def _answer(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.ndarray:
     """Positions where g is 1 and the first speeds, o and c are as in ``base``, and their slopes in x0, v0, o: rows."""
-    places, slopes = model.predict(np.array([1.0, delta, d, *base[3:]]))
-    return np.vstack([places, slopes[:, 3:-1].T])
+    motion = model.follow(np.array([1.0, delta, d, *base[3:]]))
+    return np.vstack([motion.position, motion.slopes[:, 3:-1].T])
 
 
 def _combine(rows: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from zwidth.fitting.columns import LoggedMotion
+from zwidth.fitting.columns import LoggedMotion, list_columns
 from zwidth.fitting.encoder import find_resolution
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.recordings import find_runs, read_logs
@@ -139,9 +139,7 @@ def respond_to_logs(
         raise InputError(
             "position, force: got an angle and a torque; a response is in m/N: give position and force at the handle"
         )
-    times = [period if motion.time is None else motion.time for motion in motions]
-    positions, forces = [motion.position for motion in motions], [motion.force for motion in motions]
-    return respond(times, positions, forces, cycle=cycle, resolution=motions[0].resolution)  # pyright: ignore[reportArgumentType]
+    return respond(*list_columns(motions, period), cycle=cycle, resolution=motions[0].resolution)
 
 
 def find_nominal_limit(scene: Scene) -> StiffestWall:

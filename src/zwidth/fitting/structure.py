@@ -109,11 +109,6 @@ class Recordings:
         """The scene of theta."""
         return self.normalize(theta, period).to_scene(period, velocity)
 
-    def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and their derivatives in theta."""
-        motion = self.follow(theta)
-        return motion.position, motion.slopes
-
     def follow(self, theta: np.ndarray) -> ModelledMotion:
         """The motion of theta in all logs."""
         each = [self.follow_log(theta, k) for k in range(len(self.logs))]

@@ -15,15 +15,14 @@ import numpy as np
 from zwidth.arrays.balls import quantities
 from zwidth.arrays.evaluate import as_float64, join_shapes
 from zwidth.arrays.roots import bisect
-from zwidth.arrays.xp import is_traced, within
-from zwidth.loops.normalization import normalize
+from zwidth.arrays.xp import is_traced
+from zwidth.loops.normalization import normalize, quantity_status
 from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.certified_filter import stable_everywhere
 from zwidth.loops.rigid.verdict import is_stable
 from zwidth.parts.checks import accept_units
 from zwidth.scenes.stiffness import max_stiffness
 from zwidth.words.errors import InputError
-from zwidth.words.quantities import SI_RANGE
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
@@ -186,11 +185,9 @@ def _each_box(
 
 
 def _box_status(low: np.ndarray, high: np.ndarray) -> Status:
-    positive = np.array([True, False, True, False])
-    valid = np.isfinite(low) & np.isfinite(high) & (low <= high) & np.where(positive, low > 0, low >= 0)
-    if not valid.all():
-        return Status.INVALID_INPUT
-    return Status.OK if within(np.concatenate([low, high]), SI_RANGE).all() else Status.OUT_OF_RANGE
+    found = quantity_status(**dict(zip(_NAMES, np.stack([low, high], -1), strict=True)))
+    # Of several faults the first of `Status` is told.
+    return Status(min(found[found > 0].tolist(), default=0)) if np.all(low <= high) else Status.INVALID_INPUT
 
 
 def _normalize_devices(devices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

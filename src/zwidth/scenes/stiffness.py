@@ -20,8 +20,6 @@ from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
-_NAMES: tuple[str, ...] = ("mass", "damping", "period", "delay", "delta", "d")
-
 
 def checked_device(**quantities: ArrayLike) -> Normalized:
     """The normalized device; raises `InputError` also where a scalar delta or d is beyond the range of the model."""
@@ -134,7 +132,8 @@ def sensitivities(
     """
     check_delay_model(delay_model)
     device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
-    arguments = dict(zip(_NAMES, (mass, damping, period, delay, device.delta, device.d), strict=True))
+    given = {"mass": mass, "damping": damping, "period": period, "delay": delay}
+    arguments = given | {"delta": device.delta, "d": device.d}
     return evaluate(_sensitivities_kernel, arguments, delay_model, classify_delays(device.d))
 
 

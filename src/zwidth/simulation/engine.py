@@ -114,12 +114,6 @@ def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, most: int)
     return jnp.take_along_axis(slopes, jnp.maximum(length - 1, 0)[None], 0)[0]
 
 
-def forces_of(lanes: Lanes, options: Options, commands: Array, k: Array) -> list[Array]:
-    """The commands that act one after the other until the next sample."""
-    ages = {1: (0,), 2: (1, 0), 4: (2, 1, 0, -1)}[options.pieces]
-    return [look_back(commands, k, lanes.late + age) for age in ages]
-
-
 def stored(lanes: Lanes, x: Array) -> Array:
     """Kinetic and elastic energy."""
     return dot(x, jnp.stack([dot(row, x) for row in lanes.energy]))
@@ -239,7 +233,9 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     """One period; ``ends`` the periods at which the halves of the tail begin, and the end."""
     sensed = state.body.x[0] + given.noise
     program, reading = control(lanes, options, state.program, given.k, sensed)
-    forces = forces_of(lanes, options, program.commands, given.k)
+    # The commands that act one after the other until the next sample.
+    ages = {1: (0,), 2: (1, 0), 4: (2, 1, 0, -1)}[options.pieces]
+    forces = [look_back(program.commands, given.k, lanes.late + age) for age in ages]
     durations = given.durations if options.jitter else lanes.durations
     motion = lanes.motion[0]
 

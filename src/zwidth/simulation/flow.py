@@ -122,8 +122,3 @@ def flow(rate: np.ndarray, drain: np.ndarray, times: np.ndarray) -> Flow:
         # e^A - 1 by itself keeps the digits of slow motions.
         step = 2.0 * step + step @ step
     return Flow(step[..., :count, :], lost)
-
-
-def digit_flow(rate: np.ndarray, drain: np.ndarray) -> Flow:
-    """The flow over the binary digits of time, the longest first."""
-    return flow(rate, drain, np.broadcast_to(0.5 ** np.arange(DIGITS), (rate.shape[0], DIGITS)))

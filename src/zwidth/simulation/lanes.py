@@ -13,7 +13,7 @@ import numpy as np
 
 from zwidth.loops.linear.state_space import estimate_matrices
 from zwidth.parts.velocity import FOAW, Estimate
-from zwidth.simulation.flow import Flow, Mechanics, digit_flow, flow
+from zwidth.simulation.flow import DIGITS, Flow, Mechanics, flow
 from zwidth.words.errors import InputError
 from zwidth.words.types import Array
 
@@ -184,7 +184,8 @@ def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, o
 
     digits = Flow(*(np.zeros((1, 1, 1, 1, 1)) for _ in Flow._fields))
     if options.friction or options.jitter:
-        digits = lay(digit_flow(way, machine.drain) for way in ways)
+        times = np.broadcast_to(0.5 ** np.arange(DIGITS), (len(machine.rate), DIGITS))
+        digits = lay(flow(way, machine.drain, times) for way in ways)
     longest = find_longest_steps(machine) if options.friction else np.array([2.0])
     return {
         "rate": _lay(machine.rate, which),

@@ -70,21 +70,19 @@ def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> tuple[np.ndarray
     """The bodies' map over a period and until the command changes, and what a push adds, piece by piece."""
     change = _rows(lanes.pieces.change[0], at)
     size = change.shape[-2]
-    whole = np.concatenate([np.eye(size), np.zeros((size, 2))], 1)
-    whole = halfway = np.broadcast_to(whole, (at.size, size, size + 2))
-    pushed = np.zeros((at.size, size, 1))
+    # A row for each number of the state, for the older and the newer command, and for the push.
+    axes = np.eye(size + 3)
+    whole = halfway = np.broadcast_to(axes[:size], (at.size, size, size + 3))
     for j in range(options.substeps):
         for piece in range(options.pieces):
             part = change[:, j, piece]
             # Of two pieces the first feels the older command.
             newer = piece + 1 == options.pieces
-            force = np.eye(size + 2)[size + newer]
-            moves, commanded = part[..., :size], part[..., size : size + 1]
-            whole = whole + moves @ whole + commanded * force
-            pushed = pushed + moves @ pushed + part[..., -1:]
+            given = part[..., size : size + 1] * axes[size + newer] + part[..., -1:] * axes[-1]
+            whole = whole + part[..., :size] @ whole + given
             if not newer:
-                halfway = halfway + moves @ halfway + commanded * force
-    return whole, halfway[..., :-1], pushed[..., 0]
+                halfway = halfway + part[..., :size] @ halfway + given
+    return whole[..., :-1], halfway[..., : size + 1], whole[..., -1]
 
 
 def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int, at: np.ndarray) -> LaneGroup:

@@ -61,7 +61,8 @@ def test_several_logs_share_the_device_alone():
     logs = tuple(Recording(random_force(seed), np.zeros(294), SKIP) for seed in (1, 2))
     model = Recordings(logs)
     theta = np.array([1e-5, 0.02, 1.3, 0.1, 1e-4, -0.2, -3e-4, 1e-7, 1e-6])
-    places, slopes = model.predict(theta)
+    motion = model.follow(theta)
+    places, slopes = motion.position, motion.slopes
     for k, log in enumerate(logs):
         alone = log.move(*theta[:3], *theta[3 + 2 * k : 5 + 2 * k], *theta[7:])
         rows = slice(294 * k, 294 * (k + 1))

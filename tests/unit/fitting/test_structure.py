@@ -38,7 +38,7 @@ def lay_out(delay, lag, modes, *, friction=1e-15, order=1):
 @pytest.mark.parametrize("case", CASES)
 def test_motions_are_those_of_matrix_exponentials(case):
     model, theta = lay_out(*CASES[case])
-    place = model.predict(theta)[0]
+    place = model.follow(theta).position
     np.testing.assert_allclose(place, model.measured, atol=1e-9 * np.ptp(place))
 
 
@@ -49,10 +49,10 @@ def test_derivatives_are_those_of_differences(case, friction, order):
     model, theta = lay_out(*CASES[case], friction=friction, order=order)
     # As of a device that moved before.
     theta[model.parts.stop : -2] += 1e-4 * np.random.default_rng(1).standard_normal(theta[model.parts.stop : -2].size)
-    slopes = model.predict(theta)[1]
+    slopes = model.follow(theta).slopes
     for k in range(theta.size - 1):
         step = np.eye(theta.size)[k] * 1e-5 * max(abs(theta[k]), 1e-6)
-        ends = [model.predict(theta + side * step)[0] for side in (1, -1)]
+        ends = [model.follow(theta + side * step).position for side in (1, -1)]
         found = (ends[0] - ends[1]) / (2 * step[k])
         np.testing.assert_allclose(slopes[:, k], found, atol=2e-4 * np.abs(found).max())
 

@@ -24,7 +24,6 @@ from zwidth.loops.linear.curve import (
     circle_zeros,
     curve_at,
     cut_arcs,
-    find_dips,
     lines_at,
     nodes_of,
     zeros_of,
@@ -64,8 +63,6 @@ class Boundary:
     def trace(cls, loop: LoopRoots) -> Boundary:
         """Lay out the curve."""
         w = nodes_of(loop)
-        here = curve_at(loop, w)
-        w = np.unique(np.concatenate([w, find_dips(w, here.turn)]))
         here = curve_at(loop, w)
         vertical = zeros_of(loop, w, here.fall, "fall")
         touched = [p for p in circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
@@ -160,7 +157,7 @@ class Boundary:
         limits |= {line.w: line.q - line.meeting * line.f for line in self.lines}
         slope = curve_at(self.loop, self.w).alpha_slope
         tops = zeros_of(self.loop, self.w, slope, "alpha_slope")
-        nodes = np.unique(np.concatenate([self.w, tops, find_dips(self.w, slope)]))
+        nodes = np.unique(np.concatenate([self.w, tops]))
         pieces, heights = [], []
         for a, b in pairwise(sorted(limits)):
             inner = nodes[(nodes > a) & (nodes < b)]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import fields, is_dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,37 +25,28 @@ from zwidth.words.status import Status
 if TYPE_CHECKING:
     import flint
 
-_FIRST_BITS, _MOST_BITS, _FLOAT_BITS = 128, 8192, 60
+# Precisions, one after the other until one is enough; and what is right to float64.
+_BITS, _FLOAT_BITS = tuple(128 << k for k in range(7)), 60
 _NOTHING = Estimate(0, 0.0)
-
-
-class BallPolynomials(NamedTuple):
-    """``P = D + K N1 + B N2`` at one precision, K in N/m and B in N s/m."""
-
-    D: flint.arb_poly
-    N1: flint.arb_poly
-    N2: flint.arb_poly
-    rest: bool  # whether K = 0 leaves a pole at z = 1 exactly: nothing pulls a device at rest back
 
 
 def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels and statuses of walls of one shape, in SI units."""
     if not certified.available():
         raise InputError("method: 'certified' needs python-flint for this scene; pip install 'zwidth[certified]'")
-    known: dict[int, BallPolynomials] = {}
+    known: dict[int, tuple[Any, Any, Any, bool]] = {}
     stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)
     for place in np.ndindex(stiffness.shape):
         stable[place], status[place] = _decide(scene, float(stiffness[place]), float(damping[place]), known)
     return stable, status
 
 
-def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, BallPolynomials]) -> tuple[bool, Status]:
+def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, Any]) -> tuple[bool, Status]:
     import flint
 
     if not (np.isfinite(stiffness) and np.isfinite(damping)):
         return False, Status.INVALID_INPUT
-    bits = _FIRST_BITS
-    while bits <= _MOST_BITS:
+    for bits in _BITS:
         with flint.ctx.workprec(bits):
             if bits not in known:
                 known[bits] = _polynomials(scene)
@@ -68,7 +59,6 @@ def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, BallP
             verdict = all_inside(p)
         if verdict is not None:
             return (False, Status.ON_BOUNDARY if verdict else Status.OK) if at_one else (verdict, Status.OK)
-        bits *= 2
     return False, Status.UNDECIDED
 
 
@@ -91,7 +81,11 @@ def all_inside(p: flint.arb_poly) -> bool | None:
     return True
 
 
-def _polynomials(scene: Any) -> BallPolynomials:
+def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly, bool]:
+    """D, N1 and N2 of ``P = D + K N1 + B N2``, K in N/m and B in N s/m; whether K = 0 leaves a pole at z = 1 exactly.
+
+    Then nothing pulls a device at rest back.
+    """
     import flint
 
     exact = _exact(scene)
@@ -105,7 +99,7 @@ def _polynomials(scene: Any) -> BallPolynomials:
     # F(1) is exactly 0 where a sum of exact fractions is; all other estimates are differences.
     own = isinstance(scene.velocity, VelocityFilter)
     rest = chain.free and (not own or sum(map(Fraction, scene.velocity.numerator)) == 0)
-    return BallPolynomials(waiting * bottom, answer * bottom * unit, answer * top * unit, rest)
+    return waiting * bottom, answer * bottom * unit, answer * top * unit, rest
 
 
 def _exact(part: Any) -> Any:
@@ -132,8 +126,7 @@ def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -
     """
     import flint
 
-    bits = _FIRST_BITS
-    while bits <= _MOST_BITS:
+    for bits in _BITS:
         with flint.ctx.workprec(bits):
             ball = flint.arb(period)
             response, _ = _device(System(device, ball, flint.arb(device.mass), *delay, _NOTHING))
@@ -149,7 +142,6 @@ def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -
                     roots = None
                 if roots is not None and all(root.rel_accuracy_bits() > _FLOAT_BITS for root in roots):
                     return float(coefficients[-1]), np.array([complex(root) for root in roots], complex)
-        bits *= 2
     raise InputError("device: its zeros between samples cannot be told from each other; leave out what hardly answers")
 
 

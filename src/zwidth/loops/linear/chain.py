@@ -102,62 +102,35 @@ class Chain:
         xp = namespace(*numbers, *(lag if isinstance(lag, Resonance) else () if lag is None else (lag,)))
         bodies, modes = len(self.bodies), len(self.modes)
         count, behind = bodies + modes, 0 if lag is None else 2 if isinstance(lag, Resonance) else 1
-        zero = 0.0 * (self.bodies[0].mass + self.bodies[-1].damping + sum(mode.rate for mode in self.modes))
         size = 2 * count + behind
-
-        def row(*entries: tuple[int, Any]) -> list[Any]:
-            found = [zero] * size
-            for place, value in entries:
-                found[place] = found[place] + value
-            return found
-
+        zero = xp.asarray(0.0 * (self.bodies[0].mass + self.bodies[-1].damping + sum(mode.rate for mode in self.modes)))
+        # A row for each number of the state, for the command and for a force held on the first body.
+        axes = xp.asarray(np.eye(size + 2).astype(zero.dtype)).reshape(size + 2, size + 2, *[1] * zero.ndim)
+        command, held = axes[size:]
+        driven = command if lag is None else axes[2 * count]
+        ties = [link.stiffness * axes[k] + link.damping * axes[count + k] for k, link in enumerate(self.links, start=1)]
+        ties = [zero, *ties, zero]
         accelerations = []
         for k, body in enumerate(self.bodies):
-            force = row()
-            for j, side in body_position(k, self.sensor, bodies, modes):
-                force[j] = force[j] - side * body.stiffness
-                force[count + j] = force[count + j] - side * body.damping
-            if k:
-                link = self.links[k - 1]
-                force[k], force[count + k] = force[k] - link.stiffness, force[count + k] - link.damping
-            if k + 1 < bodies:
-                link = self.links[k]
-                force[k + 1], force[count + k + 1] = force[k + 1] + link.stiffness, force[count + k + 1] + link.damping
-            accelerations.append([value / body.mass for value in force])
+            seen = body_position(k, self.sensor, bodies, modes)
+            place, speed = (sum(sign * axes[start + j] for j, sign in seen) for start in (0, count))
+            force = ties[k + 1] - ties[k] - body.stiffness * place - body.damping * speed
+            accelerations.append((force if k else force + driven + held) / body.mass)
         swings = [
-            row((bodies + k, -mode.rate * mode.rate), (count + bodies + k, -2.0 * mode.damping_ratio * mode.rate))
+            driven / mode.mass
+            - mode.rate * mode.rate * axes[bodies + k]
+            - 2.0 * mode.damping_ratio * mode.rate * axes[count + bodies + k]
             for k, mode in enumerate(self.modes)
         ]
-        seen = accelerations[self.sensor]
-        for swing in swings:
-            seen = [a + b for a, b in zip(seen, swing, strict=True)]
-        stretches = [
-            [a - b for a, b in zip(accelerations[k], accelerations[k - 1], strict=True)] for k in range(1, bodies)
-        ]
-        rows = [row((count + k, 1.0)) for k in range(count)] + [seen, *stretches, *swings]
-        first = 1.0 / self.bodies[0].mass + zero
-        # A body beyond a link feels the push through the link alone.
-        push = [zero] * count + [zero if self.sensor else first] + [-first, zero][: bodies - 1] + [zero] * modes
-        swung = [1.0 / mode.mass + zero for mode in self.modes]
-        driven = [zero] * count + [push[count] + sum(swung, zero)] + push[count + 1 : count + bodies] + swung
-        push, driven = push + [zero] * behind, driven + [zero] * behind
-        if lag is not None:
-            rows = [
-                [*line[: 2 * count], force, *[zero] * (behind - 1)] for line, force in zip(rows, driven, strict=False)
-            ]
-            driven = [zero] * size
-            if isinstance(lag, Resonance):
-                square = lag.rate * lag.rate
-                rows += [
-                    row((size - 1, 1.0)),
-                    row((size - 2, -square), (size - 1, -2.0 * lag.damping_ratio * lag.rate)),
-                ]
-                driven[-1] = square + zero
-            else:
-                rows.append(row((size - 1, -lag)))
-                driven[-1] = lag + zero
-        A = xp.stack([xp.stack([xp.asarray(v) for v in r]) for r in rows])
-        return Realization(A, *(xp.stack([xp.asarray(v) for v in column]) for column in (driven, push)))
+        rows = [*axes[count : 2 * count], sum(swings, accelerations[self.sensor])]
+        rows += [accelerations[k] - accelerations[k - 1] for k in range(1, bodies)] + swings
+        if isinstance(lag, Resonance):
+            slows = 2.0 * lag.damping_ratio * lag.rate * axes[size - 1]
+            rows += [axes[size - 1], lag.rate * lag.rate * (command - axes[size - 2]) - slows]
+        elif lag is not None:
+            rows.append(lag * (command - axes[size - 1]))
+        table = xp.stack([row + zero for row in rows])
+        return Realization(table[:, :size], table[:, size], table[:, size + 1])
 
     @cached_property
     def continuous(self) -> tuple[np.ndarray, np.ndarray]:

@@ -22,8 +22,6 @@ _STEP = 0.08
 _ROUNDS = 60
 # How near to z = -1 the last node is, for a loop without roots there.
 _LAST = 1e-4
-# Shares of a step at which a dip of the slope between two nodes is looked for.
-_INSIDE = np.arange(1, 8) / 8.0
 
 
 class CurvePoints(NamedTuple):
@@ -78,24 +76,6 @@ def zeros_of(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: str) -> 
     """Zeros of a field of the curve between nodes where its sign changes."""
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
     return zeros_between(lambda at: getattr(curve_at(loop, at), field), w, values, k)
-
-
-def find_dips(w: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Nodes to add where a slope of the curve keeps its sign from one node to the next but may not do so between them.
-
-    The curve changes so little over a step that the slope is nearly a parabola there; where an end's tangent leads
-    below a tenth of it, the step is looked at in eighths.
-    """
-    same = (values[:-1] > 0) == (values[1:] > 0)
-    step = np.diff(w)
-    # Slopes at the nodes by differences of the three around them.
-    inner = np.gradient(values, w)
-    first = np.abs(values[:-1]) + np.sign(values[:-1]) * inner[:-1] * step / 2
-    last = np.abs(values[1:]) - np.sign(values[1:]) * inner[1:] * step / 2
-    lowest = np.minimum(first, last)
-    near = same & (lowest < 0.25 * np.minimum(np.abs(values[:-1]), np.abs(values[1:])))
-    k = np.flatnonzero(near)
-    return (w[k, None] + step[k, None] * _INSIDE).ravel()
 
 
 # Of |q|: less of an imaginary part than that where Im F vanishes is none.

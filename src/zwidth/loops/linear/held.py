@@ -9,13 +9,12 @@ held for t (docs/theory/scenes.md, V2 to V4):
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, circle, lag_jet
-from zwidth.arrays.xp import namespace
+from zwidth.arrays.xp import frozen, namespace, repeat
 from zwidth.loops.linear.certified import prove_zeros
 from zwidth.loops.linear.chain import AnyChain, Chain, is_zero
 from zwidth.loops.linear.roots import LoopRoots, step_apart
@@ -26,16 +25,15 @@ from zwidth.loops.rigid.device import Plant, factor_numerator, held_plant
 _SLOW, _MOST_STEPS, _ARRIVED = 0.1, 30, 1e-13
 # The inverse of how far a zero is at most that is kept.
 _FAR = 1e-17
-# A rate that `Chain.check` allows is below 2^35.
-_DOUBLINGS = 36
+# Terms of a series; a rate that `Chain.check` allows is below 2^35.
+_TERMS, _DOUBLINGS = 15, 36
 
 
 def flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
     """``e^(A t) - 1`` and the answer ``Gamma(t)`` to a unit force held for t."""
-    A = rate * time
-    # phi1(A) = 1 + A/2! + A^2/3! + ...; e^A - 1 = A phi1(A) keeps the digits of slow motions.
-    phi1 = _known_phi1(A.tobytes(), len(A), A.dtype.char) if namespace(A) is np else _traced_phi1(A)
-    return A @ phi1, time * (phi1 @ push)
+    # e^A - 1 = A phi1(A) keeps the digits of slow motions.
+    phi1 = _phi1(rate * time)
+    return rate * time @ phi1, time * (phi1 @ push)
 
 
 def hold(chain: AnyChain, rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
@@ -43,39 +41,28 @@ def hold(chain: AnyChain, rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
     return (rate - np.eye(len(push)), push) if chain.sampled else flow(rate, push, time)
 
 
-@lru_cache(maxsize=64)
-def _known_phi1(rate: bytes, size: int, kind: str) -> np.ndarray:
-    """Kept, for the same chain is asked at many delays and its motion over a whole period hangs on none of them."""
-    from scipy.linalg import expm
+def _phi1(rate: Any) -> Any:
+    """``1 + A/2! + A^2/3! + ...``: the series for A over a power of 2, then ``phi1(2 A) = phi1(A) (1 + A phi1(A)/2)``.
 
-    # The exponential of [[A, 1], [0, 0]] holds it.
-    top = np.concatenate([np.frombuffer(rate, kind).reshape(size, size), np.eye(size)], axis=1)
-    return expm(np.concatenate([top, np.zeros((size, 2 * size))], axis=0))[:size, size:]
-
-
-def _traced_phi1(rate: Any) -> Any:
-    """The series for A over a power of 2, then ``phi1(2 A) = phi1(A) (1 + A phi1(A)/2)``.
-
-    In two loops, because a program that is differentiated costs by its length: with JAX's own exponential, which holds
-    an approximant for each of five sizes, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to
-    compile.
+    In two loops of JAX, because a program that is differentiated costs by its length: with JAX's own exponential, which
+    holds an approximant for each of five sizes, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as
+    long to compile.
     """
-    import jax
-    import jax.numpy as jnp
+    xp = namespace(rate)
+    size = frozen(xp.abs(rate).sum(0).max(), xp)
+    doublings = xp.ceil(xp.log2(xp.maximum(2.0 * size, 1.0)))
+    small, one = rate / 2.0**doublings, xp.eye(rate.shape[0], dtype=rate.dtype)
 
-    size = jax.lax.stop_gradient(jnp.abs(rate).sum(0).max())
-    doublings = jnp.ceil(jnp.log2(jnp.maximum(2.0 * size, 1.0)))
-    small, one = rate / 2.0**doublings, jnp.eye(rate.shape[0], dtype=rate.dtype)
+    def add(state: tuple[Any, Any]) -> tuple[Any, Any]:
+        k, total = state
+        return k - 1.0, one + small @ total / k
 
-    def add(total: Any, k: Any) -> tuple[Any, None]:
-        return one + small @ total / k, None
+    def double(state: tuple[Any, Any]) -> tuple[Any, Any]:
+        k, phi1 = state
+        return k + 1.0, phi1 + xp.where(k < doublings, 0.5 * 2.0**k, 0.0) * (small @ phi1 @ phi1)
 
-    def double(phi1: Any, k: Any) -> tuple[Any, None]:
-        return phi1 + jnp.where(k < doublings, 0.5 * 2.0**k, 0.0) * (small @ phi1 @ phi1), None
-
-    terms = jnp.arange(16, 1, -1, dtype=rate.dtype)
-    phi1, _ = jax.lax.scan(add, one, terms)
-    return jax.lax.scan(double, phi1, jnp.arange(_DOUBLINGS, dtype=rate.dtype))[0]
+    _, phi1 = repeat(_TERMS, add, (doublings * 0.0 + _TERMS + 1.0, one), xp)
+    return repeat(_DOUBLINGS, double, (doublings * 0.0, phi1), xp, lambda old, new: bool(new[0] >= doublings))[1]
 
 
 class Sampled(NamedTuple):

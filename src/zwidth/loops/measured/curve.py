@@ -212,12 +212,6 @@ class DecidedWalls:
         c = self.curve
         return np.abs(beta) * c.slow + 1.0 / max(c.weakest, _TINY), 1.0 / c.strongest - np.abs(beta) * c.fast
 
-    @cached_property
-    def most_damping(self) -> float:
-        """The largest ``|beta|`` of a row with decided walls; negative where there is none."""
-        low, high = self.ends(0.0)
-        return (high - low) / (self.curve.slow + self.curve.fast)
-
     def _intervals(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> Decided:
         """Of rows or columns, so many at a time."""
         size = max(1, _BLOCK // self.curve.w.size)

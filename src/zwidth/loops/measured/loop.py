@@ -120,7 +120,9 @@ class MeasuredLoop(LinearLoop):
     @cached_property
     def _tops(self) -> tuple[np.ndarray, np.ndarray]:
         """Dampings of rows across the plane, and the stiffest wall of each, 0 where there is none."""
-        most = max(self.walls.most_damping, 1e-300)
+        # No row with more damping has decided walls.
+        low, high = self.walls.ends(0.0)
+        most = max((high - low) / (self.walls.curve.slow + self.walls.curve.fast), 1e-300)
         side = most * np.sinh(_DENSER * np.arange(1, _ROWS + 1) / _ROWS) / np.sinh(_DENSER)
         beta = np.concatenate([-side[::-1], [0.0], side])
         top = self._find_tops(beta)
