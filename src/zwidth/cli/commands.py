@@ -268,8 +268,9 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
             raise
         raise InputError("explore: bokeh is not installed; pip install 'zwidth[explore]'") from error
     from zwidth.pages.explorer.controls import read_controls
+    from zwidth.runs.record import find_config
 
-    explorer = Explorer(read_controls(path), port)
+    explorer = Explorer(read_controls(find_config(path) if path and path.is_dir() else path), port)
     click.echo(f"{explorer.address}  (Ctrl-C ends it)")
     if not no_browser:
         # A browser in the terminal would keep the server waiting for its own page.
@@ -287,7 +288,7 @@ def report(folder: Path, out: Path | None, as_json: bool) -> None:
 
     It holds figures, methods, versions and configuration, and needs no server and no network.
     """
-    from zwidth.pages.report.page import write_report
+    from zwidth.runs.report.page import write_report
 
     file = write_report(folder, out)
     words.tell({"file": str(file), "bytes": file.stat().st_size}, [f"wrote {file}"], as_json)

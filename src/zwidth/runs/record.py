@@ -32,7 +32,7 @@ from zwidth.sweep.files import (
     write_whole,
 )
 from zwidth.sweep.store import SUFFIX
-from zwidth.words.errors import StoreError, StoreExistsError
+from zwidth.words.errors import InputError, StoreError, StoreExistsError
 from zwidth.words.formatting import describe
 
 RUN_FILE = "run.json"
@@ -281,6 +281,13 @@ def _find_fault(content: Any) -> str:
 def _belongs_to_runs(name: str) -> bool:
     """Whether a run without a record, or one that was killed, leaves something of this name."""
     return name.endswith((SUFFIX, ".partial")) or name in (LOCKS, CONFIG_FILE, "figures")
+
+
+def find_config(folder: Path) -> Path:
+    """The configuration that a run keeps beside its results."""
+    if CONFIG_FILE not in Record(folder).files():
+        raise InputError(f"{folder}: no run with a recorded configuration ({RUN_FILE}, {CONFIG_FILE}); name a file")
+    return folder / CONFIG_FILE
 
 
 def file_hash(path: Path) -> str:

@@ -21,7 +21,6 @@ from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity, WindowedDifference
 from zwidth.parts.wall import VirtualWall
-from zwidth.runs.record import CONFIG_FILE, RUN_FILE, Record
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import choose_damping
 from zwidth.studies.document import Config, load_config
@@ -254,13 +253,9 @@ def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Co
 
 
 def read_controls(path: Path | None) -> Controls:
-    """The scene of a configuration, or of the one that a run folder has recorded; without either, a small device."""
+    """The scene of a configuration; without one, a small device."""
     if path is None:
         return Controls()
-    if path.is_dir():
-        if CONFIG_FILE not in Record(path).files():
-            raise InputError(f"{path}: no run with a recorded configuration ({RUN_FILE}, {CONFIG_FILE}); name a file")
-        path = path / CONFIG_FILE
     given: Any = load_config(path).scene
     if given is None:
         raise InputError(f"{path}: scene: missing; the page shows the scene of a configuration, add one")

@@ -91,7 +91,7 @@ def _check(record: Record, done: list[dict[str, Any]]) -> None:
 
 def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> str:
     html, style, script = (
-        files("zwidth.pages.report").joinpath(f"report.{kind}").read_text(encoding="utf-8")
+        files("zwidth.runs.report").joinpath(f"report.{kind}").read_text(encoding="utf-8")
         for kind in ("html", "css", "js")
     )
     digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script)]
