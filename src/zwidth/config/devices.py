@@ -266,22 +266,14 @@ class SampledMass(OneKind):
     mass: Annotated[float | None, quantity_of("mass"), WrapValidator(_mass)] = Field(
         default=None, validate_default=True
     )
-    """Moving mass m of the device in kg, > 0; of a rotary one its inertia in kg m^2."""
-
     damping: Annotated[float, quantity_of("damping")] = 0.0
-    """Physical damping b of the device in N s/m, >= 0; of a rotary one in N m s/rad."""
 
     rotary: Rotary = Field(default_factory=tell_rotary)
     """Whether the device turns, as all of a file do where one quantity has a unit of rotation."""
 
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
-    """Sampling rate 1/T in Hz; give it or the period."""
-
     period: Annotated[float, quantity_of("period"), WrapValidator(_period)] = Field(default=None, validate_default=True)
-    """Sampling period T in s; give it or the rate. Always set once the file is loaded."""
-
     delay: Delay = Span(0.0, "s")
-    """Delay t_d from the sample to the moment its force acts, in s or in periods, >= 0."""
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:

@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
-from pydantic import BeforeValidator, ConfigDict, WrapValidator
-from pydantic_core import PydanticCustomError
+from pydantic import BeforeValidator, GetJsonSchemaHandler, WrapValidator
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from zwidth.config.fields import LocatedProblem, Name, Strict, listing, members, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
@@ -67,16 +67,8 @@ def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticC
 DelayModels = Annotated[tuple[DelayModel, ...], WrapValidator(members("delay models"))]
 
 
-def _drop_supplied(schema: dict[str, Any], model: type[Study]) -> None:
-    """Let an editor's check pass where the scene supplies what a study leaves out."""
-    required = schema.get("required", [])
-    schema["required"] = [name for name in required if name not in model.from_scene]
-
-
 class Study(Strict):
     """What all studies have."""
-
-    model_config = ConfigDict(json_schema_extra=_drop_supplied)
 
     from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")
     """Fields that the file's scene supplies where the study leaves them out."""
@@ -97,6 +89,16 @@ class Study(Strict):
 
     name: Name
     """Name of the study, unique in the file; its results are stored under it."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """Let an editor's check pass where the scene supplies what a study leaves out, and say so."""
+        found = super().__get_pydantic_json_schema__(schema, handler)
+        own = handler.resolve_ref_schema(found)
+        own["required"] = [name for name in own.get("required", []) if name not in cls.from_scene]
+        for field in (own["properties"][name] for name in cls.from_scene):
+            field["description"] += " The scene's where left out."
+        return found
 
     @classmethod
     def kind_name(cls) -> str:

@@ -28,7 +28,7 @@ from zwidth.config.fields import (
 )
 from zwidth.parts.checks import Span, read_span
 from zwidth.words.formatting import describe, short, suggestion
-from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
+from zwidth.words.quantities import ANY, FIELDS, FRACTION, NOT_NEGATIVE, POSITIVE, Range
 from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.units import (
     PERIOD_WORDS,
@@ -134,7 +134,7 @@ class Quantity:
 
 
 def quantity_of(name: str) -> Quantity:
-    parameter = PARAMETERS[name]
+    parameter = FIELDS[name]
     return Quantity(parameter.unit, parameter.allowed, parameter.whole, name == "delay")
 
 

@@ -252,16 +252,9 @@ class MapStudy(ComputedStudy, HeldStudy):
     kind: Literal["map"]
 
     alpha: AnyAxis
-    """Normalized stiffness of the wall, an axis."""
-
     beta: AnyAxis
-    """Normalized damping of the wall, an axis."""
-
     delta: DeltaAxis
-    """Normalized damping of the device, a number or an axis; the scene's where left out."""
-
     d: DelayAxis
-    """Delay in periods, a number or an axis; the scene's where left out."""
 
     outputs: Annotated[tuple[MapOutput, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed at every point."""

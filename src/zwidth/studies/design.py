@@ -69,13 +69,13 @@ class DesignStudy(ComputedStudy):
     kind: Literal["design"]
 
     device: PhysicalDevice
-    """Device in SI units; the scene's where left out. A delay stays as it is in seconds."""
+    """Device in SI units. A delay stays as it is in seconds."""
 
     find: Parameter
     """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
 
     stiffness: Annotated[Axis, axis_of("stiffness")]
-    """Wanted stiffness K in N/m or with a unit, one or several; the scene's where left out."""
+    """Wanted stiffness K in N/m or with a unit, one or several."""
 
     reserve: Reserve = 1.0
     """How many times the wanted stiffness the stiffest stable wall is to reach, 1 or more."""
@@ -239,7 +239,7 @@ class FiltersStudy(ComputedStudy):
     kind: Literal["filters"]
 
     device: PhysicalDevice
-    """Device in SI units; the scene's where left out. Its velocity estimate is replaced."""
+    """Device in SI units. Its velocity estimate is replaced."""
 
     damping: Annotated[Axis, axis_of("damping")] | None = None
     """Physical damping of the device, in N s/m or with a unit; the device's own where left out."""

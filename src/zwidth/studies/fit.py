@@ -129,7 +129,6 @@ class BuzzSection(Strict, what="a wall that buzzed"):
     """K in N/m or with a unit, raised at this damping until the wall buzzed."""
 
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] = 0.0
-    """B in N s/m or with a unit."""
 
     frequency: Annotated[float, Quantity("Hz", POSITIVE)]
     """Of the buzz, in Hz or with a unit."""

@@ -97,10 +97,7 @@ class CurvesStudy(ComputedStudy):
     point_bytes = 32
 
     delta: DeltaAxis
-    """Normalized damping of the device, an axis; the scene's where left out."""
-
     d: DelayAxis
-    """Delay in periods, an axis; the scene's where left out."""
 
     @property
     def sizes(self) -> dict[str, int]:

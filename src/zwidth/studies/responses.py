@@ -102,7 +102,7 @@ class StepStudy(WallsStudy, ResponseStudy):
     kind: Literal["step"]
 
     devices: Annotated[tuple[DeviceField, ...], WrapValidator(members("devices"))]
-    """Devices; the scene's where left out."""
+    """Devices."""
 
     stiffness_fraction: Fraction | None = None
     """Stiffness as a share of alpha_max, with beta as at the ridge; give this or walls."""
@@ -187,7 +187,7 @@ class RecommendStudy(ResponseStudy):
     kind: Literal["recommend"]
 
     device: PhysicalDevice
-    """Device in SI units; the scene's where left out."""
+    """Device in SI units."""
 
     stiffness_fraction: Fraction | None = None
     """Stiffness of the recommended wall as a share of the maximum, at most; 0.75 where nothing else is asked for."""

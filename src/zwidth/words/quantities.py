@@ -227,8 +227,30 @@ OF_PARTS = tuple(name for name in PARAMETERS if "." in name)
 VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}
 """The same by their names in a store."""
 _NOISE = Parameter("velocity.noise", "largest error of a measured position", "", POSITIVE, "m", note="one count")
-FIELDS = {**PARAMETERS, **{field.name: field for field in (_NOISE, *_describe_mode("mode", "a mode", "i"))}}
-"""Every number that a part may have; the noise belongs to an estimate that has no stable walls, and is no axis."""
+# Of a simulated motion, beside its scene.
+_OF_MOTIONS = (
+    Parameter(
+        "start_position", "where the motion starts", "x_0", ANY, "m",
+        note="the wall's surface is at 0 and positive is into the wall",
+    ),
+    Parameter("start_velocity", "its velocity there", "v_0", ANY, "m/s"),
+    Parameter("push", "constant force of the hand on the device", "F", ANY, "N"),
+    Parameter(
+        "resolution", "one count of the encoder", r"\Delta", NOT_NEGATIVE, "m", short_name="resolution of the encoder"
+    ),
+    Parameter("noise", "standard deviation of the measured position", r"\sigma", NOT_NEGATIVE, "m"),
+    Parameter("coulomb", "dry friction while the device slips", "F_c", NOT_NEGATIVE, "N", short_name="dry friction"),
+    Parameter(
+        "static", "dry friction that holds the device", "F_s", NOT_NEGATIVE, "N",
+        note="at least coulomb, which it is where left out",
+    ),
+    Parameter("max_force", "the most that the motor gives", "F_m", POSITIVE, "N", note="without one no limit"),
+    Parameter("max_rate", "the fastest that the command changes", "R_m", POSITIVE, "N/s", note="without one no limit"),
+)  # fmt: skip
+OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
+_FURTHER = (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)
+FIELDS = {**PARAMETERS, **{field.name: field for field in _FURTHER}}
+"""Every number of a part or a motion by its name; the noise of an estimate without stable walls is no axis."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 
 
