@@ -203,8 +203,10 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     if listing:
         width = max(map(len, known))
         for each, path in known.items():
-            sentence = describe_example(path.read_text(encoding="utf-8"))
-            words.print_folded([f"{each:<{width}}  {sentence}"], width + 2)
+            comments = [line.lstrip("# ") for line in path.read_text(encoding="utf-8").splitlines() if line[:1] == "#"]
+            sentence = re.match(r".*?[.?](?= |$)", " ".join(filter(None, comments[1:])))
+            assert sentence is not None, "every example says what it is"
+            words.print_folded([f"{each:<{width}}  {sentence.group()}"], width + 2)
         return
     example = example or (name if name in known else "quickstart")
     check_choice("--example", example, tuple(known))
@@ -239,13 +241,6 @@ def find_examples() -> dict[str, Path]:
     if not found:
         raise ZwidthError(f"init: {packaged} holds no examples; install zwidth again")
     return found
-
-
-def describe_example(text: str) -> str:
-    comments = [line.lstrip("# ") for line in text.splitlines() if line.startswith("#")][1:]
-    sentence = re.match(r".*?[.?](?= |$)", " ".join(line for line in comments if line))
-    assert sentence is not None, "every example says what it is"
-    return sentence.group()
 
 
 @cli.command()

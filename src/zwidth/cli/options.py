@@ -14,7 +14,7 @@ import click
 from zwidth.parts.checks import Span, find_kind
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import short
-from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_PARTS, PARAMETERS, Range
+from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_LOGS, OF_PARTS, PARAMETERS, Range
 from zwidth.words.rotation import is_rotary, own_unit, use_kind
 from zwidth.words.units import tell_kind
 
@@ -111,22 +111,16 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> 
         from zwidth.parts.checks import read_span
         from zwidth.words.units import find_dimension, read_quantity
 
-        number = number_or_text(text)
+        try:
+            # What is not finite is named as it was written.
+            number = value if math.isfinite(value := float(text)) else text
+        except ValueError:
+            number = text
         # Whether all are of one kind of device is asked when all are known.
         with use_kind(bool(tell_kind(number))):
             return read_span(number, allowed) if periods else read_quantity(number, find_dimension(unit), allowed)[0]
 
     return Parsed("quantity", read)
-
-
-def number_or_text(text: str) -> float | str:
-    """What stands there without a unit, or with one."""
-    try:
-        number = float(text)
-    except ValueError:
-        return text
-    # What is not finite is named as it was written.
-    return number if math.isfinite(number) else text
 
 
 def read_share(text: str) -> float:
@@ -316,19 +310,12 @@ def _make_velocity(options: dict[str, Any]) -> Any:
 
 figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-_LOG = {
-    "--time": "Column of the time: its header, or HEADER:ms. Found by its name where left out.",
-    "--position": "Column of the position: its header, or HEADER:mm, :counts, :deg.",
-    "--force": "Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.",
-    "--resolution": "One count of the encoder, as 0.03mm or 0.09deg.",
-    "--motor-constant": "What an ampere of a force in A makes, as 5N/A.",
-}
 
 
 def log_options(command: Command) -> Command:
     """What the columns of a log are, and what counts and amperes stand for."""
-    for flag, text in reversed(_LOG.items()):
-        command = click.option(flag, help=text)(command)
+    for name, text in reversed(OF_LOGS.items()):
+        command = click.option(flag_of(name), help=text)(command)
     return command
 
 

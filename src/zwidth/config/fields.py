@@ -107,16 +107,13 @@ def problems_of(error: ValidationError | PydanticCustomError, *above: str) -> li
         if kind == "zwidth":
             what = problem(**detail.get("ctx", {}))
         elif kind == "literal_error":
-            what = unlisted(detail["input"], re.findall("'(.*?)'", detail.get("ctx", {})["expected"]))
+            names = re.findall("'(.*?)'", detail.get("ctx", {})["expected"])
+            allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
+            what = problem(got, allowed, suggestion(detail["input"], names, "write one of these"))
         else:
             what = problem(got, *_PLAIN.get(kind, (detail["msg"],)))
         found.append(((*above, *detail["loc"]), what))
     return found
-
-
-def unlisted(value: Any, names: Sequence[str]) -> PydanticCustomError:
-    allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
-    return problem(f"got {describe(value)}", allowed, suggestion(value, names, "write one of these"))
 
 
 def validation_error(title: str, problems: Iterable[LocatedProblem]) -> ValidationError:

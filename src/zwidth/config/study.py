@@ -26,14 +26,7 @@ _Kind = TypeVar("_Kind", bound="type[Study]")
 
 
 def register(model: _Kind) -> _Kind:
-    """Make a kind of study known; it stands above the class.
-
-    Args:
-        model: a `zwidth.studies.ComputedStudy` whose field ``kind`` has one literal type, the name of the kind.
-
-    Returns:
-        The model.
-    """
+    """Make a kind known, a `zwidth.studies.ComputedStudy`: its field ``kind`` has one literal type, the kind's name."""
     KINDS[model.kind_name()] = model
     if "what" not in vars(model):
         model.what = f"a {model.kind_name()} study"
@@ -114,19 +107,16 @@ class Study(Strict):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         """Add what the study leaves out and the scene knows."""
-        supplied: dict[str, Any] = {
-            "delta": scene.delta,
-            "d": scene.d,
-            "delay_model": scene.delay_model,
-            "delay_models": [scene.delay_model],
-        }
+        absent = [name for name in cls.from_scene if name not in raw]
+        supplied: dict[str, Any] = {name: getattr(scene, name) for name in ("delta", "d", "delay_model")}
+        supplied["delay_models"] = [scene.delay_model]
         if isinstance(scene, PhysicalScene):
             supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
-            if "device" in cls.from_scene:
+            if "device" in absent:
                 supplied["device"] = scene.bare(SimulatedDevice if cls.simulates else PhysicalDevice)
-        if "devices" in cls.from_scene:
+        if "devices" in absent:
             supplied["devices"] = [scene.bare()]
-        return {**{name: supplied[name] for name in cls.from_scene if supplied.get(name) is not None}, **raw}
+        return {**{name: supplied[name] for name in absent if supplied.get(name) is not None}, **raw}
 
     @classmethod
     def _list_taken(cls, raw: dict[str, Any]) -> list[str]:

@@ -140,9 +140,7 @@ def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
 
 def axis_label(data: xarray.Dataset, name: str) -> str:
     """A parameter in words, with symbol and unit."""
-    parameter = VARIABLES[name]
-    definition = f" = {parameter.definition}" if parameter.definition else ""
-    return f"{parameter.words}  ${parameter.symbol}{definition}$" + _in_unit(data, name)
+    return VARIABLES[name].axis_label + _in_unit(data, name)
 
 
 def output_label(data: xarray.Dataset, name: str) -> str:

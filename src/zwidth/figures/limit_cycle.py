@@ -70,7 +70,7 @@ def draw_limit_cycles(
             ax.set_title(style.literal(label))
         grid.scale_axis(ax, "x", x)
         grid.scale_axis(ax, "y", y)
-    names = [f"{AXES[name].words}  ${AXES[name].symbol}$  in {scales[name][1]}" for name in (across, along)]
+    names = [f"{AXES[name].axis_label}  in {scales[name][1]}" for name in (across, along)]
     style.label_axes(panels, *names, once=axes is None)
     figure = style.figure_of(panels)
     label = f"amplitude of the buzz  in {meter}"
@@ -140,7 +140,7 @@ def draw_limit_cycle_curves(
                     style.use_logarithmic(ax, "y", amplitudes)
                 ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
             else:
-                ax.set_xlabel(f"{AXES[over].words}  ${AXES[over].symbol}$  in {unit}")
+                ax.set_xlabel(f"{AXES[over].axis_label}  in {unit}")
             if column == 0:
                 ax.set_ylabel(words)
     handles = [style.line(look["label"], look["linestyle"], color=look["color"]) for look in looks]

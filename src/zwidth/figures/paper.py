@@ -53,7 +53,12 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
         _shade(ax, interval, style.VERMILION)
         for name in ("beta_lower", "beta_upper"):
             ax.plot(interval.delta, getattr(interval, name), label=f"passive {name}, d = {interval.d:g}", **look)
-    _draw_lower_bound(ax, stable[0], several=len(colors) > 1)
+    # One line for all delays, where they agree.
+    lower, middle = stable[0].beta_lower, int(0.55 * stable[0].delta.size)
+    ax.plot(stable[0].delta, lower, color=style.BLACK, label="beta_lower", zorder=2.5)
+    text = r"$\beta = -\delta$ for every $d$" if len(colors) > 1 else r"$\beta = -\delta$"
+    place = stable[0].delta[middle], lower[middle]
+    ax.annotate(text, place, xytext=(8, 6), textcoords="offset points", fontsize=8)
     grid.scale_axis(ax, "x", np.unique(np.concatenate([interval.delta for interval in stable])))
     values = np.concatenate([np.r_[interval.beta_lower, interval.beta_upper] for interval in stable])
     ax.set_ylim(*style.span(float(values.min()), float(values.max())))
@@ -78,15 +83,6 @@ def _draw_curve(ax: Axes, of: Any, x: Any, y: Any, colors: dict[float, Any], wor
 def _shade(ax: Axes, interval: Any, color: Any, **keywords: Any) -> None:
     look = {"color": color, "alpha": 0.08, "linewidth": 0.0, **keywords}
     ax.fill_between(interval.delta, interval.beta_lower, interval.beta_upper, **look)
-
-
-def _draw_lower_bound(ax: Axes, first: Any, *, several: bool) -> None:
-    """One line for all delays, where they agree."""
-    ax.plot(first.delta, first.beta_lower, color=style.BLACK, label="beta_lower", zorder=2.5)
-    middle = int(0.55 * first.delta.size)
-    text = r"$\beta = -\delta$ for every $d$" if several else r"$\beta = -\delta$"
-    place = (first.delta[middle], first.beta_lower[middle])
-    ax.annotate(text, place, xytext=(8, 6), textcoords="offset points", fontsize=8)
 
 
 @draws_tables

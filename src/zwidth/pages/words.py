@@ -71,7 +71,11 @@ def scene_lines(scene: Scene) -> list[str]:
         if name == "velocity" and velocity == "BackwardDifference" and not own:
             continue
         named = {path.removeprefix(f"{name}.").replace("_", " "): path for path in own if own[path]}
-        words = [f"{key} {_spell(path, own[path])}" for key, path in named.items()]
+        words = []
+        for key, path in named.items():
+            value, unit = own[path], unit_of(path)
+            spelled = with_unit(value, unit) if unit else short(value) if isinstance(value, int) else plain(value)
+            words.append(f"{key} {spelled}")
         if name == "coupling":
             words.append(f"sensor at the {parts[name].sensor}")
         words = [velocity, *words] if name == "velocity" else words
@@ -82,11 +86,6 @@ def scene_lines(scene: Scene) -> list[str]:
 def unit_of(path: str) -> str:
     """The SI unit of a parameter by its path; nothing for whole numbers."""
     return PARAMETERS[path].unit.removeprefix("1") if path in PARAMETERS else ""
-
-
-def _spell(path: str, value: Any) -> str:
-    unit = unit_of(path)
-    return with_unit(value, unit) if unit else short(value) if isinstance(value, int) else plain(value)
 
 
 def stability_word(stable: bool | None, marginal: bool = False) -> str:

@@ -74,7 +74,12 @@ class Record:
             self.damaged = True
             if content.get("format") == RUN_FORMAT:
                 # Which files are the run's can be believed, for they are made anew; what was found cannot.
-                content["studies"] = [{**entry, "state": "open"} for entry in content["studies"] if _names_files(entry)]
+                entries = [entry for entry in content["studies"] if isinstance(entry, dict)]
+                content["studies"] = [
+                    {**entry, "state": "open"}
+                    for entry in entries
+                    if isinstance(entry.get("name"), str) and isinstance(entry.get("files"), dict)
+                ]
         fault = _find_fault(content)
         if fault:
             raise StoreError(f"{where}: {fault}; {remedy}")
@@ -104,8 +109,9 @@ class Record:
                     "--resume, or replace it with --overwrite"
                 )
             return
-        # Stores are refused or replaced one by one: they say themselves what they are.
-        strange = [path.name for path in self.folder.iterdir() if not _belongs_to_runs(path.name)]
+        # What a run without a record leaves; stores are refused or replaced one by one: they say what they are.
+        names, known = [path.name for path in self.folder.iterdir()], (LOCKS, CONFIG_FILE, "figures")
+        strange = [name for name in names if not name.endswith((SUFFIX, ".partial")) and name not in known]
         if strange and self._holds_config(config):
             if not overwrite:
                 raise StoreExistsError(
@@ -258,11 +264,6 @@ class Record:
                 remove_quietly(left)
 
 
-def _names_files(entry: Any) -> bool:
-    """Whether an entry of a damaged record still tells a study and its files."""
-    return isinstance(entry, dict) and isinstance(entry.get("name"), str) and isinstance(entry.get("files"), dict)
-
-
 def _find_fault(content: Any) -> str:
     """What keeps a JSON value from being the record of a run."""
     kinds = {"studies": list, "versions": dict, "inputs": dict}
@@ -276,11 +277,6 @@ def _find_fault(content: Any) -> str:
     # All that a run removes or replaces is named there.
     outside = [name for name in names if not isinstance(name, str) or not is_plain_name(name)]
     return f"names {describe(outside[0])}, which is no file of its folder" if outside else ""
-
-
-def _belongs_to_runs(name: str) -> bool:
-    """Whether a run without a record, or one that was killed, leaves something of this name."""
-    return name.endswith((SUFFIX, ".partial")) or name in (LOCKS, CONFIG_FILE, "figures")
 
 
 def find_config(folder: Path) -> Path:

@@ -214,18 +214,9 @@ def _fill_study(study: Any, scene: AnyScene) -> Any:
 
 
 def config_json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of configuration files, for editors.
+    """The JSON Schema (draft 2020-12) of configuration files, for editors.
 
-    An editor's check is a first help: units, conflicts between keys and sizes are checked by
-    `zwidth.load_config` alone.
-
-    Returns:
-        A JSON Schema (draft 2020-12) as a dict that ``json.dumps`` accepts.
-
-    Example:
-        >>> from zwidth.studies.document import config_json_schema
-        >>> sorted(config_json_schema()["required"])
-        ['name', 'studies', 'version']
+    A first help: units, conflicts between keys and sizes are checked by `load_config` alone.
     """
     shared: dict[str, Any] = {}
     schema = _tidy(Config.model_json_schema(), shared)

@@ -157,9 +157,11 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
         arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
         table, bounds = stack(edges), (self.silence, self.widest)
-        family = choose_curves(varied)
+        # A curve for each value of a short list, or a single one; else a plane.
+        short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MOST_CURVES]
         draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
-        if family is not None:
+        if short or len(varied) == 1:
+            family = _COLUMNS[short[0]] if len(varied) > 1 else ""
             draw = partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
         low, high = (with_unit(bound, "m", 3) for bound in bounds)
         notes.append(f"buzzing: an amplitude from {low} to {high} in the last quarter of {self.duration}")
@@ -169,14 +171,6 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
             documents={f"{self.name}_boundary.csv": csv_text(table)} if table else {},
             notes=tuple(notes),
         )
-
-
-def choose_curves(varied: dict[str, Axis]) -> str | None:
-    """The column of the axis whose values are a curve each, "" for a single curve; None where a plane is drawn."""
-    if len(varied) == 1:
-        return ""
-    short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MOST_CURVES]
-    return _COLUMNS[short[0]] if short else None
 
 
 def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[str, np.ndarray]) -> list[dict[str, Any]]:

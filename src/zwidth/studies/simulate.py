@@ -11,7 +11,7 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.fields import LocatedProblem, Strict, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, locate_refusal
-from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
+from zwidth.config.scenes import AnyScene, PhysicalWall, SimulatedDevice
 from zwidth.config.study import HeldStudy, register
 from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
@@ -153,7 +153,12 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
                 raise InputError("stiffness_fraction: no wall of this device is stable; write walls")
             shares = self.stiffness_fraction.values().tolist()
             return [(f"{share:g} of K_max", share * stiffness, damping) for share in shares]
-        walls = [wall_in_si(self.device, wall) for wall in self.walls or ()]
+        walls: list[tuple[float, float]] = [
+            (each.stiffness, each.virtual_damping)
+            if isinstance(each, PhysicalWall)
+            else (each.alpha * scene.units.stiffness, each.beta * scene.units.virtual_damping)
+            for each in self.walls or ()
+        ]
         return [(name_wall(*wall), *wall) for wall in walls]
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -180,14 +185,6 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
             documents={f"{self.name}_summary.csv": csv_text(stack(rows))},
             notes=tuple(notes),
         )
-
-
-def wall_in_si(device: PhysicalDevice, wall: AnyWall) -> tuple[float, float]:
-    """Stiffness in N/m and virtual damping in N s/m of a wall on a device."""
-    if isinstance(wall, PhysicalWall):
-        return wall.stiffness, wall.virtual_damping
-    stiffness, damping = device.to_scene().units
-    return wall.alpha * stiffness, wall.beta * damping
 
 
 def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarray]:

@@ -161,9 +161,7 @@ def differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, 
 def holding(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None]:
     """Hold a folder of results, made where it is missing, while the block runs; a shard (i, n) shares it with others.
 
-    Raises:
-        StoreBusyError: another run holds it; the message has the folder, the holder and the remedy.
-        InputError: the folder cannot be made or written.
+    A `StoreBusyError` says which other run holds it.
     """
     check_folder(folder)
     with _opened(folder / LOCKS / "run") as run:
@@ -220,11 +218,7 @@ def _this_process() -> str:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    """A file to lock; made where it is missing, and closed, which frees it, when the block ends.
-
-    Raises:
-        InputError: it may be a file elsewhere, which is not to be written.
-    """
+    """A file to lock, made where it is missing; closed, and so freed, when the block ends."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)

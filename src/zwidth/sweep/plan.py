@@ -171,7 +171,10 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     bits = [1 + sum(64 if OUTPUTS[name].dtype == "float64" else 1 for name in plan.outputs) for plan in families]
     disk = sum(math.prod(plan.shape) * each for plan, each in zip(families, bits, strict=True)) // 8 + 2**16
     reasons = {name: reason for name, (_, reason) in chosen.items()}
-    model = "device with parts, held delay" if study.with_parts else _model(study.axes.most_periods)
+    longest, model = study.axes.most_periods, "device with parts, held delay"
+    if not study.with_parts:
+        part = "" if longest == math.floor(longest) else ", also in part of a period"
+        model = f"damped mass, zero-order hold, held delay{part}: polynomials of degree up to {math.ceil(longest) + 3}"
     return Plan(study, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
@@ -206,15 +209,6 @@ def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
         proof = f"each value proved to {study.accuracy:g} by counts of poles inside circles, at a cost flat in d"
         methods["spectral_radius"] = ("newton", proof)
     return methods
-
-
-def _model(longest: float) -> str:
-    degree = math.floor(longest) + 3
-    if longest == math.floor(longest):
-        return f"damped mass, zero-order hold, held delay: polynomials of degree up to {degree}"
-    return (
-        f"damped mass, zero-order hold, held delay, also in part of a period: polynomials of degree up to {degree + 1}"
-    )
 
 
 def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collection[str] = ()) -> None:

@@ -268,13 +268,11 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
             attributes=attributes,
         )
         array[...] = values
-    packed: dict[str, Any] = {"filters": [PackBits()], "compressors": [ZstdCodec(level=3)], "fill_value": False}
-    number: dict[str, Any] = {
-        "compressors": [BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")],
-        "fill_value": np.nan,
+    keeping: dict[str, dict[str, Any]] = {
+        "bool": {"filters": [PackBits()], "compressors": [ZstdCodec(level=3)], "fill_value": False},
+        "float64": {"compressors": [BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")], "fill_value": np.nan},
+        "uint8": {"compressors": [ZstdCodec(level=3)], "fill_value": NOT_COMPUTED},
     }
-    code: dict[str, Any] = {"compressors": [ZstdCodec(level=3)], "fill_value": NOT_COMPUTED}
-    keeping = {"bool": packed, "float64": number, "uint8": code}
     for family in plan.families:
         common: dict[str, Any] = {
             "shape": family.shape,
@@ -288,7 +286,8 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
                 attributes["units"] = own_unit(output.units_in(grid.physical))
             attributes["ancillary_variables"] = STATUS_OF[family.family]
             group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
-        group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **common, **code)
+        kept = common | keeping["uint8"]
+        group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **kept)
         group.create_array(
             name_checksums(family.family),
             shape=(family.count, len(family.variables)),

@@ -1,10 +1,4 @@
-"""Values for people: numbers with SI prefixes and few digits, what was received, and the cells of CSV files.
-
-The first line of a CSV file that holds something has the names of the columns, which may have units in brackets. Lines
-before it that begin with # are remarks, and so is the ``sep=;`` of spreadsheets. Columns are separated by tabs, else
-semicolons, else commas: the first of these that the line of names holds. Where commas do not separate, they may be
-decimal signs.
-"""
+"""Values for people: numbers with SI prefixes and few digits, what was received, and the cells of CSV files."""
 
 from __future__ import annotations
 
@@ -25,7 +19,6 @@ from zwidth.words.rotation import ROTARY, is_rotary, own_unit
 
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 LONGEST_VALUE = 60
-_REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 _TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
 _CODINGS, _GZIP, _NO_TEXT = ("utf-8-sig", "cp1252", "latin-1"), b"\x1f\x8b", re.compile("[\0-\x08\x0e-\x1f]")
 _DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
@@ -235,17 +228,6 @@ def read_lines(file: Path, most_bytes: int) -> list[str]:
         if not _NO_TEXT.search(text):
             return text.splitlines()
     raise InputError(f"{file}: it is no text in UTF-8, UTF-16 or Latin-1; save it as CSV in UTF-8")
-
-
-def read_rows(file: Path, most_bytes: int) -> list[tuple[int, list[str]]]:
-    """The row of names and those below that hold something, each with its line."""
-    lines = read_lines(file, most_bytes)
-    first = next((k for k, line in enumerate(lines) if line.strip() and not _REMARK.match(line)), len(lines))
-    separator = next((mark for mark in "\t;" if mark in "".join(lines[first : first + 1])), ",")
-    rows = list(split_lines(file, lines, first, separator))
-    if separator != ",":
-        rows[1:] = [(line, [with_point(cell) for cell in cells]) for line, cells in rows[1:]]
-    return rows
 
 
 def split_lines(file: Path, lines: list[str], first: int, separator: str) -> Iterator[tuple[int, list[str]]]:

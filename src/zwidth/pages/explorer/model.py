@@ -287,16 +287,10 @@ Update = dict[str, Any]
 def compute_details(
     scene: Scene, across: Range, up: Range, *, normalized: bool, outline: bool, contact: bool, costly: bool
 ) -> Iterator[Update]:
-    """What takes longer than a drag, part by part as it is wanted; whoever asks may stop after each.
+    """What takes longer than a drag, part by part; whoever asks may stop after each.
 
-    Args:
-        scene: the scene with its wall.
-        across: the range of stiffness that is shown, for contours.
-        up: that of damping.
-        normalized: whether its units are those of m = 1 and T = 1.
-        outline: whether what hangs on the device is wanted, for it has changed.
-        contact: whether a hit of the wall is.
-        costly: whether what takes seconds in a scene with parts is.
+    Contours cover ``across`` and ``up``. Wanted may be what hangs on the device (``outline``), a hit of the wall
+    (``contact``), and what takes seconds in a scene with parts (``costly``).
     """
     quick = scene.loop.outline() is not None
     # The page shows millimeters.
