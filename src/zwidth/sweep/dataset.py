@@ -174,5 +174,5 @@ def _verify_store(path: Path) -> Verification:
     except StoreError as error:
         return Verification(path, error=str(error))
     done = [task for task in tasks if store.is_done(task)]
-    damaged += [f"{store.plan.describe(task)}: {fault}" for task in done if (fault := store.fault_of(task))]
+    damaged += [f"{task}: {fault}" for task in done if (fault := store.fault_of(task))]
     return Verification(path, len(tasks), len(done), tuple(damaged))

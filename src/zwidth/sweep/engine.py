@@ -171,11 +171,11 @@ def _follow(
     progress: Callable[[Progress], None],
 ) -> None:
     start, ended, computed = time.perf_counter(), 0, 0
-    total = sum(stores[job.path].plan.points(job.task) for job in jobs)
+    total = sum(job.task.points for job in jobs)
     try:
         for number, finished in enumerate(results, start=1):
             store, task = stores[finished.job.path], finished.job.task
-            points, name = store.plan.points(task), store.study.name
+            points, name = task.points, store.study.name
             ended += points
             if finished.error:
                 sweeps.results[name].failed[store.name(task)] = finished.error
@@ -255,7 +255,7 @@ def repair(store: Store, tasks: Iterable[Task]) -> list[str]:
         fault = store.fault_of(task) if store.is_done(task) else ""
         if fault:
             store.forget(task)
-            found.append(f"{store.plan.describe(task)}: {fault}")
+            found.append(f"{task}: {fault}")
     return found
 
 

@@ -82,18 +82,17 @@ def perform(path: str, family: str, index: int) -> None:
     """Compute and write one chunk of a store, by its number in a family of outputs, unless it is done already."""
     # Not by the file's number, which the next store may get.
     store = _open_store(path, content(Path(path) / "zarr.json"))
-    task = Task("device" if family == "device" else "wall", index)
+    task = Task(plan := store.plan.family(family), index)
     if store.is_done(task):
         return
-    plan = store.plan.family(family)
     if store.study.with_parts:
-        block = store.grid.scene_block(plan.place(index))
+        block = store.grid.scene_block(task.place)
         values = compute_scenes(plan.family, plan.outputs, store.study, block)
     else:
         # Loads JAX, which a process that only hands out work has no use for.
         from zwidth.sweep.compute import compute
 
-        values = compute(plan.family, plan.outputs, store.grid.block(plan.place(index)), store.study.accuracy)
+        values = compute(plan.family, plan.outputs, store.grid.block(task.place), store.study.accuracy)
     # A scheduler that restarts, or a run that goes on, may have handed it out twice.
     if not store.is_done(task):
         store.write(task, values)

@@ -39,17 +39,6 @@ Methods: TypeAlias = dict[str, str]
 
 
 @dataclass(frozen=True)
-class Task:
-    """One chunk of one family of outputs: what is computed, written and repaired as a whole."""
-
-    family: Family
-    index: int
-
-    def __str__(self) -> str:
-        return f"{self.family}/{self.index}"
-
-
-@dataclass(frozen=True)
 class FamilyPlan:
     """How the outputs of one family are cut into chunks."""
 
@@ -77,20 +66,36 @@ class FamilyPlan:
         """Its dimensions and their sizes, for messages."""
         return " x ".join(f"{dim} {size}" for dim, size in zip(self.dims, self.shape, strict=True)) or "one point"
 
-    def position(self, index: int) -> tuple[int, ...]:
-        return tuple(int(part) for part in np.unravel_index(index, self.counts)) if self.counts else ()
 
-    def place(self, index: int) -> tuple[slice, ...]:
-        starts = zip(self.position(index), self.chunks, self.shape, strict=True)
+@dataclass(frozen=True)
+class Task:
+    """One chunk of one family of outputs: what is computed, written and repaired as a whole."""
+
+    plan: FamilyPlan
+    index: int
+
+    @property
+    def family(self) -> Family:
+        return self.plan.family
+
+    @property
+    def position(self) -> tuple[int, ...]:
+        """Its number along each dimension."""
+        return tuple(map(int, np.unravel_index(self.index, self.plan.counts))) if self.plan.counts else ()
+
+    @property
+    def place(self) -> tuple[slice, ...]:
+        starts = zip(self.position, self.plan.chunks, self.plan.shape, strict=True)
         return tuple(slice(at * chunk, min((at + 1) * chunk, size)) for at, chunk, size in starts)
 
-    def points(self, index: int) -> int:
-        return math.prod(part.stop - part.start for part in self.place(index))
+    @property
+    def points(self) -> int:
+        return math.prod(part.stop - part.start for part in self.place)
 
-    def describe(self, index: int) -> str:
-        parts = zip(self.dims, self.place(index), strict=True)
+    def __str__(self) -> str:
+        parts = zip(self.plan.dims, self.place, strict=True)
         place = ", ".join(f"{dim} {part.start}:{part.stop}" for dim, part in parts)
-        return f"{Task(self.family, index)}{f' ({place})' if place else ''}"
+        return f"{self.family}/{self.index}{f' ({place})' if place else ''}"
 
 
 @dataclass(frozen=True)
@@ -112,13 +117,7 @@ class Plan:
     def tasks(self) -> Iterator[Task]:
         """Every chunk, in the order of the work."""
         for family in self.families:
-            yield from (Task(family.family, index) for index in range(family.count))
-
-    def points(self, task: Task) -> int:
-        return self.family(task.family).points(task.index)
-
-    def describe(self, task: Task) -> str:
-        return self.family(task.family).describe(task.index)
+            yield from (Task(family, index) for index in range(family.count))
 
     @property
     def extent(self) -> str:

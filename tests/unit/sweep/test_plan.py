@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sweeping import config_of, study, sweep_of
 
 from zwidth.runs import plan_run
-from zwidth.sweep.plan import MEMORY, FamilyPlan, Plan, check_resources, chunk_shape, kept_plan, make_plan
+from zwidth.sweep.plan import MEMORY, FamilyPlan, Plan, Task, check_resources, chunk_shape, kept_plan, make_plan
 from zwidth.words.errors import ResourceError
 
 HUGE = {
@@ -34,8 +34,9 @@ def test_chunks_cover_every_point_once(shape, target):
     plan = FamilyPlan("wall", ("stable",), tuple("abcd"[: len(shape)]), shape, chunks)
     count = np.zeros(shape, int)
     for index in range(plan.count):
-        count[plan.place(index)] += 1
-        assert plan.points(index) == count[plan.place(index)].size
+        task = Task(plan, index)
+        count[task.place] += 1
+        assert task.points == count[task.place].size
     assert (count == 1).all()
     assert plan.count == math.prod(plan.counts)
 
