@@ -88,20 +88,19 @@ def unit_of(path: str) -> str:
     return PARAMETERS[path].unit.removeprefix("1") if path in PARAMETERS else ""
 
 
-def stability_word(stable: bool | None, marginal: bool = False) -> str:
-    """The verdict, in color."""
-    if stable is None:
-        return click.style("undecided", fg="yellow", bold=True)
-    if marginal:
-        word = click.style("marginal", fg="yellow", bold=True)
-        return f"{word} (a pole at z = 1: without stiffness nothing pulls back)"
-    return click.style("stable", fg="green", bold=True) if stable else click.style("UNSTABLE", fg="red", bold=True)
+def word_of(verdict: Assessment) -> str:
+    """The verdict in one word."""
+    if verdict.stable is None:
+        return "undecided"
+    return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
 
 
 @in_own_units
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
-    wall = scene.wall
-    word = stability_word(verdict.stable, verdict.marginal)
+    wall, word = scene.wall, word_of(verdict)
+    color = {"stable": "green", "UNSTABLE": "red"}.get(word, "yellow")
+    told = click.style(word, fg=color, bold=True)
+    told += " (a pole at z = 1: without stiffness nothing pulls back)" if word == "marginal" else ""
     best, normalized = "none: no stiffness is stable at any damping", []
     # Of a device that is given as a whole no mass is known, and of a response no pole.
     by_mass, by_poles = isinstance(scene.device, Device), not isnan(verdict.frequency)
@@ -120,13 +119,13 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
         words = f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}"
         normalized = [row("normalized", words)]
     if by_poles:
-        word = f"{word}, spectral radius {verdict.spectral_radius:.6f}"
+        told = f"{told}, spectral radius {verdict.spectral_radius:.6f}"
     return [
         *scene_lines(scene),
         row("wall", f"K = {spell_stiffness(wall.stiffness)}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
         *normalized,
         "",
-        row("verdict", word),
+        row("verdict", told),
         row("to the boundary in K", _distance(wall.stiffness, verdict.stable_stiffness, "N/m", "K", "B", surely)),
         row("to the boundary in B", _distance(wall.virtual_damping, verdict.stable_damping, "N s/m", "B", "K", surely)),
         row("passive", passivity_words(scene, verdict)),

@@ -6,13 +6,13 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from zwidth.figures.curves import draw_curves, draw_outlines, find_family
 from zwidth.figures.grid import choose_axes, list_varied
-from zwidth.figures.plane import draw_plane
+from zwidth.figures.plane import Edges, draw_plane
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.style import Size, save, style_sheet
 from zwidth.parts.checks import check_number
@@ -25,8 +25,6 @@ from zwidth.words.quantities import ANY, OUTPUTS, VARIABLES
 
 if TYPE_CHECKING:
     import xarray
-
-Edges: TypeAlias = Callable[["xarray.Dataset"], dict[str, Outlines]]
 
 _PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})
 FOLDER = "figures"

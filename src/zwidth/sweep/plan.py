@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -34,8 +34,6 @@ _LAID_OUT_BYTES = 96 * 2**20
 
 # To lay out the boundary of a device with parts.
 _SCENE_SECONDS = 0.1
-
-Methods: TypeAlias = dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -104,8 +102,7 @@ class Plan:
 
     study: SweepStudy
     families: tuple[FamilyPlan, ...]
-    methods: Methods  # of every output that is found by a method of its own
-    reasons: Methods  # why it is that one
+    methods: dict[str, tuple[str, str]]  # of every output that has a choice, and why it is that one
     model: str  # what is modelled, in words
     memory: int  # bytes that a chunk takes while it is computed, at most
     disk: int  # bytes that the store takes, estimated from above
@@ -128,7 +125,7 @@ class Plan:
         """What a store keeps of the plan: later work on it must follow the same."""
         return {
             "chunks": {family.family: list(family.chunks) for family in self.families},
-            "methods": dict(sorted(self.methods.items())),
+            "methods": {name: method for name, (method, _) in sorted(self.methods.items())},
         }
 
     def lines(self) -> Iterator[str]:
@@ -140,8 +137,8 @@ class Plan:
             yield f"    points   {points:,} ({family.extent})"
             yield f"    chunks   {family.count:,} of {chunk or '1'}"
         yield f"  model      {self.model}"
-        for name, method in sorted(self.methods.items()):
-            yield f"  method     {name} by {method}: {self.reasons[name]}"
+        for name, (method, reason) in sorted(self.methods.items()):
+            yield f"  method     {name} by {method}: {reason}"
         yield f"  memory     {_size(self.memory)} a chunk, and {_size(IDLE_MEMORY)} a worker"
         yield f"  disk       {_size(self.disk)} at most"
         yield f"  time       about {_time(self.seconds)} on one core"
@@ -150,8 +147,6 @@ class Plan:
 def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     """Cut a study into chunks of so many bytes, by the points a second of each output."""
     grid = Grid(study)
-    chosen = choose_methods(study)
-    methods = {name: method for name, (method, _) in chosen.items()}
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
         sources = {OUTPUTS[name].source or name for name in outputs}
@@ -169,19 +164,18 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     # Numbers hardly shrink, truth values are packed, a status is nearly always 0.
     bits = [1 + sum(64 if OUTPUTS[name].dtype == "float64" else 1 for name in plan.outputs) for plan in families]
     disk = sum(math.prod(plan.shape) * each for plan, each in zip(families, bits, strict=True)) // 8 + 2**16
-    reasons = {name: reason for name, (_, reason) in chosen.items()}
     longest, model = study.axes.most_periods, "device with parts, held delay"
     if not study.with_parts:
         part = "" if longest == math.floor(longest) else ", also in part of a period"
         model = f"damped mass, zero-order hold, held delay{part}: polynomials of degree up to {math.ceil(longest) + 3}"
-    return Plan(study, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
+    return Plan(study, tuple(families), choose_methods(study), model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
 def kept_plan(study: SweepStudy, kept: dict[str, Any]) -> Plan:
     """The plan that a store was made with, from what it keeps of it."""
     fresh = make_plan(study)
     families = tuple(replace(plan, chunks=tuple(kept["chunks"][plan.family])) for plan in fresh.families)
-    return replace(fresh, families=families, methods=dict(kept["methods"]))
+    return replace(fresh, families=families)
 
 
 def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:

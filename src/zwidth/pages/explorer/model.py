@@ -16,7 +16,7 @@ from zwidth.loops.linear.curve import lines_at
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
-from zwidth.pages.words import check_lines, list_slopes, pole_words, row
+from zwidth.pages.words import check_lines, list_slopes, pole_words, row, word_of
 from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin
 from zwidth.scenes.scene import Scene
@@ -271,10 +271,6 @@ def normalized_lines(verdict: Assessment) -> list[str]:
         "margins": f"gain {gain}, phase {phase} degrees, delay {delay} periods, modulus {modulus}",
     }
     return [row(*each) for each in rows.items()]
-
-
-def word_of(verdict: Assessment) -> str:
-    return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
 
 
 # Held while JAX is being imported: what looks for it meanwhile would find half of it.

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.config.study import KINDS
-from zwidth.runs.draw import Edges, make_edges
+from zwidth.figures.plane import Edges
+from zwidth.runs.draw import make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.files import write_whole
