@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Annotated, Any
@@ -39,11 +40,9 @@ def _to_array(raw: Any) -> np.ndarray:
 
 
 def _check_numbers(raw: Any) -> Any:
-    try:
+    with suppress(ValueError):
         if np.all(np.isfinite(_to_array(raw))):
             return raw
-    except ValueError:
-        pass
     remedy = "write [1, 0.5], or '-3+40j' for a complex root"
     raise problem(f"got {describe(raw)}", "it must be a list of finite numbers", remedy)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import MISSING, fields
 from typing import Annotated, Any, Literal
 
@@ -345,8 +346,7 @@ def _columns(raw: Any) -> set[str]:
     """The parameters of a table, as far as it can be read."""
     if isinstance(raw, dict) and "csv" not in raw:
         return set(raw) & set(PARAMETERS)
-    try:
+    # Its faults are reported where the table itself is read.
+    with suppress(PydanticCustomError, ValidationError):
         return set(read_table(raw).columns)
-    except (PydanticCustomError, ValidationError):
-        # Reported where the table itself is read.
-        return set()
+    return set()

@@ -125,10 +125,9 @@ class Record:
             )
 
     def _holds_config(self, text: str) -> bool:
-        try:
+        with suppress(OSError):
             return (self.folder / CONFIG_FILE).read_bytes() == text.encode("utf-8")
-        except OSError:
-            return False
+        return False
 
     def check_same(self, inputs: dict[str, dict[str, Any]]) -> None:
         """Refuse to go on with a run that other releases made, or whose studies, given by name, had other inputs."""
@@ -287,13 +286,11 @@ def find_config(folder: Path) -> Path:
 
 
 def file_hash(path: Path) -> str:
-    try:
-        if path.is_symlink():
-            return ""
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError:
-        return ""
+    with suppress(OSError):
+        if not path.is_symlink():
+            with open(path, "rb") as stream:
+                return hashlib.file_digest(stream, "sha256").hexdigest()
+    return ""
 
 
 def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[str, str]]:

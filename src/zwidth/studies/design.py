@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -216,13 +217,9 @@ class DesignStudy(ComputedStudy):
         rows = []
         for value in np.geomspace(low, high, self.num).tolist():
             wall = (math.nan, math.nan)
-            try:
+            with suppress(InputError):
                 top = nominal.replace(**{self.find: value}).max_stiffness()
-            except InputError:
-                pass
-            else:
-                if top.status == Status.OK:
-                    wall = float(top.stiffness), float(top.virtual_damping)
+                wall = (float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else wall
             named = {"parameter": self.find, header("value", PARAMETERS[self.find].unit): value}
             rows.append({**named, **dict(zip(SI_COLUMNS, wall, strict=True))})
         return stack(rows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -189,11 +190,9 @@ class Config(Strict, what="a configuration"):
 
 def _scene_or_stand_in(raw: Any) -> AnyScene:
     """The file's scene; where it is faulty, one that only keeps its faults from repeating in every study."""
-    try:
+    # Its faults are reported where the scene itself is read.
+    with suppress(ValueError):
         return read_scene(raw)
-    except ValueError:
-        # The same faults are reported where the scene itself is read.
-        pass
     if isinstance(raw, dict) and is_normalized(raw):
         return NormalizedScene(delta=0.0, alpha=0.0)
     return PhysicalScene.model_validate({"mass": 1.0, "period": 1.0, "stiffness": 0.0})

@@ -116,10 +116,9 @@ def write_whole(path: Path, data: bytes) -> None:
 
 def content(path: Path) -> bytes:
     """What a file holds; nothing where there is none."""
-    try:
+    with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return path.read_bytes()
-    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
-        return b""
+    return b""
 
 
 def checksum(path: Path) -> int:
@@ -138,10 +137,8 @@ def versions(*more: str) -> dict[str, str]:
     """The releases that results depend on, and those of more packages."""
     found = {"zwidth": __version__, "python": platform.python_version()}
     for name in (*_PACKAGES, *more):
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found
 
 

@@ -149,12 +149,10 @@ class _Worker:
 
     def result(self) -> Finished | None:
         """How the job went; None where the worker died over it."""
-        try:
-            finished = self.pipe.recv() if self.pipe.poll() else None
-        except (EOFError, OSError):
-            finished = None
         self.job = None
-        return finished
+        with suppress(EOFError, OSError):
+            return self.pipe.recv() if self.pipe.poll() else None
+        return None
 
     def stop(self) -> None:
         """End the process; what it was writing is not there yet under its name."""

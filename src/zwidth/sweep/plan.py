@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -231,11 +232,10 @@ def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collec
 def _machine_memory() -> int:
     """The memory that this process may use: the machine's, or less in a container."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    try:
+    # Else no container, or one without a limit.
+    with suppress(OSError, ValueError):
         return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
-    except (OSError, ValueError):
-        # No container, or one without a limit.
-        return total
+    return total
 
 
 def _bytes_per_point(outputs: tuple[str, ...]) -> int:

@@ -10,6 +10,7 @@ import math
 import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -220,13 +221,10 @@ def read_lines(file: Path, most_bytes: int) -> list[str]:
     if len(raw) > most_bytes:
         raise InputError(f"{file}: it has more than {most_bytes >> 20} MiB; take a part of it")
     for coding in ("utf-16",) if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else _CODINGS:
-        try:
-            text = raw.decode(coding)
-        except UnicodeDecodeError:
-            continue
-        # Of numbers and names none are control characters.
-        if not _NO_TEXT.search(text):
-            return text.splitlines()
+        with suppress(UnicodeDecodeError):
+            # Of numbers and names none are control characters.
+            if not _NO_TEXT.search(text := raw.decode(coding)):
+                return text.splitlines()
     raise InputError(f"{file}: it is no text in UTF-8, UTF-16 or Latin-1; save it as CSV in UTF-8")
 
 

@@ -11,6 +11,7 @@ import csv
 import re
 import zipfile
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice, zip_longest
 from pathlib import Path
@@ -88,11 +89,9 @@ def is_unit(text: str) -> bool:
 
 
 def _is_npz(file: Path) -> bool:
-    try:
-        with zipfile.ZipFile(file) as archive:
-            return all(name.endswith(".npy") for name in archive.namelist())
-    except (zipfile.BadZipFile, OSError):
-        return False
+    with suppress(zipfile.BadZipFile, OSError), zipfile.ZipFile(file) as archive:
+        return all(name.endswith(".npy") for name in archive.namelist())
+    return False
 
 
 def _load(file: Path) -> dict[str, Any]:
@@ -216,11 +215,9 @@ def _read_number(text: str, kind: type) -> Any:
     if looks_like_number(text):
         return kind(text) if np.isfinite(float(text)) else None
     if kind is complex and text[-1:] in ("i", "j") and "_" not in text:
-        try:
+        with suppress(ValueError):
             value = complex(text.replace(" ", "").replace("i", "j"))
-        except ValueError:
-            return None
-        return value if np.isfinite(value) else None
+            return value if np.isfinite(value) else None
     return None
 
 
@@ -319,10 +316,9 @@ def _find_clocks(lines: list[str], layout: _Layout, places: Sequence[int]) -> li
 
 
 def _is_time(text: str) -> bool:
-    try:
+    with suppress(ValueError):
         return _read_clock(np.array([text])).size == 1
-    except ValueError:
-        return False
+    return False
 
 
 def _read_clock(texts: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from math import isfinite
@@ -305,10 +306,9 @@ def read_link(link: str) -> Controls:
 
 def _read_value(text: str) -> Any:
     """A number, a list or a part as JSON has it, else the text."""
-    try:
+    with suppress(json.JSONDecodeError):
         return json.loads(text)
-    except json.JSONDecodeError:
-        return text
+    return text
 
 
 def _spell_section(controls: Controls) -> dict[str, Any]:
