@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 
@@ -32,14 +32,8 @@ from zwidth.words.units import tell_kind
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
 
 
-class HeardWall(NamedTuple):
-    """A wall at the onset of buzzing, and whether it is of a rotary axis; None where no unit says."""
-
-    point: tuple[float, float, float]
-    rotary: bool | None
-
-
-def _read_wall(text: str) -> HeardWall:
+def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
+    """K, B and f of a wall at the onset of buzzing, and whether it is of a rotary axis; None where no unit says."""
     entries = _ENTRY.findall(text.replace(",", " "))
     found = dict(entries)
     if _ENTRY.sub("", text.replace(",", " ")).strip() or {"K", "f"} - set(found) or len(found) < len(entries):
@@ -53,7 +47,7 @@ def _read_wall(text: str) -> HeardWall:
         kinds |= {tell_kind(amount)} - {None}
     if len(kinds) > 1:
         raise ValueError(f"got {text!r}; N/m goes with N s/m, N m/rad with N m s/rad")
-    return HeardWall((numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None)
+    return (numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None
 
 
 _WALL = Parsed("WALL", _read_wall)
@@ -105,10 +99,10 @@ def fit(
             raise click.UsageError("give --period or --rate")
         from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 
-        kinds = {wall.rotary for wall in walls} - {None}
+        kinds = {rotary for _, rotary in walls} - {None}
         if len(kinds) > 1:
             raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
-        points = tuple(BuzzPoint(*wall.point) for wall in walls)
+        points = tuple(BuzzPoint(*point) for point, _ in walls)
         with use_kind(kinds == {True}):
             found = fit_buzz(points, period=period, velocity=velocity, noise=noise)
         source = f"{len(walls)} buzzing walls"

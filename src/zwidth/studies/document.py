@@ -15,15 +15,15 @@ from typing import Annotated, Any, Literal, Union
 from pydantic import (
     BeforeValidator,
     Field,
-    GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    PlainValidator,
     PrivateAttr,
-    SerializationInfo,
+    SerializeAsAny,
     TypeAdapter,
     WithJsonSchema,
     WrapValidator,
 )
-from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+from pydantic_core import CoreSchema, PydanticCustomError
 
 import zwidth.config.sweep  # noqa: F401  (registers its kind)
 from zwidth.config.device_table import find_file
@@ -66,20 +66,15 @@ def _read_study(raw: Any) -> Any:
 
 
 class _OfAnyKind:
-    """Reads a study by its kind; the kinds are looked up when they are needed, so that more may be registered."""
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        def spelled(study: Study, info: SerializationInfo) -> dict[str, Any]:
-            return study.model_dump(mode=info.mode, exclude_none=info.exclude_none)
-
-        serialization = core_schema.plain_serializer_function_ser_schema(spelled, info_arg=True)
-        return core_schema.no_info_plain_validator_function(_read_study, serialization=serialization)
+    """Describes a study of any kind; they are looked up when they are needed, so that more may be registered."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         every = Annotated[Union[tuple(KINDS[kind] for kind in sorted(KINDS))], Field(discriminator="kind")]  # noqa: UP007
         return handler(TypeAdapter[Any](every).core_schema)  # pyright: ignore[reportArgumentType]
+
+
+_AnyStudy = Annotated[SerializeAsAny[Study], PlainValidator(_read_study), _OfAnyKind]
 
 
 def _check_version(value: Any) -> int:
@@ -138,7 +133,7 @@ class Config(Strict, what="a configuration"):
     figure: FigureLook | None = None
     """Width and kind of the figures of studies; `zwidth figures` has options for those of sweeps."""
 
-    studies: Annotated[tuple[Annotated[Study, _OfAnyKind], ...], WrapValidator(members("studies"))]
+    studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""
 
     _rotary: bool = PrivateAttr(default_factory=is_rotary)

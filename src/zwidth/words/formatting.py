@@ -128,13 +128,21 @@ def header(name: str, unit: str) -> str:
     return f"{name}_{unit.replace('/', '_per_').replace(' ', '_').replace('^', '')}"
 
 
-def own_header(name: str) -> str:
-    """The name of a column with the unit of the kind of device in question, as ``stiffness_N_m_per_rad``."""
-    for unit in sorted(ROTARY, key=len, reverse=True) if is_rotary() else ():
-        ending = header("", unit)
-        if name.endswith(ending):
-            return name.removesuffix(ending) + header("", ROTARY[unit])
+_ENDINGS = [tuple(header("", unit) for unit in pair) for pair in sorted(ROTARY.items(), key=lambda pair: -len(pair[0]))]
+
+
+def turn_header(name: str, rotary: bool) -> str:
+    """The name of a column, as ``stiffness_N_m_per_rad``, with the unit of a rotary device, or of a linear one."""
+    for linear, turned in _ENDINGS:
+        old, new = (linear, turned) if rotary else (turned, linear)
+        if name.endswith(old):
+            return name.removesuffix(old) + new
     return name
+
+
+def own_header(name: str) -> str:
+    """The same with the unit of the kind of device in question, where that of a linear one is given."""
+    return turn_header(name, True) if is_rotary() else name
 
 
 def to_json(value: Any) -> Any:
