@@ -109,8 +109,6 @@ def fit(
     else:
         if noise is not None:
             raise click.UsageError("--noise belongs to --buzz; the noise of a log is found from it")
-        if of_logs["time"] is not None and period is not None:
-            raise click.UsageError("give one of --time, --period and --rate")
         from zwidth.fitting.columns import fit_motions
 
         options = {name: of_logs.pop(name) for name in ("max_delay", "resample")}
@@ -196,8 +194,6 @@ def respond(
     from zwidth.parts.velocity import BackwardDifference
     from zwidth.scenes.scene import Scene
 
-    if of_logs["time"] is not None and period is not None:
-        raise click.UsageError("give one of --time, --period and --rate")
     found = respond_to_logs(read_logs(logs, period, **of_logs), period=period, cycle=cycle)
     device, period, doubts = found.device, found.period, found.doubts
     kind = "stretches of a force that repeats" if found.cycle else "pieces"

@@ -93,9 +93,7 @@ class Parsed(click.ParamType):
         self.name, self.read, self.remedy = name, read, remedy
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse one option; one that is parsed, or a default that is no text, stays as it is."""
-        if not isinstance(value, str):
-            return value
+        """Parse one option."""
         if self.name == "quantity" and ctx is not None and param is not None and tell_kind(value) is not None:
             ctx.meta.setdefault(_TOLD, {})[param.opts[0]] = value
         try:
@@ -337,6 +335,8 @@ def read_logs(
     logs: Iterable[Path], period: float | None, *, resolution: str | None, motor_constant: str | None, **columns: Any
 ) -> list[Any]:
     """The motions of logs by their `log_options`; the error stream says which are read where that takes a while."""
+    if columns["time"] is not None and period is not None:
+        raise click.UsageError("give one of --time, --period and --rate")
     from zwidth.fitting.columns import read_log
 
     for log in logs:

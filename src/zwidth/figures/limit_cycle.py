@@ -14,6 +14,7 @@ from matplotlib.ticker import FuncFormatter
 
 from zwidth.figures import grid, style
 from zwidth.figures.table import Table, curves, draws_tables
+from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import count_digits_apart, header, with_unit
 from zwidth.words.quantities import FIELDS
 
@@ -21,7 +22,6 @@ AXES = {
     header(name, FIELDS[name].unit): FIELDS[name] for name in ("stiffness", "virtual_damping", "resolution", "coulomb")
 }
 """The parameters that a buzz may be drawn over, by their columns."""
-_DIVERGED = 4
 # Up to so many points of a curve are seen one by one.
 _FEW = 12
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
@@ -86,7 +86,7 @@ def draw_limit_cycles(
 
 
 def _find_beyond(arrays: Mapping[str, np.ndarray], bounds: tuple[float, float]) -> np.ndarray:
-    return (arrays["outcome"] == _DIVERGED) | ~(arrays["amplitude_m"] <= bounds[1])
+    return (arrays["outcome"] == MotionKind.DIVERGED) | ~(arrays["amplitude_m"] <= bounds[1])
 
 
 @draws_tables

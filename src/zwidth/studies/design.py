@@ -56,7 +56,6 @@ Ends = Annotated[
     ),
 ]
 Count = Annotated[int, Quantity(allowed=Range(2, 100_000), whole=True)]
-Reserve = Annotated[float, Quantity(allowed=Range(1.0, 100.0))]
 
 
 @register
@@ -78,7 +77,7 @@ class DesignStudy(ComputedStudy):
     stiffness: Annotated[Axis, axis_of("stiffness")]
     """Wanted stiffness K in N/m or with a unit, one or several."""
 
-    reserve: Reserve = 1.0
+    reserve: Annotated[float, Quantity(allowed=Range(1.0, 100.0))] = 1.0
     """How many times the wanted stiffness the stiffest stable wall is to reach, 1 or more."""
 
     within: Ends | None = None

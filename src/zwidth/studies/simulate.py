@@ -26,11 +26,8 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import header, name_wall, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, Range
 
-Seed = Annotated[int, Quantity(allowed=NOT_NEGATIVE, whole=True)]
-
 LONGEST = 1_000_000
 """Periods that one motion may take."""
-Fractions = Annotated[Axis, AxisOf(Quantity(allowed=POSITIVE))]
 
 # What the program makes of a sample stays until the next one.
 _OF_SAMPLES = ("measured", "estimated_velocity", "command", "contact")
@@ -69,7 +66,7 @@ class Circumstances(Strict):
     jitter: Delay = Span(0.0, "s")
     """Samples are late by random times up to this, in s or in periods, below one period."""
 
-    seed: Seed = 0
+    seed: Annotated[int, Quantity(allowed=NOT_NEGATIVE, whole=True)] = 0
     """Whole number that decides the random numbers."""
 
     def find_clashes(self, scene: Scene) -> Iterable[LocatedProblem]:
@@ -128,7 +125,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
     substeps: Annotated[int, Quantity(allowed=Range(1, 10_000), whole=True)] = 1
     """Points recorded per period."""
 
-    stiffness_fraction: Fractions | None = None
+    stiffness_fraction: Annotated[Axis, AxisOf(Quantity(allowed=POSITIVE))] | None = None
     """Stiffness as a share of the maximum, with the virtual damping of that wall; give this or walls."""
 
     def limits(self) -> Iterable[LocatedProblem]:

@@ -10,12 +10,12 @@ from __future__ import annotations
 import csv
 import re
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice, zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,19 +41,13 @@ _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?(\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?
 _DAY, _AT_ONCE = "1970-01-01T", 20_000
 
 
-class Numbers(Protocol):
-    """Reads some columns by their places, as finite numbers of a kind: float or complex."""
-
-    def __call__(self, places: Sequence[int], kind: type = float) -> list[np.ndarray]: ...
-
-
 @dataclass(frozen=True)
 class NamedColumns:
-    """Names of columns, and how to get the numbers of some; ``nameless`` says so where the names are 1, 2, ..."""
+    """Columns of a file, whose numbers are read when they are asked for."""
 
-    heads: list[str]
-    numbers: Numbers
-    nameless: str = ""
+    heads: list[str]  # their names, perhaps with units
+    numbers: Callable[..., list[np.ndarray]]  # of columns at some places, finite and of a kind: float or complex
+    nameless: str = ""  # says so where the names are 1, 2, ...
 
 
 def read_columns(file: Path) -> NamedColumns:
