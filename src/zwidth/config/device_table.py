@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -17,24 +16,15 @@ from pydantic_core import PydanticCustomError
 from zwidth.config.fields import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.values import quantity_of, read_entries, share
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import (
-    describe,
-    from_cell,
-    read_lines,
-    resembling,
-    split_lines,
-    split_title,
-    suggestion,
-    with_point,
-)
+from zwidth.words.formatting import describe, from_cell, resembling, suggestion
 from zwidth.words.quantities import PARAMETERS
+from zwidth.words.tables import holds_data, read_lines, split_lines, split_title, with_point
 from zwidth.words.units import looks_like_number
 
 LABEL = "label"
 MAX_ROWS = 100_000
 _KNOWN = (LABEL, *PARAMETERS)
 MAX_CSV_BYTES = 2**25
-_REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 
 _FORMS = "lists of equal length under the names of parameters, or {csv: FILE}"
 
@@ -149,14 +139,14 @@ def _read_csv(raw: dict[str, Any]) -> DeviceTable:
 def _read_rows(name: str) -> list[tuple[int, list[str]]]:
     """The header of a CSV file and the rows below it that hold something, each with its line.
 
-    Lines that begin with # are remarks, and so is the ``sep=;`` of spreadsheets. Columns are separated by tabs, else
+    Remarks above it begin with # or %, or are the ``sep=;`` of spreadsheets. Columns are separated by tabs, else
     semicolons, else commas: the first of these that the header holds. Where commas do not separate, they may be decimal
     signs.
     """
     file = find_file(name)
     try:
         lines = read_lines(file, MAX_CSV_BYTES)
-        first = next((k for k, line in enumerate(lines) if line.strip() and not _REMARK.match(line)), len(lines))
+        first = next((k for k, line in enumerate(lines) if holds_data(line)), len(lines))
         separator = next((mark for mark in "\t;" if mark in "".join(lines[first : first + 1])), ",")
         rows = [row for row in split_lines(file, lines, first, separator) if not row[1][0].startswith("#")]
         if separator != ",":
