@@ -23,9 +23,13 @@ from zwidth.cli.options import (
 )
 from zwidth.pages import words
 from zwidth.pages.words import row
+from zwidth.parts.device import Device
+from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.timing import Timing
 from zwidth.words.errors import InputError, ZwidthError, check_choice
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
+from zwidth.words.status import Status
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 # A table that a configuration reads from its own folder.
@@ -86,11 +90,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
     would change is printed as well. `zwidth recommend` says which softer wall to set.
     """
-    from zwidth.parts.device import Device
-    from zwidth.parts.timing import Timing
     from zwidth.scenes.assessment import name_kind
     from zwidth.scenes.scene import Scene
-    from zwidth.words.status import Status
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --period (with --damping and --delay)")
@@ -139,14 +140,12 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
 
 def _say_stiffer(scene: Any) -> list[str]:
     """Why no stiffer wall is sure on a measured response, and what to measure for one."""
-    from zwidth.parts.measured import MeasuredDevice
-
     if not isinstance(scene.device, MeasuredDevice):
         return []
     from zwidth.fitting.respond import find_nominal_limit
 
     top = find_nominal_limit(scene)
-    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == 0 else []
+    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
     return [
         f"K_max = {spell_stiffness(float(top.stiffness))} by the curve without its deviation; {text}" for text in said
     ]

@@ -22,10 +22,14 @@ from zwidth.cli.options import (
     velocity_options,
 )
 from zwidth.pages.words import row, tell
+from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import BackwardDifference
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import name_wall, round_safely, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.rotation import use_kind
+from zwidth.words.status import Status
 from zwidth.words.units import tell_kind
 
 # A letter, "=", and all up to the next letter with "=".
@@ -146,7 +150,6 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
     if options["period"] is None:
         raise click.UsageError("give --period or --rate")
     from zwidth.fitting.excite import excite as design
-    from zwidth.parts.measured import MeasuredDevice
 
     made = design(response=None if response is None else MeasuredDevice.read(response), **options)
     made.save(out)
@@ -190,8 +193,6 @@ def respond(
     FILE.csv` answers of it.
     """
     from zwidth.fitting.respond import find_nominal_limit, respond_to_logs
-    from zwidth.parts.timing import Timing
-    from zwidth.parts.velocity import BackwardDifference
     from zwidth.scenes.scene import Scene
 
     found = respond_to_logs(read_logs(logs, period, **of_logs), period=period, cycle=cycle)
@@ -204,10 +205,10 @@ def respond(
     lines = [row("response of", source), row("lines", f"{device.frequency.size} from {low} to {high}")]
     if device.deviation is not None:
         lines.append(row("deviation", f"{_compliance(device.deviation)} in the median"))
-    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == 0 else []
-    words = f"{name_wall(*top[:2])}, by the curve that was measured" if top.status == 0 else "undecided"
+    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
+    words = f"{name_wall(*top[:2])}, by the curve that was measured" if top.status == Status.OK else "undecided"
     lines.append(row("K_max", words))
-    given = safe.status == 0 and device.deviation is not None and not doubts
+    given = safe.status == Status.OK and device.deviation is not None and not doubts
     words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none is told"
     lines.append(row("safe wall", words))
     lines += [row("a stiffer one" if k == 0 else "", text) for k, text in enumerate(said)]
@@ -216,7 +217,7 @@ def respond(
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
         lines.append(row("wrote", str(save)))
     if figure is not None:
-        lines.append(save_figure(_draw(scene, safe if safe.status == 0 else None), figure))
+        lines.append(save_figure(_draw(scene, safe if safe.status == Status.OK else None), figure))
     told = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
     told |= {"safe_wall": _plain(safe) if given else None, "undecided": said, "doubts": list(doubts)}
     tell(told, lines, as_json)

@@ -11,12 +11,19 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
-from zwidth.parts.checks import Span, find_kind
+from zwidth.pages.words import row
+from zwidth.parts.checks import Span, find_kind, read_span
+from zwidth.parts.device import Device
+from zwidth.parts.mode import Mode
+from zwidth.parts.paths import PARTS
+from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import ESTIMATES
+from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import short
 from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_LOGS, OF_PARTS, PARAMETERS, Range
 from zwidth.words.rotation import is_rotary, own_unit, use_kind
-from zwidth.words.units import tell_kind
+from zwidth.words.units import find_dimension, read_quantity, tell_kind
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -106,9 +113,6 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> 
     """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`."""
 
     def read(text: str) -> Any:
-        from zwidth.parts.checks import read_span
-        from zwidth.words.units import find_dimension, read_quantity
-
         try:
             # What is not finite is named as it was written.
             number = value if math.isfinite(value := float(text)) else text
@@ -226,12 +230,7 @@ period_options = _take_options("period", ("period", "rate"), (), _read_period)
 
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     """The scene of some options by path; None where nothing describes one and none is required."""
-    from zwidth.parts.device import Device
     from zwidth.parts.devices import KnownDevice
-    from zwidth.parts.mode import Mode
-    from zwidth.parts.paths import PARTS
-    from zwidth.parts.timing import Timing
-    from zwidth.parts.wall import VirtualWall
     from zwidth.scenes.scene import Scene
 
     if not given and not required:
@@ -289,8 +288,6 @@ def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _make_velocity(options: dict[str, Any]) -> Any:
-    from zwidth.parts.velocity import ESTIMATES
-
     given = _own(options, "velocity")
     kind = given.pop("kind", None)
     if kind is None:
@@ -320,7 +317,6 @@ def log_options(command: Command) -> Command:
 def save_figure(drawn: Any, file: Path) -> str:
     """Write a picture to the file that an option names; returns the line that says so."""
     from zwidth.figures import save
-    from zwidth.pages.words import row
 
     save(drawn, file.with_suffix(""), (file.suffix[1:],))
     return row("wrote", str(file))

@@ -17,6 +17,7 @@ import click
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, json_option
 from zwidth.pages.words import print_folded, print_json, row
+from zwidth.words.errors import ResourceError
 from zwidth.words.formatting import plain
 
 if TYPE_CHECKING:
@@ -273,8 +274,6 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
 
     It needs a checkout of the project, whose benchmarks/methods it runs, and for the errors the extra "test".
     """
-    from zwidth.words.errors import ResourceError
-
     # Beside the package's sources; nothing of it is installed with a wheel.
     folder = Path(__file__).parents[3] / "benchmarks"
     if not (folder / "methods").is_dir():

@@ -7,6 +7,7 @@ import math
 import re
 import shutil
 import textwrap
+from collections.abc import Iterable
 from math import isfinite, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,8 +22,6 @@ from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from zwidth.scenes.assessment import Assessment, FrictionRule, Intervals, Limit
     from zwidth.scenes.scene import Scene
 

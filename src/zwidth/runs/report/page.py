@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.config.study import KINDS
+from zwidth.figures.grid import choose_axes
 from zwidth.figures.plane import Edges
+from zwidth.figures.style import pick_evenly
 from zwidth.runs.draw import make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
@@ -176,9 +178,6 @@ def _scrolling(name: str, rows: list[str], head: str = "") -> str:
 
 def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[str]:
     """The maps of a store, as HTML, with the exact edges of the stable and the passive walls."""
-    # Loads matplotlib.
-    from zwidth.figures.grid import choose_axes
-
     # A store lists its variables in any order.
     for name in (name for name in OUTPUTS if name in data and name != "kind"):
         axes = choose_axes(data, name)
@@ -191,8 +190,6 @@ def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[st
 
 
 def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edges) -> str:
-    from zwidth.figures.style import pick_evenly
-
     x, y = axes
     output = OUTPUTS[name]
     others = [str(dim) for dim in values.dims if dim not in (x, y)]
