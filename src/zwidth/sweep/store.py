@@ -297,17 +297,12 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
         )
 
 
-def find_stores(path: Path) -> list[Path]:
-    """The stores at a path: the path itself, or those in the folder."""
-    if (path / "zarr.json").is_file() or path.name.endswith(SUFFIX):
-        return [path]
-    return sorted(found for found in path.glob(f"*{SUFFIX}") if not found.name.startswith("."))
-
-
 def list_stores(path: str | os.PathLike[str]) -> list[Path]:
-    """The same, one at least."""
+    """The stores at a path: the path itself, or those in the folder, one at least."""
     folder = Path(os.fsdecode(path))
-    found = find_stores(folder)
+    if (folder / "zarr.json").is_file() or folder.name.endswith(SUFFIX):
+        return [folder]
+    found = sorted(found for found in folder.glob(f"*{SUFFIX}") if not found.name.startswith("."))
     if not found:
         raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
     return found
