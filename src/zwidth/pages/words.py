@@ -284,17 +284,11 @@ def list_slopes(scene: Scene) -> list[Slope]:
         by_one = not size or (unit == "N s/m" and not is_rotary())
         # A power of ten near one percent, as people can picture it.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if is_rotary() else 1.0
-        words = f"{with_unit(step, unit, 1)} more {describe_effect(value * step)}"
-        words += " (same delay in seconds)" if path == "period" else ""
+        effect = "changes nothing"
+        if change := value * step:
+            amount = with_unit(abs(change), "N/m", 3) if isfinite(change) else "stiffness at an infinite rate at first"
+            effect = f"{'buys' if change > 0 else 'costs'} {amount}"
+        note = " (same delay in seconds)" if path == "period" else ""
+        words = f"{with_unit(step, unit, 1)} more {effect}{note}"
         found.append(Slope(path, value, f"N/m per {unit}", words))
     return found
-
-
-def describe_effect(change: float) -> str:
-    """ "buys 0.5 kN/m", "costs 3 N/m"."""
-    if change == 0:
-        return "changes nothing"
-    verb = "buys" if change > 0 else "costs"
-    if not isfinite(change):
-        return f"{verb} stiffness at an infinite rate at first"
-    return f"{verb} {with_unit(abs(change), 'N/m', 3)}"

@@ -98,10 +98,6 @@ def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
     return np.where(edge, stiffness, np.nan), np.where(edge, damping, np.nan)
 
 
-def judge_quickly(scene: Scene) -> tuple[bool, np.ndarray]:
-    return bool(scene.decide_stability(method="companion").stable), scene.poles()
-
-
 def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
     """Round axis ranges that hold a curve, and the wall where it is not far beyond it."""
     ranges = []

@@ -257,7 +257,7 @@ class Page:
     def _show_at_once(self, controls: Controls, rest: bool) -> None:
         scene = controls.scene
         edge = model.quick_edge(scene)
-        stable, poles = model.judge_quickly(scene)
+        stable, poles = bool(scene.decide_stability(method="companion").stable), scene.poles()
         device = replace(scene, wall=VirtualWall(0.0)), controls.normalized
         if device != self.device:
             self.device, self.drawn = device, False
