@@ -31,6 +31,7 @@ from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
 from zwidth.words.status import Status
 
+EXIT_FAILED, EXIT_INPUT = 1, 2
 _PACKAGE = Path(__file__).resolve().parents[1]
 # A table that a configuration reads from its own folder.
 _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")

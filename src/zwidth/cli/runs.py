@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zwidth.cli.commands import cli
+from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.options import Parsed, json_option
 from zwidth.pages.words import print_folded, print_json, row
 from zwidth.words.errors import ResourceError
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from zwidth.runs.run import RunResult, StudyEvent
     from zwidth.sweep.engine import Progress
 
-_EXIT_FAILED = 1
 _SECONDS_BETWEEN_LINES = 10.0
 
 
@@ -106,7 +105,7 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **op
         click.echo(f"zwidth: stopped; what is done is kept, go on with: {command}", err=True)
         raise SystemExit(128 + (stopped_by[0] if stopped_by else signal.SIGINT))
     if not result.ok:
-        raise SystemExit(_EXIT_FAILED)
+        raise SystemExit(EXIT_FAILED)
 
 
 @contextmanager
@@ -199,7 +198,7 @@ def verify(folder: Path, as_json: bool) -> None:
         for damaged in store.damaged:
             click.echo(f"zwidth: {store.path}: {damaged}", err=True)
     if not all(store.ok for store in found):
-        raise SystemExit(_EXIT_FAILED)
+        raise SystemExit(EXIT_FAILED)
 
 
 @cli.command()
@@ -255,7 +254,7 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
     if as_json:
         print_json({"files": [str(file) for file in files]})
     if not files:
-        raise SystemExit(_EXIT_FAILED)
+        raise SystemExit(EXIT_FAILED)
 
 
 @cli.command()

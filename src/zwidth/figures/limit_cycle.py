@@ -25,7 +25,7 @@ AXES = {
 # Up to so many points of a curve are seen one by one.
 _FEW = 12
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
-_BEYOND: dict[str, Any] = {"facecolor": "#D9D9D9", "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
+_BEYOND: dict[str, Any] = {"facecolor": grid.MISSING, "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 
 
