@@ -40,7 +40,6 @@ from .loops.rigid.spectral_radius import decay_rate as decay_rate
 from .loops.rigid.spectral_radius import spectral_radius as spectral_radius
 from .loops.rigid.verdict import decide_stability as decide_stability
 from .loops.rigid.verdict import is_stable as is_stable
-from .pages.report.page import write_report as write_report
 from .parts import devices as devices
 from .parts.actuator import Actuator as Actuator
 from .parts.device import Coupling as Coupling
@@ -58,6 +57,7 @@ from .parts.velocity import VelocityFilter as VelocityFilter
 from .parts.velocity import WindowedDifference as WindowedDifference
 from .parts.wall import VirtualWall as VirtualWall
 from .runs import run as run
+from .runs.report.page import write_report as write_report
 from .scenes.answers import to_control as to_control
 from .scenes.assessment import Assessment as Assessment
 from .scenes.assessment import Limit as Limit

@@ -18,7 +18,8 @@ def replay_from(finished, out):
 
 def replay(path, family, index):
     """A chunk of a finished run, its mark at last; computed where none was named."""
-    store, task = Store(Path(path)), Task(family, index)
+    store = Store(Path(path))
+    task = Task(store.plan.family(family), index)
     named = store.path.parent.with_name(f"{store.path.parent.name}.finished")
     if not named.exists():
         perform(path, family, index)

@@ -18,7 +18,7 @@ from zwidth.config.sweep import SweepStudy
 from zwidth.studies.document import Config
 from zwidth.sweep import plan
 from zwidth.sweep.dataset import open_dataset
-from zwidth.sweep.store import find_stores
+from zwidth.sweep.store import list_stores
 
 AXES = {
     "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 40}},
@@ -94,9 +94,9 @@ def values_of(path):
 
 def assert_same(first, second):
     """Two stores, or all stores of two folders, hold the same values, bit by bit."""
-    stores = find_stores(Path(first))
-    assert [store.name for store in stores] == [store.name for store in find_stores(Path(second))]
-    for store, with_it in zip(stores, find_stores(Path(second)), strict=True):
+    stores = list_stores(first)
+    assert [store.name for store in stores] == [store.name for store in list_stores(second)]
+    for store, with_it in zip(stores, list_stores(second), strict=True):
         one, other = values_of(store), values_of(with_it)
         assert one.keys() == other.keys()
         for name in one:
@@ -106,7 +106,7 @@ def assert_same(first, second):
 
 def flags(path):
     """The marks of finished chunks, each with what would change if it were written again."""
-    marks = [mark for store in find_stores(Path(path)) for mark in store.glob("*_checksum/c/*/0")]
+    marks = list(Path(path).rglob("*_checksum/c/*/0"))
     return {mark: (mark.stat().st_ino, mark.stat().st_mtime_ns) for mark in marks}
 
 

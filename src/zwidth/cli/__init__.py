@@ -14,14 +14,13 @@ from pkgutil import iter_modules
 import click
 
 from zwidth.arrays.kernel_cache import use_compilation_cache
-from zwidth.cli.commands import cli
+from zwidth.cli.commands import EXIT_FAILED, EXIT_INPUT, cli
 from zwidth.words.errors import ZwidthError
 
 # Every file of this room adds its commands.
 for _module in iter_modules(__path__, f"{__name__}."):
     import_module(_module.name)
 
-_EXIT_FAILED, _EXIT_INPUT = 1, 2
 _STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 
 
@@ -48,12 +47,12 @@ def main(arguments: list[str] | None = None) -> None:
     except ZwidthError as error:
         for line in str(error).splitlines():
             click.echo(f"zwidth: {line}", err=True)
-        sys.exit(_EXIT_INPUT)
+        sys.exit(EXIT_INPUT)
     except Exception as error:
         if os.environ.get("ZWIDTH_TRACEBACK"):
             raise
         click.echo(f"zwidth: {_describe(error)}", err=True)
-        sys.exit(_EXIT_FAILED)
+        sys.exit(EXIT_FAILED)
 
 
 def _describe(error: Exception) -> str:

@@ -23,10 +23,15 @@ from zwidth.cli.options import (
 )
 from zwidth.pages import words
 from zwidth.pages.words import row
+from zwidth.parts.device import Device
+from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.timing import Timing
 from zwidth.words.errors import InputError, ZwidthError, check_choice
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
+from zwidth.words.status import Status
 
+EXIT_FAILED, EXIT_INPUT = 1, 2
 _PACKAGE = Path(__file__).resolve().parents[1]
 # A table that a configuration reads from its own folder.
 _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
@@ -86,11 +91,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
     would change is printed as well. `zwidth recommend` says which softer wall to set.
     """
-    from zwidth.parts.device import Device
-    from zwidth.parts.timing import Timing
     from zwidth.scenes.assessment import name_kind
     from zwidth.scenes.scene import Scene
-    from zwidth.words.status import Status
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --period (with --damping and --delay)")
@@ -139,14 +141,12 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
 
 def _say_stiffer(scene: Any) -> list[str]:
     """Why no stiffer wall is sure on a measured response, and what to measure for one."""
-    from zwidth.parts.measured import MeasuredDevice
-
     if not isinstance(scene.device, MeasuredDevice):
         return []
     from zwidth.fitting.respond import find_nominal_limit
 
     top = find_nominal_limit(scene)
-    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == 0 else []
+    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
     return [
         f"K_max = {spell_stiffness(float(top.stiffness))} by the curve without its deviation; {text}" for text in said
     ]
@@ -203,8 +203,10 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     if listing:
         width = max(map(len, known))
         for each, path in known.items():
-            sentence = describe_example(path.read_text(encoding="utf-8"))
-            words.print_folded([f"{each:<{width}}  {sentence}"], width + 2)
+            comments = [line.lstrip("# ") for line in path.read_text(encoding="utf-8").splitlines() if line[:1] == "#"]
+            sentence = re.match(r".*?[.?](?= |$)", " ".join(filter(None, comments[1:])))
+            assert sentence is not None, "every example says what it is"
+            words.print_folded([f"{each:<{width}}  {sentence.group()}"], width + 2)
         return
     example = example or (name if name in known else "quickstart")
     check_choice("--example", example, tuple(known))
@@ -241,13 +243,6 @@ def find_examples() -> dict[str, Path]:
     return found
 
 
-def describe_example(text: str) -> str:
-    comments = [line.lstrip("# ") for line in text.splitlines() if line.startswith("#")][1:]
-    sentence = re.match(r".*?[.?](?= |$)", " ".join(line for line in comments if line))
-    assert sentence is not None, "every example says what it is"
-    return sentence.group()
-
-
 @cli.command()
 @click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(path_type=Path))
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
@@ -268,8 +263,9 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
             raise
         raise InputError("explore: bokeh is not installed; pip install 'zwidth[explore]'") from error
     from zwidth.pages.explorer.controls import read_controls
+    from zwidth.runs.record import find_config
 
-    explorer = Explorer(read_controls(path), port)
+    explorer = Explorer(read_controls(find_config(path) if path and path.is_dir() else path), port)
     click.echo(f"{explorer.address}  (Ctrl-C ends it)")
     if not no_browser:
         # A browser in the terminal would keep the server waiting for its own page.
@@ -287,7 +283,7 @@ def report(folder: Path, out: Path | None, as_json: bool) -> None:
 
     It holds figures, methods, versions and configuration, and needs no server and no network.
     """
-    from zwidth.pages.report.page import write_report
+    from zwidth.runs.report.page import write_report
 
     file = write_report(folder, out)
     words.tell({"file": str(file), "bytes": file.stat().st_size}, [f"wrote {file}"], as_json)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 
@@ -22,24 +22,22 @@ from zwidth.cli.options import (
     velocity_options,
 )
 from zwidth.pages.words import row, tell
+from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import BackwardDifference
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import name_wall, round_safely, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.rotation import use_kind
+from zwidth.words.status import Status
 from zwidth.words.units import tell_kind
 
 # A letter, "=", and all up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
 
 
-class HeardWall(NamedTuple):
-    """A wall at the onset of buzzing, and whether it is of a rotary axis; None where no unit says."""
-
-    point: tuple[float, float, float]
-    rotary: bool | None
-
-
-def _read_wall(text: str) -> HeardWall:
+def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
+    """K, B and f of a wall at the onset of buzzing, and whether it is of a rotary axis; None where no unit says."""
     entries = _ENTRY.findall(text.replace(",", " "))
     found = dict(entries)
     if _ENTRY.sub("", text.replace(",", " ")).strip() or {"K", "f"} - set(found) or len(found) < len(entries):
@@ -53,7 +51,7 @@ def _read_wall(text: str) -> HeardWall:
         kinds |= {tell_kind(amount)} - {None}
     if len(kinds) > 1:
         raise ValueError(f"got {text!r}; N/m goes with N s/m, N m/rad with N m s/rad")
-    return HeardWall((numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None)
+    return (numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None
 
 
 _WALL = Parsed("WALL", _read_wall)
@@ -105,18 +103,16 @@ def fit(
             raise click.UsageError("give --period or --rate")
         from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 
-        kinds = {wall.rotary for wall in walls} - {None}
+        kinds = {rotary for _, rotary in walls} - {None}
         if len(kinds) > 1:
             raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
-        points = tuple(BuzzPoint(*wall.point) for wall in walls)
+        points = tuple(BuzzPoint(*point) for point, _ in walls)
         with use_kind(kinds == {True}):
             found = fit_buzz(points, period=period, velocity=velocity, noise=noise)
         source = f"{len(walls)} buzzing walls"
     else:
         if noise is not None:
             raise click.UsageError("--noise belongs to --buzz; the noise of a log is found from it")
-        if of_logs["time"] is not None and period is not None:
-            raise click.UsageError("give one of --time, --period and --rate")
         from zwidth.fitting.columns import fit_motions
 
         options = {name: of_logs.pop(name) for name in ("max_delay", "resample")}
@@ -154,7 +150,6 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
     if options["period"] is None:
         raise click.UsageError("give --period or --rate")
     from zwidth.fitting.excite import excite as design
-    from zwidth.parts.measured import MeasuredDevice
 
     made = design(response=None if response is None else MeasuredDevice.read(response), **options)
     made.save(out)
@@ -198,12 +193,8 @@ def respond(
     FILE.csv` answers of it.
     """
     from zwidth.fitting.respond import find_nominal_limit, respond_to_logs
-    from zwidth.parts.timing import Timing
-    from zwidth.parts.velocity import BackwardDifference
     from zwidth.scenes.scene import Scene
 
-    if of_logs["time"] is not None and period is not None:
-        raise click.UsageError("give one of --time, --period and --rate")
     found = respond_to_logs(read_logs(logs, period, **of_logs), period=period, cycle=cycle)
     device, period, doubts = found.device, found.period, found.doubts
     kind = "stretches of a force that repeats" if found.cycle else "pieces"
@@ -214,10 +205,10 @@ def respond(
     lines = [row("response of", source), row("lines", f"{device.frequency.size} from {low} to {high}")]
     if device.deviation is not None:
         lines.append(row("deviation", f"{_compliance(device.deviation)} in the median"))
-    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == 0 else []
-    words = f"{name_wall(*top[:2])}, by the curve that was measured" if top.status == 0 else "undecided"
+    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
+    words = f"{name_wall(*top[:2])}, by the curve that was measured" if top.status == Status.OK else "undecided"
     lines.append(row("K_max", words))
-    given = safe.status == 0 and device.deviation is not None and not doubts
+    given = safe.status == Status.OK and device.deviation is not None and not doubts
     words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none is told"
     lines.append(row("safe wall", words))
     lines += [row("a stiffer one" if k == 0 else "", text) for k, text in enumerate(said)]
@@ -226,7 +217,7 @@ def respond(
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
         lines.append(row("wrote", str(save)))
     if figure is not None:
-        lines.append(save_figure(_draw(scene, safe if safe.status == 0 else None), figure))
+        lines.append(save_figure(_draw(scene, safe if safe.status == Status.OK else None), figure))
     told = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
     told |= {"safe_wall": _plain(safe) if given else None, "undecided": said, "doubts": list(doubts)}
     tell(told, lines, as_json)

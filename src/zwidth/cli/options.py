@@ -11,12 +11,19 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
-from zwidth.parts.checks import Span, find_kind
+from zwidth.pages.words import row
+from zwidth.parts.checks import Span, find_kind, read_span
+from zwidth.parts.device import Device
+from zwidth.parts.mode import Mode
+from zwidth.parts.paths import PARTS
+from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import ESTIMATES
+from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import short
-from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_PARTS, PARAMETERS, Range
+from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_LOGS, OF_PARTS, PARAMETERS, Range
 from zwidth.words.rotation import is_rotary, own_unit, use_kind
-from zwidth.words.units import tell_kind
+from zwidth.words.units import find_dimension, read_quantity, tell_kind
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -93,9 +100,7 @@ class Parsed(click.ParamType):
         self.name, self.read, self.remedy = name, read, remedy
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse one option; one that is parsed, or a default that is no text, stays as it is."""
-        if not isinstance(value, str):
-            return value
+        """Parse one option."""
         if self.name == "quantity" and ctx is not None and param is not None and tell_kind(value) is not None:
             ctx.meta.setdefault(_TOLD, {})[param.opts[0]] = value
         try:
@@ -108,25 +113,16 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> 
     """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`."""
 
     def read(text: str) -> Any:
-        from zwidth.parts.checks import read_span
-        from zwidth.words.units import find_dimension, read_quantity
-
-        number = number_or_text(text)
+        try:
+            # What is not finite is named as it was written.
+            number = value if math.isfinite(value := float(text)) else text
+        except ValueError:
+            number = text
         # Whether all are of one kind of device is asked when all are known.
         with use_kind(bool(tell_kind(number))):
             return read_span(number, allowed) if periods else read_quantity(number, find_dimension(unit), allowed)[0]
 
     return Parsed("quantity", read)
-
-
-def number_or_text(text: str) -> float | str:
-    """What stands there without a unit, or with one."""
-    try:
-        number = float(text)
-    except ValueError:
-        return text
-    # What is not finite is named as it was written.
-    return number if math.isfinite(number) else text
 
 
 def read_share(text: str) -> float:
@@ -234,12 +230,7 @@ period_options = _take_options("period", ("period", "rate"), (), _read_period)
 
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     """The scene of some options by path; None where nothing describes one and none is required."""
-    from zwidth.parts.device import Device
     from zwidth.parts.devices import KnownDevice
-    from zwidth.parts.mode import Mode
-    from zwidth.parts.paths import PARTS
-    from zwidth.parts.timing import Timing
-    from zwidth.parts.wall import VirtualWall
     from zwidth.scenes.scene import Scene
 
     if not given and not required:
@@ -297,8 +288,6 @@ def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _make_velocity(options: dict[str, Any]) -> Any:
-    from zwidth.parts.velocity import ESTIMATES
-
     given = _own(options, "velocity")
     kind = given.pop("kind", None)
     if kind is None:
@@ -316,26 +305,18 @@ def _make_velocity(options: dict[str, Any]) -> Any:
 
 figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-_LOG = {
-    "--time": "Column of the time: its header, or HEADER:ms. Found by its name where left out.",
-    "--position": "Column of the position: its header, or HEADER:mm, :counts, :deg.",
-    "--force": "Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.",
-    "--resolution": "One count of the encoder, as 0.03mm or 0.09deg.",
-    "--motor-constant": "What an ampere of a force in A makes, as 5N/A.",
-}
 
 
 def log_options(command: Command) -> Command:
     """What the columns of a log are, and what counts and amperes stand for."""
-    for flag, text in reversed(_LOG.items()):
-        command = click.option(flag, help=text)(command)
+    for name, text in reversed(OF_LOGS.items()):
+        command = click.option(flag_of(name), help=text)(command)
     return command
 
 
 def save_figure(drawn: Any, file: Path) -> str:
     """Write a picture to the file that an option names; returns the line that says so."""
     from zwidth.figures import save
-    from zwidth.pages.words import row
 
     save(drawn, file.with_suffix(""), (file.suffix[1:],))
     return row("wrote", str(file))
@@ -350,6 +331,8 @@ def read_logs(
     logs: Iterable[Path], period: float | None, *, resolution: str | None, motor_constant: str | None, **columns: Any
 ) -> list[Any]:
     """The motions of logs by their `log_options`; the error stream says which are read where that takes a while."""
+    if columns["time"] is not None and period is not None:
+        raise click.UsageError("give one of --time, --period and --rate")
     from zwidth.fitting.columns import read_log
 
     for log in logs:

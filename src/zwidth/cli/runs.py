@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zwidth.cli.commands import cli
+from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.options import Parsed, json_option
 from zwidth.pages.words import print_folded, print_json, row
+from zwidth.words.errors import ResourceError
 from zwidth.words.formatting import plain
 
 if TYPE_CHECKING:
     from zwidth.runs.run import RunResult, StudyEvent
     from zwidth.sweep.engine import Progress
 
-_EXIT_FAILED = 1
 _SECONDS_BETWEEN_LINES = 10.0
 
 
@@ -105,7 +105,7 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **op
         click.echo(f"zwidth: stopped; what is done is kept, go on with: {command}", err=True)
         raise SystemExit(128 + (stopped_by[0] if stopped_by else signal.SIGINT))
     if not result.ok:
-        raise SystemExit(_EXIT_FAILED)
+        raise SystemExit(EXIT_FAILED)
 
 
 @contextmanager
@@ -198,7 +198,7 @@ def verify(folder: Path, as_json: bool) -> None:
         for damaged in store.damaged:
             click.echo(f"zwidth: {store.path}: {damaged}", err=True)
     if not all(store.ok for store in found):
-        raise SystemExit(_EXIT_FAILED)
+        raise SystemExit(EXIT_FAILED)
 
 
 @cli.command()
@@ -254,7 +254,7 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
     if as_json:
         print_json({"files": [str(file) for file in files]})
     if not files:
-        raise SystemExit(_EXIT_FAILED)
+        raise SystemExit(EXIT_FAILED)
 
 
 @cli.command()
@@ -273,8 +273,6 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
 
     It needs a checkout of the project, whose benchmarks/methods it runs, and for the errors the extra "test".
     """
-    from zwidth.words.errors import ResourceError
-
     # Beside the package's sources; nothing of it is installed with a wheel.
     folder = Path(__file__).parents[3] / "benchmarks"
     if not (folder / "methods").is_dir():

@@ -16,8 +16,9 @@ from pydantic_core import PydanticCustomError
 from zwidth.config.fields import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.values import quantity_of, read_entries, share
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, from_cell, read_rows, resembling, split_title, suggestion
+from zwidth.words.formatting import describe, from_cell, resembling, suggestion
 from zwidth.words.quantities import PARAMETERS
+from zwidth.words.tables import holds_data, read_lines, split_lines, split_title, with_point
 from zwidth.words.units import looks_like_number
 
 LABEL = "label"
@@ -72,8 +73,6 @@ class DeviceTable:
 
 def read_table(raw: Any) -> DeviceTable:
     """A validator for a table in any of its forms."""
-    if isinstance(raw, DeviceTable):
-        return raw
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", f"devices are {_FORMS}", "write {csv: devices.csv}")
     return _read_csv(raw) if "csv" in raw else _read_lists(raw)
@@ -99,17 +98,6 @@ def _read_lists(raw: dict[str, Any]) -> DeviceTable:
             in_periods |= "periods" in units
     if found:
         raise validation_error("devices", found)
-    return _check_lengths(columns, in_periods)
-
-
-def _check_label(cell: Any) -> Any:
-    if not isinstance(cell, str) or not cell.strip():
-        raise problem(f"got {describe(cell)}", "a label is text", "put it in quotes")
-    return cell
-
-
-def _check_lengths(columns: dict[str, tuple[Any, ...]], in_periods: bool) -> DeviceTable:
-    """The table, where its columns are of one length."""
     labels = columns.pop(LABEL, ())
     if not columns:
         raise problem("got no parameter", f"devices are {_FORMS}", f"add a column such as {'mass'!r}")
@@ -121,6 +109,12 @@ def _check_lengths(columns: dict[str, tuple[Any, ...]], in_periods: bool) -> Dev
     if rows > MAX_ROWS:
         raise problem(f"got {rows} rows", f"at most {MAX_ROWS} devices a study", "split the table")
     return DeviceTable(columns, labels, in_periods)
+
+
+def _check_label(cell: Any) -> Any:
+    if not isinstance(cell, str) or not cell.strip():
+        raise problem(f"got {describe(cell)}", "a label is text", "put it in quotes")
+    return cell
 
 
 def _read_csv(raw: dict[str, Any]) -> DeviceTable:
@@ -143,9 +137,20 @@ def _read_csv(raw: dict[str, Any]) -> DeviceTable:
 
 
 def _read_rows(name: str) -> list[tuple[int, list[str]]]:
-    """The header of a CSV file, and its rows; further lines that begin with # are remarks as well."""
+    """The header of a CSV file and the rows below it that hold something, each with its line.
+
+    Remarks above it begin with # or %, or are the ``sep=;`` of spreadsheets. Columns are separated by tabs, else
+    semicolons, else commas: the first of these that the header holds. Where commas do not separate, they may be decimal
+    signs.
+    """
+    file = find_file(name)
     try:
-        rows = [row for row in read_rows(find_file(name), MAX_CSV_BYTES) if not row[1][0].startswith("#")]
+        lines = read_lines(file, MAX_CSV_BYTES)
+        first = next((k for k, line in enumerate(lines) if holds_data(line)), len(lines))
+        separator = next((mark for mark in "\t;" if mark in "".join(lines[first : first + 1])), ",")
+        rows = [row for row in split_lines(file, lines, first, separator) if not row[1][0].startswith("#")]
+        if separator != ",":
+            rows[1:] = [(line, [with_point(cell) for cell in cells]) for line, cells in rows[1:]]
     except InputError as error:
         what, _, remedy = str(error).partition("; ")
         raise problem(printable(what), "names are relative to this file", remedy) from None

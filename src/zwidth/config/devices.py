@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Annotated, Any
@@ -39,11 +40,9 @@ def _to_array(raw: Any) -> np.ndarray:
 
 
 def _check_numbers(raw: Any) -> Any:
-    try:
+    with suppress(ValueError):
         if np.all(np.isfinite(_to_array(raw))):
             return raw
-    except ValueError:
-        pass
     remedy = "write [1, 0.5], or '-3+40j' for a complex root"
     raise problem(f"got {describe(raw)}", "it must be a list of finite numbers", remedy)
 
@@ -266,22 +265,14 @@ class SampledMass(OneKind):
     mass: Annotated[float | None, quantity_of("mass"), WrapValidator(_mass)] = Field(
         default=None, validate_default=True
     )
-    """Moving mass m of the device in kg, > 0; of a rotary one its inertia in kg m^2."""
-
     damping: Annotated[float, quantity_of("damping")] = 0.0
-    """Physical damping b of the device in N s/m, >= 0; of a rotary one in N m s/rad."""
 
     rotary: Rotary = Field(default_factory=tell_rotary)
     """Whether the device turns, as all of a file do where one quantity has a unit of rotation."""
 
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
-    """Sampling rate 1/T in Hz; give it or the period."""
-
     period: Annotated[float, quantity_of("period"), WrapValidator(_period)] = Field(default=None, validate_default=True)
-    """Sampling period T in s; give it or the rate. Always set once the file is loaded."""
-
     delay: Delay = Span(0.0, "s")
-    """Delay t_d from the sample to the moment its force acts, in s or in periods, >= 0."""
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:

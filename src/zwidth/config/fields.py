@@ -29,7 +29,7 @@ from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError
 
 from zwidth.words.errors import ConfigError, UnusableValueError
 from zwidth.words.formatting import LONGEST_VALUE, describe, resembling, suggestion
-from zwidth.words.quantities import Parameter
+from zwidth.words.quantities import FIELDS, Parameter
 
 FieldPath: TypeAlias = tuple[str | int, ...]
 Result = TypeVar("Result")
@@ -107,16 +107,13 @@ def problems_of(error: ValidationError | PydanticCustomError, *above: str) -> li
         if kind == "zwidth":
             what = problem(**detail.get("ctx", {}))
         elif kind == "literal_error":
-            what = unlisted(detail["input"], re.findall("'(.*?)'", detail.get("ctx", {})["expected"]))
+            names = re.findall("'(.*?)'", detail.get("ctx", {})["expected"])
+            allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
+            what = problem(got, allowed, suggestion(detail["input"], names, "write one of these"))
         else:
             what = problem(got, *_PLAIN.get(kind, (detail["msg"],)))
         found.append(((*above, *detail["loc"]), what))
     return found
-
-
-def unlisted(value: Any, names: Sequence[str]) -> PydanticCustomError:
-    allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
-    return problem(f"got {describe(value)}", allowed, suggestion(value, names, "write one of these"))
 
 
 def validation_error(title: str, problems: Iterable[LocatedProblem]) -> ValidationError:
@@ -216,9 +213,11 @@ class Strict(BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """Describe every field as the source does below it; pydantic would look there for every run."""
+        """Describe every field as a quantity or as the source does below it, where pydantic looks in every run."""
         found = handler(schema)
         properties = handler.resolve_ref_schema(found)["properties"]
+        for name in FIELDS.keys() & properties.keys():
+            properties[name].setdefault("description", f"{describe_parameter(FIELDS[name])}.")
         for model in (*cls.described_by, *reversed(cls.__mro__)):
             for name, words in _find_docstrings(model) if issubclass(model, Strict) else ():
                 properties[name]["description"] = words
@@ -349,6 +348,7 @@ def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
 Name = Annotated[str, BeforeValidator(_name), WithJsonSchema({"type": "string", "pattern": "^[a-z0-9_-]{1,64}$"})]
 
 
-def describe_parameter(parameter: Parameter) -> str:
+def describe_parameter(parameter: Parameter, bounds: str = "") -> str:
     """What a schema says of a parameter."""
-    return parameter.sentence + ("" if parameter.unit == "1" else f", in {parameter.unit} or with a unit")
+    unit = "" if parameter.unit == "1" else f", in {parameter.unit} or with a unit"
+    return f"{parameter.sentence}{unit}{bounds}{'; ' if parameter.note else ''}{parameter.note}"

@@ -110,7 +110,7 @@ def _describe(path: str, item: Any) -> tuple[Any, str]:
     known, allowed = FIELDS[path], find_range(item, path)
     low, high, low_open, _ = allowed
     bounds = f"{low:g} to {high:g}" if isfinite(high) else f"{'>' if low_open else '>='} {low:g}"
-    words = f"{describe_parameter(known)}, {bounds}{'; ' if known.note else ''}{known.note}."
+    words = f"{describe_parameter(known, f', {bounds}')}."
     return Annotated[int if known.whole else float, Quantity(known.unit, allowed, known.whole)], words
 
 

@@ -105,10 +105,7 @@ class _NormalizedPlant(OneKind):
     parts_beyond: ClassVar[tuple[str, ...]] = ()
 
     delta: NonNegative
-    """Normalized damping b T/m of the device, >= 0."""
-
     d: Annotated[float, quantity_of("d")] = 0.0
-    """Delay in periods, whole or not, >= 0."""
 
     def to_scene(self) -> Scene:
         """That mass and its timing."""
@@ -150,20 +147,14 @@ class PhysicalWall(OneKind, what="a wall"):
     """A wall in SI units."""
 
     stiffness: Annotated[float, quantity_of("stiffness")]
-    """Stiffness K in N/m."""
-
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] = 0.0
-    """Damping B in N s/m."""
 
 
 class NormalizedWall(OneKind, what="a wall"):
     """A normalized wall."""
 
     alpha: Number
-    """Normalized stiffness K T^2/m."""
-
     beta: Number = 0.0
-    """Normalized damping B T/m."""
 
 
 def _pick_wall(scene: Any, kind: Any) -> Any:
@@ -176,10 +167,7 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
     """The file's device, timing and wall in SI units."""
 
     stiffness: Annotated[float, quantity_of("stiffness")] | None = None
-    """Stiffness K of the wall in N/m."""
-
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
-    """Damping B of the wall in N s/m."""
 
     velocity: SimulatedVelocityField | None = None
     """How the velocity is estimated; the difference of two samples where left out."""
@@ -215,10 +203,7 @@ class NormalizedScene(_NormalizedPlant, what="a scene"):
     """The file's device, timing and wall, normalized."""
 
     alpha: Number | None = None
-    """Normalized stiffness K T^2/m of the wall."""
-
     beta: Number | None = None
-    """Normalized damping B T/m of the wall."""
 
     delay_model: DelayModel = "held"
     """How a delay that is not whole is modeled."""

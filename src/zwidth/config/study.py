@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
-from pydantic import BeforeValidator, ConfigDict, WrapValidator
-from pydantic_core import PydanticCustomError
+from pydantic import BeforeValidator, GetJsonSchemaHandler, WrapValidator
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from zwidth.config.fields import LocatedProblem, Name, Strict, listing, members, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
@@ -26,14 +26,7 @@ _Kind = TypeVar("_Kind", bound="type[Study]")
 
 
 def register(model: _Kind) -> _Kind:
-    """Make a kind of study known; it stands above the class.
-
-    Args:
-        model: a `zwidth.studies.ComputedStudy` whose field ``kind`` has one literal type, the name of the kind.
-
-    Returns:
-        The model.
-    """
+    """Make a kind known, a `zwidth.studies.ComputedStudy`: its field ``kind`` has one literal type, the kind's name."""
     KINDS[model.kind_name()] = model
     if "what" not in vars(model):
         model.what = f"a {model.kind_name()} study"
@@ -67,16 +60,8 @@ def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticC
 DelayModels = Annotated[tuple[DelayModel, ...], WrapValidator(members("delay models"))]
 
 
-def _drop_supplied(schema: dict[str, Any], model: type[Study]) -> None:
-    """Let an editor's check pass where the scene supplies what a study leaves out."""
-    required = schema.get("required", [])
-    schema["required"] = [name for name in required if name not in model.from_scene]
-
-
 class Study(Strict):
     """What all studies have."""
-
-    model_config = ConfigDict(json_schema_extra=_drop_supplied)
 
     from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")
     """Fields that the file's scene supplies where the study leaves them out."""
@@ -99,6 +84,16 @@ class Study(Strict):
     """Name of the study, unique in the file; its results are stored under it."""
 
     @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """Let an editor's check pass where the scene supplies what a study leaves out, and say so."""
+        found = super().__get_pydantic_json_schema__(schema, handler)
+        own = handler.resolve_ref_schema(found)
+        own["required"] = [name for name in own.get("required", []) if name not in cls.from_scene]
+        for field in (own["properties"][name] for name in cls.from_scene):
+            field["description"] += " The scene's where left out."
+        return found
+
+    @classmethod
     def kind_name(cls) -> str:
         """The name of the kind: the one literal of the field ``kind``, which every kind of study has."""
         (name,) = get_args(cls.model_fields["kind"].annotation)
@@ -112,19 +107,16 @@ class Study(Strict):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         """Add what the study leaves out and the scene knows."""
-        supplied: dict[str, Any] = {
-            "delta": scene.delta,
-            "d": scene.d,
-            "delay_model": scene.delay_model,
-            "delay_models": [scene.delay_model],
-        }
+        absent = [name for name in cls.from_scene if name not in raw]
+        supplied: dict[str, Any] = {name: getattr(scene, name) for name in ("delta", "d", "delay_model")}
+        supplied["delay_models"] = [scene.delay_model]
         if isinstance(scene, PhysicalScene):
             supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
-            if "device" in cls.from_scene:
+            if "device" in absent:
                 supplied["device"] = scene.bare(SimulatedDevice if cls.simulates else PhysicalDevice)
-        if "devices" in cls.from_scene:
+        if "devices" in absent:
             supplied["devices"] = [scene.bare()]
-        return {**{name: supplied[name] for name in cls.from_scene if supplied.get(name) is not None}, **raw}
+        return {**{name: supplied[name] for name in absent if supplied.get(name) is not None}, **raw}
 
     @classmethod
     def _list_taken(cls, raw: dict[str, Any]) -> list[str]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import MISSING, fields
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, GetPydanticSchema, ValidationError, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.device_table import DeviceTable, TableField, read_table
+from zwidth.config.device_table import TableField, read_table
 from zwidth.config.devices import (
     DeviceForm,
     ResponseSection,
@@ -232,7 +233,10 @@ class SweepStudy(_Parts, HeldStudy):
                 kinds = "a sweep has mass and period or rate, or, normalized, delta and d"
                 yield ("axes",), problem(f"{name} missing", kinds, f"add '{name}: {example}', or a scene")
         yield from self._outputs_limits(given, physical)
-        yield from self._delay_limits(given)
+        if "delay" in given and {"period", "rate"} & set(given) and not self.axes.most_periods <= MAX_DELAY_PERIODS:
+            what = f"the longest delay is {self.axes.most_periods:.6g} of the shortest periods"
+            place = ("axes", self.axes.place("delay"))
+            yield place, problem(what, f"at most {MAX_DELAY_PERIODS:g} periods", "check the units")
         if self.with_parts:
             yield from self._part_limits(given, physical)
         if self.points > MAX_SWEEP_POINTS:
@@ -285,7 +289,14 @@ class SweepStudy(_Parts, HeldStudy):
             what = f"got the axis {name!r}, but no {part} with the key {key!r}"
             remedy = f"add {_EXAMPLES.get(part, part)!r}"
             yield ("axes", self.axes.place(name)), problem(what, "an axis changes a part that is there", remedy)
-        found = {} if absent else {str(error): locate_refusal(error) for error in self._find_refusals()}
+        # Every parameter at its least value, and those of parts at their ends.
+        least = {name: self.axes.ends(name)[0] for name in self.axes.given if name not in WALL}
+        found = {}
+        for changed in () if absent else ({}, *({name: self.axes.ends(name)[1]} for name in self.axes.given_of_parts)):
+            try:
+                self.make_scene({**least, **changed}).check_parts()
+            except InputError as error:
+                found[str(error)] = locate_refusal(error)
         for field, what in found.values():
             name = ".".join(map(str, field))
             yield (("axes", self.axes.place(name)) if name in self.axes.given else ("axes",)), what
@@ -300,15 +311,6 @@ class SweepStudy(_Parts, HeldStudy):
         # A part that has no section is there where it needs no numbers.
         needed = section is None and any(item.default is MISSING for item in fields(kind))
         return not needed and key in kind.__dataclass_fields__
-
-    def _find_refusals(self) -> Iterator[InputError]:
-        """What the parts refuse with every parameter at its least value, and with those of parts at their ends."""
-        least = {name: self.axes.ends(name)[0] for name in self.axes.given if name not in WALL}
-        for changed in ({}, *({name: self.axes.ends(name)[1]} for name in self.axes.given_of_parts)):
-            try:
-                self.make_scene({**least, **changed}).check_parts()
-            except InputError as error:
-                yield error
 
     def make_scene(self, values: dict[str, float]) -> Scene:
         """The scene at a point of the grid, from the parameters that the axes give."""
@@ -328,15 +330,6 @@ class SweepStudy(_Parts, HeldStudy):
         device = Device(mass=given.pop("mass", 1.0), damping=given.pop("damping", 0.0), rotary=bool(self.rotary))
         return Scene(device, Timing(period=period, delay=delay)).replace(**parts, **given)
 
-    def _delay_limits(self, given: tuple[str, ...]) -> Iterable[LocatedProblem]:
-        if "delay" not in given or not {"period", "rate"} & set(given):
-            return
-        longest = self.axes.most_periods
-        if not longest <= MAX_DELAY_PERIODS:
-            what = f"the longest delay is {longest:.6g} of the shortest periods"
-            place = ("axes", self.axes.place("delay"))
-            yield place, problem(what, f"at most {MAX_DELAY_PERIODS:g} periods", "check the units")
-
     @property
     def families(self) -> dict[Family, tuple[str, ...]]:
         groups: dict[Family, tuple[str, ...]] = {
@@ -351,14 +344,9 @@ class SweepStudy(_Parts, HeldStudy):
 
 def _columns(raw: Any) -> set[str]:
     """The parameters of a table, as far as it can be read."""
-    if raw is None:
-        return set()
-    if isinstance(raw, DeviceTable):
-        return set(raw.columns)
     if isinstance(raw, dict) and "csv" not in raw:
         return set(raw) & set(PARAMETERS)
-    try:
+    # Its faults are reported where the table itself is read.
+    with suppress(PydanticCustomError, ValidationError):
         return set(read_table(raw).columns)
-    except (PydanticCustomError, ValidationError):
-        # Reported where the table itself is read.
-        return set()
+    return set()

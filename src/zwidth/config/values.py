@@ -28,7 +28,7 @@ from zwidth.config.fields import (
 )
 from zwidth.parts.checks import Span, read_span
 from zwidth.words.formatting import describe, short, suggestion
-from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
+from zwidth.words.quantities import ANY, FIELDS, FRACTION, NOT_NEGATIVE, POSITIVE, Range
 from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.units import (
     PERIOD_WORDS,
@@ -52,23 +52,14 @@ _FORMS = "a number, a list of numbers, {linear: {start, stop, num}} or {log: {st
 
 @dataclass(frozen=True)
 class Quantity:
-    """Makes a field a number of a unit and a range: read, checked, and described in the schema.
+    """Makes a field a number of a unit and a range: read, checked, and described in the schema."""
 
-    Attributes:
-        unit: the SI base unit, in which a number alone is; "1" for a number without one.
-        allowed: the admissible values.
-        whole: whether they are whole numbers.
-        periods: whether it is a length of time, in s or in sampling periods: a `Span`.
-        remedy: what helps where another number is given.
-        turns: whether it is an angle, a torque, ... where the device is rotary.
-    """
-
-    unit: str = "1"
+    unit: str = "1"  # the SI base unit, in which a number alone is; "1" for a number without one
     allowed: Range = ANY
-    whole: bool = False
-    periods: bool = False
-    remedy: str = ""
-    turns: bool = True
+    whole: bool = False  # whether the admissible values are whole numbers
+    periods: bool = False  # whether it is a length of time, in s or in sampling periods: a `Span`
+    remedy: str = ""  # what helps where another number is given
+    turns: bool = True  # whether it is an angle, a torque, ... where the device is rotary
 
     @cached_property
     def read(self) -> Callable[[Any], Any]:
@@ -134,7 +125,7 @@ class Quantity:
 
 
 def quantity_of(name: str) -> Quantity:
-    parameter = PARAMETERS[name]
+    parameter = FIELDS[name]
     return Quantity(parameter.unit, parameter.allowed, parameter.whole, name == "delay")
 
 

@@ -138,8 +138,11 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     ax.plot(values * scale, stiffness * factor, color=style.BLACK, label="K_max", zorder=3)
     colors = style.color_by_value(targets.tolist())
     ax.set(xscale="log", yscale="log")
-    _mark_present(ax, values * scale, stiffness * factor, float(required[present_in][0]) * scale)
-    curve_drawn = np.stack([values * scale, stiffness * factor])
+    present, curve_drawn = float(required[present_in][0]) * scale, np.stack([values * scale, stiffness * factor])
+    if curve_drawn[0, 0] <= present <= curve_drawn[0, -1]:
+        height = np.exp(np.interp(np.log(present), *np.log(curve_drawn)))
+        look: dict[str, Any] = {"marker": "s", "markersize": 5, "markerfacecolor": "white", "color": style.BLACK}
+        ax.plot([present], [height], linestyle="", label="present", zorder=5, **look)
     columns = (required[name] for name in (value_in, "enough", header("other_crossings", parameter.unit)))
     names = []
     for target, value, enough, others in zip(targets, *columns, strict=True):
@@ -153,7 +156,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         style.use_logarithmic(ax, name, scaled, style.DECADES)
     ax.set(
         xlim=(values[0] * scale, values[-1] * scale),
-        xlabel=f"{parameter.words}  ${parameter.symbol}$  in {spelled}",
+        xlabel=f"{parameter.axis_label}  in {spelled}",
         ylabel=f"maximum stable stiffness  $K_{{\\max}}$  in {unit}",
     )
     # Beside the panel: below its dot a value would stand on the line of the next one.
@@ -173,14 +176,6 @@ def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[f
         # Not 100 % where one of many does not.
         percent = f"{round_safely(100.0 * share, 'below', 3):.3g}"
         yield wanted * reserve, words + (f": {percent} % of devices bear it" if np.isfinite(share) else "")
-
-
-def _mark_present(ax: Axes, values: np.ndarray, stiffness: np.ndarray, present: float) -> None:
-    if not values[0] <= present <= values[-1]:
-        return
-    height = np.exp(np.interp(np.log(present), np.log(values), np.log(stiffness)))
-    look: dict[str, Any] = {"marker": "s", "markersize": 5, "markerfacecolor": "white", "color": style.BLACK}
-    ax.plot([present], [height], linestyle="", label="present", zorder=5, **look)
 
 
 def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, color: Any) -> None:

@@ -13,6 +13,7 @@ from matplotlib.contour import ContourSet
 from zwidth.figures import style
 from zwidth.words.formatting import count_digits_apart
 from zwidth.words.quantities import NOT_COMPUTED, OF_PARTS, OUTPUTS, STATUS_OF, VARIABLES, WALL
+from zwidth.words.status import Status
 
 if TYPE_CHECKING:
     import xarray
@@ -71,7 +72,7 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
     for name in names:
         values, output = data[name], OUTPUTS[name]
         if output.dtype == "bool":
-            values = values.astype(float).where(data[status] == 0)
+            values = values.astype(float).where(data[status] == Status.OK)
         elif output.dtype == "float64":
             # Two digits of the first slice are enough to choose a prefix.
             part = values.isel({dim: slice(0, 1) for dim in values.dims[:-2]}).values
@@ -140,9 +141,7 @@ def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
 
 def axis_label(data: xarray.Dataset, name: str) -> str:
     """A parameter in words, with symbol and unit."""
-    parameter = VARIABLES[name]
-    definition = f" = {parameter.definition}" if parameter.definition else ""
-    return f"{parameter.words}  ${parameter.symbol}{definition}$" + _in_unit(data, name)
+    return VARIABLES[name].axis_label + _in_unit(data, name)
 
 
 def output_label(data: xarray.Dataset, name: str) -> str:

@@ -13,20 +13,19 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
 from zwidth.figures import grid, style
-from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables
-from zwidth.words.formatting import count_digits_apart, with_unit
+from zwidth.figures.table import Table, curves, draws_tables
+from zwidth.simulation.result import MotionKind
+from zwidth.words.formatting import count_digits_apart, header, with_unit
+from zwidth.words.quantities import FIELDS
 
-_AXES = {
-    SI_COLUMNS[0]: ("stiffness", "K", "N/m"),
-    SI_COLUMNS[1]: ("virtual damping", "B", "N s/m"),
-    "resolution_m": ("resolution of the encoder", r"\Delta", "m"),
-    "coulomb_N": ("dry friction", "F_c", "N"),
+AXES = {
+    header(name, FIELDS[name].unit): FIELDS[name] for name in ("stiffness", "virtual_damping", "resolution", "coulomb")
 }
-_DIVERGED = 4
+"""The parameters that a buzz may be drawn over, by their columns."""
 # Up to so many points of a curve are seen one by one.
 _FEW = 12
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
-_BEYOND: dict[str, Any] = {"facecolor": "#D9D9D9", "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
+_BEYOND: dict[str, Any] = {"facecolor": grid.MISSING, "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 
 
@@ -45,12 +44,12 @@ def draw_limit_cycles(
         axes: Axes of yours, one for each condition.
     """
     labels = arrays["condition"].tolist()
-    across, along = (name for name in _AXES if name in arrays)
+    across, along = (name for name in AXES if name in arrays)
     columns = len(labels) if len(labels) <= 3 else 2
     rows = -(-len(labels) // columns)
     size = (max(1.3 + 2.5 * columns, 5.6), 1.3 + 2.4 * rows) if len(labels) > 1 else (5.8, 4.3)
     panels = style.panels(axes, len(labels), *size, columns, sharex=True, sharey=True)
-    scales = {name: style.si_unit(arrays[name], _AXES[name][2]) for name in (across, along)}
+    scales = {name: style.si_unit(arrays[name], AXES[name].unit) for name in (across, along)}
     beyond = _find_beyond(arrays, bounds)
     factor, meter = style.si_unit(np.sqrt(bounds[0] * bounds[1]), "m")
     norm = LogNorm(bounds[0] * factor, bounds[1] * factor)
@@ -71,7 +70,7 @@ def draw_limit_cycles(
             ax.set_title(style.literal(label))
         grid.scale_axis(ax, "x", x)
         grid.scale_axis(ax, "y", y)
-    names = [f"{_AXES[name][0]}  ${_AXES[name][1]}$  in {scales[name][1]}" for name in (across, along)]
+    names = [f"{AXES[name].axis_label}  in {scales[name][1]}" for name in (across, along)]
     style.label_axes(panels, *names, once=axes is None)
     figure = style.figure_of(panels)
     label = f"amplitude of the buzz  in {meter}"
@@ -87,7 +86,7 @@ def draw_limit_cycles(
 
 
 def _find_beyond(arrays: Mapping[str, np.ndarray], bounds: tuple[float, float]) -> np.ndarray:
-    return (arrays["outcome"] == _DIVERGED) | ~(arrays["amplitude_m"] <= bounds[1])
+    return (arrays["outcome"] == MotionKind.DIVERGED) | ~(arrays["amplitude_m"] <= bounds[1])
 
 
 @draws_tables
@@ -111,12 +110,12 @@ def draw_limit_cycle_curves(
         axes: Axes of yours, those of the amplitudes first.
     """
     labels = arrays["condition"].tolist()
-    (over,) = (name for name in _AXES if name in arrays and name != family)
+    (over,) = (name for name in AXES if name in arrays and name != family)
     size = (max(1.0 + 2.7 * len(labels), 5.8), 4.8)
     panels = style.panels(axes, 2 * len(labels), *size, len(labels), sharex=True, sharey="row")
-    scale, unit = style.si_unit(arrays[over], _AXES[over][2])
+    scale, unit = style.si_unit(arrays[over], AXES[over].unit)
     # The curves along the axis before the last one.
-    turn = 1 if family and [name for name in _AXES if name in arrays].index(family) else 0
+    turn = 1 if family and [name for name in AXES if name in arrays].index(family) else 0
     cycles = {name: arrays[name] if arrays[name].ndim == 3 else arrays[name][:, None] for name in _CYCLES}
     cycles = {name: values.swapaxes(1, 2) if turn else values for name, values in cycles.items()}
     buzzes = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
@@ -141,7 +140,7 @@ def draw_limit_cycle_curves(
                     style.use_logarithmic(ax, "y", amplitudes)
                 ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
             else:
-                ax.set_xlabel(f"{_AXES[over][0]}  ${_AXES[over][1]}$  in {unit}")
+                ax.set_xlabel(f"{AXES[over].axis_label}  in {unit}")
             if column == 0:
                 ax.set_ylabel(words)
     handles = [style.line(look["label"], look["linestyle"], color=look["color"]) for look in looks]
@@ -164,12 +163,12 @@ def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarra
     """The look of every curve, and its label: which value it belongs to, and where no wall of it is linearly stable."""
     if not family:
         return [{**style.look(0), "label": "buzz"}]
-    values, (_, symbol, unit) = arrays[family], _AXES[family]
-    times, unit = style.si_unit(values, unit)
+    values, known = arrays[family], AXES[family]
+    times, unit = style.si_unit(values, known.unit)
     colors = style.ordered_colors(values.size)
     unstable = [not np.any(stable[:, k]) for k in range(values.size)]
     digits = count_digits_apart((values * times).tolist())
-    texts = [f"${symbol} = {value * times:.{digits}g}$ {unit}" for value in values]
+    texts = [f"${known.symbol} = {value * times:.{digits}g}$ {unit}" for value in values]
     return [
         {**style.look(k), "color": color, "label": text + (", unstable" if lost else "")}
         for k, (color, text, lost) in enumerate(zip(colors, texts, unstable, strict=True))

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
 
 from zwidth.figures import style
 from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
@@ -243,8 +244,6 @@ def draw_response(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
 
 def _draw_loop(ax: Any, L: np.ndarray, share: np.ndarray) -> None:
     """The open loop, a disc around each line that the band makes of it, and -1."""
-    from matplotlib.collections import EllipseCollection
-
     near = np.abs(1.0 + L) < 2.0 * _REACH
     wide = 2.0 * (share * np.abs(L))[near]
     look: Any = {"units": "xy", "offset_transform": ax.transData, "color": style.SKY, "alpha": 0.3, "linewidth": 0}

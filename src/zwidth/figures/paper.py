@@ -53,7 +53,12 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
         _shade(ax, interval, style.VERMILION)
         for name in ("beta_lower", "beta_upper"):
             ax.plot(interval.delta, getattr(interval, name), label=f"passive {name}, d = {interval.d:g}", **look)
-    _draw_lower_bound(ax, stable[0], several=len(colors) > 1)
+    # One line for all delays, where they agree.
+    lower, middle = stable[0].beta_lower, int(0.55 * stable[0].delta.size)
+    ax.plot(stable[0].delta, lower, color=style.BLACK, label="beta_lower", zorder=2.5)
+    text = r"$\beta = -\delta$ for every $d$" if len(colors) > 1 else r"$\beta = -\delta$"
+    place = stable[0].delta[middle], lower[middle]
+    ax.annotate(text, place, xytext=(8, 6), textcoords="offset points", fontsize=8)
     grid.scale_axis(ax, "x", np.unique(np.concatenate([interval.delta for interval in stable])))
     values = np.concatenate([np.r_[interval.beta_lower, interval.beta_upper] for interval in stable])
     ax.set_ylim(*style.span(float(values.min()), float(values.max())))
@@ -78,15 +83,6 @@ def _draw_curve(ax: Axes, of: Any, x: Any, y: Any, colors: dict[float, Any], wor
 def _shade(ax: Axes, interval: Any, color: Any, **keywords: Any) -> None:
     look = {"color": color, "alpha": 0.08, "linewidth": 0.0, **keywords}
     ax.fill_between(interval.delta, interval.beta_lower, interval.beta_upper, **look)
-
-
-def _draw_lower_bound(ax: Axes, first: Any, *, several: bool) -> None:
-    """One line for all delays, where they agree."""
-    ax.plot(first.delta, first.beta_lower, color=style.BLACK, label="beta_lower", zorder=2.5)
-    middle = int(0.55 * first.delta.size)
-    text = r"$\beta = -\delta$ for every $d$" if several else r"$\beta = -\delta$"
-    place = (first.delta[middle], first.beta_lower[middle])
-    ax.annotate(text, place, xytext=(8, 6), textcoords="offset points", fontsize=8)
 
 
 @draws_tables
@@ -205,35 +201,28 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2)
     costs = curves(table, "d")
     colors = style.color_by_value([cost.d for cost in costs])
-    for ax, draw in zip(panels, (_draw_maxima, _draw_share), strict=False):
-        draw(ax, costs, colors)
+    maxima, *shares = panels
+    for cost in costs:
+        best, passive = cost.alpha_max, cost.alpha_max_passive
+        _draw_curve(maxima, cost, cost.delta, best, colors, "alpha_max")
+        _draw_curve(maxima, cost, cost.delta, passive, colors, "alpha_max_passive", linestyle=style.DASH_DOTTED)
+        maxima.fill_between(cost.delta, passive, best, color=colors[cost.d], alpha=0.12, linewidth=0.0, zorder=1)
+        for ax in shares:
+            _draw_curve(ax, cost, cost.delta, 100.0 * passive / best, colors, "passive share")
+    every = np.concatenate([[*cost.alpha_max, *cost.alpha_max_passive] for cost in costs])
+    _scale_stiffness(maxima, costs[0].delta, every)
+    style.label_ends(maxima, costs, [cost.alpha_max[-1] for cost in costs], colors)
+    maxima.set_ylabel(style.ALPHA_LABEL)
+    stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")
+    maxima.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc="upper left")
+    for ax in shares:
+        ax.set(ylim=(0.0, 100.0), ylabel=r"stiffest passive wall in % of $\alpha_{\max}$")
+        style.label_ends(ax, costs, [100.0 * cost.alpha_max_passive[-1] / cost.alpha_max[-1] for cost in costs], colors)
+    for ax in panels:
         grid.scale_axis(ax, "x", np.unique(table["delta"]))
         ax.set_xlabel(style.DELTA_LABEL)
     style.letter(panels)
     return panels
-
-
-def _draw_maxima(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
-    for cost in costs:
-        delta, best, passive = cost.delta, cost.alpha_max, cost.alpha_max_passive
-        _draw_curve(ax, cost, delta, best, colors, "alpha_max")
-        _draw_curve(ax, cost, delta, passive, colors, "alpha_max_passive", linestyle=style.DASH_DOTTED)
-        ax.fill_between(delta, passive, best, color=colors[cost.d], alpha=0.12, linewidth=0.0, zorder=1)
-    _scale_stiffness(ax, costs[0].delta, np.concatenate([[*cost.alpha_max, *cost.alpha_max_passive] for cost in costs]))
-    style.label_ends(ax, costs, [cost.alpha_max[-1] for cost in costs], colors)
-    ax.set_ylabel(style.ALPHA_LABEL)
-    stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")
-    ax.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc="upper left")
-
-
-def _draw_share(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
-    """The share of the stable stiffness that a passive wall reaches."""
-    ratios = [100.0 * cost.alpha_max_passive / cost.alpha_max for cost in costs]
-    for cost, ratio in zip(costs, ratios, strict=True):
-        _draw_curve(ax, cost, cost.delta, ratio, colors, "passive share")
-    ax.set_ylim(0.0, 100.0)
-    style.label_ends(ax, costs, [ratio[-1] for ratio in ratios], colors)
-    ax.set_ylabel(r"stiffest passive wall in % of $\alpha_{\max}$")
 
 
 # A legend of more entries than this is harder to read than a color bar.

@@ -157,8 +157,15 @@ def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str
         else:
             shown = panel.variables[name]
             image = grid.draw_cells(ax, panel.x, panel.y, shown, cmap=_colors(OUTPUTS[name]), norm=norm)
-            _draw_contours(ax, panel, name, norm)
-            _draw_corners(ax, panel)
+            if min(shown.shape) > 1 and shown.count():
+                # Labelled contours where the number is good, and the bold one at which it ceases to be.
+                others = draw_edge(ax, panel, name, **_EDGE) + ([np.array([panel.peak])] if panel.peak else [])
+                draw_contours(ax, panel.x, panel.y, shown, OUTPUTS[name], norm, others)
+            corner = np.ma.filled(panel.variables.get("kind", np.zeros(1)) == 1, False)
+            if min(shown.shape) > 1 and corner.any():
+                with matplotlib.rc_context({"hatch.linewidth": 0.5, "hatch.color": "#606060"}):
+                    hatched: Any = {"levels": [0.5, 1.5], "colors": "none", "hatches": ["////"]}
+                    ax.contourf(panel.x, panel.y, corner.astype(float), **hatched)
         if panel.peak:
             ax.plot(*panel.peak, linestyle="", zorder=5, clip_on=False, label="stiffest stable wall", **_PEAK)
     _explain(axes, panels, name, image, label, outside=outside)
@@ -199,15 +206,6 @@ def _draw_line(ax: Axes, panel: Panel, name: str, look: Mapping[str, Any]) -> An
         return None
     plain: Any = {f"{key}s": [look[key]] for key in ("color", "linestyle", "linewidth")}
     return ax.contour(panel.x, panel.y, values, levels=[level], **plain)
-
-
-def _draw_contours(ax: Axes, panel: Panel, name: str, norm: Any) -> None:
-    """Labelled contours where a number is good, and the bold one at which it ceases to be."""
-    values = panel.variables[name]
-    if min(values.shape) > 1 and values.count():
-        others = draw_edge(ax, panel, name, **_EDGE)
-        others += [np.array([panel.peak])] if panel.peak else []
-        draw_contours(ax, panel.x, panel.y, values, OUTPUTS[name], norm, others)
 
 
 def draw_contours(
@@ -258,13 +256,6 @@ def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
     else:
         levels = np.asarray(MaxNLocator(8).tick_values(low, high))
     return levels[(levels > low) & (levels < high)]
-
-
-def _draw_corners(ax: Axes, panel: Panel) -> None:
-    corner = np.ma.filled(panel.variables.get("kind", np.zeros(1)) == 1, False)
-    if min(panel.x.size, panel.y.size) > 1 and corner.any():
-        with matplotlib.rc_context({"hatch.linewidth": 0.5, "hatch.color": "#606060"}):
-            ax.contourf(panel.x, panel.y, corner.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
 
 
 def _colors(output: Output) -> Any:

@@ -180,7 +180,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     ax.plot(grid, top * factor, color=style.BLUE, label="stiffest stable wall", **(style.POINTS if whole else {}))
     if not whole:
         ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
-    words = f"{known.words}  ${known.symbol}$" if known else style.literal(parameter)
+    words = known.axis_label if known else style.literal(parameter)
     words += f"  in {spelled}" if spelled not in ("", "1") else ""
     ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
     scale_axis(ax, "x", grid)

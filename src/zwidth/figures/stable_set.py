@@ -46,14 +46,12 @@ def shade_region(ax: Axes, outlines: Outlines, face: Any, *, alpha: float | None
 
 def to_path(outlines: Outlines) -> Path:
     """The shape of a region; holes run the other way round, so that they stay empty."""
-    return Path.make_compound_path(*(Path(_wind(points, hole), closed=True) for points, hole in outlines))
-
-
-def _wind(points: np.ndarray, hole: bool) -> np.ndarray:
-    closed = _close(points)
-    x, y = closed[:-1].T
-    turn = float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))
-    return closed if (turn > 0) != hole else closed[::-1]
+    paths = []
+    for closed, hole in ((_close(points), hole) for points, hole in outlines):
+        x, y = closed[:-1].T
+        turn = float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))
+        paths.append(Path(closed if (turn > 0) != hole else closed[::-1], closed=True))
+    return Path.make_compound_path(*paths)
 
 
 def _close(points: np.ndarray) -> np.ndarray:
@@ -288,7 +286,8 @@ def draw_recommendation(
         outlines |= {"number": np.zeros(curve.size, int), "piece": np.where(curve == "passive", curve, "outline")}
     outlines["label"] = np.full(len(outlines["piece"]), "")
     kinds = np.array(["stiffest", f"recommended ({100 * wall['stiffness_fraction']:.3g} %)"])
-    walls = {name: np.array([row[key] for row in (maximum, wall)]) for name, key in zip(SI_COLUMNS, _WALL, strict=True)}
+    keys = zip(SI_COLUMNS, ("stiffness", "virtual_damping"), strict=True)
+    walls = {name: np.array([row[key] for row in (maximum, wall)]) for name, key in keys}
     digits = np.array([4, wall.get("digits", 4)])
     draw_stable_set(outlines, {"label": np.array(["", ""]), "wall": kinds, "digits": digits, **walls}, panels[:1])
     (spring, damper), _ = scale_walls([outlines, walls])
@@ -298,20 +297,13 @@ def draw_recommendation(
     panels[0].plot([wall["stiffness"] * spring] * 2, interval * damper, **look)
     if response is not None:
         for ax in panels[1:]:
-            _draw_response(ax, found, response)
+            clock, unit = draw_positions(ax, response)
+            time, settled = np.asarray(response["time_s"]), wall["settling_time"]
+            ax.set_xlim(0.0, float(time[-1] + time[1]) * clock)
+            ax.set_xlabel(f"time  $t$  in {unit}")
+            if settled is not None and settled <= time[-1]:
+                dot = Line2D([], [], linestyle="", marker="o", markersize=4.5, color=ax.lines[0].get_color())
+                text = f"settled to 2 % after {settled * clock:.3g} {unit}"
+                ax.legend([dot], [text], loc="upper right", handletextpad=0.2)
     style.letter(panels)
     return panels
-
-
-_WALL = ("stiffness", "virtual_damping")
-
-
-def _draw_response(ax: Axes, found: Mapping[str, Any], response: Table) -> None:
-    clock, unit = draw_positions(ax, response)
-    time, settled = np.asarray(response["time_s"]), found["recommended"]["settling_time"]
-    ax.set_xlim(0.0, float(time[-1] + time[1]) * clock)
-    ax.set_xlabel(f"time  $t$  in {unit}")
-    if settled is not None and settled <= time[-1]:
-        dot = Line2D([], [], linestyle="", marker="o", markersize=4.5, color=ax.lines[0].get_color())
-        text = f"settled to 2 % after {settled * clock:.3g} {unit}"
-        ax.legend([dot], [text], loc="upper right", handletextpad=0.2)

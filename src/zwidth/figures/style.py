@@ -23,6 +23,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import PREFIXES
+from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 
 # Okabe and Ito's palette, told apart with any color vision.
@@ -40,9 +41,7 @@ STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED, (0, (11.0, 2.5)), (0, (6.0, 1.8, 1
 # What tells curves apart whose line styles have a meaning of their own.
 MARKERS = ("o", "s", "^", "v", "P", "X", "*")
 
-ALPHA_LABEL = r"normalized stiffness  $\alpha = K\,T^2\!/m$"
-BETA_LABEL = r"normalized virtual damping  $\beta = B\,T/m$"
-DELTA_LABEL = r"normalized physical damping  $\delta = b\,T/m$"
+ALPHA_LABEL, BETA_LABEL, DELTA_LABEL = (PARAMETERS[name].axis_label for name in ("alpha", "beta", "delta"))
 ALPHA_MAX_LABEL = r"maximum stable stiffness  $\alpha_{\max} = K_{\max}T^2\!/m$"
 
 # Of a whole number there is nothing between its values.

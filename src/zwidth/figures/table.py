@@ -10,8 +10,8 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from zwidth.figures.style import house_style
-from zwidth.words.formatting import header
-from zwidth.words.rotation import ROTARY, is_rotary, use_kind
+from zwidth.words.formatting import turn_header
+from zwidth.words.rotation import is_rotary, use_kind
 
 # Walls in SI units, beside alpha and beta.
 SI_COLUMNS = ("stiffness_N_per_m", "virtual_damping_N_s_per_m")
@@ -26,10 +26,6 @@ class Table(Protocol):
 
     def __contains__(self, key: Any, /) -> bool: ...
 
-
-# What names of columns end with for rotary devices and, in their place, for linear ones; the longest first.
-_ENDINGS = {header("", turned): header("", unit) for unit, turned in ROTARY.items()}
-_ENDINGS = dict(sorted(_ENDINGS.items(), key=lambda pair: -len(pair[0])))
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -51,14 +47,8 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
 def _name_as_linear(table: Any) -> Any:
     """A table with the names that figures know; itself where it has them, and what is no table."""
-    if not hasattr(table, "keys") or not any(str(name).endswith(tuple(_ENDINGS)) for name in table):
-        return table
-
-    def rename(name: str) -> str:
-        ending = next((each for each in _ENDINGS if name.endswith(each)), "")
-        return name.removesuffix(ending) + _ENDINGS.get(ending, "")
-
-    return {rename(str(name)): table[name] for name in table}
+    names = {str(name): turn_header(str(name), False) for name in table} if hasattr(table, "keys") else {}
+    return {linear: table[name] for name, linear in names.items()} if any(k != v for k, v in names.items()) else table
 
 
 def select(table: Table, **wanted: object) -> dict[str, np.ndarray]:

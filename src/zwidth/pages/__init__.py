@@ -1,1 +1,1 @@
-"""Pages for a browser: the explorer, and the report of a run."""
+"""The explorer, a page for a browser, and the words in which it and the command line answer."""

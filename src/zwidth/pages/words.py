@@ -7,6 +7,7 @@ import math
 import re
 import shutil
 import textwrap
+from collections.abc import Iterable
 from math import isfinite, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,8 +22,6 @@ from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from zwidth.scenes.assessment import Assessment, FrictionRule, Intervals, Limit
     from zwidth.scenes.scene import Scene
 
@@ -71,7 +70,11 @@ def scene_lines(scene: Scene) -> list[str]:
         if name == "velocity" and velocity == "BackwardDifference" and not own:
             continue
         named = {path.removeprefix(f"{name}.").replace("_", " "): path for path in own if own[path]}
-        words = [f"{key} {_spell(path, own[path])}" for key, path in named.items()]
+        words = []
+        for key, path in named.items():
+            value, unit = own[path], unit_of(path)
+            spelled = with_unit(value, unit) if unit else short(value) if isinstance(value, int) else plain(value)
+            words.append(f"{key} {spelled}")
         if name == "coupling":
             words.append(f"sensor at the {parts[name].sensor}")
         words = [velocity, *words] if name == "velocity" else words
@@ -84,25 +87,19 @@ def unit_of(path: str) -> str:
     return PARAMETERS[path].unit.removeprefix("1") if path in PARAMETERS else ""
 
 
-def _spell(path: str, value: Any) -> str:
-    unit = unit_of(path)
-    return with_unit(value, unit) if unit else short(value) if isinstance(value, int) else plain(value)
-
-
-def stability_word(stable: bool | None, marginal: bool = False) -> str:
-    """The verdict, in color."""
-    if stable is None:
-        return click.style("undecided", fg="yellow", bold=True)
-    if marginal:
-        word = click.style("marginal", fg="yellow", bold=True)
-        return f"{word} (a pole at z = 1: without stiffness nothing pulls back)"
-    return click.style("stable", fg="green", bold=True) if stable else click.style("UNSTABLE", fg="red", bold=True)
+def word_of(verdict: Assessment) -> str:
+    """The verdict in one word."""
+    if verdict.stable is None:
+        return "undecided"
+    return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
 
 
 @in_own_units
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
-    wall = scene.wall
-    word = stability_word(verdict.stable, verdict.marginal)
+    wall, word = scene.wall, word_of(verdict)
+    color = {"stable": "green", "UNSTABLE": "red"}.get(word, "yellow")
+    told = click.style(word, fg=color, bold=True)
+    told += " (a pole at z = 1: without stiffness nothing pulls back)" if word == "marginal" else ""
     best, normalized = "none: no stiffness is stable at any damping", []
     # Of a device that is given as a whole no mass is known, and of a response no pole.
     by_mass, by_poles = isinstance(scene.device, Device), not isnan(verdict.frequency)
@@ -121,13 +118,13 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
         words = f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}"
         normalized = [row("normalized", words)]
     if by_poles:
-        word = f"{word}, spectral radius {verdict.spectral_radius:.6f}"
+        told = f"{told}, spectral radius {verdict.spectral_radius:.6f}"
     return [
         *scene_lines(scene),
         row("wall", f"K = {spell_stiffness(wall.stiffness)}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
         *normalized,
         "",
-        row("verdict", word),
+        row("verdict", told),
         row("to the boundary in K", _distance(wall.stiffness, verdict.stable_stiffness, "N/m", "K", "B", surely)),
         row("to the boundary in B", _distance(wall.virtual_damping, verdict.stable_damping, "N s/m", "B", "K", surely)),
         row("passive", passivity_words(scene, verdict)),
@@ -287,17 +284,11 @@ def list_slopes(scene: Scene) -> list[Slope]:
         by_one = not size or (unit == "N s/m" and not is_rotary())
         # A power of ten near one percent, as people can picture it.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if is_rotary() else 1.0
-        words = f"{with_unit(step, unit, 1)} more {describe_effect(value * step)}"
-        words += " (same delay in seconds)" if path == "period" else ""
+        effect = "changes nothing"
+        if change := value * step:
+            amount = with_unit(abs(change), "N/m", 3) if isfinite(change) else "stiffness at an infinite rate at first"
+            effect = f"{'buys' if change > 0 else 'costs'} {amount}"
+        note = " (same delay in seconds)" if path == "period" else ""
+        words = f"{with_unit(step, unit, 1)} more {effect}{note}"
         found.append(Slope(path, value, f"N/m per {unit}", words))
     return found
-
-
-def describe_effect(change: float) -> str:
-    """ "buys 0.5 kN/m", "costs 3 N/m"."""
-    if change == 0:
-        return "changes nothing"
-    verb = "buys" if change > 0 else "costs"
-    if not isfinite(change):
-        return f"{verb} stiffness at an infinite rate at first"
-    return f"{verb} {with_unit(abs(change), 'N/m', 3)}"

@@ -1,4 +1,4 @@
-"""Runs: a configuration in, a folder of stores, tables, figures and texts out."""
+"""Runs: a configuration in, a folder of stores, tables, figures and texts out, and the report of it."""
 
 from zwidth.runs.run import ProgressCallback, RunResult, StudyEvent, StudyResult, plan_run, run
 

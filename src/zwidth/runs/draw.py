@@ -6,13 +6,13 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from zwidth.figures.curves import draw_curves, draw_outlines, find_family
 from zwidth.figures.grid import choose_axes, list_varied
-from zwidth.figures.plane import draw_plane
+from zwidth.figures.plane import Edges, draw_plane
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.style import Size, save, style_sheet
 from zwidth.parts.checks import check_number
@@ -25,8 +25,6 @@ from zwidth.words.quantities import ANY, OUTPUTS, VARIABLES
 
 if TYPE_CHECKING:
     import xarray
-
-Edges: TypeAlias = Callable[["xarray.Dataset"], dict[str, Outlines]]
 
 _PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})
 FOLDER = "figures"
@@ -93,30 +91,12 @@ def draw_stores(
     progress: Callable[[Path], None] = lambda file: None,
     note: Callable[[str], None] = lambda text: None,
 ) -> tuple[Path, ...]:
-    """Draw the sweeps in a store, or in all stores of a folder, as PNG and SVG.
+    """Draw the sweeps in a store, or in all stores of a folder, into ``figures`` beside them where ``out`` is left out.
 
-    Args:
-        path: a store ``<study>.zarr`` or the folder of a run.
-        out: where the figures go; ``figures`` beside the stores where left out. Figures that are there are replaced.
-        at: values of parameters by name, in the units of the store or with one, as "1 ms", or the label of a device:
-            the slices to draw. The nearest values that the sweep has are taken; of a parameter that is not given, up to
-            three are shown.
-        axes: the parameters to draw over: x from left to right, y from bottom to top, of a plane, hue with a curve and
-            col with a panel for each of its values; chosen from the sweep where left out.
-        formats: the kinds of files, of "png", "svg" and "pdf".
-        dpi: dots an inch.
-        size: width and height in inches; of a width alone, beside None, the height follows.
-        style: a style sheet of matplotlib.
-        progress: called with every file when it is there.
-        note: called with what a reader should know: values that differ from those wanted, stores without a figure.
-
-    Returns:
-        The files.
-
-    Raises:
-        StoreError: there is no store, or one is damaged.
-        InputError: no sweep has a parameter of ``at`` or of the axes, or not the device; a value lies beyond what a
-            sweep has by more than half a step; the style sheet cannot be read.
+    ``at`` chooses slices, by name: the nearest value that the sweep has to one in the units of the store or with one,
+    as "1 ms", or the label of a device; of a parameter that is not given up to three values are shown. ``axes`` are the
+    parameters over ``x``, ``y``, ``hue`` and ``col``, chosen from the sweep where left out. ``progress`` is called with
+    every file, ``note`` with what a reader should know: other values than those wanted, stores without a figure.
     """
     folder = Path(os.fsdecode(path))
     stores = list_stores(folder)

@@ -32,7 +32,7 @@ from zwidth.sweep.files import (
     write_whole,
 )
 from zwidth.sweep.store import SUFFIX
-from zwidth.words.errors import StoreError, StoreExistsError
+from zwidth.words.errors import InputError, StoreError, StoreExistsError
 from zwidth.words.formatting import describe
 
 RUN_FILE = "run.json"
@@ -74,7 +74,12 @@ class Record:
             self.damaged = True
             if content.get("format") == RUN_FORMAT:
                 # Which files are the run's can be believed, for they are made anew; what was found cannot.
-                content["studies"] = [{**entry, "state": "open"} for entry in content["studies"] if _names_files(entry)]
+                entries = [entry for entry in content["studies"] if isinstance(entry, dict)]
+                content["studies"] = [
+                    {**entry, "state": "open"}
+                    for entry in entries
+                    if isinstance(entry.get("name"), str) and isinstance(entry.get("files"), dict)
+                ]
         fault = _find_fault(content)
         if fault:
             raise StoreError(f"{where}: {fault}; {remedy}")
@@ -104,8 +109,9 @@ class Record:
                     "--resume, or replace it with --overwrite"
                 )
             return
-        # Stores are refused or replaced one by one: they say themselves what they are.
-        strange = [path.name for path in self.folder.iterdir() if not _belongs_to_runs(path.name)]
+        # What a run without a record leaves; stores are refused or replaced one by one: they say what they are.
+        names, known = [path.name for path in self.folder.iterdir()], (LOCKS, CONFIG_FILE, "figures")
+        strange = [name for name in names if not name.endswith((SUFFIX, ".partial")) and name not in known]
         if strange and self._holds_config(config):
             if not overwrite:
                 raise StoreExistsError(
@@ -119,10 +125,9 @@ class Record:
             )
 
     def _holds_config(self, text: str) -> bool:
-        try:
+        with suppress(OSError):
             return (self.folder / CONFIG_FILE).read_bytes() == text.encode("utf-8")
-        except OSError:
-            return False
+        return False
 
     def check_same(self, inputs: dict[str, dict[str, Any]]) -> None:
         """Refuse to go on with a run that other releases made, or whose studies, given by name, had other inputs."""
@@ -258,11 +263,6 @@ class Record:
                 remove_quietly(left)
 
 
-def _names_files(entry: Any) -> bool:
-    """Whether an entry of a damaged record still tells a study and its files."""
-    return isinstance(entry, dict) and isinstance(entry.get("name"), str) and isinstance(entry.get("files"), dict)
-
-
 def _find_fault(content: Any) -> str:
     """What keeps a JSON value from being the record of a run."""
     kinds = {"studies": list, "versions": dict, "inputs": dict}
@@ -278,19 +278,19 @@ def _find_fault(content: Any) -> str:
     return f"names {describe(outside[0])}, which is no file of its folder" if outside else ""
 
 
-def _belongs_to_runs(name: str) -> bool:
-    """Whether a run without a record, or one that was killed, leaves something of this name."""
-    return name.endswith((SUFFIX, ".partial")) or name in (LOCKS, CONFIG_FILE, "figures")
+def find_config(folder: Path) -> Path:
+    """The configuration that a run keeps beside its results."""
+    if CONFIG_FILE not in Record(folder).files():
+        raise InputError(f"{folder}: no run with a recorded configuration ({RUN_FILE}, {CONFIG_FILE}); name a file")
+    return folder / CONFIG_FILE
 
 
 def file_hash(path: Path) -> str:
-    try:
-        if path.is_symlink():
-            return ""
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError:
-        return ""
+    with suppress(OSError):
+        if not path.is_symlink():
+            with open(path, "rb") as stream:
+                return hashlib.file_digest(stream, "sha256").hexdigest()
+    return ""
 
 
 def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[str, str]]:

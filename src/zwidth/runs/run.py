@@ -309,7 +309,8 @@ class _Run:
             # A shard that ends last finds the others' chunks done as well.
             store = Store(sweep.store)
             state = "failed" if sweep.failed else "open" if store.missing() else "done"
-            notes = _note_failures(store) if state == "done" else ()
+            counts = store.count_statuses() if state == "done" else {}
+            notes = tuple(note for family, each in counts.items() for note in note_failures(each, f"{family}s"))
             error = next(iter(sweep.failed.values()), sweeps.lost)
             seconds = time.perf_counter() - clock
             if not self.hopeless:
@@ -340,11 +341,6 @@ def _list_inputs(config: Config, names: dict[str, str]) -> dict[str, dict[str, A
             if study.reads_scene and config.scene is not None:
                 found[study.name]["scene"] = _spell(config.scene)
     return found
-
-
-def _note_failures(store: Store) -> tuple[str, ...]:
-    counts = store.count_statuses().items()
-    return tuple(note for family, each in counts for note in note_failures(each, f"{family}s"))
 
 
 def _spell(model: Any) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from zwidth.simulation.batch import TOGETHER, name_bodies, run_batch, structure
 from zwidth.simulation.lanes import Course, Law, TracedLaw
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
 from zwidth.words.errors import InputError, ResourceError, check_choice, describe_choice
-from zwidth.words.quantities import ANY, NOT_NEGATIVE
+from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
 from zwidth.words.rotation import in_own_units
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
@@ -34,19 +34,10 @@ _RECORDED, _JITTERED, _DRAWN, _MOST_BYTES = 2 * 14 * 8, 20 * 8, 4 * 8, 4 << 30
 
 _STARTS = ("start_position", "start_velocity")
 _ARGUMENTS = {
-    "stiffness": ("N/m", ANY),
-    "virtual_damping": ("N s/m", ANY),
-    "start_position": ("m", ANY),
-    "start_velocity": ("m/s", ANY),
-    "push": ("N", ANY),
-    "resolution": ("m", NOT_NEGATIVE),
-    "noise": ("m", NOT_NEGATIVE),
-    "coulomb": ("N", NOT_NEGATIVE),
-    "static": ("N", NOT_NEGATIVE),
-    "max_force": ("N", NOT_NEGATIVE),
-    "max_rate": ("N/s", NOT_NEGATIVE),
-    "jitter": ("s", NOT_NEGATIVE),
+    name: (FIELDS[name].unit, ANY if FIELDS[name].allowed == ANY else NOT_NEGATIVE)
+    for name in ("stiffness", "virtual_damping", *OF_MOTIONS)
 }
+_ARGUMENTS["jitter"] = "s", NOT_NEGATIVE
 # Infinite where there is no limit.
 _LIMITS = ("max_force", "max_rate")
 

@@ -33,7 +33,7 @@ from zwidth.studies.outcome import (
     summarize_stiffest,
 )
 from zwidth.studies.ridge import find_edges, needed_models, passive_intervals, passive_outlines, ridge_table
-from zwidth.words.quantities import WALL_RANGE
+from zwidth.words.quantities import OUTPUTS, WALL_RANGE
 from zwidth.words.status import note_failures
 from zwidth.words.types import DelayModel
 
@@ -237,8 +237,7 @@ def _complete(device: Any, scene: PhysicalScene) -> Any:
 
 MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]
 
-_TYPES = {"stable": np.bool_, "spectral_radius": np.float64, "passive": np.bool_}
-_FUNCTIONS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": is_passive}
+_OUTPUTS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": is_passive}
 
 
 @register
@@ -252,16 +251,9 @@ class MapStudy(ComputedStudy, HeldStudy):
     kind: Literal["map"]
 
     alpha: AnyAxis
-    """Normalized stiffness of the wall, an axis."""
-
     beta: AnyAxis
-    """Normalized damping of the wall, an axis."""
-
     delta: DeltaAxis
-    """Normalized damping of the device, a number or an axis; the scene's where left out."""
-
     d: DelayAxis
-    """Delay in periods, a number or an axis; the scene's where left out."""
 
     outputs: Annotated[tuple[MapOutput, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed at every point."""
@@ -269,13 +261,13 @@ class MapStudy(ComputedStudy, HeldStudy):
     @property
     def nbytes(self) -> int:
         # And a status code a point.
-        return self.points * (1 + sum(np.dtype(_TYPES[name]).itemsize for name in self.outputs))
+        return self.points * (1 + sum(np.dtype(OUTPUTS[name].dtype).itemsize for name in self.outputs))
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         alpha, beta, delta, d = (axis.values() for axis in (self.alpha, self.beta, self.delta, self.d))
         share = share_of_device(self.delta, self.d, scene)
         shape = tuple(self.sizes.values())
-        outputs = {name: np.empty(shape, dtype=_TYPES[name]) for name in self.outputs}
+        outputs = {name: np.empty(shape, dtype=OUTPUTS[name].dtype) for name in self.outputs}
         status = np.empty(shape, np.uint8)
         # One plane at a time: the columns that broadcasting lays out are several times as large as the results.
         for delta_index, d_index in np.ndindex(delta.size, d.size):
@@ -283,8 +275,8 @@ class MapStudy(ComputedStudy, HeldStudy):
             walls, device = (alpha[:, None], beta[None, :]), (delta[delta_index], d[d_index])
             for name in outputs:
                 damping = device[0] * (share if name == "passive" else 1.0)
-                outputs[name][place] = np.asarray(_FUNCTIONS[name](*walls, damping, device[1]))
-            numbers = [outputs[name][place] for name in outputs if _TYPES[name] is np.float64]
+                outputs[name][place] = np.asarray(_OUTPUTS[name](*walls, damping, device[1]))
+            numbers = [outputs[name][place] for name in outputs if OUTPUTS[name].dtype == "float64"]
             status[place] = status_of_results(shape[:2], numbers, walls, device)
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs, "status": status}
         arrays = add_si_of_scene(arrays, self.delta, self.d, scene)

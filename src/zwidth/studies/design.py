@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -55,7 +56,6 @@ Ends = Annotated[
     ),
 ]
 Count = Annotated[int, Quantity(allowed=Range(2, 100_000), whole=True)]
-Reserve = Annotated[float, Quantity(allowed=Range(1.0, 100.0))]
 
 
 @register
@@ -69,15 +69,15 @@ class DesignStudy(ComputedStudy):
     kind: Literal["design"]
 
     device: PhysicalDevice
-    """Device in SI units; the scene's where left out. A delay stays as it is in seconds."""
+    """Device in SI units. A delay stays as it is in seconds."""
 
     find: Parameter
     """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
 
     stiffness: Annotated[Axis, axis_of("stiffness")]
-    """Wanted stiffness K in N/m or with a unit, one or several; the scene's where left out."""
+    """Wanted stiffness K in N/m or with a unit, one or several."""
 
-    reserve: Reserve = 1.0
+    reserve: Annotated[float, Quantity(allowed=Range(1.0, 100.0))] = 1.0
     """How many times the wanted stiffness the stiffest stable wall is to reach, 1 or more."""
 
     within: Ends | None = None
@@ -216,13 +216,9 @@ class DesignStudy(ComputedStudy):
         rows = []
         for value in np.geomspace(low, high, self.num).tolist():
             wall = (math.nan, math.nan)
-            try:
+            with suppress(InputError):
                 top = nominal.replace(**{self.find: value}).max_stiffness()
-            except InputError:
-                pass
-            else:
-                if top.status == Status.OK:
-                    wall = float(top.stiffness), float(top.virtual_damping)
+                wall = (float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else wall
             named = {"parameter": self.find, header("value", PARAMETERS[self.find].unit): value}
             rows.append({**named, **dict(zip(SI_COLUMNS, wall, strict=True))})
         return stack(rows)
@@ -239,7 +235,7 @@ class FiltersStudy(ComputedStudy):
     kind: Literal["filters"]
 
     device: PhysicalDevice
-    """Device in SI units; the scene's where left out. Its velocity estimate is replaced."""
+    """Device in SI units. Its velocity estimate is replaced."""
 
     damping: Annotated[Axis, axis_of("damping")] | None = None
     """Physical damping of the device, in N s/m or with a unit; the device's own where left out."""

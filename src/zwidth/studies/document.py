@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -14,15 +15,15 @@ from typing import Annotated, Any, Literal, Union
 from pydantic import (
     BeforeValidator,
     Field,
-    GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    PlainValidator,
     PrivateAttr,
-    SerializationInfo,
+    SerializeAsAny,
     TypeAdapter,
     WithJsonSchema,
     WrapValidator,
 )
-from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+from pydantic_core import CoreSchema, PydanticCustomError
 
 import zwidth.config.sweep  # noqa: F401  (registers its kind)
 from zwidth.config.device_table import find_file
@@ -65,20 +66,15 @@ def _read_study(raw: Any) -> Any:
 
 
 class _OfAnyKind:
-    """Reads a study by its kind; the kinds are looked up when they are needed, so that more may be registered."""
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        def spelled(study: Study, info: SerializationInfo) -> dict[str, Any]:
-            return study.model_dump(mode=info.mode, exclude_none=info.exclude_none)
-
-        serialization = core_schema.plain_serializer_function_ser_schema(spelled, info_arg=True)
-        return core_schema.no_info_plain_validator_function(_read_study, serialization=serialization)
+    """Describes a study of any kind; they are looked up when they are needed, so that more may be registered."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         every = Annotated[Union[tuple(KINDS[kind] for kind in sorted(KINDS))], Field(discriminator="kind")]  # noqa: UP007
         return handler(TypeAdapter[Any](every).core_schema)  # pyright: ignore[reportArgumentType]
+
+
+_AnyStudy = Annotated[SerializeAsAny[Study], PlainValidator(_read_study), _OfAnyKind]
 
 
 def _check_version(value: Any) -> int:
@@ -137,7 +133,7 @@ class Config(Strict, what="a configuration"):
     figure: FigureLook | None = None
     """Width and kind of the figures of studies; `zwidth figures` has options for those of sweeps."""
 
-    studies: Annotated[tuple[Annotated[Study, _OfAnyKind], ...], WrapValidator(members("studies"))]
+    studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""
 
     _rotary: bool = PrivateAttr(default_factory=is_rotary)
@@ -189,11 +185,9 @@ class Config(Strict, what="a configuration"):
 
 def _scene_or_stand_in(raw: Any) -> AnyScene:
     """The file's scene; where it is faulty, one that only keeps its faults from repeating in every study."""
-    try:
+    # Its faults are reported where the scene itself is read.
+    with suppress(ValueError):
         return read_scene(raw)
-    except ValueError:
-        # The same faults are reported where the scene itself is read.
-        pass
     if isinstance(raw, dict) and is_normalized(raw):
         return NormalizedScene(delta=0.0, alpha=0.0)
     return PhysicalScene.model_validate({"mass": 1.0, "period": 1.0, "stiffness": 0.0})
@@ -214,18 +208,9 @@ def _fill_study(study: Any, scene: AnyScene) -> Any:
 
 
 def config_json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of configuration files, for editors.
+    """The JSON Schema (draft 2020-12) of configuration files, for editors.
 
-    An editor's check is a first help: units, conflicts between keys and sizes are checked by
-    `zwidth.load_config` alone.
-
-    Returns:
-        A JSON Schema (draft 2020-12) as a dict that ``json.dumps`` accepts.
-
-    Example:
-        >>> from zwidth.studies.document import config_json_schema
-        >>> sorted(config_json_schema()["required"])
-        ['name', 'studies', 'version']
+    A first help: units, conflicts between keys and sizes are checked by `load_config` alone.
     """
     shared: dict[str, Any] = {}
     schema = _tidy(Config.model_json_schema(), shared)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BeforeValidator, GetJsonSchemaHandler, PrivateAttr, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, PrivateAttr, WithJsonSchema, WrapValidator
 from pydantic_core import CoreSchema
 
 from zwidth import figures
@@ -29,7 +29,7 @@ from zwidth.parts.velocity import BackwardDifference
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, plain, with_unit
-from zwidth.words.quantities import POSITIVE
+from zwidth.words.quantities import OF_LOGS, POSITIVE
 from zwidth.words.rotation import in_own_units
 from zwidth.words.status import Status
 
@@ -56,21 +56,11 @@ class LogSection(Strict, what="a log"):
     csv: str
     """Name of the file, relative to the configuration: a text of columns, .npz, .npy or .mat."""
 
-    time: str | None = None
-    """Header of the column of times, or header:unit; found by its name where left out, not read where there is a
-    period."""
-
-    position: str | None = None
-    """Header of the column of positions, or header:unit; found by its name where left out."""
-
-    force: str | None = None
-    """Header of the column of commanded forces, or header:unit; found by its name where left out."""
-
-    resolution: Step | None = None
-    """One count of the encoder, a length or an angle; needed for positions in counts."""
-
-    motor_constant: str | None = None
-    """What an ampere makes, as 5 N/A or 0.03 N m/A; needed for forces in A or mA."""
+    time: str | None = Field(default=None, description=OF_LOGS["time"])
+    position: str | None = Field(default=None, description=OF_LOGS["position"])
+    force: str | None = Field(default=None, description=OF_LOGS["force"])
+    resolution: Step | None = Field(default=None, description=OF_LOGS["resolution"])
+    motor_constant: str | None = Field(default=None, description=OF_LOGS["motor_constant"])
 
     sha256: str | None = None
     """Digest of the file; another file is refused. Where left out it is the file's own, for the record."""
@@ -129,7 +119,6 @@ class BuzzSection(Strict, what="a wall that buzzed"):
     """K in N/m or with a unit, raised at this damping until the wall buzzed."""
 
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] = 0.0
-    """B in N s/m or with a unit."""
 
     frequency: Annotated[float, Quantity("Hz", POSITIVE)]
     """Of the buzz, in Hz or with a unit."""

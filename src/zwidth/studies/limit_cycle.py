@@ -13,25 +13,20 @@ from zwidth import figures
 from zwidth.config.fields import LocatedProblem, Strict, members, problem, repeated
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
-from zwidth.config.values import Axis, AxisOf, Quantity, axis_of
+from zwidth.config.values import Axis, Quantity, axis_of
+from zwidth.figures.limit_cycle import AXES
 from zwidth.figures.stable_set import trace_outlines
-from zwidth.figures.table import SI_COLUMNS, stack
+from zwidth.figures.table import stack
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
 from zwidth.studies.simulate import Circumstances, SimulatedStudy
 from zwidth.words.formatting import header, with_unit
-from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
+from zwidth.words.quantities import POSITIVE
 from zwidth.words.status import Status
 
-# The axes that there may be, with their columns.
-_COLUMNS = {
-    "stiffness": SI_COLUMNS[0],
-    "virtual_damping": SI_COLUMNS[1],
-    "resolution": "resolution_m",
-    "coulomb": "coulomb_N",
-}
+_COLUMNS = {known.name: column for column, known in AXES.items()}
 _OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
 # So many values of a list are curves, and more are a plane.
 _MOST_CURVES = 6
@@ -60,16 +55,9 @@ class CycleAxes(Strict, what="the axes of a limit_cycle study"):
     """Parameters of a limit_cycle study, one or two of them with several values."""
 
     stiffness: Annotated[Axis, axis_of("stiffness")]
-    """Stiffness K of the wall, in N/m or with a unit."""
-
     virtual_damping: Annotated[Axis, axis_of("virtual_damping")]
-    """Damping B of the wall, in N s/m or with a unit."""
-
-    resolution: Annotated[Axis, AxisOf(Quantity("m", NOT_NEGATIVE))] | None = None
-    """One count of the encoder, in m or with a unit."""
-
-    coulomb: Annotated[Axis, AxisOf(Quantity("N", NOT_NEGATIVE))] | None = None
-    """Dry friction, in N or with a unit."""
+    resolution: Annotated[Axis, axis_of("resolution")] | None = None
+    coulomb: Annotated[Axis, axis_of("coulomb")] | None = None
 
     def limits(self) -> Iterable[LocatedProblem]:
         if not 1 <= len(self.varied) <= 2:
@@ -169,9 +157,11 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
         arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
         table, bounds = stack(edges), (self.silence, self.widest)
-        family = choose_curves(varied)
+        # A curve for each value of a short list, or a single one; else a plane.
+        short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MOST_CURVES]
         draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
-        if family is not None:
+        if short or len(varied) == 1:
+            family = _COLUMNS[short[0]] if len(varied) > 1 else ""
             draw = partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
         low, high = (with_unit(bound, "m", 3) for bound in bounds)
         notes.append(f"buzzing: an amplitude from {low} to {high} in the last quarter of {self.duration}")
@@ -181,14 +171,6 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
             documents={f"{self.name}_boundary.csv": csv_text(table)} if table else {},
             notes=tuple(notes),
         )
-
-
-def choose_curves(varied: dict[str, Axis]) -> str | None:
-    """The column of the axis whose values are a curve each, "" for a single curve; None where a plane is drawn."""
-    if len(varied) == 1:
-        return ""
-    short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MOST_CURVES]
-    return _COLUMNS[short[0]] if short else None
 
 
 def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[str, np.ndarray]) -> list[dict[str, Any]]:

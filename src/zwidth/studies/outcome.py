@@ -39,23 +39,15 @@ def track(parts: Sequence[Item]) -> Iterator[Item]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of one study.
+    """The result of one study."""
 
-    Attributes:
-        table: columns of the study's CSV file, all of one length.
-        arrays: arrays of the study's npz file.
-        figures: what draws each figure and returns its Axes, by what its file name adds to the study's name.
-        documents: texts by file name.
-        answer: what was found, in a line or two for a terminal.
-        notes: what a reader of the results must know, such as points without an answer.
-    """
-
-    table: Table = field(default_factory=dict)
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    table: Table = field(default_factory=dict)  # columns of the study's CSV file, all of one length
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)  # of the study's npz file
+    # What draws each figure and returns its Axes, by what its file name adds to the study's name.
     figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
-    documents: dict[str, str] = field(default_factory=dict)
-    answer: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    documents: dict[str, str] = field(default_factory=dict)  # texts by file name
+    answer: tuple[str, ...] = ()  # what was found, in a line or two for a terminal
+    notes: tuple[str, ...] = ()  # what a reader of the results must know, such as points without an answer
 
     def write(self, folder: Path, name: str, formats: Sequence[str] = ("png", "svg")) -> None:
         """Write everything, data before figures."""
@@ -81,12 +73,7 @@ class ComputedStudy(Study):
     """Whether the results depend on the scene beyond what the study has taken from it."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """Compute everything; drawing and writing come later.
-
-        Args:
-            scene: the scene of the file.
-            alone: whether this is the file's only study of its kind.
-        """
+        """Compute everything, in the file's scene and perhaps as its only study of this kind; drawing comes later."""
         raise NotImplementedError
 
 
@@ -97,10 +84,7 @@ class CurvesStudy(ComputedStudy):
     point_bytes = 32
 
     delta: DeltaAxis
-    """Normalized damping of the device, an axis; the scene's where left out."""
-
     d: DelayAxis
-    """Delay in periods, an axis; the scene's where left out."""
 
     @property
     def sizes(self) -> dict[str, int]:

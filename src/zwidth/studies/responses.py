@@ -59,11 +59,7 @@ class ResponseStudy(ComputedStudy, HeldStudy):
     def respond(
         self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
     ) -> tuple[dict[str, Any], str]:
-        """The response of one device to 1 N, or to a unit force where normalized.
-
-        Returns:
-            Its columns, those in SI units with their unit; and what to say of one that has not settled at the end.
-        """
+        """The response of a device to 1 N, normalized to a unit force, as columns; and what to say where it is late."""
         periods = max(1, round(self.duration.periods(device.period)))
         raw = step_response(alpha, beta, device.delta, device.d, periods=periods, substeps=self.substeps)
         clock, length = (device.period, 1.0 / device.to_scene().units.stiffness) if physical else (1.0, 1.0)
@@ -102,7 +98,7 @@ class StepStudy(WallsStudy, ResponseStudy):
     kind: Literal["step"]
 
     devices: Annotated[tuple[DeviceField, ...], WrapValidator(members("devices"))]
-    """Devices; the scene's where left out."""
+    """Devices."""
 
     stiffness_fraction: Fraction | None = None
     """Stiffness as a share of alpha_max, with beta as at the ridge; give this or walls."""
@@ -156,20 +152,15 @@ class StepStudy(WallsStudy, ResponseStudy):
                 ridge = alpha_max(device.delta, device.d)
                 assert self.stiffness_fraction is not None, "a study without walls has a fraction"
                 alpha, beta = self.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
-            label = device.label or _wall_text(device, alpha, beta) or f"device {number}"
+            label = device.label or f"device {number}"
+            if not device.label and isinstance(device, PhysicalDevice):
+                wall = device.to_scene().to_si(alpha=alpha, beta=beta)
+                label = name_wall(wall.stiffness, wall.virtual_damping)
             part, note = self.respond(device, alpha, beta, label=label, physical=physical)
             parts.append(part)
             notes += [f"{label}: {note}"] if note else []
         table = stack(parts)
         return Outcome(table=table, figures={"": partial(figures.draw_step, table)}, notes=tuple(notes))
-
-
-def _wall_text(device: AnyDevice, alpha: float, beta: float) -> str:
-    """The wall in SI units, the name of a response whose device has none."""
-    if not isinstance(device, PhysicalDevice):
-        return ""
-    wall = device.to_scene().to_si(alpha=alpha, beta=beta)
-    return name_wall(wall.stiffness, wall.virtual_damping)
 
 
 _BARE = ("mass", "damping", "period", "delay", "delta", "d")
@@ -187,7 +178,7 @@ class RecommendStudy(ResponseStudy):
     kind: Literal["recommend"]
 
     device: PhysicalDevice
-    """Device in SI units; the scene's where left out."""
+    """Device in SI units."""
 
     stiffness_fraction: Fraction | None = None
     """Stiffness of the recommended wall as a share of the maximum, at most; 0.75 where nothing else is asked for."""

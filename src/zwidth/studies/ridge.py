@@ -224,10 +224,7 @@ class WorkspaceStudy(ComputedStudy):
     """A file with a row for each pose: its mass and damping, and the two columns that they are drawn over."""
 
     period: Annotated[float, quantity_of("period")]
-    """Sampling period T; the scene's where left out."""
-
     delay: Delay
-    """Delay t_d from a sample to the moment its force acts, in s or in periods; the scene's where left out."""
 
     @property
     def sizes(self) -> dict[str, int]:

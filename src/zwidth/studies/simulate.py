@@ -11,9 +11,9 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.fields import LocatedProblem, Strict, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, locate_refusal
-from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
+from zwidth.config.scenes import AnyScene, PhysicalWall, SimulatedDevice
 from zwidth.config.study import HeldStudy, register
-from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity
+from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
@@ -26,13 +26,8 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import header, name_wall, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, Range
 
-Length = Annotated[float, Quantity("m", NOT_NEGATIVE)]
-Friction = Annotated[float, Quantity("N", NOT_NEGATIVE)]
-Seed = Annotated[int, Quantity(allowed=NOT_NEGATIVE, whole=True)]
-
 LONGEST = 1_000_000
 """Periods that one motion may take."""
-Fractions = Annotated[Axis, AxisOf(Quantity(allowed=POSITIVE))]
 
 # What the program makes of a sample stays until the next one.
 _OF_SAMPLES = ("measured", "estimated_velocity", "command", "contact")
@@ -54,40 +49,24 @@ class Circumstances(Strict):
     velocity: SimulatedVelocityField | None = None
     """How the velocity is estimated; as the device has it where left out."""
 
-    start_position: Annotated[float, Quantity("m")] = 0.0
-    """Where the motion starts, in m or with a unit; the wall's surface is at 0 and positive is into the wall."""
-
-    start_velocity: Annotated[float, Quantity("m/s")] = 0.0
-    """Its velocity there, in m/s or with a unit."""
-
-    push: Annotated[float, Quantity("N")] = 0.0
-    """Constant force of the hand on the device, in N or with a unit."""
+    start_position: Annotated[float, quantity_of("start_position")] = 0.0
+    start_velocity: Annotated[float, quantity_of("start_velocity")] = 0.0
+    push: Annotated[float, quantity_of("push")] = 0.0
 
     contact: Contact = "bilateral"
     """Where the wall acts: on both sides of its surface, where positions are positive, or there and never pulling."""
 
-    resolution: Length = 0.0
-    """One count of the encoder, in m or with a unit."""
-
-    noise: Length = 0.0
-    """Standard deviation of the measured position, in m or with a unit."""
-
-    coulomb: Friction = 0.0
-    """Dry friction while the device slips, in N or with a unit."""
-
-    static: Friction | None = None
-    """Dry friction that holds the device, at least coulomb, which it is where left out."""
-
-    max_force: Annotated[float, Quantity("N", POSITIVE)] | None = None
-    """The most that the motor gives, in N or with a unit; no limit where left out."""
-
-    max_rate: Annotated[float, Quantity("N/s", POSITIVE)] | None = None
-    """The fastest that the command changes, in N/s or with a unit; no limit where left out."""
+    resolution: Annotated[float, quantity_of("resolution")] = 0.0
+    noise: Annotated[float, quantity_of("noise")] = 0.0
+    coulomb: Annotated[float, quantity_of("coulomb")] = 0.0
+    static: Annotated[float, quantity_of("static")] | None = None
+    max_force: Annotated[float, quantity_of("max_force")] | None = None
+    max_rate: Annotated[float, quantity_of("max_rate")] | None = None
 
     jitter: Delay = Span(0.0, "s")
     """Samples are late by random times up to this, in s or in periods, below one period."""
 
-    seed: Seed = 0
+    seed: Annotated[int, Quantity(allowed=NOT_NEGATIVE, whole=True)] = 0
     """Whole number that decides the random numbers."""
 
     def find_clashes(self, scene: Scene) -> Iterable[LocatedProblem]:
@@ -130,7 +109,7 @@ class SimulatedStudy(ComputedStudy, HeldStudy):
     simulates = True
 
     device: SimulatedDevice
-    """Device in SI units; the scene's where left out."""
+    """Device in SI units."""
 
 
 @register
@@ -146,7 +125,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
     substeps: Annotated[int, Quantity(allowed=Range(1, 10_000), whole=True)] = 1
     """Points recorded per period."""
 
-    stiffness_fraction: Fractions | None = None
+    stiffness_fraction: Annotated[Axis, AxisOf(Quantity(allowed=POSITIVE))] | None = None
     """Stiffness as a share of the maximum, with the virtual damping of that wall; give this or walls."""
 
     def limits(self) -> Iterable[LocatedProblem]:
@@ -171,7 +150,12 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
                 raise InputError("stiffness_fraction: no wall of this device is stable; write walls")
             shares = self.stiffness_fraction.values().tolist()
             return [(f"{share:g} of K_max", share * stiffness, damping) for share in shares]
-        walls = [wall_in_si(self.device, wall) for wall in self.walls or ()]
+        walls: list[tuple[float, float]] = [
+            (each.stiffness, each.virtual_damping)
+            if isinstance(each, PhysicalWall)
+            else (each.alpha * scene.units.stiffness, each.beta * scene.units.virtual_damping)
+            for each in self.walls or ()
+        ]
         return [(name_wall(*wall), *wall) for wall in walls]
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -198,14 +182,6 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
             documents={f"{self.name}_summary.csv": csv_text(stack(rows))},
             notes=tuple(notes),
         )
-
-
-def wall_in_si(device: PhysicalDevice, wall: AnyWall) -> tuple[float, float]:
-    """Stiffness in N/m and virtual damping in N s/m of a wall on a device."""
-    if isinstance(wall, PhysicalWall):
-        return wall.stiffness, wall.virtual_damping
-    stiffness, damping = device.to_scene().units
-    return wall.alpha * stiffness, wall.beta * damping
 
 
 def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarray]:

@@ -82,4 +82,4 @@ class CheckedStore(LocalStore):
             return None
         # Without dimensions there is one chunk, of one point.
         at = tuple(map(int, place[1:]))
-        return Task(family.family, int(np.ravel_multi_index(at, family.counts)) if at else 0)
+        return Task(family, int(np.ravel_multi_index(at, family.counts)) if at else 0)

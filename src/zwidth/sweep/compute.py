@@ -73,12 +73,14 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
     found: dict[str, np.ndarray] = {}
     unproved = False
     if RADIUS_OUTPUTS & set(outputs):
-        if block.plane.alpha.shape[1] * block.plane.beta.shape[1] >= _SMALLEST_PLANE:
-            alpha, beta, alphas, betas = block.plane
-            poles = area_poles(Area(alpha, beta, block.delta, block.d, (betas, alphas)), accuracy, with_rate=True)
+        if block.all_alpha.shape[1] * block.all_beta.shape[1] >= _SMALLEST_PLANE:
+            area = Area(block.all_alpha, block.all_beta, block.delta, block.d, (block.betas, block.alphas))
+            poles = area_poles(area, accuracy, with_rate=True)
             radius, proved, rate = (leaf.transpose(0, 2, 1) for leaf in poles)
         else:
-            listed = partial(list_poles, accuracy=accuracy, with_rate=True, route=_route(block.walls))
+            listed = partial(
+                list_poles, accuracy=accuracy, with_rate=True, route=_route(block.rows * block.all_alpha.shape[1])
+            )
             radius, proved, rate = _by_device(listed, block, shape, leaves=3)
         found["spectral_radius"], unproved = radius, proved == 0
         # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
@@ -96,24 +98,13 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
     if {"passive", "passivity_margin"} & set(outputs):
         (margin,) = _by_device(_passivity, block, shape, one_delay=True)
         found |= {"passivity_margin": margin, "passive": margin > 0}
-    found["status"] = _status(outputs, found, unproved, block, shape)
-    return found
-
-
-def _status(
-    outputs: tuple[str, ...],
-    found: dict[str, np.ndarray],
-    unproved: np.ndarray | bool,
-    block: Block,
-    shape: tuple[int, ...],
-) -> np.ndarray:
     # Of a wall that is unstable margins are NaN.
     numbers = [found[name] for name in outputs if OUTPUTS[name].dtype == "float64" and name not in MARGIN_OUTPUTS]
     device = block.delta[:, None, None], block.d[:, None, None]
     walls = block.alpha[:, :, None], block.beta[:, None, :]
-    status = status_of_results(shape, numbers, walls, device)
+    found["status"] = status = status_of_results(shape, numbers, walls, device)
     status[unproved & (status == Status.OK)] = Status.NOT_CONVERGED
-    return status
+    return found
 
 
 def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:

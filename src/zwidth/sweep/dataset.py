@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,15 +80,9 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
 
 
 def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
-    """Write the results of a sweep into one netCDF-4 file, chunk by chunk.
+    """Write the results of a sweep into one new netCDF-4 file, chunk by chunk.
 
-    Args:
-        path: as for `open_dataset`.
-        file: the file to make; truth values become bytes, and what is nested in the attributes JSON.
-
-    Raises:
-        StoreError: as `open_dataset`.
-        StoreExistsError: the file exists.
+    Truth values become bytes, and what is nested in the attributes JSON.
     """
     target = _free_place(file)
     dataset = open_dataset(path)
@@ -106,17 +99,9 @@ def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> Non
 
 
 def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
-    """Write the results of a small sweep as a table, one row a point, all parameters and outputs in columns.
+    """Write the results of a small sweep as a new table, one row a point, all parameters and outputs in columns.
 
     Columns in SI units carry their unit, as ``stiffness_N_per_m``; those of normalized quantities none.
-
-    Args:
-        path: as for `open_dataset`.
-        file: the file to make.
-
-    Raises:
-        StoreError: as `open_dataset`, or more than a million points.
-        StoreExistsError: the file exists.
     """
     target = _free_place(file)
     dataset = open_dataset(path)
@@ -176,36 +161,18 @@ class Verification:
         return not self.error and not self.damaged and self.done == self.chunks
 
 
-def verify(
-    path: str | os.PathLike[str], *, progress: Callable[[int, int], None] | None = None
-) -> tuple[Verification, ...]:
-    """Read every file of one store, or of all stores in a folder, and compare its checksum.
-
-    Args:
-        path: a store ``<study>.zarr`` or the folder of a run.
-        progress: called with the number of chunks read and their total, store by store.
-
-    Returns:
-        One `Verification` a store. Nothing is changed: a run with ``resume`` repairs what is damaged.
-
-    Raises:
-        StoreError: there is no store.
-    """
-    return tuple(_verify_store(store, progress or (lambda done, total: None)) for store in list_stores(path))
+def verify(path: str | os.PathLike[str]) -> tuple[Verification, ...]:
+    """Read every file of one store, or of all stores in a folder, and compare its checksum; nothing is changed."""
+    return tuple(map(_verify_store, list_stores(path)))
 
 
-def _verify_store(path: Path, progress: Callable[[int, int], None]) -> Verification:
+def _verify_store(path: Path) -> Verification:
     store = Store(path)
     try:
         tasks = list(store.plan.tasks())
         damaged = [f"{name} is damaged or missing" for name in store.damaged_files()]
     except StoreError as error:
         return Verification(path, error=str(error))
-    done = 0
-    for number, task in enumerate(tasks, start=1):
-        if store.is_done(task):
-            done += 1
-            fault = store.fault_of(task)
-            damaged += [f"{store.plan.describe(task)}: {fault}"] if fault else []
-        progress(number, len(tasks))
-    return Verification(path, len(tasks), done, tuple(damaged))
+    done = [task for task in tasks if store.is_done(task)]
+    damaged += [f"{task}: {fault}" for task in done if (fault := store.fault_of(task))]
+    return Verification(path, len(tasks), len(done), tuple(damaged))

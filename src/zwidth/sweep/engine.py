@@ -14,7 +14,7 @@ from typing import Any
 
 from zwidth.config.sweep import SweepStudy
 from zwidth.sweep.files import differences, digest, versions
-from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, in_this_process, in_workers
+from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, attempt, in_workers
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.store import SUFFIX, Store, create
 from zwidth.words.errors import StoreError, StoreExistsError
@@ -106,7 +106,7 @@ def compute_sweeps(
             elif workers is not None:
                 finished = in_workers(jobs, workers, perform)
             else:
-                finished = in_this_process(jobs, perform)
+                finished = (attempt(perform, job) for job in jobs)
             try:
                 _follow(finished, jobs, stores, sweeps, progress)
             except LostSchedulerError as error:
@@ -139,7 +139,22 @@ def _prepare_store(
     """The store of a sweep, made or found, and what was repaired in it."""
     path = store_path(folder, plan.study)
     if not path.exists():
-        return _make_store(path, plan, about), ()
+        attributes = {
+            "title": f"{about['name']}: {plan.study.name}",
+            "comment": about["description"],
+            "source": f"zwidth {versions()['zwidth']}",
+            "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} made by zwidth run",
+            "precision": "float64",
+            "versions": versions(),
+            "config": about["config"],
+            "config_sha256": digest(about["config"]),
+            "study": plan.study.model_dump(mode="json", exclude_none=True),
+            "plan": plan.as_dict(),
+        }
+        store = create(path, attributes)
+        # Where other runs share the folder, one of them may have been faster.
+        check_same(store, plan.study)
+        return store, ()
     store = Store(path)
     if shard is None:
         # Unfinished files of a run that was killed.
@@ -156,11 +171,11 @@ def _follow(
     progress: Callable[[Progress], None],
 ) -> None:
     start, ended, computed = time.perf_counter(), 0, 0
-    total = sum(stores[job.path].plan.points(job.task) for job in jobs)
+    total = sum(job.task.points for job in jobs)
     try:
         for number, finished in enumerate(results, start=1):
             store, task = stores[finished.job.path], finished.job.task
-            points, name = store.plan.points(task), store.study.name
+            points, name = task.points, store.study.name
             ended += points
             if finished.error:
                 sweeps.results[name].failed[store.name(task)] = finished.error
@@ -195,25 +210,6 @@ def _count(jobs: list[Job], stores: dict[str, Store], sweeps: Sweeps) -> None:
 
 def store_path(folder: Path, study: SweepStudy) -> Path:
     return folder / f"{study.name}{SUFFIX}"
-
-
-def _make_store(path: Path, plan: Plan, about: Mapping[str, Any]) -> Store:
-    """Make the store of a study; where other runs share the folder, one of them may have been faster."""
-    attributes = {
-        "title": f"{about['name']}: {plan.study.name}",
-        "comment": about["description"],
-        "source": f"zwidth {versions()['zwidth']}",
-        "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} made by zwidth run",
-        "precision": "float64",
-        "versions": versions(),
-        "config": about["config"],
-        "config_sha256": digest(about["config"]),
-        "study": plan.study.model_dump(mode="json", exclude_none=True),
-        "plan": plan.as_dict(),
-    }
-    store = create(path, attributes)
-    check_same(store, plan.study)
-    return store
 
 
 def check_same(store: Store, study: SweepStudy) -> None:
@@ -259,7 +255,7 @@ def repair(store: Store, tasks: Iterable[Task]) -> list[str]:
         fault = store.fault_of(task) if store.is_done(task) else ""
         if fault:
             store.forget(task)
-            found.append(f"{store.plan.describe(task)}: {fault}")
+            found.append(f"{task}: {fault}")
     return found
 
 

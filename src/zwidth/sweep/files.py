@@ -116,10 +116,9 @@ def write_whole(path: Path, data: bytes) -> None:
 
 def content(path: Path) -> bytes:
     """What a file holds; nothing where there is none."""
-    try:
+    with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return path.read_bytes()
-    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
-        return b""
+    return b""
 
 
 def checksum(path: Path) -> int:
@@ -138,10 +137,8 @@ def versions(*more: str) -> dict[str, str]:
     """The releases that results depend on, and those of more packages."""
     found = {"zwidth": __version__, "python": platform.python_version()}
     for name in (*_PACKAGES, *more):
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found
 
 
@@ -161,9 +158,7 @@ def differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, 
 def holding(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None]:
     """Hold a folder of results, made where it is missing, while the block runs; a shard (i, n) shares it with others.
 
-    Raises:
-        StoreBusyError: another run holds it; the message has the folder, the holder and the remedy.
-        InputError: the folder cannot be made or written.
+    A `StoreBusyError` says which other run holds it.
     """
     check_folder(folder)
     with _opened(folder / LOCKS / "run") as run:
@@ -220,11 +215,7 @@ def _this_process() -> str:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    """A file to lock; made where it is missing, and closed, which frees it, when the block ends.
-
-    Raises:
-        InputError: it may be a file elsewhere, which is not to be written.
-    """
+    """A file to lock, made where it is missing; closed, and so freed, when the block ends."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)

@@ -15,44 +15,28 @@ from zwidth.words.quantities import PARAMETERS, WALL, Family
 from zwidth.words.rotation import own_unit
 
 
-class Plane(NamedTuple):
-    """All alphas (D, ..) and betas (D, ..) of the devices of a block, and which of them are the block's."""
-
-    alpha: np.ndarray
-    beta: np.ndarray
-    alphas: slice
-    betas: slice
-
-
 class Block(NamedTuple):
     """A block of the grid, normalized: D devices with A x B walls each, every alpha with every beta."""
 
     delta: np.ndarray  # shape (D,)
     d: np.ndarray  # shape (D,)
-    plane: Plane  # the whole grid's walls, of which the block may hold a part only
+    all_alpha: np.ndarray  # of the whole grid, shape (D, ..), likewise beta
+    all_beta: np.ndarray
+    alphas: slice  # which of them are the block's
+    betas: slice
     mass: np.ndarray  # in SI units, shape (D,); empty in a normalized sweep, likewise the period
     period: np.ndarray
-    devices: int  # of the whole grid
+    rows: int  # of one beta, in the whole grid
 
     @property
     def alpha(self) -> np.ndarray:
         """Those of its walls, shape (D, A)."""
-        return self.plane.alpha[:, self.plane.alphas]
+        return self.all_alpha[:, self.alphas]
 
     @property
     def beta(self) -> np.ndarray:
         """Those of its walls, shape (D, B)."""
-        return self.plane.beta[:, self.plane.betas]
-
-    @property
-    def rows(self) -> int:
-        """How many rows of one beta the whole grid has."""
-        return self.devices * self.plane.beta.shape[1]
-
-    @property
-    def walls(self) -> int:
-        """How many walls the whole grid has."""
-        return self.rows * self.plane.alpha.shape[1]
+        return self.all_beta[:, self.betas]
 
 
 class SceneBlock(NamedTuple):
@@ -118,20 +102,18 @@ class Grid:
 
     def block(self, place: tuple[slice, ...]) -> Block:
         """The same normalized, with the walls of the whole grid."""
-        cut = [slice(0, 1), slice(0, 1)]
+        alphas = betas = slice(0, 1)
         if len(place) == len(self.dims):
             slices = dict(zip(self.dims, place, strict=True))
-            cut = [slice(*slices.get(name, cut[0]).indices(self.sizes.get(name, 1))[:2]) for name in self.of_wall]
+            alphas, betas = (
+                slice(*slices.get(name, alphas).indices(self.sizes.get(name, 1))[:2]) for name in self.of_wall
+            )
             place = (*place[: len(self.device_dims)], *[slice(None)] * len(self.wall_dims))
         given = self.scene_block(place)
-        count = math.prod(self.shape_of("device"))
-        if self.physical:
-            return self._normalize(given, cut, count)
-        plane = Plane(given.stiffness, given.virtual_damping, *cut)
-        return Block(given.parameters["delta"], given.parameters["d"], plane, np.empty(0), np.empty(0), count)
-
-    def _normalize(self, given: SceneBlock, cut: list[slice], count: int) -> Block:
-        none = np.zeros(len(given.stiffness))
+        rows, none = self.size_of("device") * given.virtual_damping.shape[1], np.zeros(len(given.stiffness))
+        if not self.physical:
+            device, walls = (given.parameters["delta"], given.parameters["d"]), given[1:]
+            return Block(*device, *walls, alphas, betas, np.empty(0), np.empty(0), rows)
         mass, damping, delay = (given.parameters.get(name, none) for name in ("mass", "damping", "delay"))
         rate = given.parameters.get("rate")
         period = given.parameters["period"] if rate is None else 1.0 / rate
@@ -142,7 +124,8 @@ class Grid:
             units = {"mass": mass[:, None], "period": period[:, None]}
             alpha = normalize(**units, stiffness=given.stiffness).alpha
             beta = normalize(**units, virtual_damping=given.virtual_damping).beta
-        return Block(device.delta, delay if in_periods else device.d, Plane(alpha, beta, *cut), mass, period, count)
+        d = delay if in_periods else device.d
+        return Block(device.delta, d, alpha, beta, alphas, betas, mass, period, rows)
 
     def _device(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
         """A parameter of the devices of a block, flat; 0 where it is not given."""

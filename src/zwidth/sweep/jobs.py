@@ -72,11 +72,6 @@ def describe_failure(job: Job, error: BaseException) -> Finished:
     return Finished(job, f"{type(error).__name__}: {error}", hopeless(error))
 
 
-def in_this_process(jobs: Iterable[Job], perform: Perform) -> Generator[Finished]:
-    for job in jobs:
-        yield attempt(perform, job)
-
-
 @lru_cache(maxsize=4)
 def _open_store(path: str, described: bytes) -> Store:
     """A store that this process works on; its description tells it from another one that took its place."""
@@ -87,18 +82,17 @@ def perform(path: str, family: str, index: int) -> None:
     """Compute and write one chunk of a store, by its number in a family of outputs, unless it is done already."""
     # Not by the file's number, which the next store may get.
     store = _open_store(path, content(Path(path) / "zarr.json"))
-    task = Task("device" if family == "device" else "wall", index)
+    task = Task(plan := store.plan.family(family), index)
     if store.is_done(task):
         return
-    plan = store.plan.family(family)
     if store.study.with_parts:
-        block = store.grid.scene_block(plan.place(index))
+        block = store.grid.scene_block(task.place)
         values = compute_scenes(plan.family, plan.outputs, store.study, block)
     else:
         # Loads JAX, which a process that only hands out work has no use for.
         from zwidth.sweep.compute import compute
 
-        values = compute(plan.family, plan.outputs, store.grid.block(plan.place(index)), store.study.accuracy)
+        values = compute(plan.family, plan.outputs, store.grid.block(task.place), store.study.accuracy)
     # A scheduler that restarts, or a run that goes on, may have handed it out twice.
     if not store.is_done(task):
         store.write(task, values)
@@ -123,11 +117,13 @@ def in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generator[F
                     continue
                 assert job is not None, "a busy worker has a job"
                 deaths[job] += 1
-                why = worker.cause_of_death()
+                worker.process.join()
+                code = worker.process.exitcode or 0
                 workers[workers.index(worker)] = _Worker(worker.number, count, perform)
                 if deaths[job] < MAX_ATTEMPTS:
                     waiting.append(job)
                 else:
+                    why = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
                     yield Finished(job, f"its worker died each of {MAX_ATTEMPTS} times ({why})")
     finally:
         for worker in workers:
@@ -153,17 +149,10 @@ class _Worker:
 
     def result(self) -> Finished | None:
         """How the job went; None where the worker died over it."""
-        try:
-            finished = self.pipe.recv() if self.pipe.poll() else None
-        except (EOFError, OSError):
-            finished = None
         self.job = None
-        return finished
-
-    def cause_of_death(self) -> str:
-        self.process.join()
-        code = self.process.exitcode or 0
-        return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        with suppress(EOFError, OSError):
+            return self.pipe.recv() if self.pipe.poll() else None
+        return None
 
     def stop(self) -> None:
         """End the process; what it was writing is not there yet under its name."""
@@ -184,7 +173,10 @@ def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
     # Ends as a program does, so that Python has no leaked semaphore to complain about.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _share_processors(number, count)
+    # Its share of the processors: JAX would start a thread on each of them in every worker.
+    available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
+    if 1 < count <= len(available):
+        os.sched_setaffinity(0, available[number::count])
     mend_compilation_cache()
     while True:
         try:
@@ -192,15 +184,6 @@ def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
         except (EOFError, OSError):
             return
         pipe.send(attempt(perform, job))
-
-
-def _share_processors(number: int, count: int) -> None:
-    """Keep to this worker's share of the processors: JAX would start a thread on each of them in every worker."""
-    if not hasattr(os, "sched_setaffinity"):
-        return
-    available = sorted(os.sched_getaffinity(0))
-    if 1 < count <= len(available):
-        os.sched_setaffinity(0, available[number::count])
 
 
 def _end_with_parent() -> None:

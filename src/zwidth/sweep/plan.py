@@ -6,9 +6,10 @@ import math
 import os
 import shutil
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -34,19 +35,6 @@ _LAID_OUT_BYTES = 96 * 2**20
 
 # To lay out the boundary of a device with parts.
 _SCENE_SECONDS = 0.1
-
-Methods: TypeAlias = dict[str, str]
-
-
-@dataclass(frozen=True)
-class Task:
-    """One chunk of one family of outputs: what is computed, written and repaired as a whole."""
-
-    family: Family
-    index: int
-
-    def __str__(self) -> str:
-        return f"{self.family}/{self.index}"
 
 
 @dataclass(frozen=True)
@@ -77,20 +65,36 @@ class FamilyPlan:
         """Its dimensions and their sizes, for messages."""
         return " x ".join(f"{dim} {size}" for dim, size in zip(self.dims, self.shape, strict=True)) or "one point"
 
-    def position(self, index: int) -> tuple[int, ...]:
-        return tuple(int(part) for part in np.unravel_index(index, self.counts)) if self.counts else ()
 
-    def place(self, index: int) -> tuple[slice, ...]:
-        starts = zip(self.position(index), self.chunks, self.shape, strict=True)
+@dataclass(frozen=True)
+class Task:
+    """One chunk of one family of outputs: what is computed, written and repaired as a whole."""
+
+    plan: FamilyPlan
+    index: int
+
+    @property
+    def family(self) -> Family:
+        return self.plan.family
+
+    @property
+    def position(self) -> tuple[int, ...]:
+        """Its number along each dimension."""
+        return tuple(map(int, np.unravel_index(self.index, self.plan.counts))) if self.plan.counts else ()
+
+    @property
+    def place(self) -> tuple[slice, ...]:
+        starts = zip(self.position, self.plan.chunks, self.plan.shape, strict=True)
         return tuple(slice(at * chunk, min((at + 1) * chunk, size)) for at, chunk, size in starts)
 
-    def points(self, index: int) -> int:
-        return math.prod(part.stop - part.start for part in self.place(index))
+    @property
+    def points(self) -> int:
+        return math.prod(part.stop - part.start for part in self.place)
 
-    def describe(self, index: int) -> str:
-        parts = zip(self.dims, self.place(index), strict=True)
+    def __str__(self) -> str:
+        parts = zip(self.plan.dims, self.place, strict=True)
         place = ", ".join(f"{dim} {part.start}:{part.stop}" for dim, part in parts)
-        return f"{Task(self.family, index)}{f' ({place})' if place else ''}"
+        return f"{self.family}/{self.index}{f' ({place})' if place else ''}"
 
 
 @dataclass(frozen=True)
@@ -99,8 +103,7 @@ class Plan:
 
     study: SweepStudy
     families: tuple[FamilyPlan, ...]
-    methods: Methods  # of every output that is found by a method of its own
-    reasons: Methods  # why it is that one
+    methods: dict[str, tuple[str, str]]  # of every output that has a choice, and why it is that one
     model: str  # what is modelled, in words
     memory: int  # bytes that a chunk takes while it is computed, at most
     disk: int  # bytes that the store takes, estimated from above
@@ -112,13 +115,7 @@ class Plan:
     def tasks(self) -> Iterator[Task]:
         """Every chunk, in the order of the work."""
         for family in self.families:
-            yield from (Task(family.family, index) for index in range(family.count))
-
-    def points(self, task: Task) -> int:
-        return self.family(task.family).points(task.index)
-
-    def describe(self, task: Task) -> str:
-        return self.family(task.family).describe(task.index)
+            yield from (Task(family, index) for index in range(family.count))
 
     @property
     def extent(self) -> str:
@@ -129,7 +126,7 @@ class Plan:
         """What a store keeps of the plan: later work on it must follow the same."""
         return {
             "chunks": {family.family: list(family.chunks) for family in self.families},
-            "methods": dict(sorted(self.methods.items())),
+            "methods": {name: method for name, (method, _) in sorted(self.methods.items())},
         }
 
     def lines(self) -> Iterator[str]:
@@ -141,8 +138,8 @@ class Plan:
             yield f"    points   {points:,} ({family.extent})"
             yield f"    chunks   {family.count:,} of {chunk or '1'}"
         yield f"  model      {self.model}"
-        for name, method in sorted(self.methods.items()):
-            yield f"  method     {name} by {method}: {self.reasons[name]}"
+        for name, (method, reason) in sorted(self.methods.items()):
+            yield f"  method     {name} by {method}: {reason}"
         yield f"  memory     {_size(self.memory)} a chunk, and {_size(IDLE_MEMORY)} a worker"
         yield f"  disk       {_size(self.disk)} at most"
         yield f"  time       about {_time(self.seconds)} on one core"
@@ -151,8 +148,6 @@ class Plan:
 def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     """Cut a study into chunks of so many bytes, by the points a second of each output."""
     grid = Grid(study)
-    chosen = choose_methods(study)
-    methods = {name: method for name, (method, _) in chosen.items()}
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
         sources = {OUTPUTS[name].source or name for name in outputs}
@@ -170,16 +165,18 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     # Numbers hardly shrink, truth values are packed, a status is nearly always 0.
     bits = [1 + sum(64 if OUTPUTS[name].dtype == "float64" else 1 for name in plan.outputs) for plan in families]
     disk = sum(math.prod(plan.shape) * each for plan, each in zip(families, bits, strict=True)) // 8 + 2**16
-    reasons = {name: reason for name, (_, reason) in chosen.items()}
-    model = "device with parts, held delay" if study.with_parts else _model(study.axes.most_periods)
-    return Plan(study, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
+    longest, model = study.axes.most_periods, "device with parts, held delay"
+    if not study.with_parts:
+        part = "" if longest == math.floor(longest) else ", also in part of a period"
+        model = f"damped mass, zero-order hold, held delay{part}: polynomials of degree up to {math.ceil(longest) + 3}"
+    return Plan(study, tuple(families), choose_methods(study), model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
 def kept_plan(study: SweepStudy, kept: dict[str, Any]) -> Plan:
     """The plan that a store was made with, from what it keeps of it."""
     fresh = make_plan(study)
     families = tuple(replace(plan, chunks=tuple(kept["chunks"][plan.family])) for plan in fresh.families)
-    return replace(fresh, families=families, methods=dict(kept["methods"]))
+    return replace(fresh, families=families)
 
 
 def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
@@ -206,15 +203,6 @@ def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
         proof = f"each value proved to {study.accuracy:g} by counts of poles inside circles, at a cost flat in d"
         methods["spectral_radius"] = ("newton", proof)
     return methods
-
-
-def _model(longest: float) -> str:
-    degree = math.floor(longest) + 3
-    if longest == math.floor(longest):
-        return f"damped mass, zero-order hold, held delay: polynomials of degree up to {degree}"
-    return (
-        f"damped mass, zero-order hold, held delay, also in part of a period: polynomials of degree up to {degree + 1}"
-    )
 
 
 def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collection[str] = ()) -> None:
@@ -244,11 +232,10 @@ def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collec
 def _machine_memory() -> int:
     """The memory that this process may use: the machine's, or less in a container."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    try:
+    # Else no container, or one without a limit.
+    with suppress(OSError, ValueError):
         return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
-    except (OSError, ValueError):
-        # No container, or one without a limit.
-        return total
+    return total
 
 
 def _bytes_per_point(outputs: tuple[str, ...]) -> int:

@@ -115,13 +115,12 @@ class Store:
 
     def name(self, task: Task) -> str:
         """A chunk by its study, for messages."""
-        return f"{self.study.name}/{self.plan.describe(task)}"
+        return f"{self.study.name}/{task}"
 
     def files(self, task: Task) -> list[Path]:
         """The files that hold a chunk, in the order of its variables."""
-        family = self.plan.family(task.family)
-        key = "/".join(("c", *map(str, family.position(task.index))))
-        return [self.path / name / key for name in family.variables]
+        key = "/".join(("c", *map(str, task.position)))
+        return [self.path / name / key for name in task.plan.variables]
 
     def flag(self, task: Task) -> Path:
         """The file that says by being there that a chunk is done."""
@@ -145,15 +144,13 @@ class Store:
 
     def write(self, task: Task, values: Mapping[str, np.ndarray]) -> None:
         """Write all variables of a chunk, then mark it as done."""
-        family = self.plan.family(task.family)
-        place = family.place(task.index)
         files = self.files(task)
-        shape = tuple(part.stop - part.start for part in place)
+        shape = tuple(part.stop - part.start for part in task.place)
         with silence_zarr():
-            for name, file in zip(family.variables, files, strict=True):
+            for name, file in zip(task.plan.variables, files, strict=True):
                 # Zarr would read what is left of a damaged chunk at the edge of the grid before it replaces it.
                 remove_quietly(file)
-                self._arrays[name][place if place else ...] = np.ascontiguousarray(values[name]).reshape(shape)
+                self._arrays[name][task.place or ...] = np.ascontiguousarray(values[name]).reshape(shape)
         sums = np.array([checksum(file) for file in files], dtype="<u4")
         write_whole(self.flag(task), sums.tobytes())
 
@@ -161,11 +158,11 @@ class Store:
         """How many points of each family have each status; those of damaged chunks are not counted."""
         counts = {family.family: np.zeros(NOT_COMPUTED, int) for family in self.plan.families}
         for task in self.plan.tasks():
-            family, name = self.plan.family(task.family), STATUS_OF[task.family]
-            file = self.files(task)[family.variables.index(name)]
+            name = STATUS_OF[task.family]
+            file = self.files(task)[task.plan.variables.index(name)]
             if self.is_done(task) and checksum(file) == self.checksums(task).get(name):
                 with silence_zarr():
-                    status = np.asarray(self._arrays[name][family.place(task.index) or ...])
+                    status = np.asarray(self._arrays[name][task.place or ...])
                 # Nearly all are 0.
                 failed = status[status.view(bool)]
                 counts[task.family][Status.OK] += status.size - failed.size
@@ -187,7 +184,7 @@ class Store:
 
     def checksums(self, task: Task) -> dict[str, int]:
         """The checksums of the files of a chunk that is done, by their variables; nothing where they are damaged."""
-        kept, variables = content(self.flag(task)), self.plan.family(task.family).variables
+        kept, variables = content(self.flag(task)), task.plan.variables
         whole = len(kept) == 4 * len(variables)
         return dict(zip(variables, np.frombuffer(kept, "<u4").tolist(), strict=True)) if whole else {}
 
@@ -268,13 +265,11 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
             attributes=attributes,
         )
         array[...] = values
-    packed: dict[str, Any] = {"filters": [PackBits()], "compressors": [ZstdCodec(level=3)], "fill_value": False}
-    number: dict[str, Any] = {
-        "compressors": [BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")],
-        "fill_value": np.nan,
+    keeping: dict[str, dict[str, Any]] = {
+        "bool": {"filters": [PackBits()], "compressors": [ZstdCodec(level=3)], "fill_value": False},
+        "float64": {"compressors": [BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")], "fill_value": np.nan},
+        "uint8": {"compressors": [ZstdCodec(level=3)], "fill_value": NOT_COMPUTED},
     }
-    code: dict[str, Any] = {"compressors": [ZstdCodec(level=3)], "fill_value": NOT_COMPUTED}
-    keeping = {"bool": packed, "float64": number, "uint8": code}
     for family in plan.families:
         common: dict[str, Any] = {
             "shape": family.shape,
@@ -288,7 +283,8 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
                 attributes["units"] = own_unit(output.units_in(grid.physical))
             attributes["ancillary_variables"] = STATUS_OF[family.family]
             group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
-        group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **common, **code)
+        kept = common | keeping["uint8"]
+        group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **kept)
         group.create_array(
             name_checksums(family.family),
             shape=(family.count, len(family.variables)),
@@ -301,17 +297,12 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
         )
 
 
-def find_stores(path: Path) -> list[Path]:
-    """The stores at a path: the path itself, or those in the folder."""
-    if (path / "zarr.json").is_file() or path.name.endswith(SUFFIX):
-        return [path]
-    return sorted(found for found in path.glob(f"*{SUFFIX}") if not found.name.startswith("."))
-
-
 def list_stores(path: str | os.PathLike[str]) -> list[Path]:
-    """The same, one at least."""
+    """The stores at a path: the path itself, or those in the folder, one at least."""
     folder = Path(os.fsdecode(path))
-    found = find_stores(folder)
+    if (folder / "zarr.json").is_file() or folder.name.endswith(SUFFIX):
+        return [folder]
+    found = sorted(found for found in folder.glob(f"*{SUFFIX}") if not found.name.startswith("."))
     if not found:
         raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
     return found

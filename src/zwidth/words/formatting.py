@@ -1,34 +1,17 @@
-"""Values for people: numbers with SI prefixes and few digits, what was received, and the cells of CSV files.
-
-The first line of a CSV file that holds something has the names of the columns, which may have units in brackets. Lines
-before it that begin with # are remarks, and so is the ``sep=;`` of spreadsheets. Columns are separated by tabs, else
-semicolons, else commas: the first of these that the line of names holds. Where commas do not separate, they may be
-decimal signs.
-"""
+"""Values for people: numbers with SI prefixes and few digits, what was received, and the cells of CSV files."""
 
 from __future__ import annotations
 
-import codecs
-import csv
 import difflib
-import gzip
 import math
 import re
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from itertools import islice
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from zwidth.words.errors import InputError
 from zwidth.words.rotation import ROTARY, is_rotary, own_unit
 
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 LONGEST_VALUE = 60
-_REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
-_TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
-_CODINGS, _GZIP, _NO_TEXT = ("utf-8-sig", "cp1252", "latin-1"), b"\x1f\x8b", re.compile("[\0-\x08\x0e-\x1f]")
-_DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
 
 
 def plain(value: float, digits: int = 4) -> str:
@@ -134,13 +117,21 @@ def header(name: str, unit: str) -> str:
     return f"{name}_{unit.replace('/', '_per_').replace(' ', '_').replace('^', '')}"
 
 
-def own_header(name: str) -> str:
-    """The name of a column with the unit of the kind of device in question, as ``stiffness_N_m_per_rad``."""
-    for unit in sorted(ROTARY, key=len, reverse=True) if is_rotary() else ():
-        ending = header("", unit)
-        if name.endswith(ending):
-            return name.removesuffix(ending) + header("", ROTARY[unit])
+_ENDINGS = [tuple(header("", unit) for unit in pair) for pair in sorted(ROTARY.items(), key=lambda pair: -len(pair[0]))]
+
+
+def turn_header(name: str, rotary: bool) -> str:
+    """The name of a column, as ``stiffness_N_m_per_rad``, with the unit of a rotary device, or of a linear one."""
+    for linear, turned in _ENDINGS:
+        old, new = (linear, turned) if rotary else (turned, linear)
+        if name.endswith(old):
+            return name.removesuffix(old) + new
     return name
+
+
+def own_header(name: str) -> str:
+    """The same with the unit of the kind of device in question, where that of a linear one is given."""
+    return turn_header(name, True) if is_rotary() else name
 
 
 def to_json(value: Any) -> Any:
@@ -207,65 +198,3 @@ def short(value: float) -> str:
     """The shortest text of a number, without ``.0`` where it is whole."""
     text = f"{value:g}"
     return text if float(text) == value else repr(value)
-
-
-def read_lines(file: Path, most_bytes: int) -> list[str]:
-    """The lines of a text: UTF-8, UTF-16 with its mark, else Latin-1 as Windows has it; packed by gzip or not."""
-    # A pipe would be waited for.
-    if not file.is_file():
-        raise InputError(f"{file}: {'it is no file' if file.exists() else 'no such file'}; check the path")
-    try:
-        with file.open("rb") as opened:
-            raw = opened.read(most_bytes + 1)
-        if raw.startswith(_GZIP):
-            with gzip.open(file) as opened:
-                raw = opened.read(most_bytes + 1)
-    except (EOFError, zlib.error, gzip.BadGzipFile):
-        raise InputError(f"{file}: its gzip is cut off or broken; pack it again") from None
-    except OSError as error:
-        raise InputError(f"{file}: {error.strerror or error}; check the path") from None
-    if len(raw) > most_bytes:
-        raise InputError(f"{file}: it has more than {most_bytes >> 20} MiB; take a part of it")
-    for coding in ("utf-16",) if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else _CODINGS:
-        try:
-            text = raw.decode(coding)
-        except UnicodeDecodeError:
-            continue
-        # Of numbers and names none are control characters.
-        if not _NO_TEXT.search(text):
-            return text.splitlines()
-    raise InputError(f"{file}: it is no text in UTF-8, UTF-16 or Latin-1; save it as CSV in UTF-8")
-
-
-def read_rows(file: Path, most_bytes: int) -> list[tuple[int, list[str]]]:
-    """The row of names and those below that hold something, each with its line."""
-    lines = read_lines(file, most_bytes)
-    first = next((k for k, line in enumerate(lines) if line.strip() and not _REMARK.match(line)), len(lines))
-    separator = next((mark for mark in "\t;" if mark in "".join(lines[first : first + 1])), ",")
-    rows = list(split_lines(file, lines, first, separator))
-    if separator != ",":
-        rows[1:] = [(line, [with_point(cell) for cell in cells]) for line, cells in rows[1:]]
-    return rows
-
-
-def split_lines(file: Path, lines: list[str], first: int, separator: str) -> Iterator[tuple[int, list[str]]]:
-    """The cells of each line from the first on that holds something, with its number."""
-    reader = csv.reader(islice(lines, first, None), delimiter=separator, skipinitialspace=True, strict=True)
-    try:
-        for row in reader:
-            cells = [cell.strip() for cell in row]
-            if any(cells):
-                yield first + reader.line_num, cells
-    except csv.Error as error:
-        raise InputError(f"{file}:{first + reader.line_num}: {error}; check the quotes") from None
-
-
-def with_point(cell: str) -> str:
-    """A number with a decimal comma, with a point."""
-    return _DECIMAL_COMMA.sub(r"\1.", cell)
-
-
-def split_title(title: str) -> tuple[str, str]:
-    """The name of a column, and its unit, which stands in brackets at its end."""
-    match = _TITLE.fullmatch(title.strip())
-    return (match[1], (match[2] or match[3] or "").strip()) if match else (title, "")

@@ -62,31 +62,18 @@ RECOMMENDED_SHARE = 0.75
 
 @dataclass(frozen=True)
 class Parameter:
-    """One quantity of the loop.
+    """One quantity of the loop."""
 
-    Attributes:
-        name: in files and stores; of a part beside device and timing, with the part's name and a dot.
-        long_name: what it is, for the readers of a store, of a schema and of the command line's help.
-        symbol: in mathtext, without dollar signs.
-        allowed: its admissible values, in its unit.
-        unit: SI base unit; "1" for a normalized quantity.
-        slider: the range in which the explorer moves it, in its unit; None where it is no slider.
-        note: more for the readers of a schema and of the command line's help.
-        short_name: what a figure and the explorer call it, where that is another.
-        definition: of a normalized quantity, in mathtext.
-        whole: whether only whole numbers are admissible.
-    """
-
-    name: str
-    long_name: str
-    symbol: str
-    allowed: Range
-    unit: str = "1"
-    slider: tuple[float, float] | None = None
-    note: str = ""
-    short_name: str = ""
-    definition: str = ""
-    whole: bool = False
+    name: str  # in files and stores; of a part beside device and timing, with the part's name and a dot
+    long_name: str  # what it is, for the readers of a store, of a schema and of the command line's help
+    symbol: str  # in mathtext, without dollar signs
+    allowed: Range  # its admissible values, in its unit
+    unit: str = "1"  # SI base unit; "1" for a normalized quantity
+    slider: tuple[float, float] | None = None  # where the explorer moves it, in its unit; None where it is no slider
+    note: str = ""  # more for the readers of a schema and of the command line's help
+    short_name: str = ""  # what a figure and the explorer call it, where that is another
+    definition: str = ""  # of a normalized quantity, in mathtext
+    whole: bool = False  # whether only whole numbers are admissible
 
     @cached_property
     def sign(self) -> Range:
@@ -104,6 +91,12 @@ class Parameter:
     def words(self) -> str:
         """What a figure and the explorer call it."""
         return self.short_name or self.long_name
+
+    @property
+    def axis_label(self) -> str:
+        """The same with its symbol, as an axis of a figure has it."""
+        definition = f" = {self.definition}" if self.definition else ""
+        return f"{self.words}  ${self.symbol}{definition}$"
 
     @property
     def sentence(self) -> str:
@@ -227,8 +220,30 @@ OF_PARTS = tuple(name for name in PARAMETERS if "." in name)
 VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}
 """The same by their names in a store."""
 _NOISE = Parameter("velocity.noise", "largest error of a measured position", "", POSITIVE, "m", note="one count")
-FIELDS = {**PARAMETERS, **{field.name: field for field in (_NOISE, *_describe_mode("mode", "a mode", "i"))}}
-"""Every number that a part may have; the noise belongs to an estimate that has no stable walls, and is no axis."""
+# Of a simulated motion, beside its scene.
+_OF_MOTIONS = (
+    Parameter(
+        "start_position", "where the motion starts", "x_0", ANY, "m",
+        note="the wall's surface is at 0 and positive is into the wall",
+    ),
+    Parameter("start_velocity", "its velocity there", "v_0", ANY, "m/s"),
+    Parameter("push", "constant force of the hand on the device", "F", ANY, "N"),
+    Parameter(
+        "resolution", "one count of the encoder", r"\Delta", NOT_NEGATIVE, "m", short_name="resolution of the encoder"
+    ),
+    Parameter("noise", "standard deviation of the measured position", r"\sigma", NOT_NEGATIVE, "m"),
+    Parameter("coulomb", "dry friction while the device slips", "F_c", NOT_NEGATIVE, "N", short_name="dry friction"),
+    Parameter(
+        "static", "dry friction that holds the device", "F_s", NOT_NEGATIVE, "N",
+        note="at least coulomb, which it is where left out",
+    ),
+    Parameter("max_force", "the most that the motor gives", "F_m", POSITIVE, "N", note="without one no limit"),
+    Parameter("max_rate", "the fastest that the command changes", "R_m", POSITIVE, "N/s", note="without one no limit"),
+)  # fmt: skip
+OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
+_FURTHER = (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)
+FIELDS = {**PARAMETERS, **{field.name: field for field in _FURTHER}}
+"""Every number of a part or a motion by its name; the noise of an estimate without stable walls is no axis."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 
 
@@ -245,6 +260,15 @@ CHOICES = {
     "coupling.sensor": Choice(("motor", "tip"), "Where the position is measured; at the motor by default"),
 }
 
+OF_LOGS = {
+    "time": "Column of the time: its header, or HEADER:ms. Found by its name where left out.",
+    "position": "Column of the position: its header, or HEADER:mm, :counts, :deg.",
+    "force": "Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.",
+    "resolution": "One count of the encoder, as 0.03mm or 0.09deg.",
+    "motor_constant": "What an ampere of a force in A makes, as 5N/A.",
+}
+"""What stands in the columns of a log, and what counts and amperes stand for."""
+
 Family: TypeAlias = Literal["wall", "device"]
 """Whether an output belongs to each wall, or to each device and delay whatever its wall."""
 
@@ -257,43 +281,24 @@ NOT_COMPUTED = 255
 
 @dataclass(frozen=True)
 class Output:
-    """One variable of a store.
+    """One variable of a store."""
 
-    Attributes:
-        name: in files and stores.
-        long_name: its definition, for the readers of a store.
-        symbol: what a figure writes behind its words, in mathtext.
-        look: how its values become colors.
-        family: what it belongs to.
-        dtype: how it is kept.
-        units: its unit in a normalized sweep.
-        physical_units: its unit in a sweep over SI quantities; None where that is the same.
-        physical_only: whether a normalized sweep cannot have it.
-        with_parts: whether it is known of devices with a velocity filter, a hand or a coupling.
-        source: the output that it follows from at no cost; itself where left out.
-        rates: points a second on one core, roughly: of rigid devices, and of devices with parts.
-        label: what a figure calls it; its name where left out.
-        center: where a diverging quantity changes sides: the edge of what is stable or passive.
-        below: whether the good side lies below the center.
-        flags: of codes and truth values, their meanings by CF's attributes.
-    """
-
-    name: str
-    long_name: str
-    symbol: str = ""
-    look: Look = "truth"
+    name: str  # in files and stores
+    long_name: str  # its definition, for the readers of a store
+    symbol: str = ""  # what a figure writes behind its words, in mathtext
+    look: Look = "truth"  # how its values become colors
     family: Family = "wall"
     dtype: Literal["bool", "float64", "uint8"] = "float64"
-    units: str = "1"
-    physical_units: str | None = None
-    physical_only: bool = False
-    with_parts: bool = False
-    source: str = ""
-    rates: tuple[float, float] = (1e6, 10.0)
-    label: str = ""
-    center: float = 0.0
-    below: bool = False
-    flags: dict[str, Any] = field(default_factory=dict)
+    units: str = "1"  # in a normalized sweep
+    physical_units: str | None = None  # in a sweep over SI quantities; None where that is the same
+    physical_only: bool = False  # whether a normalized sweep cannot have it
+    with_parts: bool = False  # whether it is known of devices with a velocity filter, a hand or a coupling
+    source: str = ""  # the output that it follows from at no cost; itself where left out
+    rates: tuple[float, float] = (1e6, 10.0)  # points a second on one core, roughly: of rigid devices, and with parts
+    label: str = ""  # what a figure calls it; its name where left out
+    center: float = 0.0  # where a diverging quantity changes sides: the edge of what is stable or passive
+    below: bool = False  # whether the good side lies below the center
+    flags: dict[str, Any] = field(default_factory=dict)  # meanings of codes and truth values, by CF's attributes
 
     @property
     def words(self) -> str:

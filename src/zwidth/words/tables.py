@@ -7,19 +7,22 @@ and a line of units alone between the two belongs to the names. Files of NumPy a
 
 from __future__ import annotations
 
+import codecs
 import csv
+import gzip
 import re
 import zipfile
-from collections.abc import Iterable, Sequence
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice, zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import read_lines, split_lines, split_title, with_point
 from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, SPEED, TIME, TORQUE, looks_like_number
 
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
@@ -28,6 +31,9 @@ COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
 _KNOWN = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
 _FURTHER = ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s", "krad/s", "dB", "m/N", "mm/N", "um/N", "µm/N")
 _MOST_BYTES = 2**28
+_TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
+_CODINGS, _GZIP, _NO_TEXT = ("utf-8-sig", "cp1252", "latin-1"), b"\x1f\x8b", re.compile("[\0-\x08\x0e-\x1f]")
+_DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
 # Lines that may stand above the numbers.
 _PREAMBLE = 500
 # Where a unit may begin behind a name without brackets: time_s, time/s, time s.
@@ -40,19 +46,13 @@ _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?(\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?
 _DAY, _AT_ONCE = "1970-01-01T", 20_000
 
 
-class Numbers(Protocol):
-    """Reads some columns by their places, as finite numbers of a kind: float or complex."""
-
-    def __call__(self, places: Sequence[int], kind: type = float) -> list[np.ndarray]: ...
-
-
 @dataclass(frozen=True)
 class NamedColumns:
-    """Names of columns, and how to get the numbers of some; ``nameless`` says so where the names are 1, 2, ..."""
+    """Columns of a file, whose numbers are read when they are asked for."""
 
-    heads: list[str]
-    numbers: Numbers
-    nameless: str = ""
+    heads: list[str]  # their names, perhaps with units
+    numbers: Callable[..., list[np.ndarray]]  # of columns at some places, finite and of a kind: float or complex
+    nameless: str = ""  # says so where the names are 1, 2, ...
 
 
 def read_columns(file: Path) -> NamedColumns:
@@ -69,6 +69,54 @@ def read_columns(file: Path) -> NamedColumns:
     if begin.startswith((b"\x93NUMPY", b"PK\x03\x04")) or file.suffix.lower() == ".mat":
         return _table_arrays(file, _load(file))
     return _table_text(file, read_lines(file, _MOST_BYTES))
+
+
+def read_lines(file: Path, most_bytes: int) -> list[str]:
+    """The lines of a text: UTF-8, UTF-16 with its mark, else Latin-1 as Windows has it; packed by gzip or not."""
+    # A pipe would be waited for.
+    if not file.is_file():
+        raise InputError(f"{file}: {'it is no file' if file.exists() else 'no such file'}; check the path")
+    try:
+        with file.open("rb") as opened:
+            raw = opened.read(most_bytes + 1)
+        if raw.startswith(_GZIP):
+            with gzip.open(file) as opened:
+                raw = opened.read(most_bytes + 1)
+    except (EOFError, zlib.error, gzip.BadGzipFile):
+        raise InputError(f"{file}: its gzip is cut off or broken; pack it again") from None
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror or error}; check the path") from None
+    if len(raw) > most_bytes:
+        raise InputError(f"{file}: it has more than {most_bytes >> 20} MiB; take a part of it")
+    for coding in ("utf-16",) if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else _CODINGS:
+        with suppress(UnicodeDecodeError):
+            # Of numbers and names none are control characters.
+            if not _NO_TEXT.search(text := raw.decode(coding)):
+                return text.splitlines()
+    raise InputError(f"{file}: it is no text in UTF-8, UTF-16 or Latin-1; save it as CSV in UTF-8")
+
+
+def split_lines(file: Path, lines: list[str], first: int, separator: str) -> Iterator[tuple[int, list[str]]]:
+    """The cells of each line from the first on that holds something, with its number."""
+    reader = csv.reader(islice(lines, first, None), delimiter=separator, skipinitialspace=True, strict=True)
+    try:
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                yield first + reader.line_num, cells
+    except csv.Error as error:
+        raise InputError(f"{file}:{first + reader.line_num}: {error}; check the quotes") from None
+
+
+def with_point(cell: str) -> str:
+    """A number with a decimal comma, with a point."""
+    return _DECIMAL_COMMA.sub(r"\1.", cell)
+
+
+def split_title(title: str) -> tuple[str, str]:
+    """The name of a column, and its unit, which stands in brackets at its end."""
+    match = _TITLE.fullmatch(title.strip())
+    return (match[1], (match[2] or match[3] or "").strip()) if match else (title, "")
 
 
 def split_head(head: str) -> tuple[str, str]:
@@ -88,11 +136,9 @@ def is_unit(text: str) -> bool:
 
 
 def _is_npz(file: Path) -> bool:
-    try:
-        with zipfile.ZipFile(file) as archive:
-            return all(name.endswith(".npy") for name in archive.namelist())
-    except (zipfile.BadZipFile, OSError):
-        return False
+    with suppress(zipfile.BadZipFile, OSError), zipfile.ZipFile(file) as archive:
+        return all(name.endswith(".npy") for name in archive.namelist())
+    return False
 
 
 def _load(file: Path) -> dict[str, Any]:
@@ -164,7 +210,7 @@ class _Layout(NamedTuple):
 
 
 def _table_text(file: Path, lines: list[str]) -> NamedColumns:
-    if not any(map(_says, lines)):
+    if not any(map(holds_data, lines)):
         raise InputError(f"{file}: it is empty; a line of column names and a line a sample are needed")
     layout = _lay_out(lines)
     separator = layout.separator
@@ -202,7 +248,7 @@ def _split(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
-def _says(line: str) -> bool:
+def holds_data(line: str) -> bool:
     """Whether a line holds more than a remark or a spreadsheet's mark."""
     return bool(line.strip()) and not _REMARK.match(line) and not _SEPARATOR.match(line)
 
@@ -216,11 +262,9 @@ def _read_number(text: str, kind: type) -> Any:
     if looks_like_number(text):
         return kind(text) if np.isfinite(float(text)) else None
     if kind is complex and text[-1:] in ("i", "j") and "_" not in text:
-        try:
+        with suppress(ValueError):
             value = complex(text.replace(" ", "").replace("i", "j"))
-        except ValueError:
-            return None
-        return value if np.isfinite(value) else None
+            return value if np.isfinite(value) else None
     return None
 
 
@@ -238,7 +282,7 @@ def _lay_out(lines: list[str]) -> _Layout:
                 best = (share, k, separator) if best is None or share > best[0] else best
                 break
     if best is None:
-        first = next(k for k, line in enumerate(lines) if _says(line))
+        first = next(k for k, line in enumerate(lines) if holds_data(line))
         separator = next((mark for mark in "\t;," if mark in lines[first]), " ")
         return _Layout(first, None, first + 1, separator)
     _, begin, separator = best
@@ -246,7 +290,7 @@ def _lay_out(lines: list[str]) -> _Layout:
     above = [k for k in reversed(held) if k < begin]
     named = [k for k in above if len(_trim(_split(lines[k], separator))) == width]
     if not named:
-        plain = [k for k in above if _says(lines[k])]
+        plain = [k for k in above if holds_data(lines[k])]
         return _Layout(plain[0] if plain else None, None, begin, separator)
     cells = [cell.strip("[]()") for cell in _split(lines[named[0]], separator)]
     if len(named) > 1 and sum(map(is_unit, cells)) >= 2 and all(is_unit(cell) or len(cell) <= 5 for cell in cells):
@@ -319,10 +363,9 @@ def _find_clocks(lines: list[str], layout: _Layout, places: Sequence[int]) -> li
 
 
 def _is_time(text: str) -> bool:
-    try:
+    with suppress(ValueError):
         return _read_clock(np.array([text])).size == 1
-    except ValueError:
-        return False
+    return False
 
 
 def _read_clock(texts: np.ndarray) -> np.ndarray:

@@ -93,8 +93,15 @@ def test_a_scene_without_a_linear_form_is_refused_by_name(load, study):
     assert "no linear form; use the kind 'simulate' or 'limit_cycle'" in str(fault)
 
 
-def test_a_study_that_takes_nothing_of_such_a_scene_is_not_refused(load):
-    assert load(f"scene: {{{DEVICE}, {FOAW}}}\nstudies: [{{kind: ridge, name: r, delta: 1, d: 0}}]\n").studies
+@pytest.mark.parametrize(
+    "study",
+    [
+        "kind: ridge, name: r, delta: 1, d: 0",
+        "kind: step, name: r, devices: [{mass: 1, period: 1 ms}], stiffness_fraction: 0.5",
+    ],
+)
+def test_a_study_that_takes_nothing_of_such_a_scene_is_not_refused(load, study):
+    assert load(f"scene: {{{DEVICE}, {FOAW}}}\nstudies: [{{{study}}}]\n").studies
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from run_folders import record_of, states
 
-from zwidth.pages.report.page import write_report
 from zwidth.runs import run
+from zwidth.runs.report.page import write_report
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
 
 pytestmark = pytest.mark.usefixtures("unpainted")

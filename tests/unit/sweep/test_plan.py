@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sweeping import config_of, study, sweep_of
 
 from zwidth.runs import plan_run
-from zwidth.sweep.plan import MEMORY, FamilyPlan, Plan, check_resources, chunk_shape, kept_plan, make_plan
+from zwidth.sweep.plan import MEMORY, FamilyPlan, Plan, Task, check_resources, chunk_shape, kept_plan, make_plan
 from zwidth.words.errors import ResourceError
 
 HUGE = {
@@ -34,8 +34,9 @@ def test_chunks_cover_every_point_once(shape, target):
     plan = FamilyPlan("wall", ("stable",), tuple("abcd"[: len(shape)]), shape, chunks)
     count = np.zeros(shape, int)
     for index in range(plan.count):
-        count[plan.place(index)] += 1
-        assert plan.points(index) == count[plan.place(index)].size
+        task = Task(plan, index)
+        count[task.place] += 1
+        assert task.points == count[task.place].size
     assert (count == 1).all()
     assert plan.count == math.prod(plan.counts)
 
@@ -87,10 +88,10 @@ def test_a_plan_tells_what_it_will_do():
 def test_the_plan_says_how_radii_are_found_and_what_is_proved_of_them():
     axes = {**HUGE, "d": [1, 70.5]}
     plan = make_plan(sweep_of(study(axes=axes, outputs=("margin", "stable"), accuracy=1e-6)))
-    assert plan.methods == {"spectral_radius": "newton", "stable": "crossover"}
+    assert plan.as_dict()["methods"] == {"spectral_radius": "newton", "stable": "crossover"}
     lines = "\n".join(plan.lines())
     assert "spectral_radius by newton: each value proved to 1e-06" in lines
     assert "stable by crossover: no pole is needed" in lines
     assert "polynomials of degree up to 74" in lines
     usual = make_plan(sweep_of(study(axes=HUGE, outputs=("margin",))))
-    assert "proved to 1e-09" in usual.reasons["spectral_radius"]
+    assert "proved to 1e-09" in usual.methods["spectral_radius"][1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from math import isfinite
@@ -21,7 +22,6 @@ from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity, WindowedDifference
 from zwidth.parts.wall import VirtualWall
-from zwidth.runs.record import CONFIG_FILE, RUN_FILE, Record
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import choose_damping
 from zwidth.studies.document import Config, load_config
@@ -254,13 +254,9 @@ def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Co
 
 
 def read_controls(path: Path | None) -> Controls:
-    """The scene of a configuration, or of the one that a run folder has recorded; without either, a small device."""
+    """The scene of a configuration; without one, a small device."""
     if path is None:
         return Controls()
-    if path.is_dir():
-        if CONFIG_FILE not in Record(path).files():
-            raise InputError(f"{path}: no run with a recorded configuration ({RUN_FILE}, {CONFIG_FILE}); name a file")
-        path = path / CONFIG_FILE
     given: Any = load_config(path).scene
     if given is None:
         raise InputError(f"{path}: scene: missing; the page shows the scene of a configuration, add one")
@@ -310,10 +306,9 @@ def read_link(link: str) -> Controls:
 
 def _read_value(text: str) -> Any:
     """A number, a list or a part as JSON has it, else the text."""
-    try:
+    with suppress(json.JSONDecodeError):
         return json.loads(text)
-    except json.JSONDecodeError:
-        return text
+    return text
 
 
 def _spell_section(controls: Controls) -> dict[str, Any]:

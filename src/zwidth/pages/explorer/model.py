@@ -16,7 +16,7 @@ from zwidth.loops.linear.curve import lines_at
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
-from zwidth.pages.words import check_lines, list_slopes, pole_words, row
+from zwidth.pages.words import check_lines, list_slopes, pole_words, row, word_of
 from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin
 from zwidth.scenes.scene import Scene
@@ -96,10 +96,6 @@ def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
         places = np.arange(0, alpha.size, stride)
     edge &= finite
     return np.where(edge, stiffness, np.nan), np.where(edge, damping, np.nan)
-
-
-def judge_quickly(scene: Scene) -> tuple[bool, np.ndarray]:
-    return bool(scene.decide_stability(method="companion").stable), scene.poles()
 
 
 def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
@@ -273,10 +269,6 @@ def normalized_lines(verdict: Assessment) -> list[str]:
     return [row(*each) for each in rows.items()]
 
 
-def word_of(verdict: Assessment) -> str:
-    return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
-
-
 # Held while JAX is being imported: what looks for it meanwhile would find half of it.
 IMPORTING = Lock()
 
@@ -287,16 +279,10 @@ Update = dict[str, Any]
 def compute_details(
     scene: Scene, across: Range, up: Range, *, normalized: bool, outline: bool, contact: bool, costly: bool
 ) -> Iterator[Update]:
-    """What takes longer than a drag, part by part as it is wanted; whoever asks may stop after each.
+    """What takes longer than a drag, part by part; whoever asks may stop after each.
 
-    Args:
-        scene: the scene with its wall.
-        across: the range of stiffness that is shown, for contours.
-        up: that of damping.
-        normalized: whether its units are those of m = 1 and T = 1.
-        outline: whether what hangs on the device is wanted, for it has changed.
-        contact: whether a hit of the wall is.
-        costly: whether what takes seconds in a scene with parts is.
+    Contours cover ``across`` and ``up``. Wanted may be what hangs on the device (``outline``), a hit of the wall
+    (``contact``), and what takes seconds in a scene with parts (``costly``).
     """
     quick = scene.loop.outline() is not None
     # The page shows millimeters.

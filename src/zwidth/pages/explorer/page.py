@@ -26,17 +26,8 @@ from zwidth.words.rotation import is_rotary, own_unit, use_kind
 
 # A message holds some dozen numbers, or an address.
 _LONGEST_MESSAGE = 16_000
-_POINTS = ("edge", "passive", "ridge", "best", "wall", "poles", "nyquist", "step")
-_COLUMNS = dict.fromkeys(_POINTS, ("x", "y")) | {
-    "area": ("xs", "ys"),
-    "away": ("x", "y", "angle", "text", "align"),
-    "islands": ("x", "y", "text"),
-    "bode": ("x", "gain", "phase"),
-    "crossover": ("x", "y", "hertz", "gain", "phase"),
-    "turned": ("hertz", "gain"),
-    "contours": ("xs", "ys", "x", "y", "text"),
-    "contact": ("x", "position", "force"),
-}
+# What of a glyph is a column of its source, unless it is a fixed word.
+_FROM_SOURCE = ("x", "y", "xs", "ys", "text", "angle", "text_align")
 # What hangs on the device and takes its time: another device's is taken away at once.
 _OF_DEVICE = ("contours", "passive", "ridge", "best", "islands")
 # What is drawn, on a light page and on a dark one.
@@ -59,10 +50,7 @@ class Page:
         self.device: tuple[Any, ...] = ()
         self.drawn = False
         self.options = {"contact": False, "costly": False}
-        self.sources = {
-            name: ColumnDataSource({column: [] for column in columns}, name=f"{name} data")
-            for name, columns in _COLUMNS.items()
-        }
+        self.sources: dict[str, ColumnDataSource] = {}
         self.inputs = ColumnDataSource({"json": []}, name="inputs")
         self.answer = ColumnDataSource({"json": []}, name="answer")
         self.inputs.on_change("data", lambda _, __, data: self.receive(data))
@@ -104,7 +92,10 @@ class Page:
 
     def _add(self, plot: figure, glyph: str, source: str, color: str, *, parts: str = "line", **keywords: Any) -> Any:
         """A glyph whose colors follow the light."""
-        drawn = getattr(plot, glyph)(source=self.sources.get(source) or ColumnDataSource(), **keywords)
+        data = self.sources.setdefault(source, ColumnDataSource(name=f"{source} data"))
+        for name in (name for name in _FROM_SOURCE if keywords.get(name, "center") != "center"):
+            data.add([], keywords[name])
+        drawn = getattr(plot, glyph)(source=data, **keywords)
         self.inks += [(drawn.glyph, f"{part}_color", color) for part in parts.split()]
         if glyph in ("line", "scatter") and source != "away":
             self.curves.setdefault(plot, []).append((source, keywords["x"], keywords["y"]))
@@ -266,14 +257,14 @@ class Page:
     def _show_at_once(self, controls: Controls, rest: bool) -> None:
         scene = controls.scene
         edge = model.quick_edge(scene)
-        stable, poles = model.judge_quickly(scene)
+        stable, poles = bool(scene.decide_stability(method="companion").stable), scene.poles()
         device = replace(scene, wall=VirtualWall(0.0)), controls.normalized
         if device != self.device:
             self.device, self.drawn = device, False
             # What has gaps has no inside; the outlines come when the slider rests.
             moving = {"area": {"xs": [], "ys": []}, "edge": {"x": edge[0], "y": edge[1]}}
             self._fill(show_outlines([edge]) if np.isfinite(edge).all() else moving)
-            self._fill({name: {column: [] for column in _COLUMNS[name]} for name in _OF_DEVICE})
+            self._fill({name: {column: [] for column in self.sources[name].data} for name in _OF_DEVICE})
             self.tell({"slopes": ""})
         self.controls = controls
         self._name_axes()

@@ -19,6 +19,7 @@ from zwidth.pages.explorer.controls import (
     to_link,
     to_python,
 )
+from zwidth.runs.record import find_config
 
 CONFIGS = Path(__file__).parents[4] / "configs"
 DEVICE = "mass: 0.1, period: 1 ms, delay: 1.5 periods"
@@ -137,13 +138,13 @@ def test_the_other_model_of_delays_and_other_folders_are_refused(tmp_path):
     with pytest.raises(zwidth.InputError, match="delay_model"):
         read_controls(written(tmp_path, f"{DEVICE}, delay_model: fractional_power"))
     with pytest.raises(zwidth.InputError, match="no run with a recorded configuration"):
-        read_controls(tmp_path)
+        find_config(tmp_path)
 
 
 def test_a_run_has_recorded_its_scene(tmp_path, unpainted):
     file = written(tmp_path, f"{DEVICE}, stiffness: 1000")
     assert zwidth.run(file, out=tmp_path / "run").ok
-    assert read_controls(tmp_path / "run") == read_controls(file)
+    assert read_controls(find_config(tmp_path / "run")) == read_controls(file)
 
 
 @pytest.mark.parametrize("operator", CHOICES["operator"])

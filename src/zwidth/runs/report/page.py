@@ -16,7 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.config.study import KINDS
-from zwidth.runs.draw import Edges, make_edges
+from zwidth.figures.grid import choose_axes
+from zwidth.figures.plane import Edges
+from zwidth.figures.style import pick_evenly
+from zwidth.runs.draw import make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.files import write_whole
@@ -91,7 +94,7 @@ def _check(record: Record, done: list[dict[str, Any]]) -> None:
 
 def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> str:
     html, style, script = (
-        files("zwidth.pages.report").joinpath(f"report.{kind}").read_text(encoding="utf-8")
+        files("zwidth.runs.report").joinpath(f"report.{kind}").read_text(encoding="utf-8")
         for kind in ("html", "css", "js")
     )
     digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script)]
@@ -175,9 +178,6 @@ def _scrolling(name: str, rows: list[str], head: str = "") -> str:
 
 def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[str]:
     """The maps of a store, as HTML, with the exact edges of the stable and the passive walls."""
-    # Loads matplotlib.
-    from zwidth.figures.grid import choose_axes
-
     # A store lists its variables in any order.
     for name in (name for name in OUTPUTS if name in data and name != "kind"):
         axes = choose_axes(data, name)
@@ -190,8 +190,6 @@ def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[st
 
 
 def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edges) -> str:
-    from zwidth.figures.style import pick_evenly
-
     x, y = axes
     output = OUTPUTS[name]
     others = [str(dim) for dim in values.dims if dim not in (x, y)]
