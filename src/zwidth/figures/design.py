@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
-from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, select
+from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, in_order, select
 from zwidth.words.formatting import ENOUGH, header, round_safely, spell_enough
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
@@ -41,7 +41,7 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     for ax, kind in zip(panels, kinds, strict=False):
         over, label = _OVER[kind]
         for damping, color in colors.items():
-            rows = select(table, damping_N_s_per_m=damping, estimate=kind)
+            rows = in_order(select(table, damping_N_s_per_m=damping, estimate=kind), over)
             look = {"color": color, "label": f"b = {damping:g}", **(style.POINTS if over == "samples" else _dots(rows))}
             ax.plot(rows[over], rows[_STIFFNESS] * factor, **look)
             (bare,) = select(table, damping_N_s_per_m=damping, estimate="backward_difference")[_STIFFNESS]
@@ -75,7 +75,7 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
     handles: list[Any] = []
     for damping, color in colors.items():
         for kind, (dash, marker, _) in kinds.items():
-            rows = select(table, damping_N_s_per_m=damping, estimate=kind)
+            rows = in_order(select(table, damping_N_s_per_m=damping, estimate=kind), _NOISE)
             mark = {"marker": marker, "markersize": 4.5} if marker else _dots(rows)
             look = {"linestyle": dash, "color": color, "label": f"{kind}, b = {damping:g}", **mark}
             ax.plot(rows[_NOISE] * speed, rows[_STIFFNESS] * factor, **look)

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from zwidth.figures import grid, style
 from zwidth.figures.plane import Panel, draw_panels, panel_grid
 from zwidth.figures.stable_set import Outlines, draw_zeros, mark_wall, shade_region
-from zwidth.figures.table import Table, curves, draws_tables, select, si_scale
+from zwidth.figures.table import Table, curves, draws_tables, grid_in_order, select, si_scale
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import round_safely
 from zwidth.words.quantities import OUTPUTS
@@ -41,8 +41,8 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     """
     ax = ax or style.panels(None, 1, 5.4, 4.1)[0]
     assert ax is not None
-    stable = curves(table, "d", "delay_model", curve="stable")
-    passive = curves(table, "d", curve="passive")
+    stable = curves(table, "d", "delay_model", over="delta", curve="stable")
+    passive = curves(table, "d", over="delta", curve="passive")
     colors = style.color_by_value([interval.d for interval in stable])
     for interval in stable:
         if interval.delay_model == "held":
@@ -113,7 +113,7 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
     delta = np.asarray(table["delta"])
     end = share * float(delta.max())
     columns = {name: column[delta <= end * (1.0 + 1e-12)] for name, column in select(table).items()}
-    shown = curves(columns, "d", "delay_model")
+    shown = curves(columns, "d", "delay_model", over="delta")
     colors = style.color_by_value([path.d for path in shown])
     for path in shown:
         _draw_curve(ax, path, path.delta, path.alpha_max, colors, "alpha_max")
@@ -149,7 +149,7 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
         axes: an Axes of yours for the first panel alone, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2, gridspec_kw={"width_ratios": [1.15, 1.0]})
-    paths, models = curves(table, "d", "delay_model"), curves(slopes, "delay_model")
+    paths, models = curves(table, "d", "delay_model", over="delta"), curves(slopes, "delay_model")
     colors = style.color_by_value([path.d for path in paths])
     for path in paths:
         own = next(model for model in models if model.delay_model == path.delay_model)
@@ -203,7 +203,7 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
         axes: an Axes of yours for the two maxima alone, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2)
-    costs = curves(table, "d")
+    costs = curves(table, "d", over="delta")
     colors = style.color_by_value([cost.d for cost in costs])
     for ax, draw in zip(panels, (_draw_maxima, _draw_share), strict=False):
         draw(ax, costs, colors)
@@ -365,6 +365,8 @@ def draw_map(
         edges: gives the exact edge of what is stable, or for "passive" passive, at a delta and d, drawn in place of
             that of the cells where all cells agree with it.
     """
+    scale = si_scale(arrays)
+    arrays = grid_in_order(arrays, ("alpha", "beta", "delta", "d"))
     delta, d = arrays["delta"], arrays["d"]
     rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
     places = list(product(rows, columns))
@@ -379,6 +381,6 @@ def draw_map(
         ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")
     style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)
     draw_panels(panels, shown, output, rf"{OUTPUTS[output].words}  ${OUTPUTS[output].symbol}$", outside=axes is None)
-    if len(places) == 1 and (scale := si_scale(arrays)) is not None:
+    if len(places) == 1 and scale is not None:
         style.add_si_axes(panels[0], scale)
     return panels

@@ -128,6 +128,7 @@ def _add_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xa
     names = dict(zip((x, y), _PEAKS.get(x, ()), strict=False))
     if y not in ("beta", "virtual_damping") or not names or not all(name in data for name in names.values()):
         return drawn
+    data = grid.in_order(data)
     peaks = {dim: data[name].squeeze().variable * drawn[dim].attrs["factor"] for dim, name in names.items()}
     return drawn.assign({f"{dim}_peak": peak for dim, peak in peaks.items()})
 

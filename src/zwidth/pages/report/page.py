@@ -176,8 +176,9 @@ def _scrolling(name: str, rows: list[str], head: str = "") -> str:
 def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[str]:
     """The maps of a store, as HTML, with the exact edges of the stable and the passive walls."""
     # Loads matplotlib.
-    from zwidth.figures.grid import choose_axes
+    from zwidth.figures.grid import choose_axes, in_order
 
+    data = in_order(data)
     # A store lists its variables in any order.
     for name in (name for name in OUTPUTS if name in data and name != "kind"):
         axes = choose_axes(data, name)
