@@ -83,7 +83,7 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
         elif output.dtype == "float64":
             # Two digits of the first slice are enough to choose a prefix.
             part = values.isel({dim: slice(0, 1) for dim in values.dims[:-2]}).values
-            part = np.abs(part[np.isfinite(part)])
+            part = np.abs(part[np.isfinite(part) & (part != 0)])
             middle = np.median(part) if part.size else 1.0
             factor, unit = style.si_unit(middle, str(values.attrs.get("units", "1")))
             values = (values * factor).where(data[status] != NOT_COMPUTED).assign_attrs(units=unit)

@@ -35,6 +35,8 @@ _FINITE_IF_STABLE = ("settling_time", "delay_margin")
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 # Beyond this multiple of the smallest, a output that grows without end has one color.
 _STEEP = 100.0
+# A color bar of fewer decades than this has 2 and 5 between them.
+_FEW_TICKS = 1000.0
 # A region that fills less of its panel than this has no room for labels.
 _LABELLED = 0.1
 # Less than this cannot be seen.
@@ -247,8 +249,9 @@ def draw_edge(ax: Axes, panel: Panel, name: str, **look: Any) -> list[np.ndarray
 def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
     """Round numbers at which contours are drawn."""
     low, high = float(values.min()), float(values.max())
-    if output.look in ("logarithmic", "steep"):
-        end = min(high, norm.vmax / 2.0) if output.look == "steep" else high
+    if output.logarithmic:
+        # Short of where a steep number rises without end, but not of the values themselves where they are close together.
+        end = min(high, max(norm.vmax / 2.0, (low * high) ** 0.5)) if output.look == "steep" else high
         levels = np.asarray(LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, end))
         levels = levels[levels <= end]
     elif output.look == "diverging":
@@ -283,15 +286,16 @@ def _norm(panels: Sequence[Panel], name: str) -> Any:
         good, bad = sides if output.below else reversed(sides)
         span = max(good if good > 0 else bad, 1e-6)
         return TwoSlopeNorm(output.center, output.center - span, output.center + span)
-    if output.look in ("logarithmic", "steep"):
-        low = max(low, 1e-300)
+    if output.logarithmic:
+        low, high = _range(panels, name, least=1e-300) or (1.0, 10.0)
         high = min(high, _STEEP * low) if output.look == "steep" else high
         return LogNorm(low, max(high, 1.001 * low))
     return Normalize(low, high if high > low else low + 1.0)
 
 
-def _range(panels: Sequence[Panel], name: str) -> tuple[float, float] | None:
+def _range(panels: Sequence[Panel], name: str, least: float = -np.inf) -> tuple[float, float] | None:
     finite = np.concatenate([panel.variables[name].compressed() for panel in panels])
+    finite = finite[finite >= least]
     return (float(finite.min()), float(finite.max())) if finite.size else None
 
 
@@ -308,6 +312,8 @@ def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, l
         beyond = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
         extend = beyond[low < image.norm.vmin, high > image.norm.vmax]
         bar = axes[0].figure.colorbar(image, ax=list(axes), label=label, extend=extend)
+        if output.logarithmic:
+            style.use_logarithmic(bar.ax, "y", (image.norm.vmin, image.norm.vmax), _FEW_TICKS)
         bar.ax.tick_params(labelsize=8)
     exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
     if output.look == "diverging" or (exact and output.look != "truth"):

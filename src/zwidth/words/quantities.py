@@ -300,6 +300,11 @@ class Output:
         """What a figure calls it."""
         return self.label or self.name.replace("_", " ")
 
+    @property
+    def logarithmic(self) -> bool:
+        """Whether its axes and colors are in equal ratios; where it is 0 it has no place on them."""
+        return self.look in ("logarithmic", "steep")
+
     def units_in(self, physical: bool) -> str:
         return self.physical_units if physical and self.physical_units else self.units
 

@@ -96,6 +96,7 @@ def test_columns_of_a_csv_file_can_be_named(load, tmp_path):
 
 
 NORMAL = "alpha: 1, delta: 1, d: 1"
+PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
 
 
 @pytest.mark.parametrize(
@@ -135,6 +136,10 @@ NORMAL = "alpha: 1, delta: 1, d: 1"
         ("devices: {csv: empty.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "0 rows"),
         ("devices: {csv: wrong.csv, colums: {}}, stiffness: 1", "", "axes.devices.colums", "did you mean 'columns'?"),
         ("devices: {csv: wrong.csv, columns: {mass: m}}, stiffness: 1", "", "axes.devices.csv", "headers"),
+        (PART + "velocity.samples: [2, 5]", "", "axes.velocity.samples", "{kind: windowed_difference, samples: 5}"),
+        (PART + "velocity.time_constant: [1 ms, 2 ms]", "", "axes.velocity.time_constant", "low_pass, time_constant: 2 ms"),
+        (PART + "velocity.order: [1, 2]", "", "axes.velocity.order", "{kind: low_pass, cutoff: 100 Hz}"),
+        (PART + "modes.0.mass: [1, 2]", "", "axes.modes.0.mass", "damping_ratio: 0.03, mass: 2 kg}]"),
         (
             "alpha: {linear: {start: 0, stop: 1, num: 9999999}}, beta: {linear: {start: 0, stop: 1, num: 9999999}}, "
             "delta: 1, d: 1",

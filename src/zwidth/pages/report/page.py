@@ -204,7 +204,7 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
         numbers, sizes = thin.values.astype(np.float32), [thin.sizes[dim] for dim in others]
     finite = numbers[np.isfinite(numbers)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    steep = output.look in ("logarithmic", "steep") and low > 0
+    steep = output.logarithmic and low > 0
     content = {
         "name": name,
         "unit": _unit(thin),

@@ -1,0 +1,45 @@
+"""Figures of sweeps that have little to show: no stable wall, numbers that are 0 or close together."""
+
+import numpy as np
+import pytest
+import xarray
+
+from zwidth import figures
+
+AXES = {"stiffness": np.linspace(1e3, 2e3, 9), "virtual_damping": np.linspace(0.0, 8.0, 9)}
+
+
+def over_walls(name, values, units="s"):
+    """A sweep over walls as a store holds it."""
+    outputs = {name: (tuple(AXES), values, {"units": units}), "status": (tuple(AXES), np.zeros(values.shape, int))}
+    return xarray.Dataset(outputs, AXES)
+
+
+def read_ticks(ax):
+    ax.figure.draw_without_rendering()
+    low, high = ax.get_ylim()
+    return [tick.label1.get_text() for tick in ax.yaxis.get_major_ticks() if low <= tick.get_loc() <= high]
+
+
+@pytest.mark.parametrize(("name", "value"), [("settling_time", np.inf), ("delay_margin", 0.0)])
+def test_nothing_is_stable(name, value):
+    (ax,) = figures.draw_plane(over_walls(name, np.full((9, 9), value)), name)
+    assert np.ma.getmaskarray(ax.collections[0].get_array()).all()
+    ax.figure.draw_without_rendering()
+
+
+def test_what_is_zero_has_no_place_on_a_logarithmic_axis():
+    margin = np.where(AXES["virtual_damping"] > 4.0, 2e-5 * AXES["virtual_damping"], 0.0)
+    (ax,) = figures.draw_curves(over_walls("delay_margin", margin * np.ones((9, 1))).isel(stiffness=0), "delay_margin")
+    drawn = ax.lines[0].get_ydata()
+    np.testing.assert_allclose(drawn[5:], 20.0 * AXES["virtual_damping"][5:])
+    assert np.isnan(drawn[:5]).all()
+    assert ax.get_ylabel().endswith("in µs")
+
+
+def test_colors_and_contours_of_numbers_close_together_are_named_in_plain_numbers():
+    times = np.geomspace(0.18, 0.39, 9)[:, None] * np.ones(9)
+    (ax,) = figures.draw_plane(over_walls("settling_time", times), "settling_time")
+    bar = ax.figure.axes[-1]
+    assert read_ticks(bar) == ["200", "300"]
+    assert len([text for text in ax.texts if text.get_text() in ("200", "220", "240", "260")]) >= 3
