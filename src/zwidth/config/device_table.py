@@ -147,8 +147,9 @@ def _read_rows(name: str) -> list[tuple[int, list[str]]]:
     try:
         rows = [row for row in read_rows(find_file(name), MAX_CSV_BYTES) if not row[1][0].startswith("#")]
     except InputError as error:
-        what, _, remedy = str(error).partition("; ")
-        raise problem(printable(what), "names are relative to this file", remedy) from None
+        what, *allowed, remedy = str(error).split("; ", 2)
+        allowed = allowed[0] if allowed else "names are relative to this file"
+        raise problem(printable(what), allowed, remedy) from None
     if len(rows) < 2:
         raise problem(f"{printable(name)} has {len(rows)} rows", "a header and one row at least", "fill the file")
     return rows

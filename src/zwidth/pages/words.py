@@ -289,7 +289,7 @@ def list_slopes(scene: Scene) -> list[Slope]:
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if is_rotary() else 1.0
         words = f"{with_unit(step, unit, 1)} more {describe_effect(value * step)}"
         words += " (same delay in seconds)" if path == "period" else ""
-        found.append(Slope(path, value, f"N/m per {unit}", words))
+        found.append(Slope(path, value, f"N/m per {unit}" if unit else "N/m", words))
     return found
 
 

@@ -29,6 +29,7 @@ _REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 _TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
 _CODINGS, _GZIP, _NO_TEXT = ("utf-8-sig", "cp1252", "latin-1"), b"\x1f\x8b", re.compile("[\0-\x08\x0e-\x1f]")
 _DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
+_FRACTION = re.compile(r"[-+]?[0-9]*([.,])[0-9]+(?:[eE][-+]?[0-9]+)?")
 
 
 def plain(value: float, digits: int = 4) -> str:
@@ -46,9 +47,12 @@ def plain(value: float, digits: int = 4) -> str:
 def with_unit(value: float, unit: str, digits: int = 4) -> str:
     """A quantity with an SI prefix on its unit: ``19.87 kN/m``, ``100.0 g`` of kilograms.
 
-    The unit is that of a linear device; of a rotary one in question its own is written.
+    The unit is that of a linear device; of a rotary one in question its own is written. A number without unit, "1" or
+    "", has no prefix either.
     """
     unit = own_unit(unit)
+    if unit in ("", "1"):
+        return plain(value, digits)
     if unit == "kg m^2":
         # What data sheets of rotors have.
         return f"{plain(1e7 * value, digits)} g cm^2" if math.isfinite(value) else plain(value)
@@ -105,26 +109,22 @@ def spell_stiffness(value: float, digits: int = 4) -> str:
 
 def tell_apart(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
     """Two ends with a unit or plain, rounded into what lies between, with as many digits as it takes to leave some."""
-
-    def spell(end: float, digits: int) -> str:
-        return with_unit(end, unit, digits) if unit else plain(end, digits)
-
     for digits in range(least, 18):
         ends = round_safely(low, "above", digits), round_safely(high, "below", digits)
         if ends[0] < ends[1]:
-            return spell(ends[0], digits), spell(ends[1], digits)
-    return spell(low, least), spell(high, least)
+            return with_unit(ends[0], unit, digits), with_unit(ends[1], unit, digits)
+    return with_unit(low, unit, least), with_unit(high, unit, least)
 
 
 def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, digits: int = 4) -> str:
     """Of which values there is enough: on one side of a value, or up to the first of others there."""
-    side, unit = (1.0 if enough == "above" else -1.0), unit.removeprefix("1")
+    side = 1.0 if enough == "above" else -1.0
     beyond = [side * other for other in others if side * other > side * value]
     if beyond:
         low, high = sorted((value, side * min(beyond)))
         return " to ".join(tell_apart(low, high, unit, digits))
     value = round_safely(value, enough, digits)
-    return f"{with_unit(value, unit, digits) if unit else plain(value, digits)} {ENOUGH[enough]}"
+    return f"{with_unit(value, unit, digits)} {ENOUGH[enough]}"
 
 
 def header(name: str, unit: str) -> str:
@@ -244,7 +244,8 @@ def read_rows(file: Path, most_bytes: int) -> list[tuple[int, list[str]]]:
     separator = next((mark for mark in "\t;" if mark in "".join(lines[first : first + 1])), ",")
     rows = list(split_lines(file, lines, first, separator))
     if separator != ",":
-        rows[1:] = [(line, [with_point(cell) for cell in cells]) for line, cells in rows[1:]]
+        signs = DecimalSigns(file)
+        rows[1:] = [(line, [signs.read(line, cell) for cell in cells]) for line, cells in rows[1:]]
     return rows
 
 
@@ -263,6 +264,26 @@ def split_lines(file: Path, lines: list[str], first: int, separator: str) -> Ite
 def with_point(cell: str) -> str:
     """A number with a decimal comma, with a point."""
     return _DECIMAL_COMMA.sub(r"\1.", cell)
+
+
+class DecimalSigns:
+    """The decimal sign of a table, a comma or a point: of one with both, either may group the digits of thousands."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.first: dict[str, tuple[int, str]] = {}
+
+    def read(self, line: int, cell: str) -> str:
+        """A cell with a point; raise `InputError` for the first whose sign is not that of those before."""
+        if match := _FRACTION.fullmatch(cell):
+            self.first.setdefault(match[1], (line, cell))
+            if len(self.first) > 1:
+                ((number, other),) = (place for sign, place in self.first.items() if sign != match[1])
+                raise InputError(
+                    f"{self.file}:{line}: got {cell!r}, and {other!r} in line {number}; a comma is a decimal sign or "
+                    "groups digits, not both; write all numbers with one decimal sign, and group no digits"
+                )
+        return with_point(cell)
 
 
 def split_title(title: str) -> tuple[str, str]:

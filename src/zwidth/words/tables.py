@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import read_lines, split_lines, split_title, with_point
+from zwidth.words.formatting import DecimalSigns, read_lines, split_lines, split_title, with_point
 from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, SPEED, TIME, TORQUE, looks_like_number
 
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
@@ -263,6 +263,9 @@ def _read_quickly(lines: list[str], layout: _Layout, count: int, places: Sequenc
     """Columns by NumPy's reader; None where there is anything that it does not read, to be told line by line."""
     begin, separator = layout.begin, layout.separator
     clocks = _find_clocks(lines, layout, places)
+    if separator != "," and all(any(sign in line for line in islice(lines, begin, None)) for sign in ",."):
+        # Cell by cell, so that numbers with either are told.
+        return None
     if separator == " ":
         wide = max(len(line.split()) for line in lines[begin:])
     else:
@@ -294,14 +297,14 @@ def _read_each(
         rows = ((k + 1, lines[k].split()) for k in range(layout.begin, len(lines)) if lines[k].strip())
     else:
         rows = split_lines(file, lines, layout.begin, separator)
-    clocks = _find_clocks(lines, layout, places)
+    clocks, signs = _find_clocks(lines, layout, places), DecimalSigns(file)
     for number, cells in rows:
         if any(cells[len(heads) :]):
             hint = "; a comma as decimal sign needs semicolons between the columns" if separator == "," else ""
             raise InputError(f"{file}:{number}: got {len(cells)} cells for {len(heads)} columns{hint}")
         for column, at in zip(found, places, strict=True):
             got = cells[at] if at < len(cells) else ""
-            value = _read_number(got if separator == "," else with_point(got), kind)
+            value = _read_number(got if separator == "," else signs.read(number, got), kind)
             if not _is_time(got) if at in clocks else value is None:
                 wanted = "a time such as 2024-05-01T12:00:00.001" if at in clocks else "a number"
                 raise InputError(
