@@ -63,6 +63,8 @@ def draw_curves(
             dots = style.POINTS if whole_numbers else {"marker": "o" if few else "", "markersize": 3.5}
             ax.plot(data[x].values, values, label=label, **look | dots)
         grid.scale_axis(ax, "x", data[x])
+        if whole_numbers:
+            style.use_whole(ax)
         ax.margins(y=0.06)
         if output.logarithmic:
             # Panels share the axis: ticks that fit all of them.

@@ -50,6 +50,8 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         ax.set_xlabel(label)
         values = select(table, estimate=kind)[over]
         style.use_logarithmic(ax, "y", table[_STIFFNESS], style.DECADES)
+        if over == "samples":
+            style.use_whole(ax)
         if kind == "low_pass" or grid.logarithmic(np.unique(values)):
             style.use_logarithmic(ax, "x", values, style.DECADES)
     panels[0].set_ylabel(words)

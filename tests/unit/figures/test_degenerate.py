@@ -28,6 +28,15 @@ def test_nothing_is_stable(name, value):
     ax.figure.draw_without_rendering()
 
 
+def test_between_whole_numbers_there_are_no_ticks():
+    sweep = xarray.Dataset(
+        {"stiffness_max": ("actuator_order", [2e3, 1e3]), "ridge_status": ("actuator_order", [0, 0])}
+    )
+    (ax,) = figures.draw_curves(sweep.assign_coords(actuator_order=[1, 2]), "stiffness_max")
+    ax.figure.draw_without_rendering()
+    assert set(np.mod(ax.get_xticks(), 1)) == {0.0}
+
+
 def test_what_is_zero_has_no_place_on_a_logarithmic_axis():
     margin = np.where(AXES["virtual_damping"] > 4.0, 2e-5 * AXES["virtual_damping"], 0.0)
     (ax,) = figures.draw_curves(over_walls("delay_margin", margin * np.ones((9, 1))).isel(stiffness=0), "delay_margin")

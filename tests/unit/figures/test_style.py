@@ -47,7 +47,18 @@ def test_the_look_is_a_style_of_matplotlib():
 
 
 @pytest.mark.parametrize(
-    "low, high", [(2.1, 4.9), (7.0, 19.0), (1.1, 1.9), (2.0, 8.0), (2.1, 10.4), (0.3, 40.0), (1e-3, 1e4)]
+    "low, high",
+    [
+        (2.1, 4.9),
+        (9.3, 11.7),
+        (99.0, 101.0),
+        (7.0, 19.0),
+        (1.1, 1.9),
+        (2.0, 8.0),
+        (2.1, 10.4),
+        (0.3, 40.0),
+        (1e-3, 1e4),
+    ],
 )
 def test_a_logarithmic_axis_has_plain_numbers(low, high):
     (ax,) = style.panels(None, 1, 5.0, 3.0)
