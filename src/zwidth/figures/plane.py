@@ -331,7 +331,14 @@ def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, l
 
 
 @style.house_style()
-def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | None = None) -> np.ndarray:
+def draw_workspace(
+    table: Table,
+    across: str,
+    up: str,
+    axes: style.AnyAxes | None = None,
+    *,
+    names: tuple[tuple[str, str], tuple[str, str]] | None = None,
+) -> np.ndarray:
     """Draw the stiffest stable wall over two coordinates of a device's pose, the weakest pose marked.
 
     Poses on a grid are a surface with contours, others dots.
@@ -341,9 +348,11 @@ def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | Non
         across: the column from left to right.
         up: the one from bottom to top.
         axes: an Axes of yours.
+        names: name and unit of both, "" of no unit; where left out, a column's unit is behind its last underscore.
     """
     (ax,) = panels = style.panels(axes, 1, 5.9, 4.3)
-    wanted = next(str(name) for name in table if str(name).startswith("stiffness_"))
+    # Behind the coordinates, which may be called anything.
+    wanted = [str(name) for name in table if str(name).startswith("stiffness_")][-1]
     x, y, stiffness = (np.asarray(table[name], float) for name in (across, up, wanted))
     factor, unit = style.si_unit(stiffness, "N/m")
     # A pose without an answer stays empty, which no smooth shading can show.
@@ -361,7 +370,8 @@ def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | Non
     else:
         image = ax.scatter(x, y, c=factor * stiffness, s=9.0, norm=norm, label="poses")
     ax.plot(x[weakest], y[weakest], linestyle="", label="weakest pose", clip_on=False, zorder=5, **_PEAK)
-    ax.set(**{f"{which}label": _spell(name) for which, name in (("x", across), ("y", up))})
+    for which, (name, own) in zip("xy", names or map(_split_column, (across, up)), strict=True):
+        ax.set(**{f"{which}label": style.literal(name) + (f"  in {style.literal(own)}" if own else "")})
     label = rf"maximum stable stiffness  $K_{{\max}}$  in {unit}"
     bar = style.figure_of(panels).colorbar(image, ax=ax, label=label)
     style.use_logarithmic(bar.ax, "y", factor * stiffness)
@@ -369,7 +379,7 @@ def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | Non
     return panels
 
 
-def _spell(column: str) -> str:
-    """The name of a column and its unit as an axis has them."""
+def _split_column(column: str) -> tuple[str, str]:
+    """The name of a column and its unit, as it is likely to be written."""
     name, _, unit = column.rpartition("_")
-    return f"{style.literal(name.replace('_', ' '))}  in {unit}" if name else column
+    return (name.replace("_", " "), unit) if name else (column, "")
