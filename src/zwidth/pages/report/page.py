@@ -123,7 +123,8 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
 
 def _section(where: Path, entry: dict[str, Any]) -> str:
     kind, name = str(entry["kind"]), escape(str(entry["name"]))
-    notes = "".join(f"<p>{escape(str(note))}</p>" for note in entry.get("notes", ()))
+    said = [*entry.get("answer", ()), *entry.get("notes", ())]
+    notes = "".join(f"<p>{escape(str(each))}</p>" for each in said)
     method = f'<p class="soft">{escape(KINDS[kind].method)}</p>' if kind in KINDS and KINDS[kind].method else ""
     body = "".join(_contents(where, entry))
     listed = ", ".join(escape(file) for file in sorted(entry.get("files", {})))
