@@ -223,7 +223,9 @@ def _draw_maxima(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
     style.label_ends(ax, costs, [cost.alpha_max[-1] for cost in costs], colors)
     ax.set_ylabel(style.ALPHA_LABEL)
     stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")
-    ax.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc="upper left")
+    # Single dots are in the middle, and curves rise to the right.
+    place = "upper left" if costs[0].delta.size > 1 else "center left"
+    ax.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc=place)
 
 
 def _draw_share(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:

@@ -55,6 +55,8 @@ DECADES = 3000.0  # from so many times its least value on, an axis of stiffnesse
 PNG_DPI = 180
 # Values closer together than this have but one or two of 1, 2 and 5 among them.
 _FEW = 5.0
+# How far an axis goes on either side of a single value.
+_AROUND = 2.0
 
 # Dates and versions out of the files, for the same figure is to give the same bytes.
 _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
@@ -168,8 +170,11 @@ class _PlainLocator(LogLocator):
     def tick_values(self, vmin: float, vmax: float) -> Any:
         ticks = np.asarray(super().tick_values(vmin, vmax))
         low, high = sorted((vmin, vmax))
-        few = np.count_nonzero((low <= ticks) & (ticks <= high)) < 2
-        return AutoLocator().tick_values(low, high) if few and low > 0 else ticks
+        if low <= 0 or np.count_nonzero((low <= ticks) & (ticks <= high)) > 1:
+            return ticks
+        # Of very many decades matplotlib marks none of 2 and 5, and then no power of ten either.
+        wide = LogLocator() if high > 10.0 * low else AutoLocator()
+        return wide.tick_values(low, high)
 
 
 def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> None:
@@ -177,6 +182,9 @@ def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> N
     getattr(ax, f"set_{which}scale")("log")
     axis, known = getattr(ax, f"{which}axis"), np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known) & (known > 0)]
+    if known.size and known.min() == known.max():
+        # A single value would have decades around it.
+        getattr(ax, f"set_{which}lim")(known[0] / _AROUND, known[0] * _AROUND)
     near = not known.size or known.max() < wide * known.min()
     few = known.size and known.max() < _FEW * known.min()
     axis.set_major_locator(

@@ -87,14 +87,14 @@ def round_safely(value: float, enough: str, digits: int = 4) -> float:
     return steps * step
 
 
-def count_digits(holds: Callable[[int], Any]) -> int:
-    """The fewest digits of a printed number, from 4 on, with which something holds."""
-    return next((digits for digits in range(4, 17) if holds(digits)), 17)
+def count_digits(holds: Callable[[int], Any], least: int = 4) -> int:
+    """The fewest digits of a printed number, from 4 or so on, with which something holds."""
+    return next((digits for digits in range(least, 17) if holds(digits)), 17)
 
 
-def count_digits_apart(values: list[float]) -> int:
-    """The fewest digits, from 4 on, that tell different numbers apart."""
-    return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)))
+def count_digits_apart(values: list[float], least: int = 4) -> int:
+    """The fewest digits, from 4 or so on, that tell different numbers apart."""
+    return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)), least)
 
 
 def spell_stiffness(value: float, digits: int = 4) -> str:

@@ -52,3 +52,26 @@ def test_colors_and_contours_of_numbers_close_together_are_named_in_plain_number
     bar = ax.figure.axes[-1]
     assert read_ticks(bar) == ["200", "300"]
     assert len([text for text in ax.texts if text.get_text() in ("200", "220", "240", "260")]) >= 3
+
+
+def test_a_motion_that_is_over_at_once_has_an_axis_of_time(recwarn):
+    columns = ("time_s", "position_m", "velocity_m_per_s", "wall_force_N", "contact")
+    energies = [f"{name}_J" for name in ("wall_work", "push_work", "damping_loss", "friction_loss", "energy")]
+    table = {"label": np.array(["still"]), **{name: np.zeros(1) for name in (*columns, *energies)}}
+    for draw in (figures.draw_motion, figures.draw_energy):
+        assert draw(table)[0].get_xlim() == (0.0, 1.0)
+    assert not recwarn.list
+
+
+def test_wanted_stiffnesses_close_together_are_told_apart():
+    wanted = np.array([11.1e3, 11.13e3, 11.138e3])
+    curve = {"parameter": np.array(["delay"] * 2), "value_s": np.array([1e-4, 1e-2]), "stiffness_N_per_m": [4e4, 1e3]}
+    required = {"stiffness_N_per_m": wanted, "reserve": np.ones(3), "present_s": np.full(3, 1e-3)}
+    required |= {
+        "value_s": np.full(3, 1e-3),
+        "enough": np.array(["below"] * 3),
+        "other_crossings_s": np.array([""] * 3),
+    }
+    (ax,) = figures.draw_requirement(curve, required)
+    names = [text.get_text() for text in ax.figure.legends[0].get_texts()]
+    assert names[:3] == ["11.1 kN/m", "11.13 kN/m", "11.14 kN/m"]

@@ -71,6 +71,22 @@ def test_a_logarithmic_axis_has_plain_numbers(low, high):
     assert [float(tick.get_text()) for tick in shown] == pytest.approx([tick.get_position()[0] for tick in shown])
 
 
+def test_a_logarithmic_axis_of_one_value_is_near_it():
+    (ax,) = style.panels(None, 1, 5.0, 3.0)
+    style.use_logarithmic(ax, "x", [100.0])
+    assert ax.get_xlim() == (50.0, 200.0)
+
+
+def test_many_decades_have_their_powers_of_ten_where_two_and_five_have_no_room():
+    (ax,) = style.panels(None, 1, 5.0, 3.0)
+    style.use_logarithmic(ax, "x", (1.0, 2000.0), style.DECADES)
+    ax.set_xlim(1e-12, 2.0)
+    style.figure_of(ax).draw_without_rendering()
+    shown = [tick for tick in ax.get_xticks() if 1e-12 <= tick <= 2.0]
+    assert len(shown) > 2
+    np.testing.assert_allclose(np.log10(shown), np.round(np.log10(shown)), atol=1e-9)
+
+
 @pytest.mark.parametrize(
     "values, expected",
     [
