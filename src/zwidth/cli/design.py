@@ -34,7 +34,14 @@ _TOLERANCE = Parsed(
 @cli.command()
 @scene_options(wall=True, required=True)
 @click.option("--find", type=click.Choice(tuple(_FINDS)), help="What to choose for the stiffness.")
-@click.option("--tolerance", "tolerances", type=_TOLERANCE, multiple=True, callback=read_pairs, help="As mass=10%; may be repeated.")
+@click.option(
+    "--tolerance",
+    "tolerances",
+    type=_TOLERANCE,
+    multiple=True,
+    callback=read_pairs,
+    help="As mass=10%; may be repeated.",
+)
 @click.option(
     "--distribution",
     type=click.Choice(("uniform", "normal")),

@@ -224,7 +224,13 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 
 @cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--at", multiple=True, type=_SLICE, callback=read_pairs, help="Draw this slice, as in --at delta=0.1 --at delay=1ms.")
+@click.option(
+    "--at",
+    multiple=True,
+    type=_SLICE,
+    callback=read_pairs,
+    help="Draw this slice, as in --at delta=0.1 --at delay=1ms.",
+)
 @click.option("--x", metavar="NAME", help="The parameter from left to right.")
 @click.option("--y", metavar="NAME", help="The parameter from bottom to top, of a plane.")
 @click.option("--hue", metavar="NAME", help="Draw curves, one for each value of this parameter.")
