@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
-from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
+from zwidth.cli.options import Parsed, flag_of, json_option, read_pairs, read_share, scene_options
 from zwidth.pages.words import row, tell
 from zwidth.words.formatting import count_digits, name_wall, plain, round_safely, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS
@@ -34,7 +34,14 @@ _TOLERANCE = Parsed(
 @cli.command()
 @scene_options(wall=True, required=True)
 @click.option("--find", type=click.Choice(tuple(_FINDS)), help="What to choose for the stiffness.")
-@click.option("--tolerance", "tolerances", type=_TOLERANCE, multiple=True, help="As mass=10%; may be repeated.")
+@click.option(
+    "--tolerance",
+    "tolerances",
+    type=_TOLERANCE,
+    multiple=True,
+    callback=read_pairs,
+    help="As mass=10%; may be repeated.",
+)
 @click.option(
     "--distribution",
     type=click.Choice(("uniform", "normal")),
@@ -45,7 +52,7 @@ _TOLERANCE = Parsed(
 @click.option("--samples", type=int, help="Devices drawn; 10,000, or 200 of a scene with parts.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the draws.")
 @json_option
-def design(scene: Any, find: str | None, tolerances: tuple[Any, ...], as_json: bool, **drawn: Any) -> None:
+def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: bool, **drawn: Any) -> None:
     """Say what a wanted stiffness needs, or what tolerances cost.
 
     With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given;
@@ -55,7 +62,7 @@ def design(scene: Any, find: str | None, tolerances: tuple[Any, ...], as_json: b
     """
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")
-    shares, uniform = dict(tolerances), drawn["distribution"] == "uniform"
+    shares, uniform = tolerances, drawn["distribution"] == "uniform"
     provable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
     parts = {
         "required": _require(scene, find) if find is not None else None,

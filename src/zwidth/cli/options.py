@@ -314,6 +314,16 @@ def log_options(command: Command) -> Command:
     return command
 
 
+def read_pairs(context: click.Context, option: click.Parameter, pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Values by their names of an option that may be repeated, each name once."""
+    found: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in found:
+            raise click.BadParameter(f"got {name!r} twice; give each name once", context, option)
+        found[name] = value
+    return found
+
+
 def save_figure(drawn: Any, file: Path) -> str:
     """Write a picture to the file that an option names; returns the line that says so."""
     from zwidth.figures import save

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from zwidth.cli.commands import EXIT_FAILED, cli
-from zwidth.cli.options import Parsed, json_option
+from zwidth.cli.options import Parsed, json_option, read_pairs
 from zwidth.pages.words import print_folded, print_json, row
 from zwidth.words.errors import ResourceError
 from zwidth.words.formatting import plain
@@ -224,7 +224,13 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 
 @cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--at", multiple=True, type=_SLICE, help="Draw this slice, as in --at delta=0.1 --at delay=1ms.")
+@click.option(
+    "--at",
+    multiple=True,
+    type=_SLICE,
+    callback=read_pairs,
+    help="Draw this slice, as in --at delta=0.1 --at delay=1ms.",
+)
 @click.option("--x", metavar="NAME", help="The parameter from left to right.")
 @click.option("--y", metavar="NAME", help="The parameter from bottom to top, of a plane.")
 @click.option("--hue", metavar="NAME", help="Draw curves, one for each value of this parameter.")
@@ -238,7 +244,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
 @json_option
-def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_json: bool, **drawing: Any) -> None:
+def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, **drawing: Any) -> None:
     """Draw the sweeps in DIR, as PNG and SVG.
 
     Stable and passive walls with their boundaries, contours of margins and decay times, surfaces of the stiffest
@@ -250,7 +256,7 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
     axes = {role: drawing.pop(role) for role in ("x", "y", "hue", "col")}
     told: dict[str, Any] = {"note": lambda text: click.echo(f"zwidth: {text}", err=True)}
     told |= {} if as_json else {"progress": lambda file: click.echo(f"wrote {file}")}
-    files = draw_stores(folder, out, at=dict(at), axes=axes, **drawing, **told)
+    files = draw_stores(folder, out, at=at, axes=axes, **drawing, **told)
     if as_json:
         print_json({"files": [str(file) for file in files]})
     if not files:

@@ -18,8 +18,8 @@ from zwidth.config.values import quantity_of, read_entries, share
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, resembling, suggestion
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.tables import holds_data, read_lines, split_lines, split_title, with_point
-from zwidth.words.units import looks_like_number
+from zwidth.words.tables import DecimalSigns, holds_data, read_lines, split_lines
+from zwidth.words.units import looks_like_number, split_title
 
 LABEL = "label"
 MAX_ROWS = 100_000
@@ -150,10 +150,12 @@ def _read_rows(name: str) -> list[tuple[int, list[str]]]:
         separator = next((mark for mark in "\t;" if mark in "".join(lines[first : first + 1])), ",")
         rows = [row for row in split_lines(file, lines, first, separator) if not row[1][0].startswith("#")]
         if separator != ",":
-            rows[1:] = [(line, [with_point(cell) for cell in cells]) for line, cells in rows[1:]]
+            signs = DecimalSigns(file)
+            rows[1:] = [(line, [signs.read(line, cell) for cell in cells]) for line, cells in rows[1:]]
     except InputError as error:
-        what, _, remedy = str(error).partition("; ")
-        raise problem(printable(what), "names are relative to this file", remedy) from None
+        what, *allowed, remedy = str(error).split("; ", 2)
+        allowed = allowed[0] if allowed else "names are relative to this file"
+        raise problem(printable(what), allowed, remedy) from None
     if len(rows) < 2:
         raise problem(f"{printable(name)} has {len(rows)} rows", "a header and one row at least", "fill the file")
     return rows

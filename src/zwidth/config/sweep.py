@@ -49,7 +49,10 @@ MAX_SWEEP_POINTS = 10**12
 
 _EXAMPLES = {
     "velocity": "velocity: {kind: low_pass, cutoff: 100 Hz}",
+    "velocity.samples": "velocity: {kind: windowed_difference, samples: 5}",
+    "velocity.time_constant": "velocity: {kind: low_pass, time_constant: 2 ms}",
     "coupling": "coupling: {mass: 50 g, stiffness: 20 kN/m}",
+    "modes": "modes: [{frequency: 120 Hz, damping_ratio: 0.03, mass: 2 kg}]",
 }
 
 
@@ -287,7 +290,7 @@ class SweepStudy(_Parts, HeldStudy):
         for name in absent:
             part, _, key = name.partition(".")
             what = f"got the axis {name!r}, but no {part} with the key {key!r}"
-            remedy = f"add {_EXAMPLES.get(part, part)!r}"
+            remedy = f"add {_EXAMPLES.get(name, _EXAMPLES.get(part, part))!r}"
             yield ("axes", self.axes.place(name)), problem(what, "an axis changes a part that is there", remedy)
         # Every parameter at its least value, and those of parts at their ends.
         least = {name: self.axes.ends(name)[0] for name in self.axes.given if name not in WALL}

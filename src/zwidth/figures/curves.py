@@ -56,13 +56,17 @@ def draw_curves(
     whole = np.concatenate([part[name].values.ravel() for part in parts])
     for part, ax in zip(parts, panels, strict=False):
         curves = [part.isel({several[0]: k}) for k in picked] if several else [part]
-        shown = [np.where(np.isfinite(curve[name].values), curve[name].values, np.nan) for curve in curves]
+        known = np.stack([curve[name].values for curve in curves])
+        # There is no place for 0 on a logarithmic axis, as of the delay margin of an unstable wall.
+        shown = np.where(np.isfinite(known) & ((known > 0) | (not output.logarithmic)), known, np.nan)
         for values, label, look in zip(shown, labels, looks, strict=True):
             dots = style.POINTS if whole_numbers else {"marker": "o" if few else "", "markersize": 3.5}
             ax.plot(data[x].values, values, label=label, **look | dots)
         grid.scale_axis(ax, "x", data[x])
+        if whole_numbers:
+            style.use_whole(ax)
         ax.margins(y=0.06)
-        if output.look in ("logarithmic", "steep"):
+        if output.logarithmic:
             # Panels share the axis: ticks that fit all of them.
             style.use_logarithmic(ax, "y", whole)
         if output.look == "diverging":

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
-from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, select
-from zwidth.words.formatting import ENOUGH, header, round_safely, spell_enough
+from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, in_order, select
+from zwidth.words.formatting import ENOUGH, count_digits_apart, header, round_safely, spell_enough
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 
@@ -41,7 +41,7 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     for ax, kind in zip(panels, kinds, strict=False):
         over, label = _OVER[kind]
         for damping, color in colors.items():
-            rows = select(table, damping_N_s_per_m=damping, estimate=kind)
+            rows = in_order(select(table, damping_N_s_per_m=damping, estimate=kind), over)
             look = {"color": color, "label": f"b = {damping:g}", **(style.POINTS if over == "samples" else _dots(rows))}
             ax.plot(rows[over], rows[_STIFFNESS] * factor, **look)
             (bare,) = select(table, damping_N_s_per_m=damping, estimate="backward_difference")[_STIFFNESS]
@@ -50,6 +50,8 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         ax.set_xlabel(label)
         values = select(table, estimate=kind)[over]
         style.use_logarithmic(ax, "y", table[_STIFFNESS], style.DECADES)
+        if over == "samples":
+            style.use_whole(ax)
         if kind == "low_pass" or grid.logarithmic(np.unique(values)):
             style.use_logarithmic(ax, "x", values, style.DECADES)
     panels[0].set_ylabel(words)
@@ -75,7 +77,7 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
     handles: list[Any] = []
     for damping, color in colors.items():
         for kind, (dash, marker, _) in kinds.items():
-            rows = select(table, damping_N_s_per_m=damping, estimate=kind)
+            rows = in_order(select(table, damping_N_s_per_m=damping, estimate=kind), _NOISE)
             mark = {"marker": marker, "markersize": 4.5} if marker else _dots(rows)
             look = {"linestyle": dash, "color": color, "label": f"{kind}, b = {damping:g}", **mark}
             ax.plot(rows[_NOISE] * speed, rows[_STIFFNESS] * factor, **look)
@@ -83,7 +85,7 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
         handles.append(style.line(rf"$b = {damping:g}$ {own_unit('N s/m')}{best}", color=color))
     if np.isfinite(limit):
         ax.axvline(limit * speed, color=style.GRAY, linewidth=0.9, linestyle=style.DASHED, zorder=0.5, label="limit")
-    style.use_logarithmic(ax, "x", speed * np.asarray(table[_NOISE]), style.DECADES)
+    style.use_logarithmic(ax, "x", speed * np.append(table[_NOISE], limit), style.DECADES)
     style.use_logarithmic(ax, "y", table[_STIFFNESS], style.DECADES)
     ax.set(xlabel=rf"noise of the velocity  $\sigma_v$  in {spelled}", ylabel=words)
     handles += [style.line(words, dash, marker=marker, markersize=4.5) for dash, marker, words in kinds.values()]
@@ -171,8 +173,9 @@ def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[f
     """What each dashed line stands for: the wanted stiffness, its reserve, and the share of devices that bear it."""
     borne = "stable_share" in required
     shares = required["stable_share"] if borne else np.full(len(required["reserve"]), np.nan)
+    digits = count_digits_apart(np.asarray(required[SI_COLUMNS[0]]).tolist(), 3)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
-        words = f"{wanted * factor:.3g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
+        words = f"{wanted * factor:.{digits}g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
         # Not 100 % where one of many does not.
         percent = f"{round_safely(100.0 * share, 'below', 3):.3g}"
         yield wanted * reserve, words + (f": {percent} % of devices bear it" if np.isfinite(share) else "")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,6 +17,8 @@ from zwidth.words.status import Status
 
 if TYPE_CHECKING:
     import xarray
+
+    Data = TypeVar("Data", xarray.Dataset, xarray.DataArray)
 
 # The color of a panel where it shows nothing.
 MISSING = "#D9D9D9"
@@ -57,18 +59,24 @@ def choose_axes(
     return [dim for dim in axes if dim is not None]
 
 
+def in_order(data: Data) -> Data:
+    """Results by rising values of every parameter, which a sweep may have in any order; devices as they are."""
+    mixed = [dim for dim, index in data.indexes.items() if dim != "device" and not index.is_monotonic_increasing]
+    return data.sortby(mixed) if mixed else data
+
+
 def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
     """Some variables of one family as they are drawn.
 
-    Only dimensions with two values or more remain, single values of the others beside them. All is in units with few
-    digits, which the attribute ``units`` names. What was not computed is NaN; truth values are 0 and 1.
+    Only dimensions with two values or more remain, in rising order, single values of the others beside them. All is in
+    units with few digits, which the attribute ``units`` names. What was not computed is NaN; truth values are 0 and 1.
     """
     family = OUTPUTS[names[0]].family
     status = STATUS_OF[family]
     data = data[[*names, status]]
     beside = [name for name, values in data.coords.items() if values.ndim and name not in data.dims]
     beside += [name for name in WALL if family == "device" and name not in data.dims]
-    data = data.drop_vars(beside, errors="ignore").squeeze()
+    data = in_order(data.drop_vars(beside, errors="ignore").squeeze())
     for name in names:
         values, output = data[name], OUTPUTS[name]
         if output.dtype == "bool":
@@ -76,7 +84,7 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
         elif output.dtype == "float64":
             # Two digits of the first slice are enough to choose a prefix.
             part = values.isel({dim: slice(0, 1) for dim in values.dims[:-2]}).values
-            part = np.abs(part[np.isfinite(part)])
+            part = np.abs(part[np.isfinite(part) & (part != 0)])
             middle = np.median(part) if part.size else 1.0
             factor, unit = style.si_unit(middle, str(values.attrs.get("units", "1")))
             values = (values * factor).where(data[status] != NOT_COMPUTED).assign_attrs(units=unit)

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
 from zwidth.figures import grid, style
-from zwidth.figures.table import Table, curves, draws_tables
+from zwidth.figures.table import Table, curves, draws_tables, grid_in_order
 from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import count_digits_apart, header, with_unit
 from zwidth.words.quantities import FIELDS
@@ -43,6 +43,7 @@ def draw_limit_cycles(
         bounds: amplitudes between which a motion counts as a buzz, in m.
         axes: Axes of yours, one for each condition.
     """
+    arrays = grid_in_order(arrays, [name for name in AXES if name in arrays])
     labels = arrays["condition"].tolist()
     across, along = (name for name in AXES if name in arrays)
     columns = len(labels) if len(labels) <= 3 else 2
@@ -109,6 +110,7 @@ def draw_limit_cycle_curves(
         family: the name of the parameter that has a curve for each of its values; "" where there is none.
         axes: Axes of yours, those of the amplitudes first.
     """
+    arrays = grid_in_order(arrays, [name for name in AXES if name in arrays])
     labels = arrays["condition"].tolist()
     (over,) = (name for name in AXES if name in arrays and name != family)
     size = (max(1.0 + 2.7 * len(labels), 5.8), 4.8)

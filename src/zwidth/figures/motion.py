@@ -125,7 +125,7 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
                 ax.plot(each.time_s * clock, getattr(each, other) * factor, label=f"{other}, {each.label}", **look)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=2)
         ax.set_ylabel(f"{words}  in {unit}")
-        ax.set_xlim(0.0, max(float(each.time_s[-1]) for each in motions) * clock)
+        _begin_at_zero(ax, max(float(each.time_s[-1]) for each in motions) * clock)
     _mark_wall(panels[0], "y", motions)
     panels[-1].set_xlabel(f"time  $t$  in {second}")
     _explain(panels, motions, *([style.line("bodies behind links", width=0.6)] if behind else []), outside=axes is None)
@@ -180,7 +180,7 @@ def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
             values = getattr(each, name) * factor
             ax.plot(each.time_s * clock, values, color=color, linestyle=dash, linewidth=1.2, label=words)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=1)
-        ax.set_xlim(0.0, float(each.time_s[-1]) * clock)
+        _begin_at_zero(ax, float(each.time_s[-1]) * clock)
         title = _in_math(each.label).replace(", ", "\n" if columns > 1 else ", ")
         ax.set(title=title, xlabel=f"time  $t$  in {second}", ylabel=f"energy  in {joule}")
     handles = [style.line(words, dash, 1.2, color) for words, color, dash in (_ENERGIES[name] for name in shown)]
@@ -196,6 +196,11 @@ def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
         each.label = style.literal(each.label[0])
         each.look = style.look(k)
     return motions
+
+
+def _begin_at_zero(ax: Axes, end: float) -> None:
+    """The axis of a time; of one instant as of a motion that is over at once it has any end."""
+    ax.set_xlim(0.0, end or 1.0)
 
 
 def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[float, str]:

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from zwidth.figures import grid, style
 from zwidth.figures.plane import Panel, draw_panels, panel_grid
 from zwidth.figures.stable_set import Outlines, draw_zeros, mark_wall, shade_region
-from zwidth.figures.table import Table, curves, draws_tables, select, si_scale
+from zwidth.figures.table import Table, curves, draws_tables, grid_in_order, select, si_scale
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import round_safely
 from zwidth.words.quantities import OUTPUTS
@@ -41,8 +41,8 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     """
     ax = ax or style.panels(None, 1, 5.4, 4.1)[0]
     assert ax is not None
-    stable = curves(table, "d", "delay_model", curve="stable")
-    passive = curves(table, "d", curve="passive")
+    stable = curves(table, "d", "delay_model", over="delta", curve="stable")
+    passive = curves(table, "d", over="delta", curve="passive")
     colors = style.color_by_value([interval.d for interval in stable])
     for interval in stable:
         if interval.delay_model == "held":
@@ -109,7 +109,7 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
     delta = np.asarray(table["delta"])
     end = share * float(delta.max())
     columns = {name: column[delta <= end * (1.0 + 1e-12)] for name, column in select(table).items()}
-    shown = curves(columns, "d", "delay_model")
+    shown = curves(columns, "d", "delay_model", over="delta")
     colors = style.color_by_value([path.d for path in shown])
     for path in shown:
         _draw_curve(ax, path, path.delta, path.alpha_max, colors, "alpha_max")
@@ -145,7 +145,7 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
         axes: an Axes of yours for the first panel alone, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2, gridspec_kw={"width_ratios": [1.15, 1.0]})
-    paths, models = curves(table, "d", "delay_model"), curves(slopes, "delay_model")
+    paths, models = curves(table, "d", "delay_model", over="delta"), curves(slopes, "delay_model")
     colors = style.color_by_value([path.d for path in paths])
     for path in paths:
         own = next(model for model in models if model.delay_model == path.delay_model)
@@ -199,7 +199,7 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
         axes: an Axes of yours for the two maxima alone, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2)
-    costs = curves(table, "d")
+    costs = curves(table, "d", over="delta")
     colors = style.color_by_value([cost.d for cost in costs])
     maxima, *shares = panels
     for cost in costs:
@@ -214,7 +214,9 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     style.label_ends(maxima, costs, [cost.alpha_max[-1] for cost in costs], colors)
     maxima.set_ylabel(style.ALPHA_LABEL)
     stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")
-    maxima.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc="upper left")
+    # Single dots are in the middle, and curves rise to the right.
+    place = "upper left" if costs[0].delta.size > 1 else "center left"
+    maxima.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc=place)
     for ax in shares:
         ax.set(ylim=(0.0, 100.0), ylabel=r"stiffest passive wall in % of $\alpha_{\max}$")
         style.label_ends(ax, costs, [100.0 * cost.alpha_max_passive[-1] / cost.alpha_max[-1] for cost in costs], colors)
@@ -354,6 +356,8 @@ def draw_map(
         edges: gives the exact edge of what is stable, or for "passive" passive, at a delta and d, drawn in place of
             that of the cells where all cells agree with it.
     """
+    scale = si_scale(arrays)
+    arrays = grid_in_order(arrays, ("alpha", "beta", "delta", "d"))
     delta, d = arrays["delta"], arrays["d"]
     rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
     places = list(product(rows, columns))
@@ -368,6 +372,6 @@ def draw_map(
         ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")
     style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)
     draw_panels(panels, shown, output, rf"{OUTPUTS[output].words}  ${OUTPUTS[output].symbol}$", outside=axes is None)
-    if len(places) == 1 and (scale := si_scale(arrays)) is not None:
+    if len(places) == 1 and scale is not None:
         style.add_si_axes(panels[0], scale)
     return panels

@@ -35,6 +35,8 @@ _FINITE_IF_STABLE = ("settling_time", "delay_margin")
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 # Beyond this multiple of the smallest, a output that grows without end has one color.
 _STEEP = 100.0
+# A color bar of fewer decades than this has 2 and 5 between them.
+_FEW_TICKS = 1000.0
 # A region that fills less of its panel than this has no room for labels.
 _LABELLED = 0.1
 # Less than this cannot be seen.
@@ -128,6 +130,7 @@ def _add_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xa
     names = dict(zip((x, y), _PEAKS.get(x, ()), strict=False))
     if y not in ("beta", "virtual_damping") or not names or not all(name in data for name in names.values()):
         return drawn
+    data = grid.in_order(data)
     peaks = {dim: data[name].squeeze().variable * drawn[dim].attrs["factor"] for dim, name in names.items()}
     return drawn.assign({f"{dim}_peak": peak for dim, peak in peaks.items()})
 
@@ -244,8 +247,9 @@ def draw_edge(ax: Axes, panel: Panel, name: str, **look: Any) -> list[np.ndarray
 def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
     """Round numbers at which contours are drawn."""
     low, high = float(values.min()), float(values.max())
-    if output.look in ("logarithmic", "steep"):
-        end = min(high, norm.vmax / 2.0) if output.look == "steep" else high
+    if output.logarithmic:
+        # Short of where a steep number rises without end, but not of the values where these are close together.
+        end = min(high, max(norm.vmax / 2.0, (low * high) ** 0.5)) if output.look == "steep" else high
         levels = np.asarray(LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, end))
         levels = levels[levels <= end]
     elif output.look == "diverging":
@@ -273,15 +277,16 @@ def _norm(panels: Sequence[Panel], name: str) -> Any:
         good, bad = sides if output.below else reversed(sides)
         span = max(good if good > 0 else bad, 1e-6)
         return TwoSlopeNorm(output.center, output.center - span, output.center + span)
-    if output.look in ("logarithmic", "steep"):
-        low = max(low, 1e-300)
+    if output.logarithmic:
+        low, high = _range(panels, name, least=1e-300) or (1.0, 10.0)
         high = min(high, _STEEP * low) if output.look == "steep" else high
         return LogNorm(low, max(high, 1.001 * low))
     return Normalize(low, high if high > low else low + 1.0)
 
 
-def _range(panels: Sequence[Panel], name: str) -> tuple[float, float] | None:
+def _range(panels: Sequence[Panel], name: str, least: float = -np.inf) -> tuple[float, float] | None:
     finite = np.concatenate([panel.variables[name].compressed() for panel in panels])
+    finite = finite[finite >= least]
     return (float(finite.min()), float(finite.max())) if finite.size else None
 
 
@@ -298,6 +303,8 @@ def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, l
         beyond = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
         extend = beyond[low < image.norm.vmin, high > image.norm.vmax]
         bar = axes[0].figure.colorbar(image, ax=list(axes), label=label, extend=extend)
+        if output.logarithmic:
+            style.use_logarithmic(bar.ax, "y", (image.norm.vmin, image.norm.vmax), _FEW_TICKS)
         bar.ax.tick_params(labelsize=8)
     exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
     if output.look == "diverging" or (exact and output.look != "truth"):
@@ -315,7 +322,14 @@ def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, l
 
 
 @style.house_style()
-def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | None = None) -> np.ndarray:
+def draw_workspace(
+    table: Table,
+    across: str,
+    up: str,
+    axes: style.AnyAxes | None = None,
+    *,
+    names: tuple[tuple[str, str], tuple[str, str]] | None = None,
+) -> np.ndarray:
     """Draw the stiffest stable wall over two coordinates of a device's pose, the weakest pose marked.
 
     Poses on a grid are a surface with contours, others dots.
@@ -325,9 +339,11 @@ def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | Non
         across: the column from left to right.
         up: the one from bottom to top.
         axes: an Axes of yours.
+        names: name and unit of both, "" of no unit; where left out, a column's unit is behind its last underscore.
     """
     (ax,) = panels = style.panels(axes, 1, 5.9, 4.3)
-    wanted = next(str(name) for name in table if str(name).startswith("stiffness_"))
+    # Behind the coordinates, which may be called anything.
+    wanted = [str(name) for name in table if str(name).startswith("stiffness_")][-1]
     x, y, stiffness = (np.asarray(table[name], float) for name in (across, up, wanted))
     factor, unit = style.si_unit(stiffness, "N/m")
     # A pose without an answer stays empty, which no smooth shading can show.
@@ -345,7 +361,8 @@ def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | Non
     else:
         image = ax.scatter(x, y, c=factor * stiffness, s=9.0, norm=norm, label="poses")
     ax.plot(x[weakest], y[weakest], linestyle="", label="weakest pose", clip_on=False, zorder=5, **_PEAK)
-    ax.set(**{f"{which}label": _spell(name) for which, name in (("x", across), ("y", up))})
+    for which, (name, own) in zip("xy", names or map(_split_column, (across, up)), strict=True):
+        ax.set(**{f"{which}label": style.literal(name) + (f"  in {style.literal(own)}" if own else "")})
     label = rf"maximum stable stiffness  $K_{{\max}}$  in {unit}"
     bar = style.figure_of(panels).colorbar(image, ax=ax, label=label)
     style.use_logarithmic(bar.ax, "y", factor * stiffness)
@@ -353,7 +370,7 @@ def draw_workspace(table: Table, across: str, up: str, axes: style.AnyAxes | Non
     return panels
 
 
-def _spell(column: str) -> str:
-    """The name of a column and its unit as an axis has them."""
+def _split_column(column: str) -> tuple[str, str]:
+    """The name of a column and its unit, as it is likely to be written."""
     name, _, unit = column.rpartition("_")
-    return f"{style.literal(name.replace('_', ' '))}  in {unit}" if name else column
+    return (name.replace("_", " "), unit) if name else (column, "")

@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import PREFIXES
@@ -54,6 +54,8 @@ DECADES = 3000.0  # from so many times its least value on, an axis of stiffnesse
 PNG_DPI = 180
 # Values closer together than this have but one or two of 1, 2 and 5 among them.
 _FEW = 5.0
+# How far an axis goes on either side of a single value.
+_AROUND = 2.0
 
 # Dates and versions out of the files, for the same figure is to give the same bytes.
 _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
@@ -161,18 +163,40 @@ def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, **keyword
             text.set_text(literal(fill(plain.replace("\0", "$"), max(int(0.9 * longest / share), 12))))
 
 
+class _PlainLocator(LogLocator):
+    """Ticks of a logarithmic axis, as of a linear one where there would not be two of them."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        ticks = np.asarray(super().tick_values(vmin, vmax))
+        low, high = sorted((vmin, vmax))
+        if low <= 0 or np.count_nonzero((low <= ticks) & (ticks <= high)) > 1:
+            return ticks
+        # Of very many decades matplotlib marks none of 2 and 5, and then no power of ten either.
+        wide = LogLocator() if high > 10.0 * low else AutoLocator()
+        return wide.tick_values(low, high)
+
+
 def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> None:
     """A logarithmic axis with plain numbers: 2 and 5 too unless positive values are as far apart, more of a few."""
     getattr(ax, f"set_{which}scale")("log")
     axis, known = getattr(ax, f"{which}axis"), np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known) & (known > 0)]
+    if known.size and known.min() == known.max():
+        # A single value would have decades around it.
+        getattr(ax, f"set_{which}lim")(known[0] / _AROUND, known[0] * _AROUND)
     near = not known.size or known.max() < wide * known.min()
     few = known.size and known.max() < _FEW * known.min()
     axis.set_major_locator(
-        LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if few else (1.0, 2.0, 5.0) if near else (1.0,))
+        _PlainLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if few else (1.0, 2.0, 5.0) if near else (1.0,))
     )
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def use_whole(ax: Axes) -> None:
+    """Ticks of whole numbers from left to right, where there is nothing between them."""
+    if ax.get_xscale() == "linear":
+        ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
 
 
 def label_ends(ax: Axes, found: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:

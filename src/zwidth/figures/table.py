@@ -59,17 +59,35 @@ def select(table: Table, **wanted: object) -> dict[str, np.ndarray]:
     return columns
 
 
-def curves(table: Table, *keys: str, **wanted: object) -> list[Any]:
+def in_order(columns: Mapping[str, np.ndarray], over: str) -> dict[str, np.ndarray]:
+    """The rows of a table by rising values of a column, which a study may have in any order."""
+    order = np.argsort(columns[over], kind="stable")
+    return {name: column[order] for name, column in columns.items()}
+
+
+def grid_in_order(arrays: Mapping[str, np.ndarray], axes: Iterable[str]) -> dict[str, np.ndarray]:
+    """Arrays by rising values of the named ones, along which the others run in the last dimensions of most."""
+    names, most = list(axes), max(values.ndim for values in arrays.values())
+    placed = dict(arrays)
+    for dimension, name in enumerate(names, start=most - len(names)):
+        order = np.argsort(arrays[name], kind="stable")
+        grids = {each: values.take(order, dimension) for each, values in placed.items() if values.ndim == most}
+        placed |= {**grids, name: arrays[name][order]}
+    return placed
+
+
+def curves(table: Table, *keys: str, over: str = "", **wanted: object) -> list[Any]:
     """The curves that lie below each other in a table: rows in a row that share the values of ``keys``.
 
-    Each has its columns as attributes: single values of the keys, arrays of the others. Rows without the wanted values
-    are left out.
+    Each has its columns as attributes: single values of the keys, arrays of the others, by rising values of the column
+    ``over`` where one is named. Rows without the wanted values are left out.
     """
     columns = select(table, **wanted)
     changes = [columns[key][1:] != columns[key][:-1] for key in keys]
     ends = np.flatnonzero(np.any(changes, axis=0)) + 1
     parts = {name: np.split(column, ends) for name, column in columns.items()}
-    found = [SimpleNamespace(**{name: part[k] for name, part in parts.items()}) for k in range(ends.size + 1)]
+    rows = [{name: part[k] for name, part in parts.items()} for k in range(ends.size + 1)]
+    found = [SimpleNamespace(**(in_order(each, over) if over else each)) for each in rows]
     for curve in found if columns[keys[0]].size else ():
         vars(curve).update({key: getattr(curve, key)[0] for key in keys})
     return found if columns[keys[0]].size else []

@@ -18,8 +18,19 @@ from zwidth.fitting.log import fit_log
 from zwidth.words.errors import InputError, UnusableValueError
 from zwidth.words.formatting import describe, suggestion, with_unit
 from zwidth.words.quantities import POSITIVE
-from zwidth.words.tables import COUNTS, NamedColumns, read_columns, split_head
-from zwidth.words.units import ANGLE, FORCE, LENGTH, TIME, TORQUE, Dimension, looks_like_number, read_quantity
+from zwidth.words.tables import NamedColumns, read_columns
+from zwidth.words.units import (
+    ANGLE,
+    COUNTS,
+    FORCE,
+    LENGTH,
+    TIME,
+    TORQUE,
+    Dimension,
+    looks_like_number,
+    read_quantity,
+    split_head,
+)
 
 QUANTITIES = ("time", "position", "force")
 # What each may be in, a linear axis first, and the names that say so by themselves.

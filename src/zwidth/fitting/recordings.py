@@ -11,7 +11,7 @@ from zwidth.fitting.moving import Recording
 from zwidth.parts.checks import check_number
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
-from zwidth.words.quantities import POSITIVE
+from zwidth.words.quantities import POSITIVE, SI_RANGE
 
 # How far a sample's time may lie from an even one, as a share of the period, unasked and where a wavering clock is
 # asked for, less than what a missing sample looks like; how far periods of logs may differ beyond their errors.
@@ -59,6 +59,13 @@ def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Recordi
         bad = np.flatnonzero(~np.isfinite(array))
         if bad.size:
             raise InputError(f"{name}: {bad.size} samples are no numbers, the first is sample {bad[0]}; leave them out")
+        low, high = float(array.min()), float(array.max())
+        if max(-low, high) > SI_RANGE[1] or 0 < high - low < SI_RANGE[0]:
+            least, most = SI_RANGE
+            raise InputError(
+                f"{name}: got values from {plain(low)} to {plain(high)}; they must be at most {most:g} in magnitude "
+                f"and at least {least:g} apart; check the unit"
+            )
     if clock is None:
         period, error = check_number("time", time, "s", POSITIVE), 0.0
     else:

@@ -63,8 +63,7 @@ def list_units(fit: DeviceFit) -> dict[str, str]:
 
 def spell(name: str, value: float, digits: int = 4) -> str:
     """A value of a fit for people."""
-    unit = _UNITS.get(name.rpartition(".")[2], "")
-    return with_unit(value, unit, digits) if unit else plain(value, digits)
+    return with_unit(value, _UNITS.get(name.rpartition(".")[2], ""), digits)
 
 
 class WallChoice(NamedTuple):

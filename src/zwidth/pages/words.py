@@ -290,5 +290,5 @@ def list_slopes(scene: Scene) -> list[Slope]:
             effect = f"{'buys' if change > 0 else 'costs'} {amount}"
         note = " (same delay in seconds)" if path == "period" else ""
         words = f"{with_unit(step, unit, 1)} more {effect}{note}"
-        found.append(Slope(path, value, f"N/m per {unit}", words))
+        found.append(Slope(path, value, f"N/m per {unit}" if unit else "N/m", words))
     return found

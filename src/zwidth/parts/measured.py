@@ -18,8 +18,8 @@ import numpy as np
 from zwidth.parts.linear_device import WholeDevice
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import suggestion
-from zwidth.words.tables import read_columns, split_head
-from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, Dimension
+from zwidth.words.tables import read_columns
+from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, Dimension, split_head
 
 # Fewer lines show no curve.
 _FEWEST = 8

@@ -86,7 +86,9 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     changed: dict[str, dict[str, Any]] = {}
     whole = {name: changes[name] for name in (*_BARE, *_NAMED) if name in changes}
     scene = replace(scene, **whole)
-    own = {name: changes[name] for name in (*_OF_DEVICE, "modes") if name in changes}
+    # A device that is given as a whole has none of them.
+    of_device = [item.name for item in fields(scene.device) if item.name in (*_OF_DEVICE, "modes")]
+    own = {name: changes[name] for name in of_device if name in changes}
     if own:
         scene = replace(scene, device=replace(scene.device, **own))
     parts = {name: part for _, name, part in _parts(scene)}
@@ -100,7 +102,7 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
         if path in whole or path in own:
             continue
         if path not in owners:
-            raise InputError(f"parameter: {describe_choice(path, tuple(owners))}")
+            raise InputError(f"parameter: {describe_choice(path, (*owners, *_BARE, *_NAMED, *of_device))}")
         part, name = owners[path]
         changed.setdefault(part, {})[name] = value
     if "rate" in changed.get("timing", {}):

@@ -202,12 +202,12 @@ class DesignStudy(ComputedStudy):
         return dict(zip(names, (drawn.stable, drawn.stable_low, drawn.stable_high, drawn.stiffness), strict=True))
 
     def _note(self, stiffness: float, needed: RequiredValue) -> Iterable[str]:
-        wanted = f"{self.reserve * stiffness:g} {own_unit('N/m')}"
-        low, high = needed.range
+        wanted = with_unit(self.reserve * stiffness, "N/m")
+        low, high = (with_unit(end, PARAMETERS[self.find].unit) for end in needed.range)
         if needed.status != Status.OK:
-            yield f"{wanted}: {self.find} from {low:g} to {high:g}: {Status(needed.status).message}"
+            yield f"{wanted}: {self.find} from {low} to {high}: {Status(needed.status).message}"
         elif needed.enough == "everywhere":
-            yield f"{wanted}: any {self.find} from {low:g} to {high:g} is enough"
+            yield f"{wanted}: any {self.find} from {low} to {high} is enough"
         elif len(needed.crossings) > 1:
             yield f"{wanted}: K_max passes it at {len(needed.crossings)} values of {self.find}; the nearest is given"
 

@@ -239,7 +239,7 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
     best, most = found["recommended"], found["maximum"]
 
     def spell(value: float | None, unit: str = "") -> str:
-        return "not known" if value is None else with_unit(value, unit) if unit else plain(value)
+        return "not known" if value is None else with_unit(value, unit)
 
     def cells(row: dict[str, Any], mark: str = "") -> str:
         digits = row.get("digits", 4)

@@ -31,8 +31,9 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, name_wall, plain, round_safely, suggestion, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.status import RidgeKind, Status
-from zwidth.words.tables import read_columns, split_head
+from zwidth.words.tables import read_columns
 from zwidth.words.types import DelayModel
+from zwidth.words.units import split_head
 
 # A path that goes this far shows what alpha_max/delta tends to: within some percent.
 _STRONG_DAMPING = 100.0
@@ -189,6 +190,11 @@ class Poses(Strict, what="a table of poses"):
             for key in (key for key, name in chosen.items() if name not in known):
                 remedy = suggestion(chosen[key], known, f"choose from {', '.join(known)}")
                 yield (key,), problem(f"got {describe(chosen[key])}", "it names a column of the file", remedy)
+            if self.across == self.up:
+                yield (
+                    ("up",),
+                    problem(f"got {describe(self.up)}, as across", "a map has two coordinates", "name another"),
+                )
             found = [(name, *known[name]) for name in chosen.values() if name in known]
             values = columns.numbers([place for _, _, place in found])
             self._coordinates = [(name, unit, of.tolist()) for (name, unit, _), of in zip(found, values, strict=True)]
@@ -205,6 +211,11 @@ class Poses(Strict, what="a table of poses"):
     def tabulate(self) -> dict[str, np.ndarray]:
         """The coordinates as columns, across and up."""
         return {header(name, unit): np.array(values) for name, unit, values in self._coordinates}
+
+    @property
+    def names(self) -> tuple[tuple[str, str], ...]:
+        """The name and the unit of both coordinates."""
+        return tuple((name, unit) for name, unit, _ in self._coordinates)
 
     def spell(self, pose: int) -> str:
         """A pose by its coordinates."""
@@ -264,5 +275,5 @@ class WorkspaceStudy(ComputedStudy):
             f"{name_wall(*wall)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
             f"stable in {np.count_nonzero(bears)} of {np.count_nonzero(known)} poses",
         )
-        draw = partial(figures.draw_workspace, table, *coordinates)
+        draw = partial(figures.draw_workspace, table, *coordinates, names=self.poses.names)
         return Outcome(table=table, figures={"": draw}, answer=answer, notes=tuple(notes))

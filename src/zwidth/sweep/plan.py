@@ -33,6 +33,9 @@ _FEWEST_CHUNKS = 16
 _SMALLEST_CHUNK = 2**15
 _LAID_OUT_BYTES = 96 * 2**20
 
+# A guess below this says no more than that.
+_INSTANT = 0.01
+
 # To lay out the boundary of a device with parts.
 _SCENE_SECONDS = 0.1
 
@@ -142,7 +145,7 @@ class Plan:
             yield f"  method     {name} by {method}: {reason}"
         yield f"  memory     {_size(self.memory)} a chunk, and {_size(IDLE_MEMORY)} a worker"
         yield f"  disk       {_size(self.disk)} at most"
-        yield f"  time       about {_time(self.seconds)} on one core"
+        yield f"  time       {_time(self.seconds)} on one core"
 
 
 def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
@@ -256,7 +259,9 @@ def _size(count: float) -> str:
 
 
 def _time(seconds: float) -> str:
+    if seconds < _INSTANT:
+        return f"less than {_INSTANT:g} s"
     for limit, unit, length in ((120, "s", 1.0), (7200, "min", 60.0), (172800, "h", 3600.0)):
         if seconds < limit:
-            return f"{seconds / length:.2g} {unit}"
-    return f"{seconds / 86400:.2g} days"
+            return f"about {seconds / length:.2g} {unit}"
+    return f"about {seconds / 86400:.2g} days"

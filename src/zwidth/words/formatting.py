@@ -29,9 +29,12 @@ def plain(value: float, digits: int = 4) -> str:
 def with_unit(value: float, unit: str, digits: int = 4) -> str:
     """A quantity with an SI prefix on its unit: ``19.87 kN/m``, ``100.0 g`` of kilograms.
 
-    The unit is that of a linear device; of a rotary one in question its own is written.
+    The unit is that of a linear device; of a rotary one in question its own is written. A number without unit, "1" or
+    "", has no prefix either.
     """
     unit = own_unit(unit)
+    if unit in ("", "1"):
+        return plain(value, digits)
     if unit == "kg m^2":
         # What data sheets of rotors have.
         return f"{plain(1e7 * value, digits)} g cm^2" if math.isfinite(value) else plain(value)
@@ -66,14 +69,14 @@ def round_safely(value: float, enough: str, digits: int = 4) -> float:
     return steps * step
 
 
-def count_digits(holds: Callable[[int], Any]) -> int:
-    """The fewest digits of a printed number, from 4 on, with which something holds."""
-    return next((digits for digits in range(4, 17) if holds(digits)), 17)
+def count_digits(holds: Callable[[int], Any], least: int = 4) -> int:
+    """The fewest digits of a printed number, from 4 or so on, with which something holds."""
+    return next((digits for digits in range(least, 17) if holds(digits)), 17)
 
 
-def count_digits_apart(values: list[float]) -> int:
-    """The fewest digits, from 4 on, that tell different numbers apart."""
-    return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)))
+def count_digits_apart(values: list[float], least: int = 4) -> int:
+    """The fewest digits, from 4 or so on, that tell different numbers apart."""
+    return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)), least)
 
 
 def spell_stiffness(value: float, digits: int = 4) -> str:
@@ -88,26 +91,22 @@ def spell_stiffness(value: float, digits: int = 4) -> str:
 
 def tell_apart(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
     """Two ends with a unit or plain, rounded into what lies between, with as many digits as it takes to leave some."""
-
-    def spell(end: float, digits: int) -> str:
-        return with_unit(end, unit, digits) if unit else plain(end, digits)
-
     for digits in range(least, 18):
         ends = round_safely(low, "above", digits), round_safely(high, "below", digits)
         if ends[0] < ends[1]:
-            return spell(ends[0], digits), spell(ends[1], digits)
-    return spell(low, least), spell(high, least)
+            return with_unit(ends[0], unit, digits), with_unit(ends[1], unit, digits)
+    return with_unit(low, unit, least), with_unit(high, unit, least)
 
 
 def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, digits: int = 4) -> str:
     """Of which values there is enough: on one side of a value, or up to the first of others there."""
-    side, unit = (1.0 if enough == "above" else -1.0), unit.removeprefix("1")
+    side = 1.0 if enough == "above" else -1.0
     beyond = [side * other for other in others if side * other > side * value]
     if beyond:
         low, high = sorted((value, side * min(beyond)))
         return " to ".join(tell_apart(low, high, unit, digits))
     value = round_safely(value, enough, digits)
-    return f"{with_unit(value, unit, digits) if unit else plain(value, digits)} {ENOUGH[enough]}"
+    return f"{with_unit(value, unit, digits)} {ENOUGH[enough]}"
 
 
 def header(name: str, unit: str) -> str:

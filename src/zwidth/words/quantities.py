@@ -241,8 +241,7 @@ _OF_MOTIONS = (
     Parameter("max_rate", "the fastest that the command changes", "R_m", POSITIVE, "N/s", note="without one no limit"),
 )  # fmt: skip
 OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
-_FURTHER = (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)
-FIELDS = {**PARAMETERS, **{field.name: field for field in _FURTHER}}
+FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
 """Every number of a part or a motion by its name; the noise of an estimate without stable walls is no axis."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 
@@ -304,6 +303,11 @@ class Output:
     def words(self) -> str:
         """What a figure calls it."""
         return self.label or self.name.replace("_", " ")
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether its axes and colors are in equal ratios; where it is 0 it has no place on them."""
+        return self.look in ("logarithmic", "steep")
 
     def units_in(self, physical: bool) -> str:
         return self.physical_units if physical and self.physical_units else self.units

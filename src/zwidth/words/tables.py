@@ -23,21 +23,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.words.errors import InputError
-from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, SPEED, TIME, TORQUE, looks_like_number
+from zwidth.words.units import is_unit, looks_like_number, split_head
 
-COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
-"""Units of a position that its encoder's resolution translates."""
-
-_KNOWN = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
-_FURTHER = ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s", "krad/s", "dB", "m/N", "mm/N", "um/N", "µm/N")
 _MOST_BYTES = 2**28
-_TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
 _CODINGS, _GZIP, _NO_TEXT = ("utf-8-sig", "cp1252", "latin-1"), b"\x1f\x8b", re.compile("[\0-\x08\x0e-\x1f]")
 _DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
+_FRACTION = re.compile(r"[-+]?[0-9]*([.,])[0-9]+(?:[eE][-+]?[0-9]+)?")
 # Lines that may stand above the numbers.
 _PREAMBLE = 500
-# Where a unit may begin behind a name without brackets: time_s, time/s, time s.
-_JOINT = re.compile(r"\s*[/,]\s*|_|\s+")
 _REMARK = re.compile(r"\s*[#%]+\s*")
 _SEPARATOR = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 _BLANKS = re.compile(r"\s+(?![\[(])")
@@ -113,26 +106,24 @@ def with_point(cell: str) -> str:
     return _DECIMAL_COMMA.sub(r"\1.", cell)
 
 
-def split_title(title: str) -> tuple[str, str]:
-    """The name of a column, and its unit, which stands in brackets at its end."""
-    match = _TITLE.fullmatch(title.strip())
-    return (match[1], (match[2] or match[3] or "").strip()) if match else (title, "")
+class DecimalSigns:
+    """The decimal sign of a table, a comma or a point: of one with both, either may group the digits of thousands."""
 
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.first: dict[str, tuple[int, str]] = {}
 
-def split_head(head: str) -> tuple[str, str]:
-    """The name of a column and its unit: in brackets, or behind a slash, an underscore or a blank where it is known."""
-    name, unit = split_title(head)
-    if unit or name != head.strip():
-        return name, unit
-    for joint in _JOINT.finditer(head):
-        if joint.start() and is_unit(head[joint.end() :]):
-            return head[: joint.start()], head[joint.end() :]
-    return name, unit
-
-
-def is_unit(text: str) -> bool:
-    """Whether a text is the unit of some column of logs or responses."""
-    return text in _FURTHER or text.lower() in COUNTS or any(each.in_base("1", 0, text) is not None for each in _KNOWN)
+    def read(self, line: int, cell: str) -> str:
+        """A cell with a point; raise `InputError` for the first whose sign is not that of those before."""
+        if match := _FRACTION.fullmatch(cell):
+            self.first.setdefault(match[1], (line, cell))
+            if len(self.first) > 1:
+                ((number, other),) = (place for sign, place in self.first.items() if sign != match[1])
+                raise InputError(
+                    f"{self.file}:{line}: got {cell!r}, and {other!r} in line {number}; a comma is a decimal sign or "
+                    "groups digits, not both; write all numbers with one decimal sign, and group no digits"
+                )
+        return with_point(cell)
 
 
 def _is_npz(file: Path) -> bool:
@@ -307,6 +298,9 @@ def _read_quickly(lines: list[str], layout: _Layout, count: int, places: Sequenc
     """Columns by NumPy's reader; None where there is anything that it does not read, to be told line by line."""
     begin, separator = layout.begin, layout.separator
     clocks = _find_clocks(lines, layout, places)
+    if separator != "," and all(any(sign in line for line in islice(lines, begin, None)) for sign in ",."):
+        # Cell by cell, so that numbers with either are told.
+        return None
     if separator == " ":
         wide = max(len(line.split()) for line in lines[begin:])
     else:
@@ -338,14 +332,14 @@ def _read_each(
         rows = ((k + 1, lines[k].split()) for k in range(layout.begin, len(lines)) if lines[k].strip())
     else:
         rows = split_lines(file, lines, layout.begin, separator)
-    clocks = _find_clocks(lines, layout, places)
+    clocks, signs = _find_clocks(lines, layout, places), DecimalSigns(file)
     for number, cells in rows:
         if any(cells[len(heads) :]):
             hint = "; a comma as decimal sign needs semicolons between the columns" if separator == "," else ""
             raise InputError(f"{file}:{number}: got {len(cells)} cells for {len(heads)} columns{hint}")
         for column, at in zip(found, places, strict=True):
             got = cells[at] if at < len(cells) else ""
-            value = _read_number(got if separator == "," else with_point(got), kind)
+            value = _read_number(got if separator == "," else signs.read(number, got), kind)
             if not _is_time(got) if at in clocks else value is None:
                 wanted = "a time such as 2024-05-01T12:00:00.001" if at in clocks else "a number"
                 raise InputError(

@@ -227,3 +227,35 @@ def read_quantity(
         within = f"it must be 0 or {least:g} to {most:g} {unit} in magnitude"
         raise UnusableValueError(f"got {short(amount)} {unit}", within, "check the units")
     return amount, unit
+
+
+COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
+"""Units of a position that its encoder's resolution translates."""
+# Of logs and responses; and their units besides.
+_KNOWN = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
+_FURTHER = ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s", "krad/s", "dB", "m/N", "mm/N", "um/N", "µm/N")
+_TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
+# Where a unit may begin behind a name without brackets: time_s, time/s, time s.
+_JOINT = re.compile(r"\s*[/,]\s*|_|\s+")
+
+
+def split_title(title: str) -> tuple[str, str]:
+    """The name of a column, and its unit, which stands in brackets at its end."""
+    match = _TITLE.fullmatch(title.strip())
+    return (match[1], (match[2] or match[3] or "").strip()) if match else (title, "")
+
+
+def split_head(head: str) -> tuple[str, str]:
+    """The name of a column and its unit: in brackets, or behind a slash, an underscore or a blank where it is known."""
+    name, unit = split_title(head)
+    if unit or name != head.strip():
+        return name, unit
+    for joint in _JOINT.finditer(head):
+        if joint.start() and is_unit(head[joint.end() :]):
+            return head[: joint.start()], head[joint.end() :]
+    return name, unit
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is the unit of some column of logs or responses."""
+    return text in _FURTHER or text.lower() in COUNTS or any(each.in_base("1", 0, text) is not None for each in _KNOWN)

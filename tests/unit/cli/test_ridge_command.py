@@ -63,3 +63,11 @@ def test_a_normalized_number_is_named_as_it_was_given():
 @pytest.mark.parametrize("arguments", [[], ["--delta", "1"], ["--mass", "1"], ["--delta", "1", "--d", "-1"]])
 def test_wrong_use_exits_with_2(arguments):
     assert CliRunner().invoke(cli, ["ridge", *arguments]).exit_code == 2
+
+
+def test_a_number_without_unit_has_no_prefix():
+    last = ridge(
+        *DEVICE, *["--actuator-cutoff", "200", "--actuator-order", "2", "--actuator-damping-ratio", "0.7"]
+    ).splitlines()[-1]
+    assert last.startswith("dK_max/d(actuator.damping_ratio)  ")
+    assert "N/m: 0.01 more " in last

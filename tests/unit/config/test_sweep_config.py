@@ -96,6 +96,7 @@ def test_columns_of_a_csv_file_can_be_named(load, tmp_path):
 
 
 NORMAL = "alpha: 1, delta: 1, d: 1"
+PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
 
 
 @pytest.mark.parametrize(
@@ -131,10 +132,20 @@ NORMAL = "alpha: 1, delta: 1, d: 1"
         ("devices: {csv: missing.csv}, stiffness: 1", "", "axes.devices.csv", "no such file"),
         ("devices: {csv: wrong.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "line 3: mass: got -1 kg"),
         ("devices: {csv: short.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "line 2: damping is missing"),
+        ("devices: {csv: mixed.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "'1,500' in line 2; a comma is"),
         ("devices: {csv: typo.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "did you mean 'damping'?"),
         ("devices: {csv: empty.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "0 rows"),
         ("devices: {csv: wrong.csv, colums: {}}, stiffness: 1", "", "axes.devices.colums", "did you mean 'columns'?"),
         ("devices: {csv: wrong.csv, columns: {mass: m}}, stiffness: 1", "", "axes.devices.csv", "headers"),
+        (PART + "velocity.samples: [2, 5]", "", "axes.velocity.samples", "{kind: windowed_difference, samples: 5}"),
+        (
+            PART + "velocity.time_constant: [1 ms, 2 ms]",
+            "",
+            "axes.velocity.time_constant",
+            "low_pass, time_constant: 2 ms",
+        ),
+        (PART + "velocity.order: [1, 2]", "", "axes.velocity.order", "{kind: low_pass, cutoff: 100 Hz}"),
+        (PART + "modes.0.mass: [1, 2]", "", "axes.modes.0.mass", "damping_ratio: 0.03, mass: 2 kg}]"),
         (
             "alpha: {linear: {start: 0, stop: 1, num: 9999999}}, beta: {linear: {start: 0, stop: 1, num: 9999999}}, "
             "delta: 1, d: 1",
@@ -149,6 +160,7 @@ def test_faults_have_their_place(load, tmp_path, axes, rest, place, words):
     (tmp_path / "short.csv").write_text("mass,damping\n1\n", encoding="utf-8")
     (tmp_path / "typo.csv").write_text("mass,dampng\n1,2\n", encoding="utf-8")
     (tmp_path / "empty.csv").write_text("", encoding="utf-8")
+    (tmp_path / "mixed.csv").write_text("mass [g];damping\n1,500;0.5\n", encoding="utf-8")
     with pytest.raises(ConfigFileError) as caught:
         load(sweep(axes, rest))
     fields = [fault.field.removeprefix("studies[0].") for fault in caught.value.faults]

@@ -47,7 +47,18 @@ def test_the_look_is_a_style_of_matplotlib():
 
 
 @pytest.mark.parametrize(
-    "low, high", [(2.1, 4.9), (7.0, 19.0), (1.1, 1.9), (2.0, 8.0), (2.1, 10.4), (0.3, 40.0), (1e-3, 1e4)]
+    "low, high",
+    [
+        (2.1, 4.9),
+        (9.3, 11.7),
+        (99.0, 101.0),
+        (7.0, 19.0),
+        (1.1, 1.9),
+        (2.0, 8.0),
+        (2.1, 10.4),
+        (0.3, 40.0),
+        (1e-3, 1e4),
+    ],
 )
 def test_a_logarithmic_axis_has_plain_numbers(low, high):
     (ax,) = style.panels(None, 1, 5.0, 3.0)
@@ -58,6 +69,22 @@ def test_a_logarithmic_axis_has_plain_numbers(low, high):
     shown = [tick for tick in ticks if low <= tick.get_position()[0] <= high]
     assert 2 <= len(shown) <= 9
     assert [float(tick.get_text()) for tick in shown] == pytest.approx([tick.get_position()[0] for tick in shown])
+
+
+def test_a_logarithmic_axis_of_one_value_is_near_it():
+    (ax,) = style.panels(None, 1, 5.0, 3.0)
+    style.use_logarithmic(ax, "x", [100.0])
+    assert ax.get_xlim() == (50.0, 200.0)
+
+
+def test_many_decades_have_their_powers_of_ten_where_two_and_five_have_no_room():
+    (ax,) = style.panels(None, 1, 5.0, 3.0)
+    style.use_logarithmic(ax, "x", (1.0, 2000.0), style.DECADES)
+    ax.set_xlim(1e-12, 2.0)
+    style.figure_of(ax).draw_without_rendering()
+    shown = [tick for tick in ax.get_xticks() if 1e-12 <= tick <= 2.0]
+    assert len(shown) > 2
+    np.testing.assert_allclose(np.log10(shown), np.round(np.log10(shown)), atol=1e-9)
 
 
 @pytest.mark.parametrize(

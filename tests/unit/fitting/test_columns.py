@@ -110,6 +110,8 @@ REFUSED = {
     "too large": ("t,x,F\n0,1,1e999\n", {}, "log.csv:2: got '1e999' under 'F'"),
     "underscores": ("t,x,F\n0,1,1_000\n", {}, "log.csv:2: got '1_000' under 'F'"),
     "thousands": ("t;x;F\n0;1.000,5;1\n", {}, "log.csv:2: got '1.000,5' under 'x'"),
+    "thousands beside points": ("t;x;F\n0;1,000;0.5\n", {}, "log.csv:2: got '0.5', and '1,000' in line 2; a comma is"),
+    "commas, then points": ("t x F\n0 1,5 1\n1 2.5 1\n", {}, "log.csv:3: got '2.5', and '1,5' in line 2; a comma is"),
     "a remark among samples": ("t,x,F\n0,1,2\n# gap\n1,2,3\n", {}, "log.csv:3: got '# gap' under 't'"),
     "decimal commas between commas": ("t,x,F\n0,1,5,2\n", {}, "got 4 cells for 3 columns; a comma as decimal sign"),
     "no text": (b"\xff\xfet,x,F", {}, "no text in UTF-8"),

@@ -213,6 +213,10 @@ TIMES = PERIOD * np.arange(200)
         ([PERIOD, PERIOD], [PLACES], [FORCE, FORCE], "give each log all three"),
         ([PERIOD, 2 * PERIOD], [PLACES, PLACES], [FORCE, FORCE], "one by one"),
         (-1.0, PLACES, FORCE, "time: got -1 s"),
+        (TIMES, 1e160 * PLACES, FORCE, "position: got values from "),
+        (TIMES, 1e-200 * PLACES, FORCE, "at least 1e-30 apart; check the unit"),
+        (TIMES, PLACES, 1e160 * FORCE, "they must be at most 1e+30 in magnitude"),
+        (1e160 * TIMES, PLACES, FORCE, "time: got values from 0 to "),
     ],
 )
 def test_bad_logs_are_refused_in_one_line(time, position, force, words):

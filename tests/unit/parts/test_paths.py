@@ -63,6 +63,7 @@ def test_whole_parts():
 @pytest.mark.parametrize(
     "changes, message",
     [
+        ({"actuatr": None}, "parameter: got 'actuatr', .*'actuator', 'modes'; did you mean 'actuator'"),
         ({"velocity.cutof": 50}, "parameter: got 'velocity.cutof', .*did you mean 'velocity.cutoff'"),
         ({"velocity.samples": 5}, "parameter: got 'velocity.samples', allowed are 'mass', "),
         ({"operator.mass": -1.0}, "operator.mass: got -1 kg"),
@@ -74,6 +75,13 @@ def test_whole_parts():
 def test_what_is_refused(changes, message):
     with pytest.raises(InputError, match=message):
         SCENE.replace(**changes)
+
+
+@pytest.mark.parametrize("name", ["actuator", "coupling", "modes"])
+def test_a_device_given_as_a_whole_has_no_parts_of_its_own(name):
+    whole = zwidth.Scene(zwidth.LinearDevice(([1], [0.1, 10, 0])), zwidth.Timing(1e-3))
+    with pytest.raises(InputError, match=f"parameter: got '{name}', allowed are 'system', .*'operator'$"):
+        whole.replace(**{name: None})
 
 
 def test_the_fields_of_parts_are_told_apart():

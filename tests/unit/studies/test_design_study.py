@@ -108,6 +108,11 @@ def test_the_figure_marks_what_is_needed_on_the_curve():
     assert [text.partition(": ")[2] for text in words[:2]] == ["99.9 % of devices bear it", "100 % of devices bear it"]
 
 
+def test_a_stiffness_that_every_value_reaches_is_told_with_units():
+    outcome = design("damping", [5e3], within=[1, 100], num=5).compute(None, True)
+    assert outcome.notes == ("5.000 kN/m: any damping from 1.000 N s/m to 100.0 N s/m is enough",)
+
+
 REFUSED = {
     "find: dampin": "did you mean 'damping'",
     "find: velocity.cutoff": "this device has",

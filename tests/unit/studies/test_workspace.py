@@ -83,6 +83,7 @@ def test_the_scene_gives_period_and_delay(tmp_path):
         ),
         ((", up: elbow", ""), r"write {csv: arm.csv, across: shoulder, up: elbow}"),
         (("arm.csv", "leg.csv"), "leg.csv"),
+        (("up: elbow", "up: shoulder"), "up: got 'shoulder', as across; a map has two coordinates; name another"),
     ],
 )
 def test_faults_are_told(change, said, tmp_path):
@@ -90,6 +91,14 @@ def test_faults_are_told(change, said, tmp_path):
         load_config(write(tmp_path, STUDY.replace(*change)))
     assert said in str(error.value)
     assert "studies[0].poses" in str(error.value)
+
+
+def test_axes_have_the_names_and_the_units_of_the_file(tmp_path):
+    poses = POSES.replace("shoulder [deg]", "elbow_angle")
+    config = load_config(write(tmp_path, STUDY.replace("shoulder, up: elbow", "elbow_angle, up: damping"), poses))
+    study: Any = config.studies[0]
+    (ax,) = study.compute(None, True).figures[""]()
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("elbow_angle", "damping  in N s/m")
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,7 @@ def test_with_unit(value, text):
 
 
 def test_digits_are_those_asked_for():
+    assert (with_unit(0.01, "", 1), with_unit(-1234.5, "1")) == ("0.01", "-1234")
     assert (plain(2 / 3, 2), with_unit(2 / 3, "s", 2), with_unit(996.0, "s", 2)) == ("0.67", "670 ms", "1.0 ks")
 
 

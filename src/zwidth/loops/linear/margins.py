@@ -7,8 +7,8 @@ sign, or as a dip that the tangents at both ends announce, and is polished from 
 One period more of delay changes nothing but the phase of L, by the angle w itself: at a gain crossover of phase
 ``p = arg(-L)`` a pole is on the circle m periods later if ``p - m w`` is a multiple of 2 pi. So the loops of delays
 within one period serve all longer ones: where m passes a whole number from one of them to the next, the delay is found
-by Newton's method, each step with the exact loop of its own. Real poles come to z = -1 where ``|L(-1)|`` passes 1. Poles
-counted before and beyond must confirm the first of these delays.
+by Newton's method, each step with the exact loop of its own. Real poles come to z = -1 where ``|L(-1)|`` passes 1.
+Poles counted before and beyond must confirm the first of these delays.
 """
 
 from __future__ import annotations
@@ -205,7 +205,7 @@ class DelayedLoop(NamedTuple):
 
 
 def lay_delays(chain: AnyChain) -> list[DelayedLoop]:
-    """The loops at delays up to a period longer than the chain's own: its own, every eighth, just before a whole one."""
+    """The loops at delays up to a period longer than the own one: that, every eighth, just before a whole one."""
     own = float(chain.d)
     fastest = -float(np.linalg.eigvals(chain.realize().A).real.min())
     early = 1.0 - _EARLY / fastest if fastest > _FAST else np.empty(0)

@@ -76,10 +76,11 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
 
     Numerics:
         Phase margin and gain crossover are in closed form, the others are found to about 1e-14, at a cost that does not
-        grow with d. The fraction of the delay is sampled 64 times a period, closest to whole delays, and the lowest place
-        that the samples show is looked for: a strongly damped device may bear less for a moment just before a whole
-        delay. Traceable: `jit`, `vmap`, `grad`. A margin that is NaN has NaN derivatives; where it is one of those of
-        which `jax.jacrev` takes all at a time, so have the wall's others, unlike in `jax.jacfwd` or one by one.
+        grow with d. The fraction of the delay is sampled 64 times a period, closest to whole delays, and the lowest
+        place that the samples show is looked for: a strongly damped device may bear less for a moment just before a
+        whole delay. Traceable: `jit`, `vmap`, `grad`. A margin that is NaN has NaN derivatives; where it is one of
+        those of which `jax.jacrev` takes all at a time, so have the wall's others, unlike in `jax.jacfwd` or one by
+        one.
 
     References:
         Landau 1990 (modulus margin); python-control's `stability_margins`, which calls them gm, pm, sm, wpc, wgc, wms.

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.config.study import KINDS
-from zwidth.figures.grid import choose_axes
+from zwidth.figures.grid import choose_axes, in_order
 from zwidth.figures.plane import Edges
 from zwidth.figures.style import pick_evenly
 from zwidth.runs.draw import make_edges
@@ -126,7 +126,8 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
 
 def _section(where: Path, entry: dict[str, Any]) -> str:
     kind, name = str(entry["kind"]), escape(str(entry["name"]))
-    notes = "".join(f"<p>{escape(str(note))}</p>" for note in entry.get("notes", ()))
+    said = [*entry.get("answer", ()), *entry.get("notes", ())]
+    notes = "".join(f"<p>{escape(str(each))}</p>" for each in said)
     method = f'<p class="soft">{escape(KINDS[kind].method)}</p>' if kind in KINDS and KINDS[kind].method else ""
     body = "".join(_contents(where, entry))
     listed = ", ".join(escape(file) for file in sorted(entry.get("files", {})))
@@ -178,6 +179,7 @@ def _scrolling(name: str, rows: list[str], head: str = "") -> str:
 
 def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[str]:
     """The maps of a store, as HTML, with the exact edges of the stable and the passive walls."""
+    data = in_order(data)
     # A store lists its variables in any order.
     for name in (name for name in OUTPUTS if name in data and name != "kind"):
         axes = choose_axes(data, name)
@@ -201,7 +203,7 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
         numbers, sizes = thin.values.astype(np.float32), [thin.sizes[dim] for dim in others]
     finite = numbers[np.isfinite(numbers)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    steep = output.look in ("logarithmic", "steep") and low > 0
+    steep = output.logarithmic and low > 0
     content = {
         "name": name,
         "unit": _unit(thin),

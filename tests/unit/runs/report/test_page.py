@@ -69,6 +69,16 @@ def test_figures_versions_and_studies_are_there(page):
     assert zwidth.__version__ in page
 
 
+def test_what_a_study_found_is_said(tmp_path):
+    device = {"mass": 0.1, "damping": 10, "period": 1e-3, "delay": 1e-3}
+    config = {"version": 1, "name": "r", "scene": device, "studies": [{"kind": "recommend", "name": "wall"}]}
+    result = zwidth.run(Config.model_validate(config), out=tmp_path / "r")
+    said = result.studies[0].answer
+    assert said[0].startswith("K = 14.89 kN/m")
+    page = zwidth.write_report(result.folder).read_text(encoding="utf-8")
+    assert all(f"<p>{line}</p>" in page for line in said)
+
+
 def test_slices_hold_what_the_store_holds(run, page):
     blocks = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page)]
     # In their order among all outputs, whatever that of the store.
