@@ -148,6 +148,20 @@ def test_a_sampled_system_is_the_held_one():
     assert np.isnan(later.sensitivities().per["period"])
 
 
+@pytest.mark.parametrize("mass, damping", [(0.1, 2.0), (0.5, 10.0), (1.0, 2.0)])
+def test_the_rounding_of_a_sampled_system_takes_no_soft_wall_away(mass, damping):
+    # What SciPy makes of a mass and a damper has its pole at z = 1 beyond it, by 1e-14: alone it is unstable.
+    top, bottom, _ = scipy.signal.cont2discrete(([1.0], [mass, damping, 0.0]), 1e-3)
+    assert sum(bottom) < 0
+    sampled = zwidth.LinearDevice(SIGNAL.dlti(np.trim_zeros(np.ravel(top), "f"), bottom, dt=1e-3))
+    scene = zwidth.Scene(sampled, zwidth.Timing(1e-3))
+    exact = zwidth.Scene(zwidth.Device(mass, damping), zwidth.Timing(1e-3)).max_stiffness()
+    assert scene.max_stiffness().stiffness == pytest.approx(exact.stiffness, rel=1e-6)
+    assert scene.islands() == []
+    assert [piece.island for piece in scene.stable_region()] == [False]
+    assert scene.recommend().stiffness > 0
+
+
 @pytest.mark.parametrize(
     "change, words",
     [

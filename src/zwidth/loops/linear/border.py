@@ -70,9 +70,9 @@ class Border:
                 "device: the pole pairs of a system of first order, not late and behind the difference of two samples, "
                 "are all at one damping, which is no curve; give the lag of its amplifier or its delay"
             )
-        edges = self._edges_among(w)
+        edges, filled = self._edges_among(w), []
         for _ in range(_LOOKS):
-            more = self._find_missed(edges)
+            more = self._find_missed(edges, filled)
             if not more.size:
                 break
             w = np.union1d(w, more)
@@ -100,10 +100,13 @@ class Border:
             edges.append(Edge(at, alpha, beta, -1))
         return edges
 
-    def _find_missed(self, edges: list[Edge]) -> np.ndarray:
-        """Angles on edges that are not among these, and within those of few nodes."""
+    def _find_missed(self, edges: list[Edge], filled: list[tuple[float, float]]) -> np.ndarray:
+        """Angles on edges that are not among these, and within those of few nodes, each time others than before."""
         b = self.boundary
         few = [edge.w for edge in edges if edge.w.size < _FEW and not edge.is_point]
+        # Next to z = 1 rounding may part an edge anew with each node: in a part of what was filled are nodes enough.
+        few = [w for w in few if not any(low <= w[0] and w[-1] <= high for low, high in filled)]
+        filled += [(w[0], w[-1]) for w in few]
         within = [np.empty(0), *(np.linspace(w[0], w[-1], _FILLED)[1:-1] for w in few)]
         ends = np.sort(np.concatenate([edge.beta[[0, -1]] for edge in edges])) if edges else np.empty(0)
         ends = ends[np.isfinite(ends)]

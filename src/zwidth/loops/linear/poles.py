@@ -27,8 +27,9 @@ from zwidth.words.types import Array
 
 # Aberth's steps at most, and the step, in units of the pole's own distance from z = 1, that ends them.
 _STEPS, _ARRIVED = 60, 4e-16
-# Where the distance from z = 1 has digits of its own that eigenvalues do not know.
-_NEAR_ONE = 1e-6
+_LONGEST_STEP = 0.5
+# A pole that would go farther, as a share of its distance from z = 1, has not arrived; and how often such are moved.
+_STRAY, _STIRS = 1e-3, 4
 # Imaginary parts that are none, as a share.
 _REAL = 1e-13
 # Numbers that a block of walls holds: eigenvalues and the distances between poles take order^2 each.
@@ -99,12 +100,17 @@ def _start(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
 def _polish(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> Array:
     """Aberth's steps: Newton's, from which each pole keeps off the others."""
     _take_steps(loop, alpha, beta, zeta, np.arange(len(zeta)))
-    # Steps keep a real pair real and a conjugate one conjugate. Of two poles next to z = 1 that are almost one,
-    # eigenvalues may have made the other kind, from which no step leads to them.
-    at = evaluate(loop, alpha[:, None], beta[:, None], zeta)
-    stray = (np.abs(at.value) > 1e-10 * at.size) & (np.abs(zeta) < _NEAR_ONE)
-    zeta *= np.where(stray, 1.0 + 0.3 * np.exp(2.4j * np.arange(zeta.shape[1])), 1.0)
-    _take_steps(loop, alpha, beta, zeta, np.flatnonzero(stray.any(1)))
+    # Steps keep a real pair real and a conjugate one conjugate. Of two poles that are almost one eigenvalues may have
+    # made the other kind, from which no step leads to them.
+    for turn in range(_STIRS):
+        at = evaluate(loop, alpha[:, None], beta[:, None], zeta)
+        with np.errstate(all="ignore"):
+            step = step_apart(zeta, at.slope / at.value)
+        stray = (np.abs(at.value) > 1e-10 * at.size) & (np.abs(step) > _STRAY * np.abs(zeta))
+        if not stray.any():
+            break
+        zeta *= np.where(stray, 1.0 + 0.3 * np.exp(2.4j * (np.arange(zeta.shape[1]) + turn)), 1.0)
+        _take_steps(loop, alpha, beta, zeta, np.flatnonzero(stray.any(1)))
     return zeta
 
 
@@ -118,8 +124,9 @@ def _take_steps(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, rows: A
         with np.errstate(all="ignore"):
             step = step_apart(now, at.slope / at.value)
         # Below the rounding of P a step moves nothing but noise.
-        good = np.isfinite(step) & (np.abs(at.value) > 1e-16 * at.size) & (np.abs(step) < 0.5)
+        good = np.isfinite(step) & (np.abs(at.value) > 1e-16 * at.size)
         step = np.where(good, step, 0.0)
+        step *= _LONGEST_STEP / np.maximum(np.abs(step), _LONGEST_STEP)
         zeta[rows] = now - step
         rows = rows[(np.abs(step) > _ARRIVED * np.abs(now)).any(1)]
 

@@ -134,3 +134,26 @@ def test_walls_of_a_row_that_contradicts_itself_are_told_by_their_poles(monkeypa
     assert 0 < expected.sum() < expected.size
     monkeypatch.setattr(type(loop.loop.boundary), "_settle", lambda self, beta: (beta, np.zeros(beta.shape, bool)))
     np.testing.assert_array_equal(loop.is_stable(stiffness, damping), expected)
+
+
+@pytest.mark.parametrize("damping", [-0.5, 5.0, 20.0])
+def test_poles_are_found_where_eigenvalues_take_a_pair_for_two_real_ones(damping):
+    # Beside modes and a hand next to z = 1 the coefficients keep few digits of the poles there.
+    tip = zwidth.Coupling(12.0, 7e3, 0.7)
+    modes = [zwidth.Mode(30, 0.0075, -50), zwidth.Mode(70, 0.2, 50), zwidth.Mode(25, 0.07, 0.2)]
+    hand = zwidth.Operator(14.0, 390.0, 540e3, coupling_stiffness=45e6, coupling_damping=7.5)
+    resonant = zwidth.Scene(
+        zwidth.Device(0.5, 0.0, tip, modes=modes),
+        zwidth.Timing(4e-4),
+        velocity=zwidth.Butterworth(400, 4),
+        operator=hand,
+    )
+    stiffness = np.linspace(0.0, 20e3, 1001)
+    labels = resonant.is_stable(stiffness, damping)
+    found = resonant.decide_stability(stiffness, damping, method="companion")
+    np.testing.assert_array_equal(found.stable, labels)
+    np.testing.assert_array_equal(resonant.spectral_radius(stiffness, damping) < 1, labels)
+    for stiff in (70.0, 115.0, 390.0):
+        exact = np.linalg.eigvals(resonant.state_space(stiff, damping).A)
+        size = np.abs(resonant.poles(stiff, damping)).max()
+        np.testing.assert_allclose(size, np.abs(exact).max(), rtol=1e-9)
