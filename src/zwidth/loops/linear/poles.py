@@ -28,8 +28,9 @@ from zwidth.words.types import Array
 # Aberth's steps at most, and the step, in units of the pole's own distance from z = 1, that ends them.
 _STEPS, _ARRIVED = 60, 4e-16
 _LONGEST_STEP = 0.5
-# A pole that would go farther, as a share of its distance from z = 1, has not arrived; and how often such are moved.
-_STRAY, _STIRS = 1e-3, 4
+# Nearer to z = 1 than this a pole's distance from it has digits of its own, that eigenvalues do not know. A pole that
+# would go farther, as a share of that distance, has not arrived; and how often such are moved.
+_NEAR_ONE, _STRAY, _STIRS = 1e-6, 1e-3, 4
 # Imaginary parts that are none, as a share.
 _REAL = 1e-13
 # Numbers that a block of walls holds: eigenvalues and the distances between poles take order^2 each.
@@ -106,7 +107,8 @@ def _polish(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> Array:
         at = evaluate(loop, alpha[:, None], beta[:, None], zeta)
         with np.errstate(all="ignore"):
             step = step_apart(zeta, at.slope / at.value)
-        stray = (np.abs(at.value) > 1e-10 * at.size) & (np.abs(step) > _STRAY * np.abs(zeta))
+        far = (np.abs(step) > _STRAY * np.abs(zeta)) | (np.abs(zeta) < _NEAR_ONE)
+        stray = (np.abs(at.value) > 1e-10 * at.size) & far
         if not stray.any():
             break
         zeta *= np.where(stray, 1.0 + 0.3 * np.exp(2.4j * (np.arange(zeta.shape[1]) + turn)), 1.0)

@@ -204,7 +204,7 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
         deepest = narrow_dips(
             lambda f: _periods_borne(f, *still), left, middle, right, sample(periods, place), _NARROWED
         )
-        dips = xp.any(dips, axis=-1)[..., None] & (np.arange(_FRACTIONS + 1) == place)
+        dips = xp.any(dips, axis=-1)[..., None] & (along(np.arange(_FRACTIONS + 1), xp.asarray(d)) == place)
         grid, periods = (xp.where(dips, at[..., None], all) for at, all in zip(deepest, (grid, periods), strict=True))
     # One period on, f = 0 again, but for n: exactly so, whatever the rounding.
     periods = xp.concatenate([periods[..., :-1], periods[..., :1] - 1.0], axis=-1)
