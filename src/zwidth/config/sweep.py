@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, GetPydanticSchema, ValidationError, WrapValidator, create_model
@@ -61,8 +61,9 @@ def _axis_field(name: str) -> tuple[Any, Any]:
         rows = "Parameters that move together, one row a device: lists of equal length, or a CSV file."
         return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
     axis: Any = Annotated[Axis, axis_of(name)]
-    words = describe_parameter(PARAMETERS[name]) + ("." if name in WALL else "; the scene's where left out.")
-    return axis | None, Field(default=None, description=words)
+    # What stands where it is left out: the scene's, here.
+    words = describe_parameter(replace(PARAMETERS[name], note="" if name in WALL else "the scene's where left out"))
+    return axis | None, Field(default=None, description=f"{words}.")
 
 
 # In the order in which a store keeps what was asked of it.
