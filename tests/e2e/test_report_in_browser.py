@@ -4,20 +4,11 @@ from __future__ import annotations
 
 import pytest
 from browser import open_page
+from sweeping import PLANES, study
 
 import zwidth
 
-STUDY = {
-    "kind": "sweep",
-    "name": "plane",
-    "axes": {
-        "alpha": {"linear": {"start": 0.01, "stop": 0.3, "num": 30}},
-        "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 20}},
-        "delta": [0.1, 0.5],
-        "d": 1,
-    },
-    "outputs": ["spectral_radius"],
-}
+STUDY = study("plane", PLANES, ("spectral_radius",))
 
 
 @pytest.mark.parametrize("width, scheme", [(1280, "light"), (390, "dark")])

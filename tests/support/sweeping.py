@@ -27,6 +27,14 @@ AXES = {
     "d": [0, 0.5, 1, 2],
 }
 
+# Two planes of walls, as a report slices them.
+PLANES = {
+    "alpha": {"linear": {"start": 0.01, "stop": 0.3, "num": 30}},
+    "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 20}},
+    "delta": [0.1, 0.5],
+    "d": 1,
+}
+
 
 def study(name="map", axes=None, outputs=("stable",), **fields):
     return {"kind": "sweep", "name": name, "axes": AXES if axes is None else axes, "outputs": list(outputs), **fields}

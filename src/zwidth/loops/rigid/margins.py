@@ -191,7 +191,7 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     whole, fraction = split_delay(d)
     grid = _grade_fractions(still[2], xp)
     crossings, phases, exist = _bound_undelayed(grid, *(value[..., None] + 0.0 * grid for value in still))
-    periods = xp.where(exist, phases / crossings, -xp.inf)
+    periods = _borne(crossings, phases, exist)
 
     def sample(of: Array, at: Array) -> Array:
         return xp.take_along_axis(of, at, axis=-1)[..., 0][()]
@@ -201,11 +201,11 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     if xp is not np or dips.any():
         place = xp.argmax(dips, axis=-1)[..., None] + 1
         left, middle, right = (sample(grid, place + k) for k in (-1, 0, 1))
-        deepest = narrow_dips(
-            lambda f: _periods_borne(f, *still), left, middle, right, sample(periods, place), _NARROWED
+        f, least = narrow_dips(
+            lambda f: _borne(*_bound_undelayed(f, *still)), left, middle, right, sample(periods, place), _NARROWED
         )
         dips = xp.any(dips, axis=-1)[..., None] & (along(np.arange(_FRACTIONS + 1), xp.asarray(d)) == place)
-        grid, periods = (xp.where(dips, at[..., None], all) for at, all in zip(deepest, (grid, periods), strict=True))
+        grid, periods = xp.where(dips, f[..., None], grid), xp.where(dips, least[..., None], periods)
     # One period on, f = 0 again, but for n: exactly so, whatever the rounding.
     periods = xp.concatenate([periods[..., :-1], periods[..., :1] - 1.0], axis=-1)
     now, part = frozen((whole, fraction), xp)
@@ -239,10 +239,9 @@ def _grade_fractions(delta: Array, xp: Any) -> Array:
     return xp.minimum(xp.where(share <= 0.5, from_end, 1.0 - from_end), 1.0 - epsilon(delta))
 
 
-def _periods_borne(f: Array, alpha: Array, beta: Array, delta: Array) -> Array:
-    """nu of `_delay_margin`."""
-    w, phase, exists = _bound_undelayed(f, alpha, beta, delta)
-    xp = namespace(f)
+def _borne(w: Array, phase: Array, exists: Array) -> Array:
+    """nu of `_delay_margin`, which no crossover leaves below all periods."""
+    xp = namespace(w)
     return xp.where(exists, phase / w, -xp.inf)
 
 

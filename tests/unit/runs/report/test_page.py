@@ -11,23 +11,14 @@ import shutil
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from sweeping import PLANES, study
 
 import zwidth
 from zwidth.cli.commands import cli
 from zwidth.studies import Config
 from zwidth.words.errors import StoreError
 
-PLANE = {
-    "kind": "sweep",
-    "name": "plane",
-    "axes": {
-        "alpha": {"linear": {"start": 0.01, "stop": 0.3, "num": 30}},
-        "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 20}},
-        "delta": [0.1, 0.5],
-        "d": 1,
-    },
-    "outputs": ["stable", "spectral_radius"],
-}
+PLANE = study("plane", PLANES, ("stable", "spectral_radius"))
 TOP = {"kind": "ridge", "name": "top", "delta": [0, 1], "d": 1}
 
 
