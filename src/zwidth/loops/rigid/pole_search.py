@@ -28,8 +28,10 @@ from zwidth.loops.rigid.device import valid_wall
 from zwidth.loops.rigid.pole_step import halley_step, join, move_pole, newton_step, value_at
 from zwidth.words.types import Array
 
-# Steps on both starts, then on the larger of the two; on both where that was not enough, next to double poles.
-_BOTH, _LARGER, _PATIENT = 2, 3, 10
+# Steps on both starts, then on the larger of the two; where that was not enough, on it and the other one, then on all.
+_BOTH, _LARGER, _AGAIN, _PATIENT = 2, 3, 6, 10
+# A start that is within so much of a pole has arrived.
+_ARRIVED = 1e-6
 # A step after which a pole is within so much of where it began may be taken without looking again: N |P/P'| bounds
 # the distance before the step, N >= 3, and the step is an N-th of it.
 _AFTER = 1.4
@@ -154,9 +156,22 @@ def quick_kernel(
 # Attempts to prove what the quick kernel has found but not proved, in NumPy; the loops are those of the walls.
 
 
+def _certify_largest(
+    starts: tuple[np.ndarray, np.ndarray], steps: int, tolerance: float, loop: Loop, fractional: bool
+) -> OutermostPoles:
+    """The largest of the poles to which starts lead, with a count that may meet several crossovers."""
+    re, im = repeat(steps, lambda at: halley_step(*at, loop, fractional), starts, np)
+    arrived = newton_step(re, im, loop, fractional).within < _ARRIVED
+    best = np.where(arrived, re, -np.inf).argmax(0), np.arange(re.shape[1])
+    return certify_pole(re[best], im[best], tolerance, loop, fractional, False)
+
+
 def certify_again(found: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
-    """What was found after one step more, with a count that may meet several crossovers."""
-    return certify_pole(*halley_step(found.re, found.im, loop, fractional), tolerance, loop, fractional, False)
+    """What was found, and the start that is farther from it."""
+    slow, pair = slow_pole(loop), first_pair(loop, fractional)
+    farther = np.abs(found.im - slow[1]) > np.abs(found.im - pair[1])
+    starts = [np.stack([leaf, np.where(farther, *both)]) for leaf, *both in zip(found[:2], slow, pair, strict=True)]
+    return _certify_largest((starts[0], starts[1]), _AGAIN, tolerance, loop, fractional)
 
 
 def bound_radius(found: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
@@ -178,10 +193,7 @@ def all_starts(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
 
 def certify_starts(_: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
     """What all of the starts lead to."""
-    at = repeat(_PATIENT, lambda at: halley_step(*at, loop, fractional), all_starts(loop, fractional), np)
-    found = certify_pole(*at, tolerance, loop, fractional, False)
-    best = np.where(found.proved, np.inf, np.nan_to_num(found.re, nan=-np.inf)).argmax(0)
-    return OutermostPoles(*(leaf[best, np.arange(best.size)] for leaf in found))
+    return _certify_largest(all_starts(loop, fractional), _PATIENT, tolerance, loop, fractional)
 
 
 def search(_: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
