@@ -41,7 +41,7 @@ SMALLEST_MAP = 1 << 11
 # Listed walls whose poles are found at one time without a compiler: in smaller lists they take longer.
 _AT_ONCE = 1 << 13
 # So few walls take less one by one than in cells.
-FEW_FOR_CELLS = 1 << 15
+FEW_FOR_CELLS = 1 << 13
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
 

@@ -176,8 +176,8 @@ class _Canvas:
 def _sides(rows: int, columns: int) -> list[tuple[int, int]]:
     """Rows and columns of the cells of a map, from the largest on, each a power of 2."""
     longer, all_sides = 0.5 * np.log2(columns / rows), []
-    # Larger ones would mostly lie beyond the map.
-    for side in (side for side in _SIDES if side < 2.0 * np.sqrt(rows * columns) or side == _SIDES[-1]):
+    # In larger ones another pole would mostly take over somewhere.
+    for side in (side for side in _SIDES if side < 0.1 * max(rows, columns) or side == _SIDES[-1]):
         high = int(2.0 ** np.clip(np.round(np.log2(side) - longer), 0.0, 2.0 * np.log2(side)))
         all_sides.append((high, side**2 // high))
     return all_sides
