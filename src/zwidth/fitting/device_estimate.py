@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -115,40 +116,14 @@ class DeviceEstimate:
     damping_tried: float | None = None
     stiffness_tried: float | None = None
 
-    @property
-    def mass(self) -> float:
-        """In kg."""
-        return self.scene.device.mass
-
-    @property
-    def damping(self) -> float:
-        """In N s/m."""
-        return self.scene.device.damping
-
-    @property
-    def delay(self) -> float:
-        """In s."""
-        return self.scene.timing.delay
-
-    @property
-    def period(self) -> float:
-        """Of the loop, in s."""
-        return self.scene.timing.period
-
-    @property
-    def velocity(self) -> Velocity:
-        """Of the loop."""
-        return self.scene.velocity
-
-    @property
-    def actuator(self) -> Actuator | None:
-        """With the lag that the records ask for."""
-        return self.scene.device.actuator
-
-    @property
-    def modes(self) -> tuple[Mode, ...]:
-        """The resonances that the records ask for."""
-        return self.scene.device.modes
+    # Of its scene: kg, N s/m, s, the period in s, and the parts that the records ask for.
+    mass = property(attrgetter("scene.device.mass"))
+    damping = property(attrgetter("scene.device.damping"))
+    delay = property(attrgetter("scene.timing.delay"))
+    period = property(attrgetter("scene.timing.period"))
+    velocity = property(attrgetter("scene.velocity"))
+    actuator = property(attrgetter("scene.device.actuator"))
+    modes = property(attrgetter("scene.device.modes"))
 
     @property
     def is_structured(self) -> bool:
