@@ -26,6 +26,8 @@ VAGUE = 0.5
 BEYOND = 3.0
 # Sampling periods of loops, in s: outside a unit is suspected.
 _QUICKEST, _SLOWEST = 5e-6, 0.02
+# About a device that may be more than the model.
+SEE_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of it"
 
 
