@@ -276,10 +276,8 @@ def _further(
     precision: np.ndarray,
     rivals: list[tuple[FittedKind, np.ndarray]],
 ) -> FurtherExperiment | None:
-    """The wall of the device's own boundary, B >= 0, after which K_max is known best.
-
-    Where a device of another kind may be there, the wall at which the two differ most.
-    """
+    """The wall of the device's own boundary, B >= 0, after which K_max is known best."""
+    # Where a device of another kind may be there, the wall at which the two differ most.
     onsets, theta = chosen.onsets, chosen.best.theta
     scene, period, mass = chosen.scene(theta), onsets.period, np.exp(theta[0])
     w = np.linspace(0.0, np.pi, _ANGLES + 2)[1:-1]

@@ -31,10 +31,8 @@ _Looked = tuple[FittedModel, HiddenPole | None, list[PoleBank], LagTest | None]
 
 
 def choose_structure(best: FittedModel) -> _Looked:
-    """Add what explains the residuals best as long as they show a pole; then, what they still show, and what of lags.
-
-    Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
-    """
+    """Add what explains the residuals best as long as they show a pole; then what they still show, and of lags."""
+    # Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
     way = max(float(np.ptp(log.position)) for log in best.model.logs)
     if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * way**2:
         return best, None, [], None
@@ -63,11 +61,9 @@ def _look(best: FittedModel) -> _Looked:
 
 
 def _grow(best: FittedModel, banks: list[PoleBank]) -> tuple[FittedModel | None, HiddenPole | None]:
-    """The likeliest device with one part more, None where none is as likely as without; and what else it may be.
-
-    A resonance that a log hardly shows looks like a lag, which has fewer numbers, but quite another K_max. So a lag is
-    doubted where the further numbers of a resonance explain more than chance does.
-    """
+    """The likeliest device with one part more, None where none is as likely as without; and what else it may be."""
+    # A resonance that a log hardly shows looks like a lag, which has fewer numbers, but quite another K_max. So a lag
+    # is doubted where the further numbers of a resonance explain more than chance does.
     begun: dict[tuple[int, int], tuple[float, Recordings, np.ndarray]] = {}
     for lag, modes, start in _start(best, banks):
         model = replace(best.model, lag=lag, modes=modes).begin(_TOLD)

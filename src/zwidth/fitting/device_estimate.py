@@ -65,10 +65,8 @@ class DimensionlessDevice(NamedTuple):
 
 
 def scene_of(values: Iterable[float], period: float, velocity: Velocity, lag: int = 0) -> Scene:
-    """The loop of a device by the numbers that `name_numbers` names; ``lag`` is an amplifier's order.
-
-    The device is of the kind in question, linear or rotary.
-    """
+    """The loop of a device by the numbers that `name_numbers` names; ``lag`` is an amplifier's order."""
+    # The device is of the kind in question, linear or rotary.
     mass, damping, delay, *beside = map(float, values)
     constant, *ratio = beside[:lag] or [None]
     actuator = Actuator(None, constant, lag, *ratio) if lag else None

@@ -129,10 +129,8 @@ class FittedModel:
 
     @cached_property
     def excess(self) -> float:
-        """By how much sums of neighboring residuals spread more than those of such noise; 1 where chance explains it.
-
-        Over twice the cube root of the samples, as usual for errors of unknown kinship (Newey, West 1987).
-        """
+        """By how much sums of neighboring residuals spread more than those of noise; 1 where chance explains it."""
+        # Over twice the cube root of the samples, as usual for errors of unknown kinship (Newey, West 1987).
         from scipy.special import chdtri
 
         weights, total = self.model.noise or self.noise, self.residuals.size
@@ -147,11 +145,9 @@ class FittedModel:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Of theta: exact slopes, the encoder's correlated errors, what else spreads the residuals, and the rivals.
-
-        NaN of what is open. Where squares rise less towards a rival than slopes say, as beyond a corner, the errors
-        that way are as large as to leave it as many standard errors away as its squares do.
-        """
+        """Of theta: exact slopes, the encoder's correlated errors, what else spreads the residuals, and the rivals."""
+        # NaN of what is open. Where squares rise less towards a rival than slopes say, as beyond a corner, the errors
+        # that way are as large as to leave it as many standard errors away as its squares do.
         (columns, sizes), weigh = self.columns, self.model.weigh
         # Not by the products of columns, which keep half of the digits.
         inverse, blind, _ = self.inverse
@@ -201,10 +197,8 @@ def fit_model(model: Recordings) -> FittedModel:
 
 
 def _start(model: Recordings) -> list[np.ndarray]:
-    """The best without friction, and for every friction the best of a grid over damping and delay; by the beginnings.
-
-    All else is linear there, for all speeds grow with g. One motion serves all delays: begun so much earlier.
-    """
+    """The best without friction, and for every friction the best of a grid over damping and delay, by beginnings."""
+    # All else is linear there, for all speeds grow with g. One motion serves all delays: begun so much earlier.
     model = model.begin(_GLIMPSE)
     base, most = np.zeros(model.size), int(model.longest)
     early = Recordings(
@@ -279,11 +273,9 @@ def follow_start(model: Recordings, start: np.ndarray, steps: int) -> tuple[np.n
 
 
 def _fit(model: Recordings, start: np.ndarray, held: _Held = (), arrived: float = _ARRIVED) -> FittedModel:
-    """Least squares from a start, or at rest where that is as good.
-
-    First speeds that friction stops within the noise hardly move the positions. Beside such a speed the position's
-    derivative is next to 0, and steps towards the best one hardly end.
-    """
+    """Least squares from a start, or at rest where that is as good."""
+    # First speeds that friction stops within the noise hardly move the positions. Beside such a speed the position's
+    # derivative is next to 0, and steps towards the best one hardly end.
     best = settle(model, start, held, arrived)
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.speeds]), best.theta
     # The way to the stop, v^2/(2 c) without damping and v/delta without friction.
@@ -311,10 +303,7 @@ def settle(model: Recordings, start: np.ndarray, held: _Held = (), arrived: floa
 def _refine(
     model: Recordings, start: np.ndarray, held: _Held, most: int = _STEPS, arrived: float = _ARRIVED
 ) -> tuple[np.ndarray, float, bool]:
-    """Levenberg and Marquardt's steps within bounds: theta, the sum of squares, and whether it is the least.
-
-    What is ``held`` stays as it starts.
-    """
+    """Levenberg and Marquardt's steps within bounds but for what is ``held``: theta, squares, whether they are least."""
     low, high = model.bounds()
     low[-1] = LEAST * abs(start[0]) * model.largest
     low[list(held)] = high[list(held)] = start[list(held)]

@@ -311,11 +311,9 @@ class FrictionRule(NamedTuple):
 def friction_rule(
     *, damping: float, period: float, friction: float | None = None, resolution: float | None = None
 ) -> FrictionRule:
-    """Up to which stiffness in N/m a wall without virtual damping and delay is passive: ``K <= min(2 b/T, 2 f_c/Q)``.
-
-    Viscous damping b pays for sampling, Coulomb friction f_c in N for quantization in steps of Q in m. A sufficient
-    condition for a spring alone, on a rigid device (Abbott, Okamura 2005, IEEE Trans. Robotics 21(5), 952-964).
-    """
+    """Up to which K in N/m a wall without virtual damping and delay is passive: ``K <= min(2 b/T, 2 f_c/Q)``."""
+    # Viscous damping b pays for sampling, Coulomb friction f_c in N for quantization in steps of Q in m. A sufficient
+    # condition for a spring alone, on a rigid device (Abbott, Okamura 2005, IEEE Trans. Robotics 21(5), 952-964).
     by_damping = 2.0 * damping / period if damping else None
     by_friction = None if friction is None or resolution is None else 2.0 * friction / resolution
     lower = None if by_damping is None or by_friction is None else min(by_damping, by_friction)
@@ -323,10 +321,8 @@ def friction_rule(
 
 
 def passive_edge(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
-    """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping.
-
-    The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
-    """
+    """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping."""
+    # The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
     own, units = float(scene.device.damping), scene.units
     turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, directions)
     # The smallest cosines are rounded zeros.
