@@ -92,19 +92,18 @@ def _grow(best: FittedModel, banks: list[PoleBank]) -> tuple[FittedModel | None,
 def _start(best: FittedModel, banks: list[PoleBank]) -> Iterator[tuple[int, int, np.ndarray]]:
     """Devices with one part more: the amplifier's order, how many modes, and theta to begin with."""
     model, theta = best.model, best.theta
-    lag, modes, logs = model.lag, model.modes, len(model.logs)
-    head, ringing = theta[:3], theta[3 + lag : 3 + lag + 3 * modes]
-    speeds, states = np.split(theta[3 + lag + 3 * modes : -2], [2 * logs])
+    lag, modes, logs, first = model.lag, model.modes, len(model.logs), model.parts.stop
     if lag == 0:
         for late in _LAGS:
-            if late <= head[2] + 0.5:
-                start = [head[0], head[1], max(head[2] - late, 0.0)]
-                yield 1, modes, np.r_[start, late, ringing, speeds, states, theta[-2:]]
-                yield 2, modes, np.r_[start, late, _RATIO, ringing, speeds, states, theta[-2:]]
+            if late <= theta[2] + 0.5:
+                start = [theta[0], theta[1], max(theta[2] - late, 0.0), late]
+                yield 1, modes, np.r_[start, theta[3:]]
+                yield 2, modes, np.r_[start, _RATIO, theta[3:]]
     elif lag == 1:
-        yield 2, modes, np.r_[head, theta[3], _RATIO, ringing, speeds, states, theta[-2:]]
+        yield 2, modes, np.r_[theta[:4], _RATIO, theta[4:]]
+    speeds, states = np.split(theta[first:-2], [2 * logs])
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
     ringing_banks = [bank for bank in banks if bank.ratio < 1.0]
     for _, frequency, ratio in islice(list_likeliest(ringing_banks, _APART), _PARTED):
         mode = [2.0 * np.pi * frequency, ratio, 0.0]
-        yield lag, modes + 1, np.r_[head, theta[3 : 3 + lag], ringing, mode, speeds, states, theta[-2:]]
+        yield lag, modes + 1, np.r_[theta[:first], mode, speeds, states, theta[-2:]]

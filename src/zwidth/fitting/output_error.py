@@ -303,7 +303,7 @@ def settle(model: Recordings, start: np.ndarray, held: _Held = (), arrived: floa
 def _refine(
     model: Recordings, start: np.ndarray, held: _Held, most: int = _STEPS, arrived: float = _ARRIVED
 ) -> tuple[np.ndarray, float, bool]:
-    """Levenberg and Marquardt's steps within bounds but for what is ``held``: theta, squares, whether they are least."""
+    """Levenberg and Marquardt's steps within bounds but for what is ``held``: theta, squares, and whether the least."""
     low, high = model.bounds()
     low[-1] = LEAST * abs(start[0]) * model.largest
     low[list(held)] = high[list(held)] = start[list(held)]
