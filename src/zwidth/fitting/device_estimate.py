@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
@@ -60,19 +60,13 @@ class DimensionlessDevice(NamedTuple):
         return cls(mass, values[1] / (mass / period), values[2] / period, delays, ringing)
 
     def to_scene(self, period: float, velocity: Velocity) -> Scene:
-        """Its loop without a wall."""
-        return scene_of(self.to_numbers(period), period, velocity, len(self.lag))
-
-
-def scene_of(values: Iterable[float], period: float, velocity: Velocity, lag: int = 0) -> Scene:
-    """The loop of a device by the numbers that `name_numbers` names; ``lag`` is an amplifier's order."""
-    # The device is of the kind in question, linear or rotary.
-    mass, damping, delay, *beside = map(float, values)
-    constant, *ratio = beside[:lag] or [None]
-    actuator = Actuator(None, constant, lag, *ratio) if lag else None
-    modes = [Mode(*beside[k : k + 3]) for k in range(lag, len(beside), 3)]
-    device = Device(mass, damping, actuator=actuator, modes=modes, rotary=is_rotary())
-    return Scene(device, Timing(period=period, delay=delay), velocity=velocity)
+        """Its loop without a wall; the device is of the kind in question, linear or rotary."""
+        lag, (mass, damping, delay, *beside) = len(self.lag), map(float, self.to_numbers(period))
+        constant, *ratio = beside[:lag] or [None]
+        actuator = Actuator(None, constant, lag, *ratio) if lag else None
+        modes = [Mode(*beside[k : k + 3]) for k in range(lag, len(beside), 3)]
+        device = Device(mass, damping, actuator=actuator, modes=modes, rotary=is_rotary())
+        return Scene(device, Timing(period=period, delay=delay), velocity=velocity)
 
 
 def differentiate(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:

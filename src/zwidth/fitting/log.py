@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.choosing import ALIKE, EXACT, choose_structure
-from zwidth.fitting.device_estimate import differentiate, find_stiffest, reach_of
-from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion
+from zwidth.fitting.device_estimate import differentiate, reach_of
+from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, doubt_period
 from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted, weigh_resonances
 from zwidth.fitting.moving import Recording
@@ -170,19 +170,18 @@ def _fit(
     if banks and not unexplained:
         shown = {"response": respond_as_fitted(best, scene, banks), "hidden": weigh_resonances(best, scene, banks)}
         shown |= {"lag": bound_lag(best, lags, scene, reach_of(freedom))}
-    return DeviceFit.conclude(
-        scene,
-        find_stiffest(scene),
-        covariance,
-        errors={"offset": offset[1], "friction": friction[1]},
+    return DeviceFit(
+        scene=scene,
+        covariance=covariance,
+        errors_of_log={"offset": offset[1], "friction": friction[1]},
         offset=offset[0],
         friction=friction[0],
         resolution=step,
         motions=motions,
         noise=float(np.sqrt(best.variance)),
         residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
-        doubts=doubts,
-        status=status,
+        doubts=(*doubts, *doubt_period(period)),
+        status=int(status),
         freedom=freedom,
         **shown,
     )
