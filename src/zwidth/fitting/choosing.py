@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from zwidth.fitting.hidden import HiddenPole, LagTest, PoleBank, find_hidden, list_likeliest, look_for_lags
-from zwidth.fitting.output_error import NEARLY, FittedModel, follow_start, settle
+from zwidth.fitting.output_error import CLOSELY, NEARLY, FittedModel, refine, settle
 from zwidth.fitting.structure import Recordings
 
 # So many parts, lags and resonances, are added at most; so many positions of each log tell which one.
@@ -67,12 +67,12 @@ def _grow(best: FittedModel, banks: list[PoleBank]) -> tuple[FittedModel | None,
     begun: dict[tuple[int, int], tuple[float, Recordings, np.ndarray]] = {}
     for lag, modes, start in _start(best, banks):
         model = replace(best.model, lag=lag, modes=modes).begin(_TOLD)
-        theta, squares = follow_start(model, start, _BEGUN)
+        theta, squares, _ = refine(model, start, (), _BEGUN, CLOSELY)
         if squares < begun.get((lag, modes), (np.inf,))[0]:
             begun[lag, modes] = squares, model, theta
     tried = []
     for _, model, start in begun.values():
-        theta, squares = follow_start(model, start, _COMPARED)
+        theta, squares, _ = refine(model, start, (), _COMPARED, CLOSELY)
         # -2 times its logarithmic likelihood, and Schwarz's criterion.
         misfit = model.measured.size * np.log(squares)
         tried.append((misfit + theta.size * np.log(model.measured.size), misfit, model, theta))

@@ -179,7 +179,7 @@ def bound_lag(best: FittedModel, test: LagTest | None, scene: Scene, reach: floa
     lag = float(test.lag[count - 1] * period)
     # What a lag moves of resonances is small, and may be more than there is.
     theta = np.clip(test.theta[:, count - 1], *best.model.bounds())
-    there = best.model.to_scene(theta, period, scene.velocity)
+    there = best.model.normalize(theta, period).to_scene(period, scene.velocity)
     there = replace(there, device=replace(there.device, actuator=Actuator(time_constant=lag)))
     return HiddenLag(lag, float(there.timing.delay), float(there.max_stiffness().stiffness))
 

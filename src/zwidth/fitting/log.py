@@ -149,7 +149,7 @@ def _fit(
             "force: mass, damping and delay cannot be told apart by this log; record longer, with a force that changes "
             "its sign at different times, as steps to and fro"
         )
-    scene, known = model.to_scene(theta, period, velocity), slice(0, model.parts.stop)
+    scene, known = model.normalize(theta, period).to_scene(period, velocity), slice(0, model.parts.stop)
     by_theta = differentiate(lambda theta: model.normalize(theta, period).to_numbers(period), theta)[:, known]
     (by_period,) = differentiate(lambda time: model.normalize(theta, time[0]).to_numbers(time[0]), np.array([period])).T
     late = wavers * period * by_period
