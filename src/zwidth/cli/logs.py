@@ -195,7 +195,7 @@ def respond(
     from zwidth.fitting.respond import find_nominal_limit, respond_to_logs
     from zwidth.scenes.scene import Scene
 
-    found = respond_to_logs(read_logs(logs, period, **of_logs), period=period, cycle=cycle)
+    found = respond_to_logs(read_logs(logs, period, **of_logs), period, cycle)
     device, period, doubts = found.device, found.period, found.doubts
     kind = "stretches of a force that repeats" if found.cycle else "pieces"
     source = f"{' and '.join(log.name for log in logs)}, {found.records} {kind}"

@@ -21,7 +21,7 @@ from zwidth.fitting.buzz_search import (
 )
 from zwidth.fitting.buzzing import Onsets
 from zwidth.fitting.device_estimate import differentiate, find_stiffest, name_numbers
-from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FurtherExperiment, RivalDevice
+from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FurtherExperiment, RivalDevice, doubt_period
 from zwidth.fitting.words import spell_rival
 from zwidth.parts.checks import check_number, read_texts
 from zwidth.parts.velocity import BackwardDifference, Velocity
@@ -169,20 +169,22 @@ def fit_buzz(
             ]
     further = _further(chosen, stiffest, information, slope @ by_theta, weights**2 / scale, rivals)
     stiffness, damping, _ = table[np.argmax(table[:, 1])].tolist()
-    return DeviceFit.conclude(
-        scene,
-        (stiffest, slope),
-        covariance,
+    fit = DeviceFit(
+        scene=scene,
+        covariance=covariance,
         noise=share or (float(np.sqrt(scale)), float(np.sqrt(scale))),
         residuals=best.residuals / np.sqrt(scale),
-        doubts=doubts,
-        status=status,
+        doubts=(*doubts, *doubt_period(period)),
+        status=int(status),
         freedom=None if share else chosen.freedom,
-        next=None if status == Status.NO_BOUNDARY else further,
         rivals=told,
         damping_tried=damping,
         stiffness_tried=stiffness,
     )
+    if further is None or status == Status.NO_BOUNDARY:
+        return fit
+    after = further.error_afterwards if fit.stiffness_max > 0 else np.nan
+    return replace(fit, next=further._replace(error_afterwards=after))
 
 
 def _read_points(points: Iterable[Any], period: float, copies_count_once: bool) -> tuple[np.ndarray, list[str]]:
@@ -276,10 +278,8 @@ def _further(
     precision: np.ndarray,
     rivals: list[tuple[FittedKind, np.ndarray]],
 ) -> FurtherExperiment | None:
-    """The wall of the device's own boundary, B >= 0, after which K_max is known best.
-
-    Where a device of another kind may be there, the wall at which the two differ most.
-    """
+    """The wall of the device's own boundary, B >= 0, after which K_max is known best."""
+    # Where a device of another kind may be there, the wall at which the two differ most.
     onsets, theta = chosen.onsets, chosen.best.theta
     scene, period, mass = chosen.scene(theta), onsets.period, np.exp(theta[0])
     w = np.linspace(0.0, np.pi, _ANGLES + 2)[1:-1]

@@ -89,10 +89,8 @@ def look_around(onsets: Onsets, weights: np.ndarray) -> list[tuple[Candidate, np
 def find_candidates(
     onsets: Onsets, weights: np.ndarray, near: Candidate, start: np.ndarray, most: float
 ) -> list[Candidate]:
-    """The local best fit there. Where damping or delay would be negative, those from the start with it held at 0.
-
-    None where its squares are more than ``most``: what is held leaves more.
-    """
+    """The local best fit there. Where damping or delay would be negative, those from the start with it held at 0."""
+    # None where its squares are more than ``most``: what is held leaves more.
     if near.found:
         free = _solve(onsets, weights, near.theta, ())
         if min(free.theta[1:3]) >= 0:
@@ -216,10 +214,8 @@ class FittedKind(NamedTuple):
 
 
 def choose_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> tuple[FittedKind, list[FittedKind]]:
-    """The likeliest kind of device, and others that are about as likely where it is no rigid one.
-
-    Parts are looked for where they could explain more than chance does.
-    """
+    """The likeliest kind of device, and others that are about as likely where it is no rigid one."""
+    # Parts are looked for where they could explain more than chance does.
     rigid = chosen = _try(onsets, weights, known_noise)
     tried = [rigid]
     for lag, modes in _KINDS:

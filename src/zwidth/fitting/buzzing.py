@@ -129,11 +129,9 @@ class Onsets:
         return Followed(kappa, w, np.abs(step) <= _FOUND * w, differentiate)
 
     def starts(self, deltas: np.ndarray, longest: float, count: int) -> list[np.ndarray]:
-        """Devices to start from: the lowest dips over damping and delay, where the mass is in closed form.
-
-        By phases and by magnitudes, of which the mean is the mass. No stable wall turns its phase by more than half a
-        turn over its delay.
-        """
+        """Devices to start from: the lowest dips over damping and delay, where the mass is in closed form."""
+        # By phases and by magnitudes, of which the mean is the mass. No stable wall turns its phase by more than half a
+        # turn over its delay.
         from scipy.ndimage import minimum_filter
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
@@ -147,10 +145,8 @@ class Onsets:
         return [np.array([log_mass[i, j], deltas[i], delays[j]]) for i, j in dips]
 
     def starts_beside(self, deltas: np.ndarray, longest: float, count: int) -> list[np.ndarray]:
-        """Devices with lag and modes to start from: the lowest dips over their time constants and frequencies.
-
-        Where the walls have the responses ``-1/(K T^2 + B T F)``, ``1/m`` and ``1/m_i`` are linear least squares.
-        """
+        """Devices with lag and modes to start from: the lowest dips over their time constants and frequencies."""
+        # Where the walls have the responses ``-1/(K T^2 + B T F)``, ``1/m`` and ``1/m_i`` are linear least squares.
         delays = np.linspace(0.0, longest, _DELAYS)
         at = circle(self.w)
         wanted = -1.0 / (self.kappa + self.rub * self._estimate.jet(at).value)

@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from zwidth.fitting.hidden import HiddenPole, LagTest, PoleBank, find_hidden, list_likeliest, look_for_lags
-from zwidth.fitting.output_error import NEARLY, FittedModel, follow_start, settle
+from zwidth.fitting.output_error import CLOSELY, NEARLY, FittedModel, refine, settle
 from zwidth.fitting.structure import Recordings
 
 # So many parts, lags and resonances, are added at most; so many positions of each log tell which one.
@@ -31,10 +31,8 @@ _Looked = tuple[FittedModel, HiddenPole | None, list[PoleBank], LagTest | None]
 
 
 def choose_structure(best: FittedModel) -> _Looked:
-    """Add what explains the residuals best as long as they show a pole; then, what they still show, and what of lags.
-
-    Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
-    """
+    """Add what explains the residuals best as long as they show a pole; then what they still show, and of lags."""
+    # Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
     way = max(float(np.ptp(log.position)) for log in best.model.logs)
     if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * way**2:
         return best, None, [], None
@@ -63,20 +61,18 @@ def _look(best: FittedModel) -> _Looked:
 
 
 def _grow(best: FittedModel, banks: list[PoleBank]) -> tuple[FittedModel | None, HiddenPole | None]:
-    """The likeliest device with one part more, None where none is as likely as without; and what else it may be.
-
-    A resonance that a log hardly shows looks like a lag, which has fewer numbers, but quite another K_max. So a lag is
-    doubted where the further numbers of a resonance explain more than chance does.
-    """
+    """The likeliest device with one part more, None where none is as likely as without; and what else it may be."""
+    # A resonance that a log hardly shows looks like a lag, which has fewer numbers, but quite another K_max. So a lag
+    # is doubted where the further numbers of a resonance explain more than chance does.
     begun: dict[tuple[int, int], tuple[float, Recordings, np.ndarray]] = {}
     for lag, modes, start in _start(best, banks):
         model = replace(best.model, lag=lag, modes=modes).begin(_TOLD)
-        theta, squares = follow_start(model, start, _BEGUN)
+        theta, squares, _ = refine(model, start, (), _BEGUN, CLOSELY)
         if squares < begun.get((lag, modes), (np.inf,))[0]:
             begun[lag, modes] = squares, model, theta
     tried = []
     for _, model, start in begun.values():
-        theta, squares = follow_start(model, start, _COMPARED)
+        theta, squares, _ = refine(model, start, (), _COMPARED, CLOSELY)
         # -2 times its logarithmic likelihood, and Schwarz's criterion.
         misfit = model.measured.size * np.log(squares)
         tried.append((misfit + theta.size * np.log(model.measured.size), misfit, model, theta))
@@ -96,19 +92,18 @@ def _grow(best: FittedModel, banks: list[PoleBank]) -> tuple[FittedModel | None,
 def _start(best: FittedModel, banks: list[PoleBank]) -> Iterator[tuple[int, int, np.ndarray]]:
     """Devices with one part more: the amplifier's order, how many modes, and theta to begin with."""
     model, theta = best.model, best.theta
-    lag, modes, logs = model.lag, model.modes, len(model.logs)
-    head, ringing = theta[:3], theta[3 + lag : 3 + lag + 3 * modes]
-    speeds, states = np.split(theta[3 + lag + 3 * modes : -2], [2 * logs])
+    lag, modes, logs, first = model.lag, model.modes, len(model.logs), model.parts.stop
     if lag == 0:
         for late in _LAGS:
-            if late <= head[2] + 0.5:
-                start = [head[0], head[1], max(head[2] - late, 0.0)]
-                yield 1, modes, np.r_[start, late, ringing, speeds, states, theta[-2:]]
-                yield 2, modes, np.r_[start, late, _RATIO, ringing, speeds, states, theta[-2:]]
+            if late <= theta[2] + 0.5:
+                start = [theta[0], theta[1], max(theta[2] - late, 0.0), late]
+                yield 1, modes, np.r_[start, theta[3:]]
+                yield 2, modes, np.r_[start, _RATIO, theta[3:]]
     elif lag == 1:
-        yield 2, modes, np.r_[head, theta[3], _RATIO, ringing, speeds, states, theta[-2:]]
+        yield 2, modes, np.r_[theta[:4], _RATIO, theta[4:]]
+    speeds, states = np.split(theta[first:-2], [2 * logs])
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
     ringing_banks = [bank for bank in banks if bank.ratio < 1.0]
     for _, frequency, ratio in islice(list_likeliest(ringing_banks, _APART), _PARTED):
         mode = [2.0 * np.pi * frequency, ratio, 0.0]
-        yield lag, modes + 1, np.r_[head, theta[3 : 3 + lag], ringing, mode, speeds, states, theta[-2:]]
+        yield lag, modes + 1, np.r_[theta[:first], mode, speeds, states, theta[-2:]]

@@ -276,21 +276,18 @@ def read_step(resolution: Any) -> tuple[float, bool | None]:
             ) from None
 
 
-def list_columns(motions: Sequence[LoggedMotion], period: float | None) -> tuple[Any, Any, Any]:
-    """The times of logs, their period in place of those that were not read, their positions, and their forces."""
-    times = [period if motion.time is None else motion.time for motion in motions]
-    return times, [motion.position for motion in motions], [motion.force for motion in motions]
-
-
-def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None, **options: Any) -> DeviceFit:
-    """`zwidth.fit_log` of logs that are read, all of one axis.
-
-    Raises:
-        InputError: the logs are of different axes or encoders, or as `zwidth.fit_log` says.
-    """
+def join_logs(motions: Sequence[LoggedMotion], period: float | None) -> dict[str, Any]:
+    """Arguments of `zwidth.fit_log`: one axis and one encoder, and the period where no times were read."""
     if len({motion.rotary for motion in motions}) > 1:
         raise InputError("logs: some are of an angle, others of a length; fit them apart")
     steps = {motion.resolution for motion in motions}
     if len(steps) > 1:
         raise InputError("resolution: the logs have several; give all of them the same, or fit them apart")
-    return fit_log(*list_columns(motions, period), resolution=steps.pop(), rotary=motions[0].rotary, **options)
+    columns = {name: [getattr(motion, name) for motion in motions] for name in QUANTITIES}
+    columns["time"] = [period if time is None else time for time in columns["time"]]
+    return {**columns, "resolution": steps.pop(), "rotary": motions[0].rotary}
+
+
+def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None, **options: Any) -> DeviceFit:
+    """`zwidth.fit_log` of logs that are read."""
+    return fit_log(**join_logs(motions, period), **options)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,21 +60,13 @@ class DimensionlessDevice(NamedTuple):
         return cls(mass, values[1] / (mass / period), values[2] / period, delays, ringing)
 
     def to_scene(self, period: float, velocity: Velocity) -> Scene:
-        """Its loop without a wall."""
-        return scene_of(self.to_numbers(period), period, velocity, len(self.lag))
-
-
-def scene_of(values: Iterable[float], period: float, velocity: Velocity, lag: int = 0) -> Scene:
-    """The loop of a device by the numbers that `name_numbers` names; ``lag`` is an amplifier's order.
-
-    The device is of the kind in question, linear or rotary.
-    """
-    mass, damping, delay, *beside = map(float, values)
-    constant, *ratio = beside[:lag] or [None]
-    actuator = Actuator(None, constant, lag, *ratio) if lag else None
-    modes = [Mode(*beside[k : k + 3]) for k in range(lag, len(beside), 3)]
-    device = Device(mass, damping, actuator=actuator, modes=modes, rotary=is_rotary())
-    return Scene(device, Timing(period=period, delay=delay), velocity=velocity)
+        """Its loop without a wall; the device is of the kind in question, linear or rotary."""
+        lag, (mass, damping, delay, *beside) = len(self.lag), map(float, self.to_numbers(period))
+        constant, *ratio = beside[:lag] or [None]
+        actuator = Actuator(None, constant, lag, *ratio) if lag else None
+        modes = [Mode(*beside[k : k + 3]) for k in range(lag, len(beside), 3)]
+        device = Device(mass, damping, actuator=actuator, modes=modes, rotary=is_rotary())
+        return Scene(device, Timing(period=period, delay=delay), velocity=velocity)
 
 
 def differentiate(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
@@ -115,40 +108,14 @@ class DeviceEstimate:
     damping_tried: float | None = None
     stiffness_tried: float | None = None
 
-    @property
-    def mass(self) -> float:
-        """In kg."""
-        return self.scene.device.mass
-
-    @property
-    def damping(self) -> float:
-        """In N s/m."""
-        return self.scene.device.damping
-
-    @property
-    def delay(self) -> float:
-        """In s."""
-        return self.scene.timing.delay
-
-    @property
-    def period(self) -> float:
-        """Of the loop, in s."""
-        return self.scene.timing.period
-
-    @property
-    def velocity(self) -> Velocity:
-        """Of the loop."""
-        return self.scene.velocity
-
-    @property
-    def actuator(self) -> Actuator | None:
-        """With the lag that the records ask for."""
-        return self.scene.device.actuator
-
-    @property
-    def modes(self) -> tuple[Mode, ...]:
-        """The resonances that the records ask for."""
-        return self.scene.device.modes
+    # Of its scene: kg, N s/m, s, the period in s, and the parts that the records ask for.
+    mass = property(attrgetter("scene.device.mass"))
+    damping = property(attrgetter("scene.device.damping"))
+    delay = property(attrgetter("scene.timing.delay"))
+    period = property(attrgetter("scene.timing.period"))
+    velocity = property(attrgetter("scene.velocity"))
+    actuator = property(attrgetter("scene.device.actuator"))
+    modes = property(attrgetter("scene.device.modes"))
 
     @property
     def is_structured(self) -> bool:

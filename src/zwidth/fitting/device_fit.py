@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.device_estimate import RELIABILITY, UPPER, DeviceEstimate, name_numbers
+from zwidth.fitting.device_estimate import RELIABILITY, UPPER, DeviceEstimate, find_stiffest
 from zwidth.fitting.hidden import HiddenLag, HiddenResonances
 from zwidth.fitting.safe_wall import SafeWall, find_safe_wall
-from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import to_json, with_unit
 from zwidth.words.showing import shown
@@ -26,6 +24,8 @@ VAGUE = 0.5
 BEYOND = 3.0
 # Sampling periods of loops, in s: outside a unit is suspected.
 _QUICKEST, _SLOWEST = 5e-6, 0.02
+# About a device that may be more than the model.
+SEE_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of it"
 
 
@@ -106,8 +106,8 @@ class DeviceFit(DeviceEstimate):
         rivals: those devices, a `zwidth.RivalDevice` each.
         next: the further experiment that narrows K_max most, or tells the device from a rival of another kind; None of
             a log.
-        offset: constant force in N beside the commanded one, of a log; its error in ``errors``.
-        friction: Coulomb friction in N, of a log; its error in ``errors``, NaN where the log leaves it open.
+        offset, friction: constant force beside the commanded one and Coulomb friction, in N, of a log; their errors in
+            ``errors_of_log`` and ``errors``, NaN where the log leaves open how much is of which.
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
         motions: of a log, each with its fit, a `zwidth.FittedMotion`.
         scene, period, velocity: the estimated device in its loop, a `zwidth.Scene`.
@@ -125,9 +125,6 @@ class DeviceFit(DeviceEstimate):
         freedom: degrees of freedom that the noise was estimated with; None where it is known.
     """
 
-    errors: dict[str, float]
-    stiffness_max: float
-    stiffness_error: float
     residuals: np.ndarray
     doubts: tuple[str, ...]
     status: int
@@ -139,39 +136,32 @@ class DeviceFit(DeviceEstimate):
     rivals: tuple[RivalDevice, ...] = ()
     lag: HiddenLag | None = None
     hidden: HiddenResonances | None = None
+    errors_of_log: dict[str, float] = field(default_factory=dict)
 
-    @classmethod
-    def conclude(
-        cls,
-        scene: Scene,
-        stiffest: tuple[float, np.ndarray],
-        covariance: np.ndarray,
-        *,
-        doubts: Iterable[str],
-        status: int,
-        rivals: tuple[RivalDevice, ...] = (),
-        next: FurtherExperiment | None = None,
-        errors: dict[str, float] | None = None,
-        **records: Any,
-    ) -> DeviceFit:
-        """A fit of a scene, its K_max with the gradient in what was fitted, and the covariance of that."""
-        value, gradient = stiffest
-        error = float(np.sqrt(gradient @ covariance @ gradient))
-        agreed = bool(rivals) and all(abs(one.stiffness_max - value) <= error for one in rivals)
-        known = 1.0 if status == Status.OK or (status == Status.UNDECIDED and agreed) else np.nan
-        own = dict(zip(name_numbers(scene), np.sqrt(np.diag(covariance)).tolist(), strict=True))
-        return cls(
-            scene=scene,
-            covariance=covariance,
-            errors=own | (errors or {}),
-            stiffness_max=known * value,
-            stiffness_error=known * error,
-            doubts=(*doubts, *_doubt_period(scene.timing.period)),
-            status=int(status),
-            rivals=rivals,
-            next=next and next._replace(error_afterwards=known * next.error_afterwards),
-            **records,
-        )
+    @cached_property
+    def errors(self) -> dict[str, float]:
+        """Standard errors by name."""
+        own = np.sqrt(np.diag(self.covariance)).tolist()
+        return dict(zip(self.numbers, own, strict=True)) | self.errors_of_log
+
+    @cached_property
+    def _stiffest(self) -> tuple[float, float]:
+        """K_max and its standard error; NaN where the device that bears it is another one, or may be."""
+        value, gradient = find_stiffest(self.scene)
+        error = float(np.sqrt(gradient @ self.covariance @ gradient))
+        agreed = bool(self.rivals) and all(abs(one.stiffness_max - value) <= error for one in self.rivals)
+        known = self.status == Status.OK or (self.status == Status.UNDECIDED and agreed)
+        return (value, error) if known else (np.nan, np.nan)
+
+    @property
+    def stiffness_max(self) -> float:
+        """In N/m."""
+        return self._stiffest[0]
+
+    @property
+    def stiffness_error(self) -> float:
+        """In N/m."""
+        return self._stiffest[1]
 
     @property
     def is_doubted(self) -> bool:
@@ -321,7 +311,7 @@ class DeviceFit(DeviceEstimate):
         return to_json(numbers)
 
 
-def _doubt_period(period: float) -> list[str]:
+def doubt_period(period: float) -> list[str]:
     if _QUICKEST <= period <= _SLOWEST:
         return []
     slip = "in ms or us" if period > _SLOWEST else "in s"

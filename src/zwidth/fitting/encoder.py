@@ -60,10 +60,8 @@ class MeasurementNoise:
 
     @cached_property
     def _rests(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Samples of stretches within a step that err alike; where among them each begins, and how many it has.
-
-        Last, how many times white noise's variance their means have.
-        """
+        """Samples of stretches within a step that err alike; where among them each begins, and how many it has."""
+        # Last, how many times white noise's variance their means have.
         starts, first = [], np.inf
         for k, place in enumerate(self.position.tolist()):
             if not abs(place - first) < self.resolution:

@@ -61,11 +61,9 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 @in_own_units
 def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
-    """The stiffest stable wall at each damping B >= 0, and between which stiffnesses it lies with 95 %.
-
-    The band is pointwise: the quantiles of devices drawn around the estimate, by a fixed seed; NaN where the records
-    leave the device open. A damping at which a device has no stable wall counts as 0.
-    """
+    """The stiffest stable wall at each damping B >= 0, and between which stiffnesses it lies with 95 %."""
+    # The band is pointwise: the quantiles of devices drawn around the estimate, by a fixed seed; NaN where the records
+    # leave the device open. A damping at which a device has no stable wall counts as 0.
     outlines = fit.scene.stable_region()
     if not outlines:
         raise InputError("scene: no wall of the fitted device is stable; measure again")
@@ -91,10 +89,8 @@ def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.
 
 @in_own_units
 def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str, np.ndarray]:
-    """The stiffest wall, the one to set, and walls that buzzed: their errors, frequencies, and distances from the fit.
-
-    Distances are in units of the noise, stiffness and frequency apart.
-    """
+    """The stiffest wall, the one to set, and walls that buzzed: errors, frequencies, and distances from the fit."""
+    # Distances are in units of the noise, stiffness and frequency apart.
     top, choice, lost = fit.scene.max_stiffness(), choose_wall(fit), (np.nan,) * 4
     rows: list[tuple[Any, ...]] = [("stiffest", float(top.stiffness), float(top.virtual_damping), *lost)]
     rows += [] if choice is None else [("set", choice.stiffness, choice.virtual_damping, *lost)]

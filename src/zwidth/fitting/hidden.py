@@ -104,10 +104,8 @@ class PoleBank:
 
 
 def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
-    """Look for the pole whose filtered force explains most of the residuals; None where chance explains as much.
-
-    Schwarz's criterion with the numbers that the pole adds, two rates and two sizes; one of each of a real pole.
-    """
+    """Look for the pole whose filtered force explains most of the residuals; None where chance explains as much."""
+    # Schwarz's criterion with the numbers that the pole adds, two rates and two sizes; one of each of a real pole.
     best = _glimpse(best)
     basis, rest = best.inverse.basis, best.model.weigh(best.residuals)
     rest = rest - basis @ (basis.T @ rest)
@@ -169,10 +167,8 @@ def look_for_lags(best: FittedModel) -> LagTest:
 
 
 def bound_lag(best: FittedModel, test: LagTest | None, scene: Scene, reach: float) -> HiddenLag | None:
-    """The longest lag, a first-order one of the amplifier, with which the log goes as well; None where it shows all.
-
-    The delay is less by the lag and has to remain.
-    """
+    """The longest lag, a first-order one of the amplifier, with which the log goes as well; None where it shows all."""
+    # The delay is less by the lag and has to remain.
     if test is None:
         return None
     period = scene.timing.period
@@ -183,16 +179,14 @@ def bound_lag(best: FittedModel, test: LagTest | None, scene: Scene, reach: floa
     lag = float(test.lag[count - 1] * period)
     # What a lag moves of resonances is small, and may be more than there is.
     theta = np.clip(test.theta[:, count - 1], *best.model.bounds())
-    there = best.model.to_scene(theta, period, scene.velocity)
+    there = best.model.normalize(theta, period).to_scene(period, scene.velocity)
     there = replace(there, device=replace(there.device, actuator=Actuator(time_constant=lag)))
     return HiddenLag(lag, float(there.timing.delay), float(there.max_stiffness().stiffness))
 
 
 def respond_as_fitted(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> MeasuredDevice:
-    """The response of a fitted device, with the radius by which a resonance may move it that the log does not show.
-
-    What such a resonance moves the other numbers by, they have been found with.
-    """
+    """The response of a fitted device, with the radius by which a resonance may move it that the log does not show."""
+    # What such a resonance moves the other numbers by, they have been found with.
     lines = np.unique(np.concatenate([_lay_lines(scene, _TURN), banks[0].frequency]))
     response, slopes = _respond(best, scene.timing.period, lines)
     radius = np.zeros(lines.size)

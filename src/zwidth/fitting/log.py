@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.choosing import ALIKE, EXACT, choose_structure
-from zwidth.fitting.device_estimate import differentiate, find_stiffest, reach_of
-from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FittedMotion
+from zwidth.fitting.device_estimate import differentiate, reach_of
+from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, doubt_period
 from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted, weigh_resonances
 from zwidth.fitting.moving import Recording
@@ -41,8 +41,7 @@ _MOST = 200_000
 _SEEN = 5.0
 # So much of the motion's squares may stay unexplained by anything, where it is so far from noise.
 _UNEXPLAINED, _SMOOTH = 0.01, 5.0
-# What to do about a device that is more than the model, and about one that may be.
-_RECORD_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
+# What to do about a device that is more than the model.
 _RECORD_NEXT = (
     "it has something that the model lacks, so that no K_max follows; play a record of zwidth.excite, for "
     "zwidth.respond needs no model"
@@ -150,7 +149,7 @@ def _fit(
             "force: mass, damping and delay cannot be told apart by this log; record longer, with a force that changes "
             "its sign at different times, as steps to and fro"
         )
-    scene, known = model.to_scene(theta, period, velocity), slice(0, model.parts.stop)
+    scene, known = model.normalize(theta, period).to_scene(period, velocity), slice(0, model.parts.stop)
     by_theta = differentiate(lambda theta: model.normalize(theta, period).to_numbers(period), theta)[:, known]
     (by_period,) = differentiate(lambda time: model.normalize(theta, time[0]).to_numbers(time[0]), np.array([period])).T
     late = wavers * period * by_period
@@ -171,19 +170,18 @@ def _fit(
     if banks and not unexplained:
         shown = {"response": respond_as_fitted(best, scene, banks), "hidden": weigh_resonances(best, scene, banks)}
         shown |= {"lag": bound_lag(best, lags, scene, reach_of(freedom))}
-    return DeviceFit.conclude(
-        scene,
-        find_stiffest(scene),
-        covariance,
-        errors={"offset": offset[1], "friction": friction[1]},
+    return DeviceFit(
+        scene=scene,
+        covariance=covariance,
+        errors_of_log={"offset": offset[1], "friction": friction[1]},
         offset=offset[0],
         friction=friction[0],
         resolution=step,
         motions=motions,
         noise=float(np.sqrt(best.variance)),
         residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
-        doubts=doubts,
-        status=status,
+        doubts=(*doubts, *doubt_period(period)),
+        status=int(status),
         freedom=freedom,
         **shown,
     )
@@ -194,7 +192,7 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float)
     if pole is not None and pole.instead:
         near = with_unit(pole.frequency / period, "Hz", 3)
         what = f"an amplifier's lag explains the log, and so does a resonance near {near}, whose K_max is another one"
-        return [f"{what}: {_RECORD_MORE}"]
+        return [f"{what}: {SEE_MORE}"]
     if pole is not None:
         kind = "most like a resonance near" if pole.rings else "with a lag, most like one of"
         what = f"it follows the force{',' if pole.rings else ''} {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"

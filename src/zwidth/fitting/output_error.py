@@ -28,7 +28,7 @@ _GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
 # So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
 # Devices with other parts are compared at this promised reduction.
-_CLOSELY = 2e-5
+CLOSELY = 2e-5
 # Promised reductions of the squares that end the search, and that tell the noise and excuse a corner; steps; how they
 # are damped.
 _ARRIVED, NEARLY, _STEPS = 1e-14, 1e-6, 100
@@ -129,10 +129,8 @@ class FittedModel:
 
     @cached_property
     def excess(self) -> float:
-        """By how much sums of neighboring residuals spread more than those of such noise; 1 where chance explains it.
-
-        Over twice the cube root of the samples, as usual for errors of unknown kinship (Newey, West 1987).
-        """
+        """By how much sums of neighboring residuals spread more than those of noise; 1 where chance explains it."""
+        # Over twice the cube root of the samples, as usual for errors of unknown kinship (Newey, West 1987).
         from scipy.special import chdtri
 
         weights, total = self.model.noise or self.noise, self.residuals.size
@@ -147,11 +145,9 @@ class FittedModel:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Of theta: exact slopes, the encoder's correlated errors, what else spreads the residuals, and the rivals.
-
-        NaN of what is open. Where squares rise less towards a rival than slopes say, as beyond a corner, the errors
-        that way are as large as to leave it as many standard errors away as its squares do.
-        """
+        """Of theta: exact slopes, the encoder's correlated errors, what else spreads the residuals, and the rivals."""
+        # NaN of what is open. Where squares rise less towards a rival than slopes say, as beyond a corner, the errors
+        # that way are as large as to leave it as many standard errors away as its squares do.
         (columns, sizes), weigh = self.columns, self.model.weigh
         # Not by the products of columns, which keep half of the digits.
         inverse, blind, _ = self.inverse
@@ -201,10 +197,8 @@ def fit_model(model: Recordings) -> FittedModel:
 
 
 def _start(model: Recordings) -> list[np.ndarray]:
-    """The best without friction, and for every friction the best of a grid over damping and delay; by the beginnings.
-
-    All else is linear there, for all speeds grow with g. One motion serves all delays: begun so much earlier.
-    """
+    """The best without friction, and for every friction the best of a grid over damping and delay, by beginnings."""
+    # All else is linear there, for all speeds grow with g. One motion serves all delays: begun so much earlier.
     model = model.begin(_GLIMPSE)
     base, most = np.zeros(model.size), int(model.longest)
     early = Recordings(
@@ -232,7 +226,7 @@ def _start(model: Recordings) -> list[np.ndarray]:
     for _, delta, d in search():
         if all(abs(d - other) > _APART or delta != of for of, other in apart):
             apart.append((delta, d))
-    glides = [_refine(model, start(*one), (-1,), arrived=_NEAR) for one in apart[:_STARTS]]
+    glides = [refine(model, start(*one), (-1,), arrived=_NEAR) for one in apart[:_STARTS]]
     starts = [min(glides, key=lambda found: found[1])[0]]
     # From there on with the speeds and the constant force that were found.
     firsts = [log.position[: 2 * _FIRST].reshape(2, -1).mean(1) for log in model.logs]
@@ -268,22 +262,15 @@ def _follow(model: Recordings, starts: list[np.ndarray]) -> np.ndarray:
     """The best start, followed through ever longer beginnings: few turns and rests make hardly a false optimum."""
     for count, kept in _ROUNDS:
         part = model.begin(count)
-        found = [_refine(part, start, (), _FOLLOWED, _NEAR) for start in starts]
+        found = [refine(part, start, (), _FOLLOWED, _NEAR) for start in starts]
         starts = [theta for theta, *_ in sorted(found, key=lambda found: found[1])[:kept]]
     return starts[0]
 
 
-def follow_start(model: Recordings, start: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
-    """Some steps from a start, as close as devices are compared by: theta and the sum of squares."""
-    return _refine(model, start, (), steps, _CLOSELY)[:2]
-
-
 def _fit(model: Recordings, start: np.ndarray, held: _Held = (), arrived: float = _ARRIVED) -> FittedModel:
-    """Least squares from a start, or at rest where that is as good.
-
-    First speeds that friction stops within the noise hardly move the positions. Beside such a speed the position's
-    derivative is next to 0, and steps towards the best one hardly end.
-    """
+    """Least squares from a start, or at rest where that is as good."""
+    # First speeds that friction stops within the noise hardly move the positions. Beside such a speed the position's
+    # derivative is next to 0, and steps towards the best one hardly end.
     best = settle(model, start, held, arrived)
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.speeds]), best.theta
     # The way to the stop, v^2/(2 c) without damping and v/delta without friction.
@@ -299,22 +286,19 @@ def _fit(model: Recordings, start: np.ndarray, held: _Held = (), arrived: float 
 
 
 def settle(model: Recordings, start: np.ndarray, held: _Held = (), arrived: float = _ARRIVED) -> FittedModel:
-    """As `_refine`, with neither damping nor delay negative."""
-    best = _refine(model, start, held, arrived=arrived)
+    """As `refine`, with neither damping nor delay negative."""
+    best = refine(model, start, held, arrived=arrived)
     while negative := tuple(k for k in (1, 2) if best[0][k] < 0):
         best[0][list(negative)] = 0.0
         held = (*held, *negative)
-        best = _refine(model, best[0], held, arrived=arrived)
+        best = refine(model, best[0], held, arrived=arrived)
     return FittedModel(model, *best)
 
 
-def _refine(
+def refine(
     model: Recordings, start: np.ndarray, held: _Held, most: int = _STEPS, arrived: float = _ARRIVED
 ) -> tuple[np.ndarray, float, bool]:
-    """Levenberg and Marquardt's steps within bounds: theta, the sum of squares, and whether it is the least.
-
-    What is ``held`` stays as it starts.
-    """
+    """Levenberg and Marquardt's steps within bounds but for what is ``held``: theta, squares, and whether the least."""
     low, high = model.bounds()
     low[-1] = LEAST * abs(start[0]) * model.largest
     low[list(held)] = high[list(held)] = start[list(held)]

@@ -80,10 +80,8 @@ def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Recordi
 
 
 def _period(clock: np.ndarray, wavering: bool) -> tuple[float, float]:
-    """The period of even samples whose times are read by a clock that wavers, and its standard error.
-
-    The line through all times: nothing between the samples is guessed, they are taken as they are.
-    """
+    """The period of even samples whose times are read by a clock that wavers, and its standard error."""
+    # The line through all times: nothing between the samples is guessed, they are taken as they are.
     steps = np.diff(clock)
     if steps.min() <= 0:
         k = int(np.argmin(steps))

@@ -92,10 +92,8 @@ def _answer(plant: Any, at: CirclePoints) -> Any:
 
 
 def list_poles(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
-    """Poles and residues of ``A(s) (1/(s (s + delta)) + sum of modes)`` but for ``1/(s (s + delta))``.
-
-    Those of the amplifier, -delta behind one, and two of each mode: frequency, damping ratio and ``m/m_i``.
-    """
+    """Poles and residues of ``A(s) (1/(s (s + delta)) + sum of modes)`` but for ``1/(s (s + delta))``."""
+    # Those of the amplifier, -delta behind one, and two of each mode: frequency, damping ratio and ``m/m_i``.
     late, gains = (list(each) for each in _amplify(lag))
     poles, weights = list(late), [gain / pole / (pole + delta) for pole, gain in zip(late, gains, strict=True)]
     if late:

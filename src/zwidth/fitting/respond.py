@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from zwidth.fitting.columns import LoggedMotion, list_columns
+from zwidth.fitting.columns import LoggedMotion, join_logs
 from zwidth.fitting.encoder import find_resolution
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.recordings import find_runs, read_logs
@@ -127,19 +127,14 @@ def respond(
     return _average_periods(stretches, count, period, step, doubts)
 
 
-def respond_to_logs(
-    motions: Sequence[LoggedMotion], *, period: float | None = None, cycle: Any = None
-) -> ResponseEstimate:
-    """`respond` of logs that are read, all of one axis.
-
-    Raises:
-        InputError: an axis turns, or as `respond` says.
-    """
-    if any(motion.rotary for motion in motions):
+def respond_to_logs(motions: Sequence[LoggedMotion], period: float | None, cycle: Any = None) -> ResponseEstimate:
+    """`respond` of logs that are read."""
+    logs = join_logs(motions, period)
+    if logs.pop("rotary"):
         raise InputError(
             "position, force: got an angle and a torque; a response is in m/N: give position and force at the handle"
         )
-    return respond(*list_columns(motions, period), cycle=cycle, resolution=motions[0].resolution)
+    return respond(**logs, cycle=cycle)
 
 
 def find_nominal_limit(scene: Scene) -> StiffestWall:

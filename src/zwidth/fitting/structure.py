@@ -23,8 +23,6 @@ from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.fitting.moving import ModelledMotion, Recording, recur
 from zwidth.fitting.required_wall import list_poles
 from zwidth.loops.rigid.device import phi_functions
-from zwidth.parts.velocity import Velocity
-from zwidth.scenes.scene import Scene
 
 # Of differences to both sides: of delta and of a followed pole absolute, of all else relative.
 _STEP = 1e-6
@@ -104,10 +102,6 @@ class Recordings:
         """The device of theta."""
         modes = theta[self.parts][self.lag :].reshape(-1, 3) / [1.0, 1.0, theta[0]]
         return DimensionlessDevice(period**2 / theta[0], theta[1], theta[2], _read_lag(theta, self.lag), modes)
-
-    def to_scene(self, theta: np.ndarray, period: float, velocity: Velocity) -> Scene:
-        """The scene of theta."""
-        return self.normalize(theta, period).to_scene(period, velocity)
 
     def follow(self, theta: np.ndarray) -> ModelledMotion:
         """The motion of theta in all logs."""

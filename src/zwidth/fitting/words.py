@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.device_fit import DeviceFit, RivalDevice
+from zwidth.fitting.device_fit import SEE_MORE, DeviceFit, RivalDevice
 from zwidth.fitting.safe_wall import bears_resonances
 from zwidth.parts.paths import spell_estimate
 from zwidth.words.formatting import name_wall, plain, with_unit
-from zwidth.words.quantities import RECOMMENDED_SHARE
+from zwidth.words.quantities import FIELDS, RECOMMENDED_SHARE
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 from zwidth.words.status import Status
 
@@ -23,21 +23,9 @@ SYMBOLS = {
     "friction": "F_c",
     "stiffness_max": "K_max",
 }
-# SI units of a linear device.
-_UNITS = {
-    "mass": "kg",
-    "damping": "N s/m",
-    "delay": "s",
-    "stiffness": "N/m",
-    "stiffness_max": "N/m",
-    "friction": "N",
-    "offset": "N",
-    "force": "N",
-    "position": "m",
-    "resolution": "m",
-    "time_constant": "s",
-    "frequency": "Hz",
-}
+# SI units of a linear device by the last part of a path: of parameters, and of what a fit has beside them.
+_UNITS = {path.rpartition(".")[2]: known.unit.removeprefix("1") for path, known in FIELDS.items()}
+_UNITS |= {"stiffness_max": "N/m", "friction": "N", "offset": "N", "force": "N", "position": "m"}
 # What a status says of a fit; the doubts say more.
 _TROUBLES = {
     Status.NOT_CONVERGED: "the search ended before its aim",
@@ -45,7 +33,6 @@ _TROUBLES = {
     Status.UNDECIDED: "another device fits as well",
     Status.UNREACHABLE: "the delay ends the range looked in",
 }
-_SEE_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
 _TRY_MORE = "try walls of more damping"
 NO_WALL = "under a doubt no safe wall is given, and none to set; do what it says, and record again"
 
@@ -136,7 +123,7 @@ def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     rows += [("doubt", doubt) for doubt in fit.doubts]
     if not fit.is_doubted and (rigid := choose_wall(fit, rigid=True)) not in (None, wall):
         at = "" if math.isnan(safe.resonance) else f" near {with_unit(safe.resonance, 'Hz', 3)}"
-        hidden = f"a resonance{at} may make stiffer walls unstable, K_max too, and not show in this log: {_SEE_MORE}"
+        hidden = f"a resonance{at} may make stiffer walls unstable, K_max too, and not show in this log: {SEE_MORE}"
         if fit.damping_tried is not None:
             hidden = f"a resonance may make other walls unstable, K_max too, and not show in these: {_TRY_MORE}"
         alone = "if nothing hides" if fit.is_structured else "if it is rigid"
@@ -239,7 +226,7 @@ def write_scene(fit: DeviceFit, source: str) -> list[str]:
             alone = "these parts alone" if fit.is_structured else "a rigid device"
             lines += [
                 f"# As of {alone}. A resonance that the log does not show may make walls unstable,",
-                f"# if they are stiffer than {name_wall(*safe[:2])}: {_SEE_MORE}.",
+                f"# if they are stiffer than {name_wall(*safe[:2])}: {SEE_MORE}.",
             ]
         lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
     if fit.friction and math.isfinite(fit.errors["friction"]):

@@ -21,10 +21,8 @@ from zwidth.words.units import TIME, find_dimension, read_quantity, tell_kind, t
 
 
 def in_periods(delay: Array, period: Array) -> Array:
-    """``delay/period``, with a quotient within 4 rounding errors of a whole number taken as that number.
-
-    1.1 ms over 0.1 ms is 11 periods, but its float64 quotient is 11.000000000000002, another polynomial.
-    """
+    """``delay/period``, with a quotient within 4 rounding errors of a whole number taken as that number."""
+    # 1.1 ms over 0.1 ms is 11 periods, but its float64 quotient is 11.000000000000002, another polynomial.
     xp = namespace(delay, period)
     quotient = delay / period
     whole = xp.round(quotient)
@@ -69,10 +67,8 @@ Result = TypeVar("Result")
 
 
 def accept_units(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Let the SI quantities that a function takes be texts with a unit: "70 g", and a delay "1.5 periods" as well.
-
-    Where one is in a unit of rotary devices, the answer is in theirs.
-    """
+    """Let the SI quantities that a function takes be texts with a unit: "70 g", and a delay "1.5 periods" as well."""
+    # Where one is in a unit of rotary devices, the answer is in theirs.
     names = tuple(inspect.signature(function).parameters)
 
     @wraps(function)
@@ -133,11 +129,9 @@ class Part:
     _owner: ClassVar[str] = ""  # what begins the names of its quantities
 
     def __post_init__(self) -> None:
-        """Put every number in its SI unit, where `words.quantities` allows it; else raise `InputError`.
-
-        One that is None by default may be left out. A part that was told in units of one kind of device, linear or
-        rotary, has that as ``rotary``.
-        """
+        """Put every number in its SI unit, where `words.quantities` allows it; else raise `InputError`."""
+        # One that is None by default may be left out. A part that was told in units of one kind of device, linear or
+        # rotary, has that as ``rotary``.
         own = {f"{self._owner}.{item.name}".lstrip("."): item for item in fields(self)}  # pyright: ignore[reportArgumentType]
         told = find_kind({path: getattr(self, item.name) for path, item in own.items()})
         if told is not None:
@@ -214,11 +208,9 @@ def find_range(item: Field[Any], path: str) -> Range:
 
 
 def check_number(field: str, value: Any, unit: str = "", allowed: Range | None = None) -> Any:
-    """Return one quantity in its SI unit, a float unless JAX traces or holds it; else raise `InputError`.
-
-    A text is a number with a unit, as in configuration files: "70 g". Unit and range are those that `words.quantities`
-    has for the field where they are left out.
-    """
+    """Return one quantity in its SI unit, a float unless JAX traces or holds it; else raise `InputError`."""
+    # A text is a number with a unit, as in configuration files: "70 g". Unit and range are those that
+    # `words.quantities` has for the field where they are left out.
     if is_jax(value):
         return value
     if not unit:

@@ -136,21 +136,15 @@ class KnownHand:
     damping: Published
     stiffness: Published
 
-    def to_operator(self, *, coupling_stiffness: Any = None, coupling_damping: Any = 0.0) -> Operator:
-        """A `zwidth.Operator`: a rigid grasp, or behind a spring in N/m and a damper in N s/m of yours.
+    def to_operator(self) -> Operator:
+        """A `zwidth.Operator` who holds the device rigidly; `dataclasses.replace` puts a spring of yours between.
 
         Example:
             >>> import zwidth
             >>> zwidth.devices.HAND.to_operator().mass
             0.554
         """
-        return Operator(
-            mass=self.mass.value,
-            damping=self.damping.value,
-            stiffness=self.stiffness.value,
-            coupling_stiffness=coupling_stiffness,
-            coupling_damping=coupling_damping,
-        )
+        return Operator(self.mass.value, self.damping.value, self.stiffness.value)
 
 
 def _read_published() -> tuple[tuple[KnownDevice, ...], KnownHand]:

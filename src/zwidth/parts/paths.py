@@ -83,26 +83,21 @@ def list_parameters(scene: Parts) -> dict[str, Any]:
 
 def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     """A new scene with some parameters, or whole parts, changed; everything else stays as it is in SI units."""
-    changed: dict[str, dict[str, Any]] = {}
-    whole = {name: changes[name] for name in (*_BARE, *_NAMED) if name in changes}
-    scene = replace(scene, **whole)
-    # A device that is given as a whole has none of them.
-    of_device = [item.name for item in fields(scene.device) if item.name in (*_OF_DEVICE, "modes")]
-    own = {name: changes[name] for name in of_device if name in changes}
-    if own:
-        scene = replace(scene, device=replace(scene.device, **own))
+    # Numbers are those of the new parts.
+    levels = {path: 0 if path in (*_BARE, *_NAMED) else 1 if path in (*_OF_DEVICE, "modes") else 2 for path in changes}
+    for level in sorted(set(levels.values())):
+        scene = _replace_fields(scene, {path: value for path, value in changes.items() if levels[path] == level})
+    return scene
+
+
+def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     parts = {name: part for _, name, part in _parts(scene)}
-    owners = {
-        prefix + item.name: (name, item.name)
-        for prefix, name, part in _parts(scene)
-        for item in fields(part)
-        if item.name not in (*_OF_DEVICE, "modes")
-    }
+    owners = {prefix + item.name: (name, item.name) for prefix, name, part in _parts(scene) for item in fields(part)}
+    owners |= {name: ("", name) for name in (*_BARE, *_NAMED)}
+    changed: dict[str, dict[str, Any]] = {}
     for path, value in changes.items():
-        if path in whole or path in own:
-            continue
         if path not in owners:
-            raise InputError(f"parameter: {describe_choice(path, (*owners, *_BARE, *_NAMED, *of_device))}")
+            raise InputError(f"parameter: {describe_choice(path, tuple(owners))}")
         part, name = owners[path]
         changed.setdefault(part, {})[name] = value
     if "rate" in changed.get("timing", {}):
@@ -110,14 +105,14 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
         changed["timing"].setdefault("period", None)
     if isinstance(scene.wall, NoWall):
         parts["wall"] = VirtualWall(0.0)
-    own = changed.pop("device", {})
+    whole, own = changed.pop("", {}), changed.pop("device", {})
     made = {name: replace(parts[name], **new) for name, new in changed.items()}
     own |= {name: made.pop(name) for name in _OF_DEVICE if name in made}
     if any(name.startswith("modes.") for name in made):
         own["modes"] = tuple(made.pop(f"modes.{k}", mode) for k, mode in enumerate(scene.device.modes))
     if own:
         made["device"] = replace(scene.device, **own)
-    return replace(scene, **made)
+    return replace(scene, **whole, **made)
 
 
 def spell_scene(scene: Any) -> dict[str, Any]:

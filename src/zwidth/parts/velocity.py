@@ -312,13 +312,11 @@ def _offsets(polynomial: np.ndarray) -> np.ndarray:
 
 
 def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> float:
-    """The standard deviation of a velocity estimate whose positions are quantized, in m/s.
-
-    The positions' error is nearly white, of variance ``Q^2/12`` with Q the resolution in m (Widrow, Kollar 2008,
-    chapter 5). Through ``F(z)`` with the impulse response f that becomes ``Q^2/12 sum f_k^2``, with ``sum f^2`` of
-    ``2/(n T)^2`` for a difference over n, ``2 (1 - p)^2/((1 + p) T^2)`` for a low-pass of pole p, ``2 (1 - p)^3/((1 +
-    p)^3 T^2)`` for two; of other estimates there is no closed form.
-    """
+    """The standard deviation of a velocity estimate whose positions are quantized, in m/s."""
+    # The positions' error is nearly white, of variance ``Q^2/12`` with Q the resolution in m (Widrow, Kollar 2008,
+    # chapter 5). Through ``F(z)`` with the impulse response f that becomes ``Q^2/12 sum f_k^2``, with ``sum f^2`` of
+    # ``2/(n T)^2`` for a difference over n, ``2 (1 - p)^2/((1 + p) T^2)`` for a low-pass of pole p, ``2 (1 - p)^3/((1 +
+    # p)^3 T^2)`` for two; of other estimates there is no closed form.
     estimate = velocity.estimate(period)
     power = 2.0 * (float(estimate.gain) / (estimate.window * period)) ** 2 if estimate.window else math.nan
     if isinstance(velocity, LowPass):

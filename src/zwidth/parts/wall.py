@@ -35,12 +35,10 @@ class NoWall(VirtualWall):
 def resolve_wall(
     wall: VirtualWall, stiffness: Any, virtual_damping: Any, rotary: bool | None = None
 ) -> tuple[Any, Any]:
-    """Which K and B a question means of a scene with this wall, the one rule for all of them.
-
-    Neither given means the scene's own wall. Both given are what they say. K alone is a spring, B = 0, of a scene
-    without a wall; where there is one it could as well mean that wall's B, and is refused. Texts have a unit, of a
-    rotary device or not, or of the kind of device in question.
-    """
+    """Which K and B a question means of a scene with this wall, the one rule for all of them."""
+    # Neither given means the scene's own wall. Both given are what they say. K alone is a spring, B = 0, of a scene
+    # without a wall; where there is one it could as well mean that wall's B, and is refused. Texts have a unit, of a
+    # rotary device or not, or of the kind of device in question.
     # Whole numbers beyond float64 are infinite.
     both = stiffness, virtual_damping
     stiffness, virtual_damping = (to_float(v) if isinstance(v, int) and v.bit_length() > 1023 else v for v in both)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -169,48 +169,6 @@ def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
     return intervals[away.index(min(away))] if away else (math.nan, math.nan)
 
 
-def assess_many(scenes: Iterable[SceneOptima] | Mapping[str, SceneOptima]) -> list[dict[str, Any]]:
-    """Judge the walls of many scenes, one record each; a scene that has no answer leaves the others alone.
-
-    Args:
-        scenes: scenes of any kind, or a mapping of names to scenes.
-
-    Returns:
-        A list of dicts with the same keys, a row of a table each: ``scene``, its name or number; ``status`` and
-        ``message`` ("OK" and nothing, or "INVALID_INPUT" and why); every parameter by its dotted path; and what
-        `assess` finds, None where a scene has no such number. ``csv.DictWriter`` writes them as they are.
-
-    References:
-        Hulin, Preusche, Hirzinger 2006, sections V to VIII.
-
-    Example:
-        >>> import zwidth
-        >>> device, timing, wall = zwidth.Device(0.1, 10), zwidth.Timing(1e-3), zwidth.VirtualWall(25e3, 40)
-        >>> scenes = {name: zwidth.Scene(device, timing, wall, zwidth.LowPass(cutoff=c)) for name, c in
-        ...           {"slow": 20, "fast": 200, "refused": 900}.items()}
-        >>> [(row["scene"], row["status"], row["stable"]) for row in zwidth.assess_many(scenes)]
-        [('slow', 'OK', False), ('fast', 'OK', True), ('refused', 'INVALID_INPUT', None)]
-    """
-    named: Any = scenes.items() if isinstance(scenes, Mapping) else enumerate(scenes)
-    records = [_record(name, scene) for name, scene in named]
-    answers = [field.name for field in fields(Assessment)]
-    given = [name for record in records for name in record if name not in answers]
-    names = list(dict.fromkeys([*given, *answers]))
-    return [{name: record.get(name) for name in names} for record in records]
-
-
-def _record(name: str | int, scene: SceneOptima) -> dict[str, Any]:
-    head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
-    try:
-        if not isinstance(scene, SceneOptima):
-            raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed")
-        verdict = assess(scene).as_dict()
-    except InputError as error:
-        verdict, head = {}, head | {"status": Status.INVALID_INPUT.name, "message": str(error)}
-    own = scene.parameters() if isinstance(scene, SceneOptima) else {}
-    return head | own | verdict
-
-
 # What somebody can buy of a parameter, by its path: the factor on it, and the words.
 _STEPS = {
     "delay": (0.5, "half the delay"),
@@ -347,30 +305,24 @@ class FrictionRule(NamedTuple):
 
     by_damping: float | None  # 2 b/T; None where there is no damping
     by_friction: float | None  # 2 f_c/Q; None where friction or resolution is not given
-
-    @property
-    def stiffness(self) -> float | None:
-        """The lower of the two, which is the rule; None where one of them is missing."""
-        return None if self.by_damping is None or self.by_friction is None else min(self.by_damping, self.by_friction)
+    stiffness: float | None  # the lower of the two, which is the rule; None where one of them is missing
 
 
 def friction_rule(
     *, damping: float, period: float, friction: float | None = None, resolution: float | None = None
 ) -> FrictionRule:
-    """Up to which stiffness in N/m a wall without virtual damping and delay is passive: ``K <= min(2 b/T, 2 f_c/Q)``.
-
-    Viscous damping b pays for sampling, Coulomb friction f_c in N for quantization in steps of Q in m. A sufficient
-    condition for a spring alone, on a rigid device (Abbott, Okamura 2005, IEEE Trans. Robotics 21(5), 952-964).
-    """
+    """Up to which K in N/m a wall without virtual damping and delay is passive: ``K <= min(2 b/T, 2 f_c/Q)``."""
+    # Viscous damping b pays for sampling, Coulomb friction f_c in N for quantization in steps of Q in m. A sufficient
+    # condition for a spring alone, on a rigid device (Abbott, Okamura 2005, IEEE Trans. Robotics 21(5), 952-964).
+    by_damping = 2.0 * damping / period if damping else None
     by_friction = None if friction is None or resolution is None else 2.0 * friction / resolution
-    return FrictionRule(2.0 * damping / period if damping else None, by_friction)
+    lower = None if by_damping is None or by_friction is None else min(by_damping, by_friction)
+    return FrictionRule(by_damping, by_friction, lower)
 
 
 def passive_edge(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
-    """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping.
-
-    The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
-    """
+    """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping."""
+    # The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
     own, units = float(scene.device.damping), scene.units
     turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, directions)
     # The smallest cosines are rounded zeros.

@@ -212,11 +212,9 @@ def _stable_dampings(stiffness: float, devices: np.ndarray) -> tuple[np.ndarray,
 def _lowest(
     cost: Callable[[np.ndarray], np.ndarray], starts: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """The best device that a pattern search finds in a box, from the best of ``starts``, rows of shares from 0 to 1.
-
-    A pattern is a center and its neighbors, a step away along any of the uncertain quantities; it moves to the lowest
-    of them, and where none is lower the step is halved.
-    """
+    """The best device that a pattern search finds in a box, from the best of ``starts``, rows of shares from 0 to 1."""
+    # A pattern is a center and its neighbors, a step away along any of the uncertain quantities; it moves to the lowest
+    # of them, and where none is lower the step is halved.
     free = np.flatnonzero(high > low)
     moves = np.zeros((3**free.size, low.size))
     moves[:, free] = np.array(list(product((-1.0, 0.0, 1.0), repeat=free.size)))
@@ -259,10 +257,9 @@ def _grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
 def _prove(
     stiffness: float, damping: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray
 ) -> tuple[bool, np.ndarray]:
-    """Prove that (K, ``damping`` of the part's central device) is stable on every device of every part of a box.
-
-    It ends as soon as the wall is not stable on the center of a part: no cutting would help. Such centers come second.
-    """
+    """Prove that (K, ``damping`` of the part's central device) is stable on every device of every part of a box."""
+    # It ends as soon as the wall is not stable on the center of a part: no cutting would help. Such centers come
+    # second.
     waiting = [(low[None], high[None])]
     looked_at = 0
     while waiting:

@@ -40,11 +40,9 @@ class StiffestWall(NamedTuple):
 
 
 def choose_damping(scene: SceneAnswers, top: StiffestWall, stiffness: float) -> float:
-    """A damping with which a softer wall than the stiffest is stable, where it can be so without leaving its piece.
-
-    That of the stiffest wall, if all walls of that damping between the two are stable; else the middle of the widest
-    interval of dampings.
-    """
+    """A damping with which a softer wall than the stiffest is stable, where it can be so without leaving its piece."""
+    # That of the stiffest wall, if all walls of that damping between the two are stable; else the middle of the widest
+    # interval of dampings.
     damping = float(top.virtual_damping)
     row = scene.stable_stiffness(damping)
     if np.any((row[:, 0] < stiffness) & (row[:, 1] > (1.0 - _ROUNDED) * top.stiffness)):

@@ -13,12 +13,11 @@ from zwidth.arrays.evaluate import check_scalars, compile_traced, evaluate
 from zwidth.arrays.xp import namespace
 from zwidth.loops.normalization import Normalized, normalize, quantity_status
 from zwidth.loops.rigid.device import DelayClasses, classify_delays
-from zwidth.loops.rigid.polynomial import check_delay_model
 from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
 from zwidth.parts.checks import accept_units
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
-from zwidth.words.types import Array, ArrayLike, DelayModel
+from zwidth.words.types import Array, ArrayLike
 
 
 def checked_device(**quantities: ArrayLike) -> Normalized:
@@ -94,12 +93,7 @@ class Sensitivities(NamedTuple):
 
 @accept_units
 def sensitivities(
-    *,
-    mass: ArrayLike,
-    damping: ArrayLike = 0.0,
-    period: ArrayLike,
-    delay: ArrayLike = 0.0,
-    delay_model: DelayModel = "held",
+    *, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike, delay: ArrayLike = 0.0
 ) -> Sensitivities:
     """Return the stiffest stable wall and what it gains per unit of mass, damping, period and delay.
 
@@ -110,8 +104,7 @@ def sensitivities(
         mass: m in kg, > 0.
         damping: b in N s/m, >= 0.
         period: T in s, > 0.
-        delay: t_d in s, >= 0. All four broadcast.
-        delay_model: "held" (exact) or "fractional_power" (the paper's z^(1+d)).
+        delay: t_d in s, >= 0, held. All four broadcast.
 
     Returns:
         Sensitivities of the broadcast shape: ``stiffness_max`` in N/m, ``per_mass`` in N/m per kg, ``per_damping``
@@ -119,7 +112,7 @@ def sensitivities(
 
     Numerics:
         Exact derivatives, about 1e-14. Both sides agree at whole d > 0; at zero damping and zero delay they are those
-        from the right (-inf for ``per_delay`` of the fractional power at strong damping). Traceable.
+        from the right. Traceable.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -130,20 +123,19 @@ def sensitivities(
         >>> print(f"{gain.per_damping:.0f} N/m per N s/m")
         572 N/m per N s/m
     """
-    check_delay_model(delay_model)
     device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
     given = {"mass": mass, "damping": damping, "period": period, "delay": delay}
     arguments = given | {"delta": device.delta, "d": device.d}
-    return evaluate(_sensitivities_kernel, arguments, delay_model, classify_delays(device.d))
+    return evaluate(_sensitivities_kernel, arguments, classify_delays(device.d))
 
 
-def _sensitivities_kernel(mass, damping, period, delay, delta, d, delay_model, kind) -> Sensitivities:
+def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensitivities:
     xp = namespace(mass, delta, d)
     if xp is np:
-        found = slopes_kernel(delta, d, delay_model, kind)
+        found = slopes_kernel(delta, d, "held", kind)
     else:
         # Its slopes are found once, in delta and d, and not once more for each quantity.
-        found = compile_traced(slopes_kernel, (delay_model, kind))(delta, d)
+        found = compile_traced(slopes_kernel, ("held", kind))(delta, d)
     # An array's entry beyond the range of its quantity is NaN in delta or d; the quantities tell why.
     given = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
     status = xp.where(given == Status.OK, found.point.status, given).astype(np.int32)

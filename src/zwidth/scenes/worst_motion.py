@@ -170,10 +170,8 @@ def _delay(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _move(scene: SceneAnswers, wall: tuple[float, float], x: np.ndarray, damping: float) -> WorstMotion | None:
-    """The motion through these samples; None where it does not give energy for certain.
-
-    Between them it bends, where a force arrives, as takes least energy under this damping.
-    """
+    """The motion through these samples; None where it does not give energy for certain."""
+    # Between them it bends, where a force arrives, as takes least energy under this damping.
     period, b = scene.timing.period, scene.device.damping
     estimate = scene.loop.chain.estimate
     estimated = _estimate_velocity(estimate, x)

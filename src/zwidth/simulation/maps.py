@@ -150,10 +150,8 @@ def lay_loop(group: LaneGroup, seen: bool, touching: bool, held: bool) -> LoopMa
 
 
 def square(A: np.ndarray) -> np.ndarray:
-    """How many squarings shrink a map by half, negative where they show that it grows, 0 where neither.
-
-    ``trace A^N > n`` needs an eigenvalue outside of the unit circle, ``|A^N| < 1`` needs none.
-    """
+    """How many squarings shrink a map by half, negative where they show that it grows, 0 where neither."""
+    # ``trace A^N > n`` needs an eigenvalue outside of the unit circle, ``|A^N| < 1`` needs none.
     count, n = A.shape[:2]
     found, left, power = np.zeros(count, int), np.arange(count), A
     for j in range(1, _SQUARINGS + 1):
@@ -171,12 +169,10 @@ def square(A: np.ndarray) -> np.ndarray:
 def bound_rows(
     A: np.ndarray, state: np.ndarray, rows: np.ndarray, signed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The least and the most that rows of a state that A moves ever are, and whether the signed rows stay above 0.
-
-    The first steps as they are; then no row is further from 0 than the sum of what the slow eigenvectors add to it,
-    ``|g v| |c| |eigenvalue|^k``, which falls. By then the others, shift registers among them, have no share. A row
-    stays above 0 if the slowest adds more to it than all others. NaN where the state does not decay.
-    """
+    """The least and the most that rows of a state that A moves ever are, and whether the signed rows stay above 0."""
+    # The first steps as they are; then no row is further from 0 than the sum of what the slow eigenvectors add to it,
+    # ``|g v| |c| |eigenvalue|^k``, which falls. By then the others, shift registers among them, have no share. A row
+    # stays above 0 if the slowest adds more to it than all others. NaN where the state does not decay.
     values, vectors = np.linalg.eig(A)
     slow, inside = np.abs(values) > _FAST, np.abs(values).max(-1) < _INSIDE
     vectors = np.where(slow[:, None], vectors, 0.0)

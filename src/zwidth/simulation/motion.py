@@ -52,10 +52,8 @@ def advance(
     keep: Callable[[Array], Array] | None = None,
     which: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """The state after as long a time up to ``limit`` as ``keep`` holds at, that time, and what dampers have taken.
-
-    Of the lanes ``which``, where these are not all that have digits.
-    """
+    """The state after as long a time up to ``limit`` as ``keep`` holds at, that time, and what dampers have taken."""
+    # Of the lanes ``which``, where these are not all that have digits.
 
     def pick(part: Array, k: Array) -> Array:
         ways = [_take(way[k], which) for way in part]
@@ -217,10 +215,8 @@ class _Joint(NamedTuple):
 def slide(
     lanes: Lanes, body: BodyState, forces: Array, duration: Array, whole: Flow | None
 ) -> tuple[BodyState, Array, Array]:
-    """The motion under constant forces, of which friction adds to the last; what dampers and friction have taken.
-
-    ``whole`` is the flow over all of the duration, slipping and held, where it is known.
-    """
+    """The motion under constant forces, of which friction adds to the last; what dampers and friction have taken."""
+    # ``whole`` is the flow over all of the duration, slipping and held, where it is known.
     motion, motor, none = lanes.motion[0], lanes.motor, 0.0 * forces[-1]
     pull = jnp.stack([dot(motion, column) for column in jnp.moveaxis(lanes.rate, 1, 0)])
     joint = _Joint(motion, lanes.place[0], lanes.rate, pull, lanes.longest, motor.coulomb, motor.static, forces)

@@ -48,10 +48,8 @@ class Outlook(NamedTuple):
 def foresee(
     lanes: Lanes, options: Options, state: Any, push: np.ndarray, known: np.ndarray, sensed: np.ndarray, periods: int
 ) -> Outlook:
-    """What can be proved of lanes; ``known``, of which a proof is tried, ``sensed``, the last positions.
-
-    A motion near the end of the range of floats overflows, and nothing is proved of it.
-    """
+    """What can be proved of lanes; ``known``, of which a proof is tried, ``sensed``, the last positions."""
+    # A motion near the end of the range of floats overflows, and nothing is proved of it.
     no = np.zeros(push.size, bool)
     outlook = Outlook(no, no.copy(), no.copy(), no.copy(), np.full(push.size, np.inf))
     if options.foaw or options.jitter or options.law is not None:
@@ -228,11 +226,9 @@ def _outgrows(group: LaneGroup, loop: LoopMap, periods: int) -> np.ndarray:
 
 
 def _repeats(group: LaneGroup, sensed: np.ndarray, periods: int) -> np.ndarray:
-    """Whether the readings repeat for good: the motion draws near to one that repeats, too near for a change.
-
-    Without a filter readings alone decide the commands, whatever the motor's limits: two motions of equal readings
-    differ by what the bodies make of it.
-    """
+    """Whether the readings repeat for good: the motion draws near to one that repeats, too near for a change."""
+    # Without a filter readings alone decide the commands, whatever the motor's limits: two motions of equal readings
+    # differ by what the bodies make of it.
     found = np.zeros(len(group.push), bool)
     counts = sensed / group.lanes.resolution
     reading, memory = np.floor(counts + 0.5), group.window + group.late + 2

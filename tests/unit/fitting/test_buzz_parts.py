@@ -7,7 +7,7 @@ from measured_devices import OTHERS, PERIOD, OtherDevice, TrueDevice
 import zwidth
 from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import Onsets
-from zwidth.fitting.device_estimate import differentiate, name_numbers, scene_of
+from zwidth.fitting.device_estimate import DimensionlessDevice, differentiate, name_numbers
 from zwidth.fitting.words import choose_wall, describe_fit, write_scene
 from zwidth.words.status import Status
 
@@ -57,7 +57,7 @@ def test_walls_and_numbers_move_with_theta_as_their_derivatives_say(lag, modes):
 
     values, by_theta, found = to_numbers(theta), differentiate(to_numbers, theta), differ(to_numbers, theta)
     np.testing.assert_allclose(by_theta, found, rtol=1e-7, atol=1e-7 * np.abs(values).max())
-    scene = scene_of(values, PERIOD, VELOCITY, lag)
+    scene = DimensionlessDevice.of_numbers(np.array(values), PERIOD, lag).to_scene(PERIOD, VELOCITY)
     own = scene.parameters()
     np.testing.assert_allclose([own[name] for name in name_numbers(scene)], values, rtol=1e-15)
 
@@ -151,7 +151,7 @@ def test_a_lag_and_a_resonance_that_explain_walls_alike_leave_no_wall_to_set():
     assert "resonance = 65.6" in dict(describe_fit(fit, "walls"))["or as well"]
     # The wall to measure next is one that the two do not have alike.
     values = [rival.mass, rival.damping, rival.delay, *rival.parts.values()]
-    other = scene_of(values, PERIOD, VELOCITY)
+    other = DimensionlessDevice.of_numbers(np.array(values), PERIOD, 0).to_scene(PERIOD, VELOCITY)
     assert float(other.max_stiffness().stiffness) == pytest.approx(rival.stiffness_max, rel=1e-9)
     assert fit.next is not None
     assert fit.actuator is not None

@@ -64,7 +64,7 @@ def test_the_numbers_of_the_scene_move_with_theta_as_their_derivatives_say():
     names += tuple(f"modes.{k}.{name}" for k in range(2) for name in ("frequency", "damping_ratio", "mass"))
 
     def numbers(theta, period=PERIOD):
-        own = model.to_scene(theta, period, velocity).parameters()
+        own = model.normalize(theta, period).to_scene(period, velocity).parameters()
         return np.array([own[name] for name in names])
 
     slopes = differentiate(lambda theta: model.normalize(theta, PERIOD).to_numbers(PERIOD), theta)
