@@ -62,6 +62,7 @@ from .scenes.answers import to_control as to_control
 from .scenes.assessment import Assessment as Assessment
 from .scenes.assessment import Limit as Limit
 from .scenes.assessment import assess as assess
+from .scenes.assessment import assess_many as assess_many
 from .scenes.assessment import limits_of as limits_of
 from .scenes.recommendation import Recommendation as Recommendation
 from .scenes.robust import Interval as Interval

@@ -159,6 +159,7 @@ CASES = [
 # Public functions that take no arrays point by point, or that compile for long: who holds their contract instead.
 OTHERS = {
     "assess": "one scene: tests/unit/studies/test_published.py, tests/properties/test_consistency.py",
+    "assess_many": "scenes by name: tests/unit/scenes/test_assessment.py",
     "excite": "one signal: tests/unit/fitting/test_respond.py",
     "fit_buzz": "one device: tests/unit/fitting/test_buzz.py",
     "fit_log": "one device: tests/unit/fitting/test_log.py",

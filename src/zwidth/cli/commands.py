@@ -68,7 +68,7 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
         # The device's own: the rule is for any hand.
         device = {"damping": scene.device.damping, "period": scene.timing.period}
         rule = friction_rule(**device, friction=friction, resolution=resolution)
-        result["friction_rule"] = rule._asdict()
+        result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
         lines += words.friction_lines(rule)
     words.tell(result, lines + words.note_lines(notes), as_json)
 

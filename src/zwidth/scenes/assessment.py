@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -167,6 +167,48 @@ def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
     """The interval that holds a value or is the nearest to it; NaN where there is none."""
     away = [max(low - value, value - high, 0.0) for low, high in intervals]
     return intervals[away.index(min(away))] if away else (math.nan, math.nan)
+
+
+def assess_many(scenes: Iterable[SceneOptima] | Mapping[str, SceneOptima]) -> list[dict[str, Any]]:
+    """Judge the walls of many scenes, one record each; a scene that has no answer leaves the others alone.
+
+    Args:
+        scenes: scenes of any kind, or a mapping of names to scenes.
+
+    Returns:
+        A list of dicts with the same keys, a row of a table each: ``scene``, its name or number; ``status`` and
+        ``message`` ("OK" and nothing, or "INVALID_INPUT" and why); every parameter by its dotted path; and what
+        `assess` finds, None where a scene has no such number. ``csv.DictWriter`` writes them as they are.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, sections V to VIII.
+
+    Example:
+        >>> import zwidth
+        >>> device, timing, wall = zwidth.Device(0.1, 10), zwidth.Timing(1e-3), zwidth.VirtualWall(25e3, 40)
+        >>> scenes = {name: zwidth.Scene(device, timing, wall, zwidth.LowPass(cutoff=c)) for name, c in
+        ...           {"slow": 20, "fast": 200, "refused": 900}.items()}
+        >>> [(row["scene"], row["status"], row["stable"]) for row in zwidth.assess_many(scenes)]
+        [('slow', 'OK', False), ('fast', 'OK', True), ('refused', 'INVALID_INPUT', None)]
+    """
+    named: Any = scenes.items() if isinstance(scenes, Mapping) else enumerate(scenes)
+    records = [_record(name, scene) for name, scene in named]
+    answers = [field.name for field in fields(Assessment)]
+    given = [name for record in records for name in record if name not in answers]
+    names = list(dict.fromkeys([*given, *answers]))
+    return [{name: record.get(name) for name in names} for record in records]
+
+
+def _record(name: str | int, scene: SceneOptima) -> dict[str, Any]:
+    head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
+    try:
+        if not isinstance(scene, SceneOptima):
+            raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed")
+        verdict = assess(scene).as_dict()
+    except InputError as error:
+        verdict, head = {}, head | {"status": Status.INVALID_INPUT.name, "message": str(error)}
+    own = scene.parameters() if isinstance(scene, SceneOptima) else {}
+    return head | own | verdict
 
 
 # What somebody can buy of a parameter, by its path: the factor on it, and the words.

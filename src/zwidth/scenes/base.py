@@ -59,6 +59,8 @@ class SceneParts(Part):
     operator: Operator | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.wall, Velocity):
+            self._move_up()
         for name, (kind, example) in _KINDS.items():
             part = getattr(self, name)
             if not isinstance(part, kind):
@@ -69,6 +71,17 @@ class SceneParts(Part):
             raise InputError(
                 "operator: a hand holds a body, and of this device no body is known; make the hand a part of it"
             )
+
+    def _move_up(self) -> None:
+        """Without a wall the velocity estimate is the third part, and the hand the fourth."""
+        estimate, fourth, hand = self.wall, self.velocity, self.operator
+        if isinstance(fourth, Operator) and hand is None:
+            hand = fourth
+        elif fourth != BackwardDifference():
+            raise InputError(f"wall: got {estimate!r}, and {fourth!r} as the velocity as well; name parts that follow")
+        moved = {"wall": NoWall(), "velocity": estimate, "operator": hand}
+        for name, part in moved.items():
+            object.__setattr__(self, name, part)
 
     @cached_property
     def parts_beyond(self) -> tuple[str, ...]:

@@ -1,6 +1,8 @@
-"""Verdicts on walls: passivity and margins of scenes with parts, and walls that are marginal."""
+"""Verdicts on walls: passivity and margins of scenes with parts, walls that are marginal, and tables of many scenes."""
 
+import csv
 import dataclasses
+import io
 import math
 
 import numpy as np
@@ -103,9 +105,49 @@ def test_an_undamped_device_has_no_stable_spring(delay):
     assert verdict.stable_damping == ()
 
 
-def test_a_part_in_the_place_of_another_is_refused():
-    with pytest.raises(InputError, match="wall: got LowPass"):
-        zwidth.Scene(DEVICE, TIMING, SLOW)  # pyright: ignore[reportArgumentType]
+def test_many_scenes_make_a_table_and_a_bad_one_spoils_no_other():
+    scenes = {
+        "rigid": zwidth.Scene(DEVICE, TIMING, WALL),
+        "refused": zwidth.Scene(DEVICE, TIMING, WALL, zwidth.LowPass(cutoff=900)),
+        "no poles": zwidth.Scene(DEVICE, zwidth.Timing(1e-3, delay_model="fractional_power"), WALL),
+        "no scene": None,
+        "filter": zwidth.Scene(DEVICE, TIMING, WALL, SLOW),
+    }
+    records = zwidth.assess_many(scenes)  # pyright: ignore[reportArgumentType]
+    assert [record["status"] for record in records] == ["OK", *["INVALID_INPUT"] * 3, "OK"]
+    assert [bool(record["message"]) for record in records] == [False, True, True, True, False]
+    for name, record in zip(scenes, records, strict=True):
+        assert record["scene"] == name
+        if record["status"] == "OK":
+            expected = zwidth.assess(scenes[name]).as_dict()
+            assert {key: record[key] for key in expected} == expected
+            assert record["stiffness"] == 3e3
+        else:
+            assert record["stable"] is None
+    assert records[4]["velocity.cutoff"] == 100.0
+    assert records[0]["velocity.cutoff"] is None
+    text = io.StringIO()
+    table = csv.DictWriter(text, list(records[0]))
+    table.writeheader()
+    table.writerows(records)
+    text.seek(0)
+    assert [row["scene"] for row in csv.DictReader(text)] == list(scenes)
+
+
+def test_many_scenes_without_names_are_counted():
+    records = zwidth.assess_many(zwidth.Scene(DEVICE, TIMING, zwidth.VirtualWall(K, 40)) for K in (1e3, 50e3))
+    assert [(record["scene"], record["stable"]) for record in records] == [(0, True), (1, False)]
+    assert zwidth.assess_many([]) == []
+
+
+def test_parts_by_place():
+    scene = zwidth.Scene(DEVICE, TIMING, SLOW, HAND)  # pyright: ignore[reportArgumentType]
+    assert scene == zwidth.Scene(DEVICE, TIMING, velocity=SLOW, operator=HAND)
+    assert zwidth.Scene(DEVICE, TIMING, SLOW, operator=HAND) == scene  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="as the velocity as well"):
+        zwidth.Scene(DEVICE, TIMING, SLOW, zwidth.LowPass(cutoff=50))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="as the velocity as well"):
+        zwidth.Scene(DEVICE, TIMING, SLOW, HAND, HAND)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -135,10 +177,12 @@ def test_the_device_s_own_damping_counts():
 def test_a_scene_without_a_wall_has_none_to_judge():
     with pytest.raises(InputError, match="the scene has no wall"):
         zwidth.assess(zwidth.Scene(DEVICE, TIMING))
+    assert zwidth.assess_many([zwidth.Scene(DEVICE, TIMING)])[0]["status"] == "INVALID_INPUT"
 
 
 def test_too_many_poles_are_refused_before_minutes_are_spent(monkeypatch):
     late = zwidth.Scene(DEVICE, zwidth.Timing(1e-3, 5.0), WALL, SLOW)
     monkeypatch.setattr(zwidth.Scene, "max_stiffness", lambda scene: pytest.fail("the boundary is laid out"))
-    with pytest.raises(InputError, match="poles"):
-        zwidth.assess(late)
+    (row,) = zwidth.assess_many([late])
+    assert row["status"] == "INVALID_INPUT"
+    assert "poles" in row["message"]
