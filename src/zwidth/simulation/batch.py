@@ -24,7 +24,7 @@ from zwidth.simulation.lanes import (
     lay_machines,
     round_up,
 )
-from zwidth.simulation.result import UNITS, to_si
+from zwidth.simulation.result import OF_ENERGY, to_si
 
 # Lanes that run together: enough for the vector units, few enough that a state stays next to the processor.
 TOGETHER = 1 << 10
@@ -153,7 +153,7 @@ class Batch:
             outlook = foresee(lanes, self.options, state, last, steady, sensed, self.course.periods)
         found = to_si((state, reading, frame), given, lanes.motor.static > 0, outlook, self.names, self.course)
         # Where a force acts and what stores its work is known of bodies.
-        unknown = () if self.options.bodies else [name for name in found if UNITS.get(name) == "J"]
+        unknown = () if self.options.bodies else OF_ENERGY & found.keys()
         return found | {name: np.full_like(found[name], np.nan) for name in unknown}
 
 

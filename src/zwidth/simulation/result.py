@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zwidth.words.errors import InputError
 from zwidth.words.showing import draw_line, shown
 from zwidth.words.status import Status
+
+if TYPE_CHECKING:
+    import xarray
 
 
 class MotionKind(IntEnum):
@@ -30,16 +34,35 @@ _AT_REST, _STILL, _ALIKE, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 2, 1e100
 # Who halves in so many times the periods has changed by 2 % after 20 times as many.
 _FOR_GOOD = 4000.0
 
-# What is said of the whole, beside the arrays over time; and the units of both, where they have one.
-_SIZES = ("amplitude", "trend", "frequency", "penetration", "bounces", "impact_velocity", "energy_given")
-OF_WHOLE = (*_SIZES, "outcome", "status")
-UNITS = {
-    **{"time": "s", "frequency": "Hz"},
-    **dict.fromkeys(("position", "tip_position", "hand_position", "measured", "amplitude", "penetration"), "m"),
-    **dict.fromkeys(("velocity", "estimated_velocity", "impact_velocity"), "m/s"),
-    **dict.fromkeys(("wall_force", "command"), "N"),
-    **dict.fromkeys(("wall_work", "push_work", "damping_loss", "friction_loss", "energy", "energy_given"), "J"),
+OF_MOTION = {
+    "position": ("position of the device, into the wall", "m"),
+    "velocity": ("velocity of the device", "m/s"),
+    "wall_force": ("force of the wall that acts", "N"),
+    "sticking": ("whether friction holds the device", "1"),
+    "tip_position": ("position of the mass beyond the coupling", "m"),
+    "hand_position": ("position of the hand behind its grasp", "m"),
+    "measured": ("position that the program reads", "m"),
+    "estimated_velocity": ("velocity that the program estimates", "m/s"),
+    "command": ("force that the program commands at the sample", "N"),
+    "contact": ("whether the program sees contact at the sample", "1"),
+    "wall_work": ("energy that the wall has given since the start", "J"),
+    "push_work": ("energy that the pushing hand has given", "J"),
+    "damping_loss": ("energy that dampers have taken", "J"),
+    "friction_loss": ("energy that friction has taken", "J"),
+    "energy": ("kinetic and elastic energy of all bodies", "J"),
 }
+OF_WHOLE = {
+    "amplitude": ("half of the peak-to-peak position in the tail", "m"),
+    "trend": ("width of the second half of the tail over that of the first", "1"),
+    "frequency": ("frequency of the motion in the tail", "Hz"),
+    "penetration": ("largest position at a sample", "m"),
+    "bounces": ("times the wall was left again", "1"),
+    "impact_velocity": ("velocity at the first sample in contact", "m/s"),
+    "energy_given": ("most energy that the wall has given beyond what it took", "J"),
+    "outcome": ("how the motion ends", "1"),
+    "status": ("why a simulation has its values", "1"),
+}
+OF_ENERGY = {"wall_work", "push_work", "damping_loss", "friction_loss", "energy", "energy_given"}
 
 
 def _draw(motion: Motion) -> str:
@@ -58,7 +81,8 @@ def _draw(motion: Motion) -> str:
         "trend": "nothing moves",
     },
     outcome=MotionKind,
-    **UNITS,
+    time="s",
+    **{name: unit for name, (_, unit) in OF_WHOLE.items() if name != "outcome" and name != "status"},
 )
 @dataclass(frozen=True)
 class Motion:
@@ -116,8 +140,37 @@ class Motion:
     outcome: Any
     status: Any
 
+    def to_dataset(self, *dims: str) -> xarray.Dataset:
+        """The same as an xarray Dataset (extra ``store``), each variable with its long name and unit.
 
-OF_MOTION = tuple(each.name for each in fields(Motion) if each.name not in ("time", *OF_WHOLE))
+        Args:
+            *dims: names of the batch's axes, none for a single motion; ``batch_0``, ``batch_1``, ... where left out.
+
+        Raises:
+            InputError: more or fewer names than axes, one twice, or that of a variable.
+        """
+        import xarray
+
+        shape = np.shape(self.amplitude)
+        names = dims or tuple(f"batch_{k}" for k in range(len(shape)))
+        taken = {"time", "instant", *OF_MOTION, *OF_WHOLE}
+        if len(names) != len(shape) or len(set(names)) < len(names) or taken & set(names):
+            raise InputError(
+                f"dims: got {', '.join(map(repr, names))} for a batch of shape {shape}; give a name for each axis, all "
+                "different and none of a variable or time"
+            )
+        variables: dict[str, Any] = {}
+        for name, (long_name, units) in (OF_MOTION | OF_WHOLE).items():
+            value = getattr(self, name)
+            if value is not None:
+                over = (*names, "time") if name in OF_MOTION else names
+                variables[name] = (over, value, {"long_name": long_name, "units": units})
+        data = xarray.Dataset(variables)
+        if self.time is not None:
+            over = "time" if self.time.ndim == 1 else (*names, "time")
+            name = "time" if self.time.ndim == 1 else "instant"
+            data = data.assign_coords({name: (over, self.time, {"long_name": "time", "units": "s"})})
+        return data
 
 
 def classify(known: Any, outlook: Any, course: Any) -> np.ndarray:

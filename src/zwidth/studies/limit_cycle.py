@@ -19,7 +19,7 @@ from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.table import stack
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
-from zwidth.simulation.result import UNITS, MotionKind
+from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
 from zwidth.studies.simulate import Circumstances, SimulatedStudy
 from zwidth.words.formatting import header, with_unit
@@ -153,8 +153,9 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
                 edges += trace_edges(placed, label, varied, axes)
             found["linearly_stable"].append(stable)
             notes.append(f"{label}: {describe_outcomes(motion, stable, self.silence, self.widest)}")
+        units = {name: unit for name, (_, unit) in OF_WHOLE.items()}
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
-        arrays |= {header(name, UNITS.get(name, "1")): np.stack(values) for name, values in found.items()}
+        arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
         table, bounds = stack(edges), (self.silence, self.widest)
         # A curve for each value of a short list, or a single one; else a plane.
         short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MOST_CURVES]

@@ -19,7 +19,7 @@ from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
-from zwidth.simulation.result import OF_MOTION, OF_WHOLE, UNITS, Motion, MotionKind
+from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
 from zwidth.simulation.simulate import Contact
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text
 from zwidth.words.errors import InputError
@@ -170,7 +170,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
             parts.append({**named, **tabulate_motion(motion, k, self.substeps)})
             words = describe_end(motion, k)
             judged = {} if linear is None else {"linearly_stable": bool(linear[k])}
-            whole = {header(name, UNITS.get(name, "1")): getattr(motion, name)[k] for name in OF_WHOLE}
+            whole = {header(name, unit): getattr(motion, name)[k] for name, (_, unit) in OF_WHOLE.items()}
             rows.append({**named, **judged, **whole, "outcome": words})
             verdict = "" if linear is None else f" (linearly {'stable' if linear[k] else 'unstable'})"
             notes.append(f"{label}{verdict}: {words}")
@@ -188,11 +188,11 @@ def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarr
     """One motion of several over time, as columns."""
     assert motion.time is not None, "it is recorded"
     columns = {"time_s": motion.time if motion.time.ndim == 1 else motion.time[k]}
-    for name in OF_MOTION:
+    for name, (_, unit) in OF_MOTION.items():
         values = getattr(motion, name)
         if values is not None:
             own = np.repeat(values[k], substeps) if name in _OF_SAMPLES else values[k]
-            columns[header(name, UNITS.get(name, "1"))] = own.astype(int) if own.dtype == bool else own
+            columns[header(name, unit)] = own.astype(int) if own.dtype == bool else own
     return columns
 
 

@@ -88,6 +88,16 @@ def test_who_flies_off_does_not_return():
     assert [MotionKind(code).name for code in found.outcome[1:]] == ["UNCLEAR", "RESTLESS"]
 
 
+@pytest.mark.parametrize("names", [("a", "b"), (), ("position",)])
+def test_names_of_axes_fit(names):
+    alone, two = SCENE.simulate(1e3, 5.0, periods=5), SCENE.simulate([1e3, 2e3], 5.0, periods=5)
+    if names:
+        with pytest.raises(InputError, match="dims: got"):
+            (alone if len(names) > 1 else two).to_dataset(*names)
+    else:
+        assert alone.to_dataset().amplitude.dims == ()
+
+
 def test_the_amplitude_is_that_of_the_whole_tail():
     found = SCENE.simulate(1.1 * TOP.stiffness, TOP.virtual_damping, start_position=1e-3, periods=200, tail=60)
     tail = found.position[-60:]
@@ -129,11 +139,13 @@ def test_scenes_without_jitter_have_instants_beside_some_that_have_it():
     assert late.max() > 0
 
 
-def test_instants_are_of_one_axis_where_all_share_a_period():
+def test_a_dataset_has_one_time_where_all_share_it_and_else_instants():
     both = [SCENE, SCENE.replace(period=5e-4)]
-    shared, own = (zwidth.simulate(scenes, [1e3, 2e3], 5.0, periods=8) for scenes in (SCENE, both))
+    shared, own = (zwidth.simulate(scenes, [1e3, 2e3], 5.0, periods=8).to_dataset("wall") for scenes in (SCENE, both))
+    assert shared.time.dims == ("time",)
     np.testing.assert_allclose(shared.time, 1e-3 * np.arange(8))
-    np.testing.assert_allclose(own.time, np.outer([1e-3, 5e-4], np.arange(8)))
+    assert own.instant.dims == ("wall", "time")
+    np.testing.assert_allclose(own.instant, np.outer([1e-3, 5e-4], np.arange(8)))
 
 
 def test_what_becomes_of_a_motion_is_said_of_a_hand_that_holds_still_in_the_tail():
