@@ -24,7 +24,7 @@ def page():
 def test_a_drag_shows_edge_wall_poles_and_verdict_alone(page):
     say(page, serial=1, set={"damping": 20})
     scene = Controls().change({"damping": 20}).scene
-    edge = model.quick_edge(scene)
+    (edge,) = model.outlines(scene)
     closed = [*edge[0], edge[0][0], np.nan]
     np.testing.assert_array_equal(page.sources["edge"].data["x"], closed)
     assert page.sources["wall"].data == {"x": [10e3], "y": [40.0]}
@@ -48,11 +48,8 @@ def test_at_rest_the_words_are_those_of_check(page, parts):
     assert len(page.sources["passive"].data["x"]) > 3
 
 
-def test_at_rest_the_edge_of_a_scene_with_parts_is_its_outlines(page):
+def test_a_drag_shows_the_outlines_of_a_scene_with_parts(page):
     say(page, set={"velocity": "LowPass"})
-    assert page.sources["area"].data == {"xs": [], "ys": []}
-    say(page, rest=True)
-    page.queue.work()
     (outline,) = page.controls.scene.stable_region()
     np.testing.assert_array_equal(page.sources["edge"].data["x"][:-2], outline.stiffness)
     np.testing.assert_array_equal(page.sources["area"].data["ys"][0][0][0][:-1], outline.virtual_damping)
