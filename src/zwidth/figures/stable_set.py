@@ -148,13 +148,7 @@ def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
     ]
     if not np.isfinite(least).any():
         return outlines
-    return [(np.maximum(_refine(points), least), hole) for points, hole in outlines]
-
-
-def _refine(points: np.ndarray) -> np.ndarray:
-    at = np.linspace(0, len(points), _BEND * len(points) + 1)
-    closed = np.append(points, points[:1], 0)
-    return np.stack([np.interp(at, np.arange(len(closed)), values) for values in closed.T], -1)
+    return [(np.maximum(Path(_close(points)).interpolated(_BEND).vertices, least), hole) for points, hole in outlines]
 
 
 def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
