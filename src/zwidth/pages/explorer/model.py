@@ -224,12 +224,11 @@ IMPORTING = Lock()
 
 
 def compute_details(
-    scene: Scene, across: Range, up: Range, *, normalized: bool, of_device: bool, contact: bool, costly: bool
+    scene: Scene, across: Range, up: Range, *, normalized: bool, of_device: bool, contact: bool
 ) -> Iterator[Update]:
     """What takes longer than a drag, part by part; whoever asks may stop after each.
 
-    Contours cover ``across`` and ``up``. Wanted may be what hangs on the device (``of_device``), a hit of the wall
-    (``contact``), and what takes seconds in a scene with parts (``costly``).
+    Contours cover ``across`` and ``up``. Wanted may be what hangs on the device alone, and a hit of the wall.
     """
     # The page shows millimeters.
     length = 1.0 if normalized else 1e3
@@ -250,12 +249,9 @@ def compute_details(
         yield {"passive": {"x": x, "y": y}, "contours": contours(scene, across, up)}
     if not own:
         yield {"verdict": "\n".join(check_lines(scene, verdict, limits_of(scene)))}
-    if contact or (costly and scene.parts_beyond):
-        with IMPORTING:
-            import jax  # noqa: F401
     # Of a linear system no damping is known that could grow, and no place to hit the wall from.
     bodies = isinstance(scene.device, Device)
-    if costly or not scene.parts_beyond:
+    if of_device:
         x, y = ridge_path(scene) if bodies else (np.empty(0), np.empty(0))
         yield {"ridge": {"x": x, "y": y}}
         yield {"slopes": "\n".join([] if normalized else [slope.line() for slope in list_slopes(scene)])}
@@ -263,6 +259,8 @@ def compute_details(
         empty = {"x": [], "position": [], "force": []}
         yield {"contact": empty, "contact_words": "(a linear system has no body that comes with a velocity)"}
     elif contact:
+        with IMPORTING:
+            import jax  # noqa: F401
         time, position, force, text = contact_motion(scene, 2 * length_of(scene, verdict))
         position = position * length
         yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}

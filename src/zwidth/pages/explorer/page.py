@@ -49,7 +49,7 @@ class Page:
         self.dark: bool | None = None
         self.device: tuple[Any, ...] = ()
         self.drawn = False
-        self.options = {"contact": False, "costly": False}
+        self.contact = False
         self.sources: dict[str, ColumnDataSource] = {}
         self.inputs = ColumnDataSource({"json": []}, name="inputs")
         self.answer = ColumnDataSource({"json": []}, name="answer")
@@ -224,8 +224,7 @@ class Page:
         if message.get("dark") in (True, False) and message["dark"] != self.dark:
             self.dark = message["dark"]
             self._paint()
-        for name in self.options:
-            self.options[name] = bool(message.get(name, self.options[name]))
+        self.contact = bool(message.get("contact", self.contact))
         link = link if isinstance(link, str) else None
         self.update(message.get("set", {}), rest=bool(message.get("rest")), link=link)
 
@@ -251,7 +250,7 @@ class Page:
             return
         if rest:
             assert self.frame is not None, "it has just been shown"
-            wanted = {"normalized": controls.normalized, "of_device": not self.drawn, **self.options}
+            wanted = {"normalized": controls.normalized, "of_device": not self.drawn, "contact": self.contact}
             self.executor.submit(self._compute, self.generation, controls.scene, *self.frame, **wanted)
 
     def _show_at_once(self, controls: Controls, rest: bool) -> None:
@@ -335,8 +334,8 @@ class Page:
             return
         self._fill({name: columns for name, columns in update.items() if name in self.sources})
         texts = {name: text for name, text in update.items() if name not in self.sources}
-        if "contours" in update:
-            self.drawn = True
+        # The last of what hangs on the device.
+        self.drawn = self.drawn or "slopes" in update
         if texts:
             self.tell(texts)
 
