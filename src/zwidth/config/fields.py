@@ -319,7 +319,7 @@ def find_kind(
     raise validation_error(what, [(("kind",), found)])
 
 
-def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
+def repeated(raw: Iterable[Any], remedy: str, allowed: str = "each value once") -> Iterable[LocatedProblem]:
     """A problem for every plain value of a list that an earlier entry already holds."""
     seen: dict[Any, int] = {}
     for index, value in enumerate(raw):
@@ -327,7 +327,7 @@ def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
             continue
         if value in seen:
             what = f"got {describe(value)} twice, here and at [{seen[value]}]"
-            yield (index,), problem(what, "each value once", remedy)
+            yield (index,), problem(what, allowed, remedy)
         else:
             seen[value] = index
 
