@@ -85,14 +85,6 @@ SLOPES = stack(
     for model in ("held", "fractional_power")
 )
 COSTS = stack([cost(0.0), cost(1.0)])
-FOUND = {
-    "maximum": {"stiffness": 1.1e5, "virtual_damping": 100.0},
-    "recommended": {
-        **{"stiffness": 8e4, "virtual_damping": 100.0, "stiffness_fraction": 0.75, "settling_time": 0.03},
-        **{"virtual_damping_lower": 20.0, "virtual_damping_upper": 180.0},
-    },
-}
-REGION = in_si(stack([outline(0.1, 1.0), passive_outline(0.1, 1.0)]))
 
 # What each function draws; the name is the function's, and what is special about the case.
 _POSE = np.meshgrid(np.linspace(0.0, 120.0, 5), np.linspace(30.0, 150.0, 4))
@@ -121,5 +113,4 @@ EVERY_FIGURE = {
     "draw_map of radius": (grid_map(), "spectral_radius"),
     "draw_map of stable": (in_si(grid_map()), "stable"),
     "draw_map of many": (grid_map(np.linspace(0, 1, 7)), "passive"),
-    "draw_recommendation": (FOUND, REGION, stack([response()])),
 }

@@ -157,11 +157,7 @@ CONTOUR = Tolerance(
     0.01, "Of the spectral radius: between the places of a grid of some dozens a side it is taken for linear."
 )
 EDGE_RADIUS = Tolerance(
-    2e-5,
-    "Of the spectral radius from 1. Places are asked with eigenvalues to 1e-5, which double poles lose to rounding.",
-)
-QUICK_EDGE = Tolerance(
-    0.03, "Relative to the largest outline's width and height: at a corner a step of curve and of line may be missing."
+    1e-7, "Of the spectral radius from 1: where two poles meet, as in a corner, half of the digits are rounding."
 )
 
 FIT_EXACT = Tolerance(

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.fields import LocatedProblem, listing, printable, problem, problems_of, validation_error
+from zwidth.config.fields import LocatedProblem, Strict, listing, printable, problem, problems_of, validation_error
 from zwidth.config.values import quantity_of, read_entries, share
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, resembling, suggestion
@@ -117,21 +117,16 @@ def _check_label(cell: Any) -> Any:
     return cell
 
 
+class _TableFile(Strict, what="a table from a file"):
+    csv: str
+
+
 def _read_csv(raw: dict[str, Any]) -> DeviceTable:
     """A table from a file, whose header names parameters and, in brackets, their units."""
-    for key in raw:
-        if key not in ("csv", "columns"):
-            allowed = "a table from a file has the keys 'csv' and 'columns'"
-            what = problem("unknown key", allowed, suggestion(key, ("csv", "columns"), "remove it"), on_key=True)
-            raise validation_error("devices", [((key,), what)])
-    name = raw["csv"]
-    if not isinstance(name, str) or not name:
-        what = problem(f"got {describe(name)}", "csv is the name of a file", "write 'csv: devices.csv'")
-        raise validation_error("devices", [(("csv",), what)])
+    name = _TableFile.model_validate(raw).csv
     try:
         rows = _read_rows(name)
-        chosen = _choose_columns(rows[0][1], raw.get("columns"), name)
-        return _parse_rows(rows, chosen, name)
+        return _parse_rows(rows, _choose_columns(rows[0][1], name), name)
     except PydanticCustomError as error:
         raise validation_error("devices", [(("csv",), error)]) from None
 
@@ -161,10 +156,8 @@ def _read_rows(name: str) -> list[tuple[int, list[str]]]:
     return rows
 
 
-def _choose_columns(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, str]]:
+def _choose_columns(header: list[str], name: str) -> dict[str, tuple[int, str]]:
     """For every parameter that the file holds its column and unit."""
-    if mapping is not None:
-        return _map_columns(header, mapping, name)
     chosen: dict[str, tuple[int, str]] = {}
     for index, title in enumerate(header):
         key, unit = split_title(title)
@@ -176,23 +169,6 @@ def _choose_columns(header: list[str], mapping: Any, name: str) -> dict[str, tup
             # A misspelled column must not be taken for a remark; other ones, as a source, are the reader's own.
             what = f"{printable(name)}: got the column {describe(key)}"
             raise problem(what, f"columns are {listing(_KNOWN)}, and others", suggestion(key, _KNOWN, "rename it"))
-    return chosen
-
-
-def _map_columns(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, str]]:
-    """The same where the configuration says which column is what, as ``mass: "moving mass [g]"``."""
-    if not isinstance(mapping, dict) or not mapping:
-        raise problem(f"got columns: {describe(mapping)}", f"a mapping from {listing(_KNOWN)} to headers", "write one")
-    chosen = {}
-    for key, title in mapping.items():
-        if key not in _KNOWN:
-            raise problem(
-                f"columns: got {describe(key)}", f"the keys are {listing(_KNOWN)}", suggestion(key, _KNOWN, "")
-            )
-        if not isinstance(title, str) or title.strip() not in header:
-            allowed = f"the headers of {printable(name)} are {listing(header[:20])}"
-            raise problem(f"columns: got {describe(title)}", allowed, suggestion(title, header, "write one of these"))
-        chosen[key] = header.index(title.strip()), split_title(title)[1]
     return chosen
 
 
@@ -222,9 +198,8 @@ def _to_value(cell: str, unit: str) -> float | str:
 def _make_schema() -> dict[str, Any]:
     column = share("column", {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}})
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
-    names = {"type": "object", "additionalProperties": {"type": "string"}}
     lists = {LABEL: labels, **dict.fromkeys(PARAMETERS, column)}
-    keys = {"csv": {"type": "string"}, "columns": names}
+    keys = {"csv": {"type": "string"}}
     closed = {"type": "object", "additionalProperties": False}
     forms = [{"properties": lists, "minProperties": 1, **closed}, {"properties": keys, "required": ["csv"], **closed}]
     return {"description": f"Devices: {_FORMS}.", "anyOf": forms}

@@ -27,12 +27,11 @@ from pydantic import (
 from pydantic import ModelWrapValidatorHandler as Handler
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError
 
-from zwidth.words.errors import ConfigError, UnusableValueError
+from zwidth.words.errors import ConfigError
 from zwidth.words.formatting import LONGEST_VALUE, describe, resembling, suggestion
 from zwidth.words.quantities import FIELDS, Parameter
 
 FieldPath: TypeAlias = tuple[str | int, ...]
-Result = TypeVar("Result")
 Kind = TypeVar("Kind")
 LocatedProblem: TypeAlias = tuple[FieldPath, PydanticCustomError]
 
@@ -76,18 +75,6 @@ def problem(what: str, allowed: str = "", remedy: str = "", *, on_key: bool = Fa
     """What a validator raises; ``on_key`` points at the key of the field instead of its value."""
     context = {"what": what, "allowed": allowed, "remedy": remedy, "on_key": on_key}
     return PydanticCustomError("zwidth", "{what}; {allowed}; {remedy}", context)
-
-
-def raise_problems(read: Callable[[Any], Result]) -> Callable[[Any], Result]:
-    """Make a validator of what reads a value and raises `UnusableValueError`."""
-
-    def validate(value: Any) -> Result:
-        try:
-            return read(value)
-        except UnusableValueError as error:
-            raise problem(*error.parts) from None
-
-    return validate
 
 
 # What pydantic itself finds: what is allowed, and the remedy.
@@ -332,7 +319,7 @@ def find_kind(
     raise validation_error(what, [(("kind",), found)])
 
 
-def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
+def repeated(raw: Iterable[Any], remedy: str, allowed: str = "each value once") -> Iterable[LocatedProblem]:
     """A problem for every plain value of a list that an earlier entry already holds."""
     seen: dict[Any, int] = {}
     for index, value in enumerate(raw):
@@ -340,7 +327,7 @@ def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
             continue
         if value in seen:
             what = f"got {describe(value)} twice, here and at [{seen[value]}]"
-            yield (index,), problem(what, "each value once", remedy)
+            yield (index,), problem(what, allowed, remedy)
         else:
             seen[value] = index
 

@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import inf
 from typing import Annotated, Any, TypeAlias, cast
 
@@ -22,11 +21,11 @@ from zwidth.config.fields import (
     Strict,
     problem,
     problems_of,
-    raise_problems,
     repeated,
     validation_error,
 )
 from zwidth.parts.checks import Span, read_span
+from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, FIELDS, FRACTION, NOT_NEGATIVE, POSITIVE, Range
 from zwidth.words.rotation import is_rotary, use_kind
@@ -61,11 +60,14 @@ class Quantity:
     remedy: str = ""  # what helps where another number is given
     turns: bool = True  # whether it is an angle, a torque, ... where the device is rotary
 
-    @cached_property
-    def read(self) -> Callable[[Any], Any]:
-        if self.periods:
-            return raise_problems(lambda value: read_span(value, self.allowed))
-        return raise_problems(self._read_number if self.unit == "1" else self._read_quantity)
+    def read(self, value: Any) -> Any:
+        """A value of a configuration in the unit."""
+        try:
+            if self.periods:
+                return read_span(value, self.allowed)
+            return self._read_number(value) if self.unit == "1" else self._read_quantity(value)
+        except UnusableValueError as error:
+            raise problem(*error.parts) from None
 
     def read_alike(self) -> tuple[Entry, set[str]]:
         """What reads several values, lengths of time all in seconds or all in periods; and the unit of those read."""

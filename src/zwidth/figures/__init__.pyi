@@ -22,7 +22,6 @@ from .paper import draw_slope as draw_slope
 from .paper import draw_zero_stiffness as draw_zero_stiffness
 from .plane import draw_plane as draw_plane
 from .plane import draw_workspace as draw_workspace
-from .stable_set import draw_recommendation as draw_recommendation
 from .stable_set import draw_stable_set as draw_stable_set
 from .style import house_style as house_style
 from .style import save as save

@@ -22,14 +22,15 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from zwidth.arrays.evaluate import as_float64
 from zwidth.figures import style
 from zwidth.figures.grid import scale_axis
-from zwidth.figures.motion import draw_motion, draw_step
-from zwidth.figures.stable_set import draw_recommendation, draw_stable_set, tabulate_sets, tabulate_walls
-from zwidth.figures.table import Parameters, Result, Table, stack
+from zwidth.figures.motion import draw_motion, draw_positions, draw_step
+from zwidth.figures.stable_set import draw_stable_set, scale_walls, tabulate_sets, tabulate_walls
+from zwidth.figures.table import Parameters, Result, Table, name_as_linear, stack
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import settling_time
 from zwidth.parts.checks import read_texts
@@ -130,29 +131,49 @@ def recommendation(
         axes: an Axes of yours for the walls alone, or two; a figure of pyplot's where left out.
         response: columns of a step study of this wall, in SI units; computed at the samples where left out.
     """
-    scene, told = found.scene, found.as_dict()
+    scene, verdict, told = found.scene, found.verdict, found.as_dict()["recommended"]
     # Without a model there is no response.
     moves = not isinstance(scene.device, MeasuredDevice)
     if axes is None:
-        axes = _two(None, 1, 2, (style.WIDTH, 3.5)) if found.verdict is not None and moves else _axes(None)
+        axes = _two(None, 1, 2, (style.WIDTH, 3.5)) if verdict is not None and moves else _axes(None)
+    panels = _two(axes, 1, 2, None)
     outlines, walls = tabulate_sets({"": scene})
     if not find_obstacle(**vars(scene.device)) and scene.device.damping > 0:
         outlines = stack([outlines, _trace_passive(scene)])
-    if found.verdict is None:
-        return draw_stable_set(outlines, walls, axes)
+    if verdict is None:
+        return draw_stable_set(outlines, walls, panels[:1])
     K, B = found.stiffness, found.virtual_damping
+    named = {"label": "", "wall": f"recommended ({100 * told['stiffness_fraction']:.3g} %)", "digits": told["digits"]}
+    walls = stack([{**walls, "digits": 4}, {**named, **tabulate_walls(scene, K, B)}])
+    draw_stable_set(outlines, walls, panels[:1])
+    (spring, damper), _ = scale_walls([outlines, walls])
+    interval = np.array([verdict.virtual_damping_lower, verdict.virtual_damping_upper])
+    look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
+    panels[0].plot([K * spring] * 2, interval * damper, **look)
     if response is None and moves:
         # As long as the slowest motion takes to decay, or so many periods.
-        decay = told["recommended"]["decay_time"] or 0.0
-        periods = int(min(max(_PERIODS, 1.5 * decay / scene.timing.period), _MOST_PERIODS))
+        periods = int(min(max(_PERIODS, 1.5 * (told["decay_time"] or 0.0) / scene.timing.period), _MOST_PERIODS))
         columns = _tabulate_step(scene, K, B, periods)
         if not scene.parts_beyond:
-            wall = found.verdict.alpha, found.verdict.beta, float(scene.delta), float(scene.d)
+            wall = verdict.alpha, verdict.beta, float(scene.delta), float(scene.d)
             columns["settling_time_s"] = settling_time(*wall) * scene.timing.period
         response = stack([columns])
-    if response is not None and "settling_time_s" in response and np.isfinite(response["settling_time_s"][0]):
-        told["recommended"]["settling_time"] = float(response["settling_time_s"][0])
-    return draw_recommendation(told, outlines, response, axes)
+    for ax in panels[1:] if response is not None else ():
+        _draw_response(ax, name_as_linear(response))
+    style.letter(panels)
+    return panels
+
+
+def _draw_response(ax: Axes, response: Table) -> None:
+    """Positions over time, and when they have settled."""
+    clock, unit = draw_positions(ax, response)
+    time = np.asarray(response["time_s"])
+    ax.set(xlim=(0.0, float(time[-1] + time[1]) * clock), xlabel=f"time  $t$  in {unit}")
+    settled = float(response["settling_time_s"][0]) if "settling_time_s" in response else math.nan
+    if settled <= time[-1]:
+        dot = Line2D([], [], linestyle="", marker="o", markersize=4.5, color=ax.lines[0].get_color())
+        text = f"settled to 2 % after {settled * clock:.3g} {unit}"
+        ax.legend([dot], [text], loc="upper right", handletextpad=0.2)
 
 
 @_draws

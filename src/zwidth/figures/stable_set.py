@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
 from zwidth.figures import style
-from zwidth.figures.motion import draw_positions
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select, stack
 from zwidth.words.formatting import round_safely
 
@@ -150,13 +148,7 @@ def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
     ]
     if not np.isfinite(least).any():
         return outlines
-    return [(np.maximum(_refine(points), least), hole) for points, hole in outlines]
-
-
-def _refine(points: np.ndarray) -> np.ndarray:
-    at = np.linspace(0, len(points), _BEND * len(points) + 1)
-    closed = np.append(points, points[:1], 0)
-    return np.stack([np.interp(at, np.arange(len(closed)), values) for values in closed.T], -1)
+    return [(np.maximum(Path(_close(points)).interpolated(_BEND).vertices, least), hole) for points, hole in outlines]
 
 
 def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
@@ -264,46 +256,3 @@ def _draw_pieces(
     for passive, outlines in edges.items():
         shade_region(ax, outlines, style.GRAY if passive else color, alpha=shade, zorder=1.5 if passive else 1.0)
     return {str(one.piece) for one in found}
-
-
-@draws_tables
-def draw_recommendation(
-    found: Mapping[str, Any], region: Table, response: Table | None, axes: style.AnyAxes | None = None
-) -> np.ndarray:
-    """Draw the stable region over K and B with the recommended wall, and the response of the position to 1 N.
-
-    Args:
-        found: the recommendation, as its JSON file holds it.
-        region: columns of a boundary study of the device, in SI units, or of a device with parts.
-        response: columns of a step study of the device with this wall; None where no model tells one.
-        axes: an Axes of yours for the region alone, or two.
-    """
-    panels = style.panels(axes, 2, style.WIDTH, 3.5, 2)
-    wall, maximum = found["recommended"], found["maximum"]
-    outlines = {name: region[name] for name in (*SI_COLUMNS, *({"number", "piece"} & set(region)))}
-    if "piece" not in outlines:
-        curve = np.asarray(region["curve"])
-        outlines |= {"number": np.zeros(curve.size, int), "piece": np.where(curve == "passive", curve, "outline")}
-    outlines["label"] = np.full(len(outlines["piece"]), "")
-    kinds = np.array(["stiffest", f"recommended ({100 * wall['stiffness_fraction']:.3g} %)"])
-    keys = zip(SI_COLUMNS, ("stiffness", "virtual_damping"), strict=True)
-    walls = {name: np.array([row[key] for row in (maximum, wall)]) for name, key in keys}
-    digits = np.array([4, wall.get("digits", 4)])
-    draw_stable_set(outlines, {"label": np.array(["", ""]), "wall": kinds, "digits": digits, **walls}, panels[:1])
-    (spring, damper), _ = scale_walls([outlines, walls])
-    # A bound that is not known is None in JSON.
-    interval = np.array([wall["virtual_damping_lower"], wall["virtual_damping_upper"]], dtype=np.float64)
-    look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
-    panels[0].plot([wall["stiffness"] * spring] * 2, interval * damper, **look)
-    if response is not None:
-        for ax in panels[1:]:
-            clock, unit = draw_positions(ax, response)
-            time, settled = np.asarray(response["time_s"]), wall["settling_time"]
-            ax.set_xlim(0.0, float(time[-1] + time[1]) * clock)
-            ax.set_xlabel(f"time  $t$  in {unit}")
-            if settled is not None and settled <= time[-1]:
-                dot = Line2D([], [], linestyle="", marker="o", markersize=4.5, color=ax.lines[0].get_color())
-                text = f"settled to 2 % after {settled * clock:.3g} {unit}"
-                ax.legend([dot], [text], loc="upper right", handletextpad=0.2)
-    style.letter(panels)
-    return panels

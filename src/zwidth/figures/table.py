@@ -37,7 +37,7 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
     @wraps(function)
     def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         given: Any = [*args, *kwargs.values()]
-        read: Any = [_name_as_linear(each) for each in given]
+        read: Any = [name_as_linear(each) for each in given]
         turned = any(new is not old for new, old in zip(read, given, strict=True))
         with house_style(), use_kind(turned or is_rotary()):
             return function(*read[: len(args)], **dict(zip(kwargs, read[len(args) :], strict=True)))  # pyright: ignore
@@ -45,7 +45,7 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
     return within
 
 
-def _name_as_linear(table: Any) -> Any:
+def name_as_linear(table: Any) -> Any:
     """A table with the names that figures know; itself where it has them, and what is no table."""
     names = {str(name): turn_header(str(name), False) for name in table} if hasattr(table, "keys") else {}
     return {linear: table[name] for name, linear in names.items()} if any(k != v for k, v in names.items()) else table

@@ -327,7 +327,7 @@ def _choose_name(name: str, taken: dict[str, bytes]) -> str:
 
 
 def rename_inputs(value: Any, names: dict[str, str]) -> Any:
-    """A configuration's JSON with the names of the copies."""
+    """A configuration's JSON with other names of its files."""
     if isinstance(value, list):
         return [rename_inputs(item, names) for item in value]
     if not isinstance(value, dict):

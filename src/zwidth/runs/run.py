@@ -176,7 +176,7 @@ def run(
     with holding(folder, shard):
         record = Record(folder)
         record.check_free(text, overwrite=overwrite, going_on=going_on)
-        inputs = _list_inputs(config, names)
+        inputs = _list_inputs(config, names, files)
         if overwrite:
             record.clear()
             for study in sweeps:
@@ -327,11 +327,10 @@ class _Run:
         return {"name": study.name, "kind": "sweep", "state": state, "inputs": self.inputs[study.name], "files": files}
 
 
-def _list_inputs(config: Config, names: dict[str, str]) -> dict[str, dict[str, Any]]:
-    """What the results of each study follow from, besides the releases.
-
-    Files are named by the copies of them that the run keeps, so that it may go on from its own folder.
-    """
+def _list_inputs(config: Config, names: dict[str, str], files: dict[str, bytes]) -> dict[str, dict[str, Any]]:
+    """What the results of each study follow from, besides the releases; a file by its copy and what that holds."""
+    digests = {name: hashlib.sha256(files[Path(copy).name]).hexdigest()[:16] for name, copy in names.items()}
+    names = {name: f"{copy}, sha256 {digests[name]}..." for name, copy in names.items()}
     found = {study.name: _spell(study) for study in config.studies}
     for study in config.studies:
         if isinstance(study, ComputedStudy):

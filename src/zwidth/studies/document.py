@@ -27,7 +27,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 import zwidth.config.sweep  # noqa: F401  (registers its kind)
 from zwidth.config.device_table import find_file
-from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, members, problem
+from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, members, problem, repeated
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
@@ -171,16 +171,10 @@ class Config(Strict, what="a configuration"):
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         studies = raw.get("studies")
-        first: dict[str, int] = {}
-        for index, study in enumerate(studies if isinstance(studies, list | tuple) else ()):
-            name = study.get("name") if isinstance(study, dict) else None
-            if not isinstance(name, str):
-                continue
-            if name in first:
-                what = f"got {describe(name)}, the name of studies[{first[name]}] as well"
-                allowed = "results are kept by name, so each study has its own"
-                yield ("studies", index, "name"), problem(what, allowed, "rename one")
-            first.setdefault(name, index)
+        given = studies if isinstance(studies, list | tuple) else ()
+        names = [study.get("name") if isinstance(study, dict) else None for study in given]
+        for place, what in repeated(names, "rename one", "results are kept by name, so each study has its own"):
+            yield ("studies", *place, "name"), what
 
 
 def _scene_or_stand_in(raw: Any) -> AnyScene:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -62,37 +61,14 @@ class LogSection(Strict, what="a log"):
     resolution: Step | None = Field(default=None, description=OF_LOGS["resolution"])
     motor_constant: str | None = Field(default=None, description=OF_LOGS["motor_constant"])
 
-    sha256: str | None = None
-    """Digest of the file; another file is refused. Where left out it is the file's own, for the record."""
-
-    @classmethod
-    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        digest = _digest(raw.get("csv"))
-        return {**raw, "sha256": digest} if digest and "sha256" not in raw else raw
-
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
         return "a log is a CSV file", "add 'csv: log.csv'"
-
-    def limits(self) -> Iterable[LocatedProblem]:
-        digest = _digest(self.csv)
-        if digest and digest != self.sha256:
-            what = f"{self.csv} has another digest, {digest[:12]}..."
-            yield ("sha256",), problem(what, "it is the file that was fitted before", "remove sha256 if it may change")
 
     def read(self, period: float | None) -> LoggedMotion:
         columns = {name: getattr(self, name) for name in ("time", "position", "force")}
         options = {"resolution": self.resolution, "motor_constant": self.motor_constant}
         return read_log(find_file(self.csv), columns, period=period, **options)
-
-
-def _digest(name: Any) -> str:
-    """Of a file's bytes; "" where it cannot be read."""
-    try:
-        file = find_file(name) if isinstance(name, str) else None
-        return hashlib.sha256(file.read_bytes()).hexdigest() if file is not None and file.is_file() else ""
-    except (OSError, ValueError):
-        return ""
 
 
 def _read_logs(raw: Any, handler: Any) -> Any:

@@ -32,10 +32,10 @@ from zwidth.figures.table import Table, stack
 from zwidth.loops.rigid.response import step_response
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.checks import Span
-from zwidth.parts.device import Device
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.recommendation import RANGES, Recommendation
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
-from zwidth.words.formatting import name_wall, plain, round_safely, tell_apart, to_json, with_unit
+from zwidth.words.formatting import name_wall, plain, to_json, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range
 
 
@@ -233,64 +233,22 @@ def draw(found: Recommendation, response: Table | None = None) -> Any:
     return figures.plot.recommendation(found, axes, response=response)
 
 
-def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
-    """A recommendation as Markdown, from its numbers."""
-    scene, verdict = recommendation.scene, recommendation.verdict
-    best, most = found["recommended"], found["maximum"]
-
-    def spell(value: float | None, unit: str = "") -> str:
-        return "not known" if value is None else with_unit(value, unit)
-
-    def cells(row: dict[str, Any], mark: str = "") -> str:
-        digits = row.get("digits", 4)
-        # Rounded up a stiffness might be stable no longer, or not have what is wanted.
-        K, alpha = (round_safely(row[name], "below", digits) for name in ("stiffness", "alpha"))
-        wall = with_unit(K, "N/m", digits), with_unit(row["virtual_damping"], "N s/m", digits)
-        normalized = plain(alpha, digits), plain(row["beta"], digits)
-        return " | ".join([*(f"{mark}{text}{mark}" for text in wall), *normalized])
-
-    parts = [f"{name} = {value}" for name, value in found["device"].items() if name not in _BARE]
-    by_mass = isinstance(scene.device, Device)
-    normalized = f" (normalized: delta = {plain(scene.delta)}, d = {plain(scene.d)})" if by_mass else ""
+def _describe(found: Recommendation, told: dict[str, Any]) -> str:
+    """A recommendation as Markdown: its device, what a terminal is told of the wall, and what would allow more."""
+    scene, settled, said = found.scene, told["recommended"]["settling_time"], list(found.lines())
+    times = (with_unit(time, "s") for time in (scene.timing.period, scene.timing.delay))
+    parts = [f"{name} = {value}" for name, value in told["device"].items() if name not in _BARE]
+    if isinstance(scene.device, MeasuredDevice) and found.verdict is not None:
+        every = "by the measured curve" if scene.device.deviation is None else "for every response in the band"
+        said.append(f"stable {every}")
+    if settled is not None:
+        said.append(f"settles to 2 % of a step of force in about {with_unit(settled, 's')}")
     lines = [
-        "# Recommended virtual wall",
-        "",
-        f"Device: {scene.device.spell()}, sampled every {with_unit(scene.timing.period, 's')}, force delayed by",
-        f"{with_unit(scene.timing.delay, 's')}{normalized}.",
+        *("# Recommended virtual wall", ""),
+        "Device: {}, sampled every {}, force delayed by {}.".format(scene.device.spell(), *times),
         *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
-        "",
-        "| | stiffness K | virtual damping B | alpha | beta |",
-        "|---|---|---|---|---|",
-        f"| stiffest stable wall | {cells(most)} |",
+        *("", *(f"- {text}" for text in said), ""),
+        *(("What would raise the maximum:", "") if found.steps else ()),
+        *(f"- {step.spell()}" for step in found.steps),
     ]
-    if verdict is None:
-        lines += ["", f"No wall to set: {recommendation.reason}.", ""]
-    else:
-        lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
-        passive, missing = recommendation.spell_passive(), verdict.passivity_margin
-        if verdict.passive is False:
-            passive += f", that would take {with_unit(round_safely(-missing, 'above'), 'N s/m')} more physical damping"
-        radius, how = best["spectral_radius"], ""
-        if math.isnan(verdict.frequency):
-            how = "by the measured curve" if scene.device.deviation is None else "for every response in the band"
-        settles = f"settles to 2 % of a step of force in about {spell(best['settling_time'], 's')}"
-        if best["settling_time"] is None:
-            settles = f"has a slowest motion that decays to 2 % in {spell(best['decay_time'], 's')}"
-        lines += [
-            f"| **recommended, {100 * best['stiffness_fraction']:.4g} % of it** | {cells(best, '**')} |",
-            "",
-            "The recommended wall",
-            "",
-            f"- is stable: {how if radius is None else f'spectral radius {radius:.6f}'};",
-            f"- stays stable at this K for B between {lower} and {upper};",
-            *([] if how else [f"- {settles};"]),
-            f"- is passive: {passive}.",
-            "",
-        ]
-    if not scene.parts_beyond:
-        lines += ["No virtual damping makes a stiffness above the maximum stable.", ""]
-    if recommendation.steps:
-        lines += ["What would raise the maximum:", ""]
-        lines += [f"- {step.spell()};" for step in recommendation.steps]
-        lines = [*lines[:-1], f"{lines[-1].removesuffix(';')}.", ""]
-    return "\n".join(lines)
+    return "\n".join(lines).rstrip() + "\n"

@@ -64,11 +64,8 @@ def in_own_units(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
     @wraps(function)
     def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        token = _rotary.set(find_kind_of(args[0] if args else next(iter(kwargs.values()), None)))
-        try:
+        with use_kind(find_kind_of(args[0] if args else next(iter(kwargs.values()), None))):
             return function(*args, **kwargs)
-        finally:
-            _rotary.reset(token)
 
     return within
 

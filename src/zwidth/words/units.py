@@ -173,47 +173,43 @@ _KIND_OF_UNIT = {
 
 def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, str]:
     """The number in the base unit and that unit, or the number and "periods"."""
-    units = (*dimension.units, *PERIOD_WORDS) if periods else dimension.units
-    names = ", ".join(units)
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
-    remedy = f"write a number and a unit, as in {dimension.example!r}"
-    if isinstance(value, str) and _COMMA.search(value):
-        ways = [value.strip().replace(",", sign) for sign in ("", ".")]
-        meant = " or ".join(map(repr, ways if _THOUSANDS.match(value) else ways[1:]))
-        raise UnusableValueError(f"got {describe(value)}", "a number has no comma", f"write {meant}")
+    units = (*dimension.units, *PERIOD_WORDS) if periods else dimension.units
+    text, names, got = value if isinstance(value, str) else "", ", ".join(units), f"got {describe(value)}"
+    if _COMMA.search(text):
+        ways = [text.strip().replace(",", sign) for sign in ("", ".")]
+        meant = " or ".join(map(repr, ways if _THOUSANDS.match(text) else ways[1:]))
+        raise UnusableValueError(got, "a number has no comma", f"write {meant}")
     allowed = f"it must be a number in {dimension.base} or a number with one of the units {names}"
+    remedy = f"write a number and a unit, as in {dimension.example!r}"
     if dimension is RATIO:
         allowed, remedy = "it must be a number without a unit", f"write a number, as {dimension.example}"
-    if not isinstance(value, str):
-        raise UnusableValueError(f"got {describe(value)}", allowed, remedy)
-    if looks_like_number(value):
+    if looks_like_number(text):
         raise UnusableValueError(
             f"got the text {describe(value)}", allowed, f"drop the quotes (it is then in {dimension.base})"
         )
-    match = _QUANTITY.fullmatch(value.strip())
+    match = _QUANTITY.fullmatch(text.strip())
     if match is None:
-        raise UnusableValueError(f"got {describe(value)}", allowed, remedy)
+        raise UnusableValueError(got, allowed, remedy)
     mantissa, exponent, unit = match.groups()
     if periods and unit in PERIOD_WORDS:
         return float(f"{mantissa}e{exponent or 0}"), "periods"
     amount = dimension.in_base(mantissa, int(exponent or 0), unit)
-    if amount is None and dimension is not RATIO:
-        other = find_other(dimension)
-        if other is not None and other.in_base(mantissa, 0, unit) is not None:
-            this, that = ("rotary", "linear") if is_rotary() else ("linear", "rotary")
-            raise UnusableValueError(
-                f"got {describe(value)}, a unit of a {that} device where the device is {this}",
-                f"the units allowed are {names}",
-                f"write one of these, or every quantity of the device in {that} units, as {other.example!r} here",
-            )
-        known = (*units, *(other.units if other else ()))
+    if amount is not None:
+        return amount, dimension.base
+    if dimension is RATIO:
+        raise UnusableValueError(got, allowed, remedy)
+    other = find_other(dimension)
+    if other is not None and other.in_base(mantissa, 0, unit) is not None:
+        this, that = ("rotary", "linear") if is_rotary() else ("linear", "rotary")
         raise UnusableValueError(
-            f"got {describe(value)}", f"the units allowed are {names}", suggestion(unit, known, remedy)
+            f"{got}, a unit of a {that} device where the device is {this}",
+            f"the units allowed are {names}",
+            f"write one of these, or every quantity of the device in {that} units, as {other.example!r} here",
         )
-    if amount is None:
-        raise UnusableValueError(f"got {describe(value)}", allowed, remedy)
-    return amount, dimension.base
+    known = (*units, *(other.units if other else ()))
+    raise UnusableValueError(got, f"the units allowed are {names}", suggestion(unit, known, remedy))
 
 
 def read_quantity(

@@ -89,12 +89,6 @@ def test_devices_of_a_spreadsheet_with_decimal_commas(load, tmp_path):
     assert (table.labels, table.columns) == (("arm, left",), {"mass": (0.0005,), "damping": (1.5,)})
 
 
-def test_columns_of_a_csv_file_can_be_named(load, tmp_path):
-    (tmp_path / "d.csv").write_text("Moving mass [g],b\n100,2\n", encoding="utf-8")
-    text = 'devices: {csv: d.csv, columns: {mass: "Moving mass [g]", damping: b}}, rate: 1, stiffness: 1'
-    assert load(sweep(text)).studies[0].axes.devices.columns == {"mass": (0.1,), "damping": (2.0,)}
-
-
 NORMAL = "alpha: 1, delta: 1, d: 1"
 PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
 
@@ -135,8 +129,8 @@ PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
         ("devices: {csv: mixed.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "'1,500' in line 2; a comma is"),
         ("devices: {csv: typo.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "did you mean 'damping'?"),
         ("devices: {csv: empty.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "0 rows"),
-        ("devices: {csv: wrong.csv, colums: {}}, stiffness: 1", "", "axes.devices.colums", "did you mean 'columns'?"),
-        ("devices: {csv: wrong.csv, columns: {mass: m}}, stiffness: 1", "", "axes.devices.csv", "headers"),
+        ("devices: {csv: wrong.csv, unit: g}, stiffness: 1", "", "axes.devices.unit", "has the keys 'csv'"),
+        ("devices: {csv: 3}, stiffness: 1", "", "axes.devices.csv", "must be text"),
         (PART + "velocity.samples: [2, 5]", "", "axes.velocity.samples", "{kind: windowed_difference, samples: 5}"),
         (
             PART + "velocity.time_constant: [1 ms, 2 ms]",

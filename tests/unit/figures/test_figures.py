@@ -329,15 +329,6 @@ def test_a_map_of_many_deltas_shows_the_ends_and_the_middle():
     assert titles == [rf"$\delta = {delta:g}$,  $d = 1$" for delta in (0, 0.5, 1)]
 
 
-def test_a_recommendation_is_marked_inside_its_interval():
-    region, _ = drawn("draw_recommendation").axes
-    marks = curves(region)
-    np.testing.assert_allclose(marks["recommended (75 %)"][:, 0], (80.0, 100.0))
-    np.testing.assert_allclose(marks["virtual_damping_interval"][1], (20.0, 180.0))
-    np.testing.assert_allclose(marks["stiffest"][:, 0], (110.0, 100.0))
-    assert "kN/m" in region.get_xlabel()
-
-
 def test_a_wall_to_be_set_is_written_no_stiffer_than_it_is():
     outlines = {"label": np.full(3, ""), "number": np.ones(3), "piece": np.full(3, "outline")}
     outlines |= {"stiffness_N_per_m": np.array([0, 2e4, 0]), "virtual_damping_N_s_per_m": np.array([0, 40.0, 90])}

@@ -71,6 +71,11 @@ def test_a_recommendation_is_drawn_with_its_response():
     assert len(plt.get_fignums()) == 1
     at, _ = line(walls, "recommended (50 %)")
     assert float(at[0]) * 1e3 == pytest.approx(found.stiffness)
+    _, ends = line(walls, "virtual_damping_interval")
+    assert found.verdict is not None
+    np.testing.assert_allclose(ends, (found.verdict.virtual_damping_lower, found.verdict.virtual_damping_upper))
+    (top, _) = line(walls, "stiffest")
+    assert float(top[0]) * 1e3 == pytest.approx(float(found.stiffest.stiffness))
     time, position = np.asarray(response.lines[0].get_data())
     expected = found.scene.state_space().step(time.size)
     np.testing.assert_allclose(position * 1e-6, expected, rtol=1e-9, atol=1e-12)

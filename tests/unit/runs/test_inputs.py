@@ -10,7 +10,7 @@ from run_folders import record_of
 import zwidth
 from zwidth.runs.record import gather_inputs
 from zwidth.sweep.dataset import open_dataset
-from zwidth.words.errors import StoreExistsError
+from zwidth.words.errors import StoreError, StoreExistsError
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -70,6 +70,19 @@ def test_a_configuration_that_is_read_already_finds_its_files(tmp_path, monkeypa
     # What a table holds is written out.
     assert zwidth.run(config, out="out").ok
     assert zwidth.run("out/config.yaml", out="again").ok
+
+
+def test_results_of_a_table_that_has_changed_are_not_kept(tmp_path):
+    poses, config = tmp_path / "arm.csv", tmp_path / "arm.yaml"
+    poses.write_text("x,y,mass [kg],damping\n0,0,0.1,1\n1,0,0.2,1\n", encoding="utf-8")
+    study = "{kind: workspace, name: w, poses: {csv: arm.csv, across: x, up: y}, period: 1 ms, delay: 0 s}"
+    config.write_text(f"{{version: 1, name: arm, studies: [{study}]}}", encoding="utf-8")
+    assert zwidth.run(config, out=tmp_path / "out").ok
+    assert zwidth.run(config, out=tmp_path / "out", resume=True).studies[0].state == "kept"
+    assert zwidth.run(tmp_path / "out" / "config.yaml", out=tmp_path / "out", resume=True).studies[0].state == "kept"
+    poses.write_text("x,y,mass [kg],damping\n0,0,0.1,1\n1,0,0.3,1\n", encoding="utf-8")
+    with pytest.raises(StoreError, match=r"studies\[w\].poses.csv: the run was made with 'inputs/arm.csv, sha256 "):
+        zwidth.run(config, out=tmp_path / "out", resume=True)
 
 
 def test_files_of_one_name_anchors_and_quotes(tmp_path):

@@ -195,7 +195,6 @@ FAULTS = {
     "a key": ("    log: {csv: log.csv, positon: x}\n", "did you mean 'position'?"),
     "a study's key": ("    log: {csv: log.csv}\n    max_dely: 1 ms\n", "did you mean 'max_delay'?"),
     "a resolution": ("    log: {csv: log.csv, resolution: 1 kg}\n", "got '1 kg'"),
-    "another file": ("    log: {csv: log.csv, sha256: abc}\n", "log.csv has another digest"),
     "an empty list": ("    log: []\n", "got an empty list"),
     "no period": ("    buzz: [{stiffness: 1, frequency: 2}]\n", "walls that buzzed need the sampling period"),
     "noise of a log": ("    log: {csv: log.csv}\n    noise: 0.1\n", "got noise without buzz"),

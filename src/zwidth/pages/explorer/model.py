@@ -12,10 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.loops.linear.curve import lines_at
 from zwidth.loops.linear.passivity import find_obstacle
-from zwidth.loops.linear.roots import affine_polynomial
-from zwidth.loops.rigid.poles import companion
 from zwidth.pages.words import check_lines, list_slopes, pole_words, row, word_of
 from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin
@@ -25,13 +22,9 @@ from zwidth.words.formatting import plain, round_safely, tell_apart
 
 Curve = tuple[np.ndarray, np.ndarray]
 Range = tuple[float, float]
+# What a part of the page shows: the columns of a source, or a text, by name.
+Update = dict[str, Any]
 
-# Points of the curve and of a line while a slider moves.
-_QUICK_CURVE, _QUICK_LINE = 513, 129
-# How many coefficients of the poles leave time to ask every so many place at first.
-_STRIDES = ((9, 1), (15, 2), (26, 4), (42, 8))
-# Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
-_ON_EDGE = 1e-5
 LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
 # By how many poles a radius takes; so few points that no compiler is asked for (`arrays.evaluate.FEW`).
 _GRIDS = ((1, (72, 56)), (12, (48, 40)), (inf, (36, 30)))
@@ -48,54 +41,11 @@ def outlines(scene: Scene) -> list[Curve]:
     return [(piece.stiffness, piece.virtual_damping) for piece in scene.stable_region()]
 
 
-def quick_edge(scene: Scene) -> Curve:
-    """Points of the stable set's edge, NaN between its parts, at a cost that follows a drag.
-
-    On the boundary curve and on the lines of real poles, those at which no pole lies outside of the unit circle. A
-    part through which the curve runs in a few of its places, as behind a long window, comes with the `outlines` only.
-    """
-    if scene.loop.outline() is not None:
-        return outlines(scene)[0]
-    # Closer together at low frequencies, where loops with a hand have their resonance.
-    w = np.pi * ((np.arange(_QUICK_CURVE) + 0.5) / _QUICK_CURVE) ** 2
-    parts = [_on_edge(scene, *scene.boundary(w / scene.timing.period))]
-    known = parts[0][1][np.isfinite(parts[0][1])]
-    low, high = (float(known.min()), float(known.max())) if known.size else (-1.0, 1.0)
-    damping = np.linspace(low - 0.5 * (high - low), high + 0.5 * (high - low), _QUICK_LINE)
-    units = scene.units
-    for line in lines_at(scene.loop.roots, (0.0, np.pi)):
-        stiffness = (line.q - damping / units.virtual_damping * line.f) * units.stiffness
-        parts.append(_on_edge(scene, stiffness, damping))
-    x, y = (np.concatenate([np.append(part[k], np.nan) for part in parts]) for k in (0, 1))
-    return x, y
-
-
-def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
-    """Points of a curve that border the stable set, the others NaN: some are asked, then those between two answers."""
-    D, N1, N2 = affine_polynomial(scene.loop.roots)
-    alpha, beta = scene.normalize_walls(stiffness, damping)
-    finite = np.isfinite(alpha) & np.isfinite(beta)
-    edge = np.zeros(alpha.size, bool)
-
-    def ask(places: np.ndarray) -> None:
-        places = places[finite[places]]
-        polynomials = D + alpha[places, None] * N1 + beta[places, None] * N2
-        poles = np.linalg.eigvals(companion(polynomials / D[0]))
-        edge[places] = np.abs(poles).max(-1) <= 1.0 + _ON_EDGE
-
-    stride = next((stride for most, stride in _STRIDES if D.size <= most), 16)
-    places = np.arange(0, alpha.size, stride)
-    ask(places)
-    ask(np.arange(places[-1] + 1, alpha.size))
-    while stride > 1:
-        between = places[:-1] + stride // 2
-        same = edge[places[:-1]] == edge[places[1:]]
-        edge[between[same]] = edge[places[:-1]][same]
-        ask(between[~same])
-        stride //= 2
-        places = np.arange(0, alpha.size, stride)
-    edge &= finite
-    return np.where(edge, stiffness, np.nan), np.where(edge, damping, np.nan)
+def show_outlines(scene: Scene) -> Update:
+    """All outlines, closed, as one line and as one area, what lies within two of them being a hole; and islands."""
+    xs, ys = ([np.append(outline[axis], outline[axis][:1]) for outline in outlines(scene)] for axis in (0, 1))
+    x, y = (np.concatenate([np.append(ring, np.nan) for ring in rings] or [np.empty(0)]) for rings in (xs, ys))
+    return {"area": {"xs": [[xs]], "ys": [[ys]]}, "edge": {"x": x, "y": y}, "islands": name_islands(scene)}
 
 
 def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
@@ -272,23 +222,16 @@ def normalized_lines(verdict: Assessment) -> list[str]:
 # Held while JAX is being imported: what looks for it meanwhile would find half of it.
 IMPORTING = Lock()
 
-# What a part of the page shows: the columns of a source, or a text, by name.
-Update = dict[str, Any]
-
 
 def compute_details(
-    scene: Scene, across: Range, up: Range, *, normalized: bool, outline: bool, contact: bool, costly: bool
+    scene: Scene, across: Range, up: Range, *, normalized: bool, of_device: bool, contact: bool
 ) -> Iterator[Update]:
     """What takes longer than a drag, part by part; whoever asks may stop after each.
 
-    Contours cover ``across`` and ``up``. Wanted may be what hangs on the device (``outline``), a hit of the wall
-    (``contact``), and what takes seconds in a scene with parts (``costly``).
+    Contours cover ``across`` and ``up``. Wanted may be what hangs on the device alone, and a hit of the wall.
     """
-    quick = scene.loop.outline() is not None
     # The page shows millimeters.
     length = 1.0 if normalized else 1e3
-    if outline and not quick:
-        yield {**show_outlines(outlines(scene)), "islands": name_islands(scene)}
     verdict = assess(scene)
     own = normalized_lines(verdict) if normalized else None
     lines = own or check_lines(scene, verdict, [])
@@ -301,17 +244,14 @@ def compute_details(
         "best": {"x": [verdict.stiffness_max], "y": [verdict.virtual_damping_at_max]},
     }
     yield {"word": word, "verdict": "\n".join(lines), **captions, **curves}
-    if outline:
+    if of_device:
         x, y = passive_set(scene) or (np.empty(0), np.empty(0))
         yield {"passive": {"x": x, "y": y}, "contours": contours(scene, across, up)}
     if not own:
         yield {"verdict": "\n".join(check_lines(scene, verdict, limits_of(scene)))}
-    if contact or (costly and not quick):
-        with IMPORTING:
-            import jax  # noqa: F401
     # Of a linear system no damping is known that could grow, and no place to hit the wall from.
     bodies = isinstance(scene.device, Device)
-    if quick or costly:
+    if of_device:
         x, y = ridge_path(scene) if bodies else (np.empty(0), np.empty(0))
         yield {"ridge": {"x": x, "y": y}}
         yield {"slopes": "\n".join([] if normalized else [slope.line() for slope in list_slopes(scene)])}
@@ -319,13 +259,8 @@ def compute_details(
         empty = {"x": [], "position": [], "force": []}
         yield {"contact": empty, "contact_words": "(a linear system has no body that comes with a velocity)"}
     elif contact:
+        with IMPORTING:
+            import jax  # noqa: F401
         time, position, force, text = contact_motion(scene, 2 * length_of(scene, verdict))
         position = position * length
         yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}
-
-
-def show_outlines(outlines: list[Curve]) -> Update:
-    """All outlines, closed, as one line and as one area: what lies within two of them is a hole."""
-    xs, ys = ([np.append(outline[axis], outline[axis][:1]) for outline in outlines] for axis in (0, 1))
-    x, y = (np.concatenate([np.append(ring, np.nan) for ring in rings] or [np.empty(0)]) for rings in (xs, ys))
-    return {"area": {"xs": [[xs]], "ys": [[ys]]}, "edge": {"x": x, "y": y}}

@@ -29,7 +29,7 @@ _LONGEST_MESSAGE = 16_000
 # What of a glyph is a column of its source, unless it is a fixed word.
 _FROM_SOURCE = ("x", "y", "xs", "ys", "text", "angle", "text_align")
 # What hangs on the device and takes its time: another device's is taken away at once.
-_OF_DEVICE = ("contours", "passive", "ridge", "best", "islands")
+_OF_DEVICE = ("contours", "passive", "ridge", "best")
 # What is drawn, on a light page and on a dark one.
 _INKS = ("paper", "ink", "faint", "edge", "passive", "ridge")
 _LIGHT = dict(zip(_INKS, ("#FFFFFF", style.BLACK, "#565656", style.BLUE, "#00735A", style.VERMILION), strict=True))
@@ -49,7 +49,7 @@ class Page:
         self.dark: bool | None = None
         self.device: tuple[Any, ...] = ()
         self.drawn = False
-        self.options = {"contact": False, "costly": False}
+        self.contact = False
         self.sources: dict[str, ColumnDataSource] = {}
         self.inputs = ColumnDataSource({"json": []}, name="inputs")
         self.answer = ColumnDataSource({"json": []}, name="answer")
@@ -224,8 +224,7 @@ class Page:
         if message.get("dark") in (True, False) and message["dark"] != self.dark:
             self.dark = message["dark"]
             self._paint()
-        for name in self.options:
-            self.options[name] = bool(message.get(name, self.options[name]))
+        self.contact = bool(message.get("contact", self.contact))
         link = link if isinstance(link, str) else None
         self.update(message.get("set", {}), rest=bool(message.get("rest")), link=link)
 
@@ -251,26 +250,24 @@ class Page:
             return
         if rest:
             assert self.frame is not None, "it has just been shown"
-            wanted = {"normalized": controls.normalized, "outline": not self.drawn, **self.options}
+            wanted = {"normalized": controls.normalized, "of_device": not self.drawn, "contact": self.contact}
             self.executor.submit(self._compute, self.generation, controls.scene, *self.frame, **wanted)
 
     def _show_at_once(self, controls: Controls, rest: bool) -> None:
         scene = controls.scene
-        edge = model.quick_edge(scene)
         stable, poles = bool(scene.decide_stability(method="companion").stable), scene.poles()
         device = replace(scene, wall=VirtualWall(0.0)), controls.normalized
         if device != self.device:
+            self._fill(show_outlines(scene))
             self.device, self.drawn = device, False
-            # What has gaps has no inside; the outlines come when the slider rests.
-            moving = {"area": {"xs": [], "ys": []}, "edge": {"x": edge[0], "y": edge[1]}}
-            self._fill(show_outlines([edge]) if np.isfinite(edge).all() else moving)
             self._fill({name: {column: [] for column in self.sources[name].data} for name in _OF_DEVICE})
             self.tell({"slopes": ""})
         self.controls = controls
         self._name_axes()
         wall = {"x": [controls.wall[0]], "y": [controls.wall[1]]}
         self._fill({"wall": wall, "poles": {"x": np.real(poles), "y": np.imag(poles)}})
-        frame = model.frame(edge, controls.wall)
+        x, y = (np.asarray(self.sources["edge"].data[name], float) for name in "xy")
+        frame = model.frame((x, y), controls.wall)
         if frame != self.frame:
             self.frame = frame
             plane = self.plots["plane"]
@@ -337,8 +334,8 @@ class Page:
             return
         self._fill({name: columns for name, columns in update.items() if name in self.sources})
         texts = {name: text for name, text in update.items() if name not in self.sources}
-        if "contours" in update:
-            self.drawn = True
+        # The last of what hangs on the device.
+        self.drawn = self.drawn or "slopes" in update
         if texts:
             self.tell(texts)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tolerances import CONTOUR, EDGE_RADIUS, QUICK_EDGE, RESPONSE, RIDGE
+from tolerances import CONTOUR, EDGE_RADIUS, RESPONSE, RIDGE
 
 import zwidth
 from zwidth.pages.explorer import model
@@ -33,29 +33,19 @@ def scene(request):
 def test_the_edge_of_a_rigid_device_is_its_boundary():
     scene = Controls().scene
     region = zwidth.stable_region(scene.delta, scene.d)
-    edge, units = model.quick_edge(scene), scene.units
+    (edge,), units = model.outlines(scene), scene.units
     np.testing.assert_array_equal(edge, (region.alpha * units.stiffness, region.beta * units.virtual_damping))
     inner = (region.omega > 0) & (region.omega < np.pi)
     exact = scene.boundary(region.omega[inner] / scene.timing.period)
     np.testing.assert_allclose(edge[0][inner], exact.stiffness, rtol=RIDGE.float64, atol=1e-9 * exact.stiffness.max())
 
 
-def test_the_quick_edge_is_the_edge(scene):
-    x, y = model.quick_edge(scene)
+def test_on_the_edge_a_pole_stands_on_the_unit_circle(scene):
+    shown = model.show_outlines(scene)["edge"]
+    x, y = shown["x"], shown["y"]
     known = np.isfinite(x)
     radius = np.abs(scene.poles(x[known], y[known])).max(-1)
     assert np.abs(radius - 1.0).max() < EDGE_RADIUS.float64
-    # No place of the exact outlines is far from the line that is drawn.
-    line = np.stack([x, y], -1)
-    start, along = line[:-1], np.diff(line, axis=0)
-    drawn = np.isfinite(along).all(1)
-    outlines = model.outlines(scene)
-    size = np.array([np.ptp(part) for part in outlines[0]])
-    for outline in outlines:
-        places, first, way = np.stack(outline, -1)[:, None] / size, start[drawn] / size, along[drawn] / size
-        share = np.clip(((places - first) * way).sum(-1) / np.maximum((way**2).sum(-1), 1e-300), 0, 1)
-        away = np.linalg.norm(first + share[..., None] * way - places, axis=-1).min(1)
-        assert away.max() < QUICK_EDGE.float64
 
 
 def test_the_verdict_at_once_is_that_of_assess(scene):
@@ -112,7 +102,7 @@ def test_the_ridge_path_goes_through_the_stiffest_wall():
 
 
 def test_contours_are_where_they_say(scene):
-    across, up = model.frame(model.quick_edge(scene), (10e3, 40.0))
+    across, up = model.frame(model.outlines(scene)[0], (10e3, 40.0))
     found = model.contours(scene, across, up)
     levels = {}
     for x, y in zip(found["xs"], found["ys"], strict=True):
@@ -124,7 +114,7 @@ def test_contours_are_where_they_say(scene):
 
 
 def test_the_frame_holds_the_edge_and_the_wall():
-    edge = model.quick_edge(Controls().scene)
+    (edge,) = model.outlines(Controls().scene)
     for wall in ((0.0, 0.0), (30e3, 150.0), (-9e3, 40.0)):
         across, up = model.frame(edge, wall)
         assert across[0] <= min(edge[0].min(), wall[0]) < max(edge[0].max(), wall[0]) <= across[1]

@@ -103,7 +103,7 @@ function flush() {
   requestAnimationFrame(() => {
     scheduled = false;
     serial += 1;
-    const message = { serial, rest: rests, set: waiting, dark: dark.matches, contact: by("contact-wanted").checked, costly: by("costly").checked };
+    const message = { serial, rest: rests, set: waiting, dark: dark.matches, contact: by("contact-wanted").checked };
     if (opens) asked = [serial, location.hash];
     if (opens) message.open = location.hash.slice(1);
     [sent, waiting, opens] = [waiting, {}, false];
@@ -212,7 +212,7 @@ const dark = window.matchMedia("(prefers-color-scheme: dark)");
 dark.addEventListener("change", () => send({}, true));
 build();
 by("plane").addEventListener("keydown", moveWall);
-for (const id of ["contact-wanted", "costly"]) by(id).addEventListener("change", () => send({}, true));
+by("contact-wanted").addEventListener("change", () => send({}, true));
 by("plane").addEventListener("pointerdown", () => { moved = ""; });
 by("address").addEventListener("click", () => copy(location.href));
 for (const button of document.querySelectorAll("[data-copy]")) button.addEventListener("click", () => copy(by(button.dataset.copy).value, by(button.dataset.copy)));
