@@ -25,8 +25,8 @@ from zwidth.words.status import Status
 if TYPE_CHECKING:
     import flint
 
-# Precisions, one after the other until one is enough; and what is right to float64.
-_BITS, _FLOAT_BITS = tuple(128 << k for k in range(7)), 60
+# What is right to float64.
+_FLOAT_BITS = 60
 _NOTHING = Estimate(0, 0.0)
 
 
@@ -46,7 +46,7 @@ def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, Any])
 
     if not (np.isfinite(stiffness) and np.isfinite(damping)):
         return False, Status.INVALID_INPUT
-    for bits in _BITS:
+    for bits in certified.BITS:
         with flint.ctx.workprec(bits):
             if bits not in known:
                 known[bits] = _polynomials(scene)
@@ -126,7 +126,7 @@ def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -
     """
     import flint
 
-    for bits in _BITS:
+    for bits in certified.BITS:
         with flint.ctx.workprec(bits):
             ball = flint.arb(period)
             response, _ = _device(System(device, ball, flint.arb(device.mass), *delay, _NOTHING))
