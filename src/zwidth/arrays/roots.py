@@ -41,11 +41,8 @@ def bisect(holds: Function, low: Array, high: Array, *, geometric: bool = False)
 
 
 def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) -> tuple[Array, Array]:
-    """Newton's method in a bracket below which a function is negative; the zero, and the size of the last step.
-
-    The bracket shrinks with every value, and a step that leaves it becomes a bisection. A point whose step was
-    ``_SMALL`` is done: of its error nothing but rounding is left.
-    """
+    """Newton's method in a bracket below which a function is negative; the zero, and the size of the last step."""
+    # The bracket shrinks with every value, and a step that leaves it becomes a bisection.
     xp = namespace(low, start)
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -102,12 +99,9 @@ class _Bracket(NamedTuple):
 def false_position(
     function: Function, low: Array, high: Array, at_low: Array, at_high: Array, steps: int, width: Array | float
 ) -> Array:
-    """Where a function that is positive at ``low`` and not at ``high`` changes sign.
-
-    False position with halved weights, every sixth step a bisection, until every point is done: its value
-    no more than rounding, or the bracket no wider than two of ``width``; so far from its ends it is cut at least, or
-    the end that is not next to the zero would stay.
-    """
+    """Where a function that is positive at ``low`` and not at ``high`` changes sign, within two of ``width``."""
+    # With halved weights, every sixth step a bisection, and cut ``width`` from the ends at least, or the end that is
+    # not next to the zero would stay.
     xp = namespace(low, at_low)
 
     def done(at: _Bracket) -> Array:
@@ -173,11 +167,9 @@ def follow_root(
     *known: Any,
     slope: Callable[..., Array] | None = None,
 ) -> Array:
-    """A zero x of ``function(x, *known)``, in JAX with its derivatives of every order in what is known.
-
-    They are those of the implicit function, so that nothing of a search is differentiated, and 0 but where
-    ``usable(x, slope, step)``, of the function and of Newton's next step. ``slope`` is its derivative where known.
-    """
+    """A zero x of ``function(x, *known)``, in JAX with its derivatives of every order in what is known."""
+    # They are those of the implicit function, so that nothing of a search is differentiated, and 0 but where
+    # ``usable(x, slope, step)``, of the function and of Newton's next step. ``slope`` is its derivative where known.
     xp = namespace(root)
     if xp is np:
         return root
@@ -202,10 +194,8 @@ def follow_root(
 
 
 def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes: Sequence[int]) -> Array:
-    """The integral of a function of points along a new last axis, piece by piece between edges.
-
-    JAX takes equally many points at a time: the function is compiled once, and its arrays stay in caches.
-    """
+    """The integral of a function of points along a new last axis, piece by piece between edges."""
+    # JAX takes equally many points at a time: the function is compiled once, and its arrays stay in caches.
     xp = namespace(*edges)
     pieces, together = [], gcd(*nodes)
     for low, high, count in zip(edges[:-1], edges[1:], nodes, strict=True):

@@ -59,10 +59,8 @@ def repeat(
     xp: Any,
     arrived: Callable[[State, State], bool] = lambda old, new: False,
 ) -> State:
-    """Apply ``step`` so many times: a loop of the compiler in JAX, whose length does not add to the time to compile.
-
-    In NumPy no longer than until ``arrived(old, new)`` says that further steps change nothing.
-    """
+    """Apply ``step`` so many times; in NumPy until ``arrived(old, new)`` says that more would change nothing."""
+    # For JAX a loop of the compiler, whose length does not add to the time to compile.
     if xp is np:
         for _ in range(steps):
             old, state = state, step(state)
@@ -102,10 +100,7 @@ def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
 
 
 def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes: tuple[Any, ...], xp: Any) -> Any:
-    """How the results of an analytic function move when its arguments do; trees are (named) tuples.
-
-    NumPy takes a step into the complex plane, which no difference rounds.
-    """
+    """How the results, trees of (named) tuples, of an analytic function move when its arguments do."""
     if xp is not np:
         from jax import jvp
 
@@ -227,12 +222,10 @@ def known_options(*options: tuple[str, int]) -> dict[str, int]:
 
 
 def store_once(values: Values, witness: Array) -> Values:
-    """``values``, computed once: for a kernel in which many later steps use them.
-
-    XLA repeats a chain of cheap operations in every loop it makes out of the operations behind it, but never a
-    division. The divisor here is 1, or NaN where ``witness`` (anything known at run time) is, so that the compiler
-    cannot see it. The rigid loop's ridge compiles 1.3 and runs 1.3 to 1.5 times as fast.
-    """
+    """``values``, computed once: for a kernel in which many later steps use them."""
+    # XLA repeats a chain of cheap operations in every loop it makes out of the operations behind it, but never a
+    # division. The divisor here is 1, or NaN where ``witness`` (anything known at run time) is, so that the compiler
+    # cannot see it. The rigid loop's ridge compiles 1.3 and runs 1.3 to 1.5 times as fast.
     if not is_jax(witness):
         return values
     import jax
@@ -243,10 +236,7 @@ def store_once(values: Values, witness: Array) -> Values:
 
 
 def fit_arcsine(terms: int) -> list[float]:
-    """``asin(sqrt y)/sqrt y`` on [0, 1/2] as powers of 4 y - 1, by interpolation.
-
-    Right to 2e-16 relative with 19 terms, to 6e-15 with 16.
-    """
+    """``asin(sqrt y)/sqrt y`` on [0, 1/2] by powers of 4 y - 1: to 2e-16 with 19 terms, to 6e-15 with 16."""
     node = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
     y = 0.25 * (node + 1.0)
     fit = np.polynomial.chebyshev.chebfit(node, np.arcsin(np.sqrt(y)) / np.sqrt(y), terms - 1)

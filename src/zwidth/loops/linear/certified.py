@@ -82,10 +82,7 @@ def all_inside(p: flint.arb_poly) -> bool | None:
 
 
 def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly, bool]:
-    """D, N1 and N2 of ``P = D + K N1 + B N2``, K in N/m and B in N s/m; whether K = 0 leaves a pole at z = 1 exactly.
-
-    Then nothing pulls a device at rest back.
-    """
+    """D, N1 and N2 of ``P = D + K N1 + B N2`` in SI units, and whether K = 0 leaves a pole at z = 1 exactly."""
     import flint
 
     exact = _exact(scene)
@@ -119,11 +116,8 @@ def _exact(part: Any) -> Any:
 
 
 def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -> tuple[float, np.ndarray]:
-    """The gain of the sampled response of a linear device, and ``1 - z`` of its zeros, right to float64.
-
-    What the aliases of fast poles leave of slow zeros is not to be had in floats: balls find it, where one precision is
-    not enough with twice as much.
-    """
+    """The gain of the sampled response of a linear device, and ``1 - z`` of its zeros, right to float64."""
+    # What the aliases of fast poles leave of slow zeros is not to be had in floats.
     import flint
 
     for bits in certified.BITS:

@@ -23,10 +23,9 @@ _FEW_WALLS = 4
 
 
 class BoundIntervals(NamedTuple):
-    """Stable intervals of alpha: shape (rows, most intervals of a row), NaN where a row has fewer.
+    """Stable intervals of alpha: shape (rows, most intervals of a row), NaN where a row has fewer."""
 
-    With each stands the column of the crossings that ends it, -1 where there is none, and the angle there.
-    """
+    # With each stands the column of the crossings that ends it, -1 where there is none, and the angle there.
 
     low: np.ndarray
     high: np.ndarray
@@ -120,12 +119,10 @@ _BESIDE = 1e-7
 
 
 def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
-    """Where a column is stable: array (intervals, 2) of beta, ascending.
-
-    Every damping at which the column meets the boundary is found, for alpha is monotone along the curve between two
-    nodes once its extremes are among them; the walls between two such dampings share the label of one of them. An end
-    whose own neighbors contradict that is sought by labels alone.
-    """
+    """Where a column is stable: array (intervals, 2) of beta, ascending."""
+    # Every damping at which the column meets the boundary is found, for alpha is monotone along the curve between two
+    # nodes once its extremes are among them; the walls between two such dampings share the label of one of them. An end
+    # whose own neighbors contradict that is sought by labels alone.
     on_lines = np.array([(line.q - alpha) / line.f for line in boundary.lines if line.f != 0.0])
     w, height = boundary.heights
     above = height - alpha

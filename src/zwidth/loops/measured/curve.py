@@ -171,10 +171,7 @@ _BLOCK = 1 << 15
 
 
 class Decided(NamedTuple):
-    """Decided intervals of alpha or beta, ascending: (lines, intervals), NaN where a line of the plane has fewer.
-
-    Their ends, and whether the walls inside are stable.
-    """
+    """Decided intervals of alpha or beta, ascending: (lines of the plane, intervals), NaN where one has fewer."""
 
     low: np.ndarray
     high: np.ndarray

@@ -69,10 +69,7 @@ def short_place(b: Array, curve: Any) -> tuple[Array, Array]:
 
 
 def short_row(beta: Array, device: DeviceTerms) -> Array:
-    """The limit for d < 1, where the lobe is a quadratic in y; 0 where no alpha is stable, NaN for bad input.
-
-    Beyond the corner, the double pole at z = -1, only the line bounds the row.
-    """
+    """The limit for d < 1, beyond the corner that of the line; 0 where no alpha is stable, NaN for bad input."""
     p1, psi, tilt = device.p1, device.psi, device.tilt
     xp = namespace(beta, device.delta)
     b = beta + device.delta
@@ -180,11 +177,9 @@ def turn_angles(at: Angles) -> _Turned:
 
 
 def _lobe_end(lobe: LongLobe, ratio: Array, d: Array) -> Array:
-    """The first w at which alpha returns to 0: the phase of ``e^(j (n+1) w) (E + j sin w H)`` reaches pi there.
-
-    Newton's method on that phase, nearly linear in w; ``ratio`` is E/H at w = 0 and places the start between
-    pi/(2 (n+1)), for no damping, and pi/(n+1).
-    """
+    """The first w at which alpha returns to 0: the phase of ``e^(j (n+1) w) (E + j sin w H)`` reaches pi there."""
+    # Newton's method on that phase, nearly linear in w; ``ratio`` is E/H at w = 0 and places the start between pi/(2
+    # (n+1)), for no damping, and pi/(n+1).
     turns = lobe.k + 0.5
     xp = namespace(turns)
     limit = np.pi / (d + 0.5)
@@ -203,11 +198,9 @@ def _lobe_end(lobe: LongLobe, ratio: Array, d: Array) -> Array:
 
 
 def long_row_point(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
-    """The limit for d >= 1, 0 where no alpha is stable and NaN for bad input; and its frequency w, if there is one.
-
-    b grows with w along the whole lobe, so Newton's method on sqrt(b), nearly linear in w, needs no bracket but the
-    lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
-    """
+    """The limit for d >= 1, 0 where no alpha is stable and NaN for bad input; and its frequency w, if there is one."""
+    # b grows with w along the whole lobe, so Newton's method on sqrt(b), nearly linear in w, needs no bracket but the
+    # lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
     delta, end, top, bow, sin_bow, bend = lobe.delta, *lobe[-5:]
     xp = namespace(beta, delta)
     b = beta + delta
@@ -236,10 +229,8 @@ def _arcsine(x: Array) -> Array:
 
 
 def _newton_step(goal: Array, at: Angles) -> Array:
-    """``2 (b - sqrt(goal b))/b'`` with sqrt(goal/b) as (1 + 3 goal/b)/(3 + goal/b): one division in all.
-
-    XLA fuses a chain of such steps into one loop over the rows only while no quotient is used twice.
-    """
+    """``2 (b - sqrt(goal b))/b'`` with sqrt(goal/b) as (1 + 3 goal/b)/(3 + goal/b): one division in all."""
+    # XLA fuses a chain of such steps into one loop over the rows only while no quotient is used twice.
     total, d_total, scale, d_scale = offset(at)
     part = goal * scale
     return 4.0 * total * scale * (total - part) / ((d_total * scale - total * d_scale) * (3.0 * total + part))
@@ -250,10 +241,8 @@ _LARGE, _ENOUGH_ROWS = 1 << 16, 8
 
 
 def boundary_map(points: Points) -> np.ndarray:
-    """Labels of all points, False out of range: stable walls are those with ``0 < alpha < limit`` of their row.
-
-    The limit is right to about 1e-15 relative, and to 1e-15 of the largest limit near the lobe's end.
-    """
+    """Labels of all points, False out of range: stable walls are those with ``0 < alpha < limit`` of their row."""
+    # The limit is right to about 1e-15 relative, and to 1e-15 of the largest limit near the lobe's end.
     alpha, beta = nan_beyond(WALL_RANGE, points.alpha, points.beta)
     return _compare(alpha, row_limits(beta, points.delta, points.d))
 
