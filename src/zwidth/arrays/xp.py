@@ -171,7 +171,7 @@ def within(value: Array, limits: tuple[float, float]) -> Array:
     # In single precision the limits lie outside of what there is.
     kind = getattr(size, "dtype", np.float64)
     most = limits[1] if kind == np.float64 else min(limits[1], float(np.finfo(kind).max))
-    return (size == 0) | ((size >= limits[0]) & (size <= most))
+    return (size <= most) & ((size >= limits[0]) | (size == 0)) if limits[0] else size <= most
 
 
 def nan_beyond(limits: tuple[float, float], *values: Array) -> list[np.ndarray]:
