@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import along, frozen, namespace, push_moving, repeat
+from zwidth.arrays.xp import along, frozen, namespace, repeat
 from zwidth.words.types import Array
 
 Function = Callable[[Array], Array]
@@ -183,7 +183,16 @@ def follow_root(
 
     def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
         x, known = follow(*primals), primals[1:]
-        value, change = push_moving(lambda *known: function(x, *known), known, tangents[1:])
+        leaves, tree = jax.tree.flatten(known)
+        sides = jax.tree.leaves(tangents[1:])
+        # What does not move costs nothing.
+        moving = [k for k, side in enumerate(sides) if not isinstance(side, jax.custom_derivatives.SymbolicZero)]
+
+        def of_moving(*moved: Any) -> Array:
+            among = dict(zip(moving, moved, strict=True))
+            return function(x, *tree.unflatten([among.get(k, leaf) for k, leaf in enumerate(leaves)]))
+
+        value, change = jax.jvp(of_moving, tuple(leaves[k] for k in moving), tuple(sides[k] for k in moving))
         rate = (slope or differentiate)(x, *known)
         taken = usable(*frozen((x, rate, value / xp.where(rate == 0, 1.0, rate)), xp))
         return x, xp.where(taken, -change / xp.where(taken, rate, 1.0), 0.0)

@@ -109,21 +109,6 @@ def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes:
     return tree_map(lambda result: np.imag(result) / _STEP, function(*moved))
 
 
-def push_moving(function: Callable[..., Any], values: tuple[Any, ...], changes: tuple[Any, ...]) -> tuple[Any, Any]:
-    """`jax.jvp` in a rule of ``symbolic_zeros``: what does not move costs nothing."""
-    import jax
-
-    leaves, tree = jax.tree.flatten(values)
-    sides = jax.tree.leaves(changes)
-    moving = [k for k, side in enumerate(sides) if not isinstance(side, jax.custom_derivatives.SymbolicZero)]
-
-    def of_moving(*moved: Any) -> Any:
-        known = dict(zip(moving, moved, strict=True))
-        return function(*tree.unflatten([known.get(k, leaf) for k, leaf in enumerate(leaves)]))
-
-    return jax.jvp(of_moving, tuple(leaves[k] for k in moving), tuple(sides[k] for k in moving))
-
-
 def along(values: np.ndarray, like: Any) -> Any:
     """Values along a new last axis behind those of ``like``, and of its type."""
     return namespace(like).asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))

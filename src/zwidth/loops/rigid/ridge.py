@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward, push_moving, store_once
+from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward, store_once
 from zwidth.loops.rigid.device import (
     ANY,
     GAP,
@@ -130,9 +130,9 @@ def _jax_ridge() -> Any:
         def moving(plant: Plant, lag: Array) -> Ridge:
             return Ridge(*follow(ridge.s, plant, lag, delay_model, kind), ridge.last)
 
-        return ridge, push_moving(moving, primals[:2], tangents[:2])[1]
+        return ridge, jax.jvp(moving, primals[:2], tangents[:2])[1]
 
-    function.defjvp(rule, symbolic_zeros=True)
+    function.defjvp(rule)
     return function
 
 
