@@ -67,14 +67,17 @@ def _some_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
     wide = ends[:, 1:] > ends[:, :-1] + WALL_RANGE[0]
     stable = (np.round(outside) == 0) & wide & (np.isfinite(beta) & found.sound)[:, None]
     # Neighbors that touch, where one pole leaves as another enters, stay apart: their common end is on the boundary.
-    place = np.cumsum(stable, 1) - 1
-    shape = beta.size, int(stable.sum(1).max(initial=0))
-    out = BoundIntervals(*(np.full(shape, np.nan) for _ in range(4)), *(np.full(shape, -1) for _ in range(2)))
     row, gap = np.nonzero(stable)
-    for whole, values in zip(
-        out, (part for both in (ends, w, met) for part in (both[:, :-1], both[:, 1:])), strict=True
-    ):
-        whole[row, place[row, gap]] = values[row, gap]
+    values = [part[row, gap] for both in (ends, w, met) for part in (both[:, :-1], both[:, 1:])]
+    columns = np.moveaxis(side_by_side(beta.size, row, np.stack(values, -1)), -1, 0)
+    return BoundIntervals(*columns[:4], *np.where(np.isnan(columns[4:]), -1.0, columns[4:]).astype(int))
+
+
+def side_by_side(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values that belong to ascending lines by line: (lines, most of one, ...), NaN where one has fewer."""
+    place = np.arange(line.size) - np.searchsorted(line, line)
+    out = np.full((lines, int(place.max(initial=-1)) + 1, *values.shape[1:]), np.nan)
+    out[line, place] = values
     return out
 
 
