@@ -9,9 +9,8 @@ import numpy as np
 
 from methods.problems import Walls
 from zwidth.loops.rigid.boundary import boundary, sample_lobe
-from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.loops.rigid.verdict import StabilityMethod, is_stable
+from zwidth.loops.rigid.verdict import StabilityMethod, decide_stability, is_stable
 from zwidth.words.status import Status
 
 DELTAS = (0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-4, 1.0, 50.0, 700.0, 750.0, 1e4, 1e6, 1e12)
@@ -88,7 +87,7 @@ def _ridge(delta: float, d: float) -> tuple[np.ndarray, ...]:
 def judge(d: float) -> Iterator[Finding]:
     """What every method makes of every group; points exactly on the boundary have no label and are left out."""
     for group in groups(d):
-        truth = certified_stable(*group.walls)
+        truth = decide_stability(*group.walls, method="certified")
         known = np.asarray(truth.status) == Status.OK
         walls = Walls(*(part[known] for part in group.walls))
         for method in METHODS:

@@ -10,9 +10,9 @@ import numpy as np
 
 from zwidth.loops.rigid import certified
 from zwidth.loops.rigid.boundary import boundary, sample_lobe
-from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.outermost_poles import outermost_poles
 from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.loops.rigid.verdict import decide_stability
 from zwidth.words.status import Status
 
 # The device of the speed problems; the cost of no method depends on it.
@@ -104,7 +104,7 @@ def near_boundary(d: float, points: int) -> Labelled:
         distances.append(np.abs(offset))
     alpha, beta, delta, distance = (np.concatenate(part) for part in (alphas, betas, deltas, distances))
     walls = Walls(alpha, beta, delta, np.full(alpha.size, float(d)))
-    truth = certified_stable(*walls)
+    truth = decide_stability(*walls, method="certified")
     known = np.asarray(truth.status) == Status.OK
     kept = Walls(*(np.asarray(part)[known] for part in walls))
     return Labelled(kept, np.asarray(truth.stable)[known], distance[known])

@@ -15,12 +15,11 @@ from methods.baselines import available
 from methods.clock import time_calls
 from methods.problems import Walls
 from zwidth.loops.rigid import certified
-from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.passivity import is_passive, passivity_margin
 from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.ridge import RidgeMethod, alpha_max
 from zwidth.loops.rigid.spectral_radius import spectral_radius
-from zwidth.loops.rigid.verdict import StabilityMethod, is_stable
+from zwidth.loops.rigid.verdict import StabilityMethod, decide_stability, is_stable
 
 # A measurement is repeated until it has taken this long, and at least this often.
 _SECONDS = 0.4
@@ -221,7 +220,7 @@ def ridge_error(d: float, method: RidgeMethod = "newton") -> Error:
     error = np.full(delta.size, np.inf)
     for distance in (1e-6, 1e-9, 1e-11, 1e-12, 1e-13, 1e-14, 4e-15, 1e-15):
         below, above = (
-            certified_stable(scale * alpha, scale * (beta + delta) - delta, delta, d)
+            decide_stability(scale * alpha, scale * (beta + delta) - delta, delta, d, method="certified")
             for scale in (1 - distance, 1 + distance)
         )
         error[below.stable & ~above.stable & (below.status == 0) & (above.status == 0)] = distance

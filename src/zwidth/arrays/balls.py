@@ -224,11 +224,8 @@ def quantities(low: np.ndarray, high: np.ndarray) -> list[Form]:
 
 
 def chord(x: Form, ends: tuple[np.ndarray, np.ndarray], bend: np.ndarray, error: Any) -> Form:
-    """A function of x by the chord between its ``ends``, each within the relative ``error``.
-
-    ``bend`` is the second derivative of largest size: of one sign throughout, it keeps the function on one side of the
-    chord, at most ``bend width^2/8`` from it.
-    """
+    """A function of x by the chord between its ``ends``, each of a relative ``error``; ``bend`` is its largest f''."""
+    # Of one sign throughout, f'' keeps it on one side of the chord, at most ``bend width^2/8`` from it.
     low, high = x.lower(), x.upper()
     width = np.maximum(high - low, TINY)
     slope = (ends[1] - ends[0]) / width

@@ -32,10 +32,7 @@ _NUMBERS = (int, float, np.floating, np.integer)
 
 @contextmanager
 def compute_concretely() -> Iterator[None]:
-    """Compute in float64 and at once, though the caller may be inside a JAX transformation that traces other values.
-
-    The settings belong to the thread and end with the block.
-    """
+    """Compute in float64 and at once, also inside a JAX transformation that traces other values, in this thread."""
     import jax
 
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
@@ -238,13 +235,11 @@ def _plain(leaf: Any) -> Any:
 def compile_traced(
     kernel: Callable[..., Any], static: tuple[Any, ...], slopes: Slopes | None = None
 ) -> Callable[..., Any]:
-    """A kernel compiled for traced values, with its derivatives as one product for each argument.
-
-    A point depends on itself alone, so that all there is to differentiate is a few numbers a point. Left to itself,
-    `jax.grad` outside `jit` would compile a program that hands out every intermediate result: for the ridge
-    1.2 to 1.5 times as long (benchmarks/bench_xla.py). There the values are concrete: where ``slopes`` are known for
-    them, nothing is compiled.
-    """
+    """A kernel compiled for traced values, with its derivatives as one product for each argument."""
+    # A point depends on itself alone: all there is to differentiate is a few numbers a point. Left to itself,
+    # `jax.grad` outside `jit` would compile a program that hands out every intermediate result: for the ridge 1.2 to
+    # 1.5 times as long (benchmarks/bench_xla.py). There the values are concrete: where ``slopes`` are known, nothing is
+    # compiled.
     import jax
 
     def plain(*arrays: Any) -> Any:
@@ -274,11 +269,9 @@ def compile_traced(
 
     @cache
     def sloped(active: tuple[bool, ...]) -> Callable[..., Any]:
-        """`by_argument`, compiled.
-
-        `jax.grad` divides a compiled function into what is linear in the tangents and what is not, equation by
-        equation, also where nothing is; one with a rule of its own it takes as a whole, in half of the time.
-        """
+        """`by_argument`, compiled."""
+        # Of a compiled function `jax.grad` parts every equation into what is linear in the tangents and what is not;
+        # one with a rule of its own it takes as a whole, in half of the time.
         compiled = jax.jit(partial(by_argument, active))
         whole = jax.custom_jvp(compiled)
         whole.defjvp(lambda primals, tangents: jax.jvp(compiled, primals, tangents))
@@ -351,12 +344,9 @@ def map_blocks(
     within: Callable[[], Any] = compute_concretely,
     exact: bool = False,
 ) -> Any:
-    """Apply a function of columns to equally long ones, block by block on every processor; NumPy arrays come back.
-
-    One array of a million points is 2.5 times slower for the ridge (benchmarks/bench_xla.py):
-    what the function holds meanwhile leaves the cache.
-    Columns of one value are handed over as they are. ``exact``: few points fill up a whole block too.
-    """
+    """Apply a function to columns of one length, or of one value, block by block on every processor."""
+    # One array of a million points is 2.5 times slower for the ridge (benchmarks/bench_xla.py): what the function holds
+    # meanwhile leaves the cache. ``exact``: few points fill up a whole block too.
     count = _length(columns)
     # A power of two, so that batches of many sizes share a few compilations.
     size = block if exact else min(block, 1 << max(count - 1, _LEAST - 1).bit_length())

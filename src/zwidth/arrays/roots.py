@@ -6,12 +6,11 @@ The number of steps is fixed, so that no point of a batch waits for another, and
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import gcd
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import along, frozen, namespace, push_moving, repeat
+from zwidth.arrays.xp import along, frozen, namespace, repeat
 from zwidth.words.types import Array
 
 Function = Callable[[Array], Array]
@@ -41,11 +40,8 @@ def bisect(holds: Function, low: Array, high: Array, *, geometric: bool = False)
 
 
 def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) -> tuple[Array, Array]:
-    """Newton's method in a bracket below which a function is negative; the zero, and the size of the last step.
-
-    The bracket shrinks with every value, and a step that leaves it becomes a bisection. A point whose step was
-    ``_SMALL`` is done: of its error nothing but rounding is left.
-    """
+    """Newton's method in a bracket below which a function is negative; the zero, and the size of the last step."""
+    # The bracket shrinks with every value, and a step that leaves it becomes a bisection.
     xp = namespace(low, start)
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -102,12 +98,9 @@ class _Bracket(NamedTuple):
 def false_position(
     function: Function, low: Array, high: Array, at_low: Array, at_high: Array, steps: int, width: Array | float
 ) -> Array:
-    """Where a function that is positive at ``low`` and not at ``high`` changes sign.
-
-    False position with halved weights, every sixth step a bisection, until every point is done: its value
-    no more than rounding, or the bracket no wider than two of ``width``; so far from its ends it is cut at least, or
-    the end that is not next to the zero would stay.
-    """
+    """Where a function that is positive at ``low`` and not at ``high`` changes sign, within two of ``width``."""
+    # With halved weights, every sixth step a bisection, and cut ``width`` from the ends at least, or the end that is
+    # not next to the zero would stay.
     xp = namespace(low, at_low)
 
     def done(at: _Bracket) -> Array:
@@ -173,11 +166,9 @@ def follow_root(
     *known: Any,
     slope: Callable[..., Array] | None = None,
 ) -> Array:
-    """A zero x of ``function(x, *known)``, in JAX with its derivatives of every order in what is known.
-
-    They are those of the implicit function, so that nothing of a search is differentiated, and 0 but where
-    ``usable(x, slope, step)``, of the function and of Newton's next step. ``slope`` is its derivative where known.
-    """
+    """A zero x of ``function(x, *known)``, in JAX with its derivatives of every order in what is known."""
+    # They are those of the implicit function, so that nothing of a search is differentiated, and 0 but where
+    # ``usable(x, slope, step)``, of the function and of Newton's next step. ``slope`` is its derivative where known.
     xp = namespace(root)
     if xp is np:
         return root
@@ -192,7 +183,16 @@ def follow_root(
 
     def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
         x, known = follow(*primals), primals[1:]
-        value, change = push_moving(lambda *known: function(x, *known), known, tangents[1:])
+        leaves, tree = jax.tree.flatten(known)
+        sides = jax.tree.leaves(tangents[1:])
+        # What does not move costs nothing.
+        moving = [k for k, side in enumerate(sides) if not isinstance(side, jax.custom_derivatives.SymbolicZero)]
+
+        def of_moving(*moved: Any) -> Array:
+            among = dict(zip(moving, moved, strict=True))
+            return function(x, *tree.unflatten([among.get(k, leaf) for k, leaf in enumerate(leaves)]))
+
+        value, change = jax.jvp(of_moving, tuple(leaves[k] for k in moving), tuple(sides[k] for k in moving))
         rate = (slope or differentiate)(x, *known)
         taken = usable(*frozen((x, rate, value / xp.where(rate == 0, 1.0, rate)), xp))
         return x, xp.where(taken, -change / xp.where(taken, rate, 1.0), 0.0)
@@ -202,27 +202,11 @@ def follow_root(
 
 
 def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes: Sequence[int]) -> Array:
-    """The integral of a function of points along a new last axis, piece by piece between edges.
-
-    JAX takes equally many points at a time: the function is compiled once, and its arrays stay in caches.
-    """
-    xp = namespace(*edges)
-    pieces, together = [], gcd(*nodes)
+    """The integral of a function of points along a new last axis, by Gauss and Legendre's nodes between edges."""
+    xp, pieces = namespace(*edges), []
     for low, high, count in zip(edges[:-1], edges[1:], nodes, strict=True):
         node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(count))
-        width = high - low
-        points = low[..., None] + width[..., None] * (0.5 * (node + 1.0))
-        size = count if xp is np else together
-        cuts = [slice(k, k + size) for k in range(0, count, size)]
-        pieces += [(points[..., cut], 0.0 * low[..., None] + weight[..., cut], 0.5 * width) for cut in cuts]
-
-    def add_up(piece: tuple[Array, Array, Array]) -> Array:
-        points, weight, half = piece
-        # Of no width: the values are finite and do not matter.
-        return half * xp.sum(function(points) * weight, axis=-1)
-
-    if xp is np or len(pieces) == 1:
-        return sum(map(add_up, pieces))
-    from jax.lax import map as map_in_turn
-
-    return xp.sum(map_in_turn(add_up, tuple(map(xp.stack, zip(*pieces, strict=True)))), axis=0)
+        half = 0.5 * (high - low)[..., None]
+        pieces.append((low[..., None] + half * (node + 1.0), half * weight))
+    points, weights = (xp.concatenate(parts, axis=-1) for parts in zip(*pieces, strict=True))
+    return xp.sum(function(points) * weights, axis=-1)

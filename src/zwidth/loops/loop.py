@@ -102,10 +102,7 @@ class LinearLoop:
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod, exact: tuple[np.ndarray, np.ndarray]
     ) -> Stability:
-        """Labels with status and method; ``exact`` are the walls in SI units, as "certified" takes them.
-
-        All of them need only broadcast.
-        """
+        """Labels with status and method, broadcast; ``exact`` are the walls in SI units, as "certified" takes them."""
         # Device and delay were checked as the parts of the scene.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)

@@ -75,7 +75,8 @@ def quantity_status(**values: Array) -> Array:
     valid = inside = True
     for name, value in values.items():
         valid, inside = valid & _valid(name, value), inside & within(value, _magnitudes(name))
-    return xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
+    status = xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
+    return status.astype(np.int32)
 
 
 def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:

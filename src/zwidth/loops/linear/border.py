@@ -58,11 +58,9 @@ class Border:
 
     @cached_property
     def curved(self) -> list[Edge]:
-        """The edges on the curve of complex pairs.
-
-        A resonance may sweep past the stable set between two nodes: beside the ends of the edges that the nodes show,
-        rows tell what else bounds it.
-        """
+        """The edges on the curve of complex pairs."""
+        # A resonance may sweep past the stable set between two nodes: beside the ends of the edges that these show,
+        # rows tell what else bounds it.
         w = self.boundary.w
         beta = curve_at(self.boundary.loop, w).beta
         if np.ptp(beta) <= _ONE_DAMPING * np.abs(beta).max():
@@ -160,10 +158,8 @@ class Border:
         return _narrow(b.borders, inside, outside, _ROUNDS)[0]
 
     def _meeting(self, ends: np.ndarray, gaps: np.ndarray, other: int) -> float:
-        """Where the curve meets another crossing of its rows, by Newton's method.
-
-        ``ends`` has the angles of both between which they meet, ``gaps`` how far their alphas are apart there.
-        """
+        """Where the curve meets another crossing of its rows, by Newton's method."""
+        # ``ends`` has the angles of both between which they meet, ``gaps`` how far their alphas are apart there.
         b = self.boundary
         line = b.lines[other - len(b.arcs)] if other >= len(b.arcs) else None
         low, high = ends.min(1), ends.max(1)
@@ -225,10 +221,8 @@ class Border:
 
     @cached_property
     def straight(self) -> list[Edge]:
-        """The edges on which a real pole, or a pair at one frequency, is on the circle.
-
-        They end where an edge of the curve does, where two lines meet, or where the curve meets the line.
-        """
+        """The edges on which a real pole, or a pair at one frequency, is on the circle."""
+        # They end where an edge of the curve does, where two lines meet, or where the curve meets the line.
         lines = self.boundary.lines
         crossed = [beta for k, line in enumerate(lines) for beta in _meetings(lines[:k], line)]
         betas = np.concatenate([*(edge.beta for edge in self.curved), crossed, [0.0] if not self.curved else []])

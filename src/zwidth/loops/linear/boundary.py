@@ -92,11 +92,9 @@ class Boundary:
         return out
 
     def _solve(self, beta: np.ndarray, place: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The angle before node ``k`` of all arcs' at which each row crosses, and its alpha.
-
-        ``Im(q - beta F)``, which rises with w where a pair leaves, over what vanishes on every row, by Newton's method
-        kept inside its bracket; who has arrived takes no part any more.
-        """
+        """The angle before node ``k`` of all arcs' at which each row crosses, and its alpha."""
+        # Newton's method, inside a bracket, on ``Im(q - beta F)``, which rises with w where a pair leaves, over what
+        # vanishes on every row; who has arrived takes no part any more.
         steps, nodes = self._steps, self._at_nodes
         lower = np.where(steps.w[k - 1] < steps.w[k], k - 1, k)
         upper = 2 * k - 1 - lower
@@ -179,10 +177,8 @@ class Boundary:
         return self._settle(beta)[1]
 
     def _settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows whose crossings lead from the count far below to that far above, and which ones do (V15).
-
-        A row within rounding of a turn of the curve may miss one of two arcs: a neighbor that does not stands for it.
-        """
+        """Rows whose crossings lead from the count far below to that far above, and which ones do (V15)."""
+        # A row within rounding of a turn of the curve may miss one of two arcs: a neighbor that does not stands for it.
         missed = self._missed(beta)
         for shift in _SHIFTS:
             row = np.flatnonzero(missed)
@@ -204,18 +200,13 @@ class Boundary:
         return total + sum(np.minimum(line.leaving(beta), most) for line in self.lines)
 
     def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """How many poles of each wall lie outside the unit circle, for arrays of one shape (points,).
-
-        -1 where the row's crossings contradict each other.
-        """
+        """How many poles of each wall lie outside the circle; -1 where the row's crossings contradict each other."""
         passed, sound = self._passed(alpha, beta)
         return np.where(sound, self.base + passed, -1)
 
     def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> tuple[np.ndarray, np.ndarray]:
-        """Poles that have left below each wall, without those of one column of the crossings; and if that is sound.
-
-        Most walls are far above or below where an arc crosses their row, which the nodes beside tell.
-        """
+        """Poles that have left below each wall, without those of one column of the crossings; and if that is sound."""
+        # Most walls are far above or below where an arc crosses their row, which the nodes beside tell.
         but = np.broadcast_to(but, beta.shape)
         beta, sound = self._settle(beta)
         steps = self._steps

@@ -25,8 +25,8 @@ from zwidth.words.status import Status
 if TYPE_CHECKING:
     import flint
 
-# Precisions, one after the other until one is enough; and what is right to float64.
-_BITS, _FLOAT_BITS = tuple(128 << k for k in range(7)), 60
+# What is right to float64.
+_FLOAT_BITS = 60
 _NOTHING = Estimate(0, 0.0)
 
 
@@ -46,7 +46,7 @@ def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, Any])
 
     if not (np.isfinite(stiffness) and np.isfinite(damping)):
         return False, Status.INVALID_INPUT
-    for bits in _BITS:
+    for bits in certified.BITS:
         with flint.ctx.workprec(bits):
             if bits not in known:
                 known[bits] = _polynomials(scene)
@@ -82,10 +82,7 @@ def all_inside(p: flint.arb_poly) -> bool | None:
 
 
 def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly, bool]:
-    """D, N1 and N2 of ``P = D + K N1 + B N2``, K in N/m and B in N s/m; whether K = 0 leaves a pole at z = 1 exactly.
-
-    Then nothing pulls a device at rest back.
-    """
+    """D, N1 and N2 of ``P = D + K N1 + B N2`` in SI units, and whether K = 0 leaves a pole at z = 1 exactly."""
     import flint
 
     exact = _exact(scene)
@@ -119,14 +116,11 @@ def _exact(part: Any) -> Any:
 
 
 def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -> tuple[float, np.ndarray]:
-    """The gain of the sampled response of a linear device, and ``1 - z`` of its zeros, right to float64.
-
-    What the aliases of fast poles leave of slow zeros is not to be had in floats: balls find it, where one precision is
-    not enough with twice as much.
-    """
+    """The gain of the sampled response of a linear device, and ``1 - z`` of its zeros, right to float64."""
+    # What the aliases of fast poles leave of slow zeros is not to be had in floats.
     import flint
 
-    for bits in _BITS:
+    for bits in certified.BITS:
         with flint.ctx.workprec(bits):
             ball = flint.arb(period)
             response, _ = _device(System(device, ball, flint.arb(device.mass), *delay, _NOTHING))

@@ -173,10 +173,8 @@ AnyChain: TypeAlias = Chain | System
 
 
 def chain_of(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Estimate | None = None) -> AnyChain:
-    """The bodies of a scene, or its linear system, normalized by its period and by the mass the wall's force acts on.
-
-    ``delay`` is the delay in periods and its whole part, where a trace hides them; ``estimate`` stands for the scene's.
-    """
+    """The bodies of a scene, or its linear system, normalized by its period and by the mass that the force acts on."""
+    # ``delay`` is in periods, with its whole part, where a trace hides it; ``estimate`` stands for the scene's.
     device, timing, hand = scene.device, scene.timing, scene.operator
     period = timing.period
     d, whole = delay or (timing.d, int(np.floor(timing.d)))
@@ -223,10 +221,8 @@ def body_position(body: int, sensor: int, bodies: int, modes: int) -> list[tuple
 
 
 def compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and denominator in s of what the sensor sees of a force, highest power first.
-
-    Sums of positive terms, so that slow roots are exact.
-    """
+    """Numerator and denominator in s of what the sensor sees of a force, highest power first."""
+    # Sums of positive terms, so that slow roots are exact.
     top, bottom, seen = np.zeros(0), np.ones(1), np.ones(1)
     for k in reversed(range(len(chain.bodies))):
         body = chain.bodies[k]

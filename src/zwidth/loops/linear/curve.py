@@ -107,10 +107,8 @@ class CrossingLine(NamedTuple):
 
 
 def lines_at(loop: LoopRoots, angles: Iterable[float]) -> list[CrossingLine]:
-    """The lines of zeros of Im F where q is real as well: at z = 1 and -1, and inside of undamped devices and windows.
-
-    There is none where q or F is infinite: where the device does not move, say.
-    """
+    """The lines of zeros of Im F where q is real as well: at z = 1 and -1, inside of undamped devices and windows."""
+    # There is none where q or F is infinite: where the device does not move, say.
     lines = []
     for w in angles:
         at, end = circle(np.array([w])), w in (0.0, np.pi)
@@ -199,12 +197,10 @@ def _bands(
     beta_slope: np.ndarray,
     size: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where alpha may be between two nodes: `Arc.straight` and `Arc.room`.
-
-    Where the slope of beta hardly changes over a step, a straight line misses alpha by an eighth of the step times what
-    alpha's slope changes, and by what beta bends; four times that is allowed. Elsewhere, by far more than both ends
-    differ.
-    """
+    """Where alpha may be between two nodes: `Arc.straight` and `Arc.room`."""
+    # Where the slope of beta hardly changes over a step, a straight line misses alpha by an eighth of the step times
+    # what alpha's slope changes, and by what beta bends; four times that is allowed. Elsewhere, more than both ends
+    # differ.
     with np.errstate(all="ignore"):
         bend = beta_slope[1:] / beta_slope[:-1]
         straight = (bend > 0.5) & (bend < 2.0)

@@ -42,12 +42,9 @@ def hold(chain: AnyChain, rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
 
 
 def _phi1(rate: Any) -> Any:
-    """``1 + A/2! + A^2/3! + ...``: the series for A over a power of 2, then ``phi1(2 A) = phi1(A) (1 + A phi1(A)/2)``.
-
-    In two loops of JAX, because a program that is differentiated costs by its length: with JAX's own exponential, which
-    holds an approximant for each of five sizes, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as
-    long to compile.
-    """
+    """``1 + A/2! + A^2/3! + ...``: the series of A over a power of 2, ``phi1(2 A) = phi1(A) (1 + A phi1(A)/2)``."""
+    # In two loops, because a program that is differentiated costs by its length: with JAX's own exponential derivatives
+    # of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to compile.
     xp = namespace(rate)
     size = frozen(xp.abs(rate).sum(0).max(), xp)
     doublings = xp.ceil(xp.log2(xp.maximum(2.0 * size, 1.0)))

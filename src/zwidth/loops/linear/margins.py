@@ -249,11 +249,9 @@ def delay_margin(chain: AnyChain, delayed: list[DelayedLoop], alpha: float, beta
 def _find_starts(
     delays: list[float], crossed: list[np.ndarray], turns: list[np.ndarray]
 ) -> Iterator[tuple[float, float]]:
-    """Angles and delays next to which a pole is on the circle, by the gain crossovers of laid delays and their phases.
-
-    So many periods more as the phase is of the angle turn L to -1, and whole ones leave its size as it is: between two
-    delays each whole number is looked for that this passes, and beside a lowest one that below it.
-    """
+    """Angles and delays next to which a pole is on the circle, by gain crossovers of laid delays and their phases."""
+    # So many periods more as the phase is of the angle turn L to -1, and whole ones leave its size as it is: between
+    # two delays each whole number is looked for that this passes, and beside a lowest one that below it.
     more = [phases / w for phases, w in zip(turns, crossed, strict=True)]
     for k, (w, after) in enumerate(pairwise(crossed)):
         if w.size != after.size:
@@ -278,10 +276,7 @@ def _find_starts(
 
 
 def _follow(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) -> float:
-    """The delay near a start with which a pole is on the circle, by Newton's method on ``log(-L)``; NaN where none is.
-
-    Each trial has the exact loop of its own.
-    """
+    """The delay near a start with which a pole is on the circle, by Newton's method on ``log(-L)``; else NaN."""
     for _ in range(_TRIALS):
         if not (0.0 < w < np.pi and delay >= 0.0):
             break

@@ -47,10 +47,7 @@ _OBSTACLES = {
 
 
 def find_obstacle(*, coupling: Any = None, **parts: Any) -> str:
-    """Why parts of a device have no such condition; nothing where they have.
-
-    It is about a force that acts as it is commanded, and the motion of the point where it does.
-    """
+    """Why parts of a device have no such condition; nothing where force and sensed motion are those of one point."""
     for name, (what, where) in _OBSTACLES.items():
         part = parts.get(name)
         if part if isinstance(part, tuple | list) else part is not None:

@@ -156,11 +156,9 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
 
 
 def _conditions(loop: LoopRoots, wall: BoundRidge) -> tuple[np.ndarray, list[int]]:
-    """How what binds a wall moves with what may move of alpha, beta, w1 and w2, and which of five conditions these are.
-
-    Of ``r = alpha + beta F - q``: Re and Im at w1, the same at w2, and Im dr/dw at w1, where w stays. At a smooth
-    optimum the angle may stay where it is: to first order it does not matter.
-    """
+    """How what binds a wall moves with what may of alpha, beta, w1 and w2, and which of five conditions that is."""
+    # Of ``r = alpha + beta F - q``: Re and Im at w1, the same at w2, and Im dr/dw at w1, where w stays. At a smooth
+    # optimum the angle may stay where it is: to first order it does not matter.
     at = circle(np.array([wall.w1, wall.w2]))
     with np.errstate(all="ignore"):
         q, f = loop.required_wall(at), loop.estimate.jet(at)
@@ -263,11 +261,7 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
 
 
 def _slope(scene: Any, found: BoundRidge, path: str) -> float:
-    """The derivative of K_max in one parameter: as it moves, the conditions that bind go on to hold.
-
-    The derivatives of the conditions are exact in the wall and its angles. In the parameter they are exact but for the
-    rates of the chain and the velocity estimate, which are smooth over its own size (docs/theory/scenes.md, V21).
-    """
+    """The derivative of K_max in one parameter: as it moves, the conditions that bind go on to hold (V21)."""
     matrix, rows = _conditions(scene.loop.roots, found)
     at = circle(np.array([found.w1, found.w2]))
     # Longer periods are fewer in a delay: from a whole number of them on, a fraction of one less.
@@ -307,10 +301,8 @@ def _inputs(scene: Any, whole: int, at: CirclePoints) -> tuple[Any, ...]:
 def _needed_slopes(
     scene: Any, whole: int, at: CirclePoints, by_rate: np.ndarray, by_push: np.ndarray, by_delay: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The derivatives of ``q = -1/G`` and of dq/dw in a parameter, by those of the chain's rates and of the delay.
-
-    NaN where G by the matrices of the chain is not G by its roots: then rounding has eaten what they tell.
-    """
+    """The derivatives of ``q = -1/G`` and of dq/dw in a parameter, by those of the chain's rates and of the delay."""
+    # NaN where G by the matrices of the chain is not G by its roots: then rounding has eaten what they tell.
     chain = scene.loop.chain
     # An imaginary step so short that its square is nothing is a derivative without a difference, here of e^A.
     rate, push = (value + 1j * _TINY * by for value, by in zip(chain.realize(), (by_rate, by_push), strict=False))

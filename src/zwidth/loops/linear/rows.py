@@ -23,10 +23,9 @@ _FEW_WALLS = 4
 
 
 class BoundIntervals(NamedTuple):
-    """Stable intervals of alpha: shape (rows, most intervals of a row), NaN where a row has fewer.
+    """Stable intervals of alpha: shape (rows, most intervals of a row), NaN where a row has fewer."""
 
-    With each stands the column of the crossings that ends it, -1 where there is none, and the angle there.
-    """
+    # With each stands the column of the crossings that ends it, -1 where there is none, and the angle there.
 
     low: np.ndarray
     high: np.ndarray
@@ -68,14 +67,17 @@ def _some_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
     wide = ends[:, 1:] > ends[:, :-1] + WALL_RANGE[0]
     stable = (np.round(outside) == 0) & wide & (np.isfinite(beta) & found.sound)[:, None]
     # Neighbors that touch, where one pole leaves as another enters, stay apart: their common end is on the boundary.
-    place = np.cumsum(stable, 1) - 1
-    shape = beta.size, int(stable.sum(1).max(initial=0))
-    out = BoundIntervals(*(np.full(shape, np.nan) for _ in range(4)), *(np.full(shape, -1) for _ in range(2)))
     row, gap = np.nonzero(stable)
-    for whole, values in zip(
-        out, (part for both in (ends, w, met) for part in (both[:, :-1], both[:, 1:])), strict=True
-    ):
-        whole[row, place[row, gap]] = values[row, gap]
+    values = [part[row, gap] for both in (ends, w, met) for part in (both[:, :-1], both[:, 1:])]
+    columns = np.moveaxis(side_by_side(beta.size, row, np.stack(values, -1)), -1, 0)
+    return BoundIntervals(*columns[:4], *np.where(np.isnan(columns[4:]), -1.0, columns[4:]).astype(int))
+
+
+def side_by_side(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values that belong to ascending lines by line: (lines, most of one, ...), NaN where one has fewer."""
+    place = np.arange(line.size) - np.searchsorted(line, line)
+    out = np.full((lines, int(place.max(initial=-1)) + 1, *values.shape[1:]), np.nan)
+    out[line, place] = values
     return out
 
 
@@ -120,12 +122,10 @@ _BESIDE = 1e-7
 
 
 def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
-    """Where a column is stable: array (intervals, 2) of beta, ascending.
-
-    Every damping at which the column meets the boundary is found, for alpha is monotone along the curve between two
-    nodes once its extremes are among them; the walls between two such dampings share the label of one of them. An end
-    whose own neighbors contradict that is sought by labels alone.
-    """
+    """Where a column is stable: array (intervals, 2) of beta, ascending."""
+    # Every damping at which the column meets the boundary is found, for alpha is monotone along the curve between two
+    # nodes once its extremes are among them; the walls between two such dampings share the label of one of them. An end
+    # whose own neighbors contradict that is sought by labels alone.
     on_lines = np.array([(line.q - alpha) / line.f for line in boundary.lines if line.f != 0.0])
     w, height = boundary.heights
     above = height - alpha

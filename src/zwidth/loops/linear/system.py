@@ -94,10 +94,8 @@ def _sections(device: LinearDevice) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pair(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Numerator and denominator of each section, of one length, slow ones first: two poles each, a last real one alone.
-
-    A pair of zeros finds its section, for there are more poles than zeros.
-    """
+    """Numerator and denominator of each section, slow ones first: two poles each, a last real one alone."""
+    # A pair of zeros finds its section, for there are more poles than zeros.
 
     def group(roots: Any) -> list[np.ndarray]:
         real, pairs = (

@@ -36,10 +36,7 @@ _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), fl
 
 
 class Structure(NamedTuple):
-    """What is compiled once: a scene whose moving parameters are placeholders, their paths, and its delay.
-
-    ``held`` tells that the delay is ``whole`` periods and stays so.
-    """
+    """What is compiled once: a scene whose moving parameters are placeholders, their paths, and its delay."""
 
     template: Any
     paths: tuple[str, ...]

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import circle
+from zwidth.loops.linear.rows import side_by_side
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 
@@ -171,10 +172,7 @@ _BLOCK = 1 << 15
 
 
 class Decided(NamedTuple):
-    """Decided intervals of alpha or beta, ascending: (lines, intervals), NaN where a line of the plane has fewer.
-
-    Their ends, and whether the walls inside are stable.
-    """
+    """Decided intervals of alpha or beta, ascending: (lines of the plane, intervals), NaN where one has fewer."""
 
     low: np.ndarray
     high: np.ndarray
@@ -280,14 +278,6 @@ class DecidedWalls:
         wall, c = np.array([1.0, alpha, beta]), self.curve
         size = np.abs(c.u) ** 2 + np.abs((alpha + beta * c.F) * c.S) ** 2
         return int(np.argmin(np.einsum("i,ijk,j->k", wall, self._forms, wall) / size))
-
-
-def side_by_side(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values that belong to ascending lines by line: (lines, most of one, ...), NaN where one has fewer."""
-    place = np.arange(line.size) - np.searchsorted(line, line)
-    out = np.full((lines, int(place.max(initial=-1)) + 1, *values.shape[1:]), np.nan)
-    out[line, place] = values
-    return out
 
 
 def _gram(parts: np.ndarray) -> np.ndarray:

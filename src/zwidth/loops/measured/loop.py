@@ -11,9 +11,9 @@ import numpy as np
 from zwidth.arrays.roots import narrow_dips
 from zwidth.loops.linear.chain import AnyChain
 from zwidth.loops.linear.margins import find_nearest
-from zwidth.loops.linear.rows import Island
+from zwidth.loops.linear.rows import Island, side_by_side
 from zwidth.loops.loop import LinearLoop, SlowestMotion
-from zwidth.loops.measured.curve import Decided, DecidedWalls, ResponseCurve, side_by_side
+from zwidth.loops.measured.curve import Decided, DecidedWalls, ResponseCurve
 from zwidth.loops.rigid.margins import Margins
 from zwidth.loops.rigid.ridge import RidgePoint
 from zwidth.loops.rigid.verdict import Stability, StabilityMethod

@@ -105,10 +105,8 @@ def _start(loop: Loop, degree: Degree, spring: bool) -> RootsFirst:
 
 
 def discs(z: RootsFirst, loop: Loop, degree: Degree, spring: bool) -> tuple[RadiiFirst, Array, Array]:
-    """Radii of discs round ``z``, the poles along the first axis: in each lies one pole if the second result says so.
-
-    The third says whether P is as small at each of them as rounding lets it be seen.
-    """
+    """Radii of discs round ``z``, poles along the first axis: in each lies one pole if the second result says so."""
+    # The third says whether P is as small at each of them as rounding lets it be seen.
     xp, poles = namespace(z), len(z)
     at, unit = split(z), epsilon(z.real)
     apart = [xp.sqrt(part.real * part.real + part.imag * part.imag) for part in _differences(z)]

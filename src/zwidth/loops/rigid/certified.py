@@ -1,17 +1,17 @@
 """Stability that is never guessed: the verdict in float64 with a proved error bound, then in ball arithmetic.
 
 The text is that of `loops.rigid.crossover`; for the points that the floating-point filter leaves open its numbers are
-balls of python-flint (optional) around inputs taken as exact, and the precision doubles until a verdict is certain.
-What no precision decides is a pair of poles exactly on the unit circle. For delta > 0 and alpha > 0 no such point is
-known: c is then transcendental, while alpha, beta, delta and d are rational. For delta = 0 there are such walls (alpha
-= 0, beta = 2, d = 0): they stay undecided.
+balls of python-flint (optional) around inputs taken as exact, and the precision doubles until a verdict is certain
+(Walton, Marshall 1987; Rump 1999; Johansson 2017). What no precision decides is a pair of poles exactly on the unit
+circle. For delta > 0 and alpha > 0 no such point is known: c is then transcendental, while alpha, beta, delta and d are
+rational. For delta = 0 there are such walls (alpha = 0, beta = 2, d = 0): they stay undecided.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,16 +19,15 @@ from zwidth.arrays.xp import horner
 from zwidth.loops.rigid.certified_filter import OPEN, STABLE, UNSTABLE, filter_walls
 from zwidth.loops.rigid.crossover import Lag, Verdict, first_zero, long_verdict, short_verdict
 from zwidth.loops.rigid.device import DeviceTerms, PhiFunctions, held_plant, wall_status
-from zwidth.loops.rigid.folding import Points, fold_arguments
-from zwidth.words.errors import InputError
+from zwidth.loops.rigid.folding import Points, pick_points
 from zwidth.words.status import Status
-from zwidth.words.types import ArrayLike
 
 if TYPE_CHECKING:
     import flint
 
 
-FIRST_BITS = 128
+# Precisions, one after the other until one is enough.
+BITS = tuple(128 << k for k in range(7))
 _EXTRA_BITS = 64
 
 
@@ -37,17 +36,15 @@ def available() -> bool:
     return find_spec("flint") is not None
 
 
-def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> tuple[bool, Status, int]:
-    """Label, status and bits of one exact point: alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
-    edge, bits = alpha == 0, min(FIRST_BITS, max_bits)
-    while True:
+def decide(alpha: float, beta: float, delta: float, d: float) -> tuple[bool, Status]:
+    """Label and status of one exact point: alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
+    edge = alpha == 0
+    for bits in BITS:
         found = verdict(alpha, beta, delta, d, bits)
         if found.stable or found.unstable:
             inside = bool(found.stable)
-            return inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits
-        if bits == max_bits:
-            return False, Status.UNDECIDED, bits
-        bits = min(2 * bits, max_bits)
+            return inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK
+    return False, Status.UNDECIDED
 
 
 def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Verdict:
@@ -124,54 +121,20 @@ def _take_lag(u: flint.arb, whole: int) -> Lag:
     return Lag(cosine, sine, half * half, lag < turn, w * (whole + 1) > turn)
 
 
-class CertifiedResult(NamedTuple):
-    """Labels that are right or absent, with the reason and the precision."""
-
-    stable: np.ndarray
-    status: np.ndarray
-    bits: np.ndarray
-
-
-def certified_stable(
-    alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, max_bits: int = 8192
-) -> CertifiedResult:
-    """Decide whether every pole lies strictly inside the unit circle, for the inputs exactly as given.
-
-    A label is a theorem about the float64 inputs, provided that ``+ - * /`` and the square root round correctly, as
-    XLA's do unless its fast-math flags are set. ``stable`` is False wherever the status is not OK: ON_BOUNDARY, no pole
-    is outside and at least one exactly on the circle; UNDECIDED, more than ``max_bits`` (at least 64) is needed, or the
-    filter left the point open and the extra ``certified`` is not installed; or the input is out of range. ``bits`` is 0
-    where the filter or a sign decided. The filter decides more than 99.9 % of a map and of scattered points; balls take
-    about 0.1 ms a point (Walton, Marshall 1987; Rump 1999; Johansson 2017).
-
-    Example:
-        >>> from zwidth.loops.rigid.certified import certified_stable
-        >>> certified_stable([0.3, 0.6, 0.7], 0.5, 0.0, 0).stable.tolist()
-        [True, True, False]
-
-        The boundary is at 3/5; the float64 number 0.6 is 2e-17 below it.
-    """
-    if max_bits < 64:
-        raise InputError(f"max_bits: got {max_bits}, 64 or more is needed")
-    laid = fold_arguments((alpha, beta, delta, d))
-    points, shape = laid.points, laid.points.shape
+def prove_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Labels that are right, and statuses: ON_BOUNDARY or UNDECIDED where there is none (docs/theory/certified.md)."""
     code = filter_walls(points)
-    stable, status, bits = np.asarray(code == STABLE), np.zeros(shape, np.int32), np.zeros(shape, np.int32)
-    rest = np.flatnonzero(code >= OPEN)
-    if rest.size:
-        # A single index, because a point without axes has no other.
-        flat = [np.broadcast_to(array, shape).reshape(-1)[rest] for array in points]
-        settled = _settle_points(Points(*flat), code.reshape(-1)[rest] & 3, max_bits)
-        for result, values in zip((stable, status, bits), settled, strict=True):
-            result.reshape(-1)[rest] = values
-    return CertifiedResult(*map(laid.spread, (stable, status, bits)))
+    stable, status = np.asarray(code == STABLE), np.zeros(points.shape, np.int32)
+    rest = code >= OPEN
+    if rest.any():
+        stable[rest], status[rest] = _settle_points(pick_points(points, rest).columns(), code[rest] & 3)
+    return stable, status
 
 
-def _settle_points(points: Points, verdict: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decide what the filter left open or marked as special, one axis of points: by signs, then by balls."""
-    alpha, beta, delta, _ = points
-    bits = np.zeros(alpha.size, np.int32)
-    status = wall_status(*points)
+def _settle_points(columns: list[np.ndarray], verdict: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Decide what the filter left open or marked as special, by signs, then by balls."""
+    alpha, beta, delta, d = np.broadcast_arrays(*columns)
+    status = np.broadcast_to(wall_status(alpha, beta, delta, d), verdict.shape).copy()
     inside = status == Status.OK
     # P(1) = phi1 alpha < 0, or for alpha = 0 P'(1) = phi1 (delta + beta) < 0: a real pole beyond z = 1. For alpha > 0
     # the lobe lies above beta = -delta.
@@ -185,6 +148,6 @@ def _settle_points(points: Points, verdict: np.ndarray, max_bits: int) -> tuple[
     rest = np.flatnonzero(inside & (verdict == OPEN))
     status[rest] = Status.UNDECIDED
     if rest.size and available():
-        walls = zip(*(column[rest].tolist() for column in points), strict=True)
-        stable[rest], status[rest], bits[rest] = zip(*(decide(*wall, max_bits=max_bits) for wall in walls), strict=True)
-    return stable, status, bits
+        walls = zip(*(column[rest].tolist() for column in (alpha, beta, delta, d)), strict=True)
+        stable[rest], status[rest] = zip(*(decide(*wall) for wall in walls), strict=True)
+    return stable, status

@@ -157,12 +157,10 @@ _ASIDE = 1e-9
 
 
 def filter_walls(points: Points) -> np.ndarray:
-    """The code of every point, of the broadcast shape.
-
-    On every row (beta, delta, d) the stable walls are one interval, 0 < alpha < limit (docs/theory/one-lobe.md): what
-    lies below a wall proved stable is stable, what lies above one proved unstable is not. Which two walls does not
-    matter for the proof, so those next to the limit as computed are taken. What they leave is asked point by point.
-    """
+    """The code of every point, of the broadcast shape."""
+    # On every row the stable walls are one interval, 0 < alpha < limit (docs/theory/one-lobe.md): what lies below a
+    # wall proved stable is stable, what lies above one proved unstable is not. Which two walls does not matter for the
+    # proof, so those next to the limit as computed are taken. What they leave is asked point by point.
     if not has_rows(points):
         return each_code(points)
     # A wall of moderate stiffness stands for the row: what is special about it is special about all.

@@ -221,10 +221,8 @@ def _loop(roots: Array, gain: Array, turns: Array, radius: Array, xp: Any) -> tu
 
 
 def _alone(loop: _Rational, eps: float, xp: Any) -> tuple[Array, Array]:
-    """Whether one part is larger on the whole circle by its least and the other's largest possible size.
-
-    Such loops need no crossovers, whose disks are wide where many roots coincide.
-    """
+    """Whether one part is larger on the whole circle by its least and the other's largest possible size."""
+    # Such loops need no crossovers, whose disks are wide where many roots coincide.
     size = xp.abs(loop.inside)  # (r - |a|)/(r + |a|), the least of |z - a| over its largest
     doubt = _ROUNDINGS * eps * (loop.doubt + (1.0 / (size + eps)).sum((-2, -1)))
     least = xp.abs(loop.weight) * (size * size).prod(-1)
@@ -256,11 +254,7 @@ def _smallest(xp: Any, like: Array) -> float:
 
 
 def _intervals(loop: _Rational, eps: float, xp: Any) -> tuple[Array, Array, Array, Array]:
-    """Intervals of t that together hold every crossover, as sorted lower and upper ends.
-
-    They are infinite where a disk misses the real axis. Also the polynomial's leading coefficient, and whether all this
-    is proved.
-    """
+    """Sorted ends of intervals of t, some infinite, that hold every crossover; the leading coefficient; if proved."""
     # The coefficients, lowest power first: products of |u + jtv|^2 = |u|^2 + 2 t Im(u conj v) + t^2 |v|^2.
     a0, a1, a2 = xp.abs(loop.u) ** 2, 2.0 * (loop.u * xp.conj(loop.v)).imag, xp.abs(loop.v) ** 2
     size = a0.shape[-1]

@@ -95,10 +95,8 @@ def gain_cubic(alpha: Any, beta: Any, here: Any) -> tuple[Any, ...]:
 
 
 def long_verdict(alpha: Any, beta: Any, whole: Any, here: Any, solve: Solve, take_lag: TakeLag) -> Verdict:
-    """The verdict for d >= 1, alpha > 0 and beta > -delta: the curve where the gain is one.
-
-    At alpha = 0, where a pole is at z = 1, it is on the others, for ``beta > delta`` (docs/theory, S15b).
-    """
+    """The verdict for d >= 1, alpha > 0 and beta > -delta: the curve where the gain is one."""
+    # At alpha = 0, where a pole is at z = 1, it is on the others, for ``beta > delta`` (docs/theory, S15b).
     cubic = gain_cubic(alpha, beta, here)
     u, found = solve(cubic)
     y = u * 0.5
@@ -162,10 +160,8 @@ def _take_lag(u: Array, whole: Array) -> Lag:
 
 
 def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
-    """The w at which the gain is one, for margins, and whether there is one, without which w means nothing.
-
-    Of u and 2 - u = 1 + cos w the nearer one is found, which then has all its digits.
-    """
+    """The w at which the gain is one, for margins, and whether there is one, without which w means nothing."""
+    # Of u and 2 - u = 1 + cos w the nearer one is found, which then has all its digits.
     xp = namespace(alpha, here.delta)
     cubic = gain_cubic(alpha, beta, here)
     # At z = -1 the device and its delay must be the larger part; there the cubic starts in y with the opposite sign.

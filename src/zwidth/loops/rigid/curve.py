@@ -67,10 +67,7 @@ class Peak(NamedTuple):
 
 
 def creeps(delay_model: str, kind: DelayClasses) -> bool:
-    """Whether there may be a fractional power of less than one, whose lobe ends within any distance of pi.
-
-    No fit holds for it: it is solved by halving.
-    """
+    """Whether a fractional power of less than one may occur, whose lobe ends next to pi: no fit holds, it is halved."""
     return delay_model == "fractional_power" and kind.short and kind.fractional
 
 
@@ -251,10 +248,8 @@ def _short_end_of_column(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tu
 
 
 def _long_end_of_column(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> Array:
-    """Newton's method in variables in which alpha is nearly linear, from the ridge to where it vanishes.
-
-    Behind the ridge ``S = sqrt(1 - alpha/top)`` over omega; before it ``G = sqrt(top/alpha - 1)`` over 1/omega.
-    """
+    """Newton's method in variables in which alpha is nearly linear, from the ridge to where it vanishes."""
+    # Behind the ridge ``S = sqrt(1 - alpha/top)`` over omega; before it ``G = sqrt(top/alpha - 1)`` over 1/omega.
     xp = namespace(alpha, lobe.d)
     share = alpha / top.alpha
     S = xp.sqrt(xp.maximum(1.0 - share, 0.0))

@@ -30,6 +30,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_float64
 from zwidth.arrays.xp import horner, is_traced, namespace, nan_unless, within
+from zwidth.loops.normalization import quantity_status
 from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
@@ -220,12 +221,12 @@ def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
 
 def device_status(delta: Array, d: Array) -> Array:
     """The `Status` of a device and its delay."""
-    return _status(valid_device(delta, d), delta, d)
+    return quantity_status(delta=delta, d=d)
 
 
 def wall_status(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     """The `Status` of a wall on a device."""
-    return _status(valid_wall(alpha, beta, delta, d), delta, d, alpha, beta)
+    return quantity_status(alpha=alpha, beta=beta, delta=delta, d=d)
 
 
 def status_of_results(
@@ -240,12 +241,3 @@ def status_of_results(
         told = wall_status(*walls, *device)
         np.copyto(status, told, where=told != Status.OK, casting="unsafe")
     return status
-
-
-def _status(inside: Array, delta: Array, d: Array, *others: Array) -> Array:
-    xp = namespace(delta, d, *others)
-    valid = (delta >= 0) & (d >= 0)
-    for value in (delta, d, *others):
-        valid = valid & xp.isfinite(value)
-    status = xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
-    return status.astype(np.int32)

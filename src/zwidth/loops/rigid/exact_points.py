@@ -38,10 +38,7 @@ _NEWTON_STEPS = 16
 
 
 def bisect(function: Callable[..., Array], lower: Array, upper: Array, *args: Any) -> tuple[Array, Array]:
-    """A sign change of ``function(x, *args)`` in [lower, upper], and whether the bracket held one.
-
-    No derivative passes through: the result is a starting point, to be polished by something differentiable.
-    """
+    """A sign change of ``function(x, *args)`` between two places, without derivative, and whether there is one."""
     with warnings.catch_warnings():
         # jaxopt announces at import that it is no longer maintained; a user of zwidth cannot act on that.
         warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
@@ -89,10 +86,7 @@ def frequency_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyL
 
 
 def _residual(line: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Array]) -> Array:
-    """The three equations, of order one; ``unknowns`` are alpha, beta and omega over their scales.
-
-    ``args`` are the loop, the alpha or beta of the line, and the scales.
-    """
+    """The three equations, of order one, in alpha, beta and omega over ``scales``; ``number`` is that of the line."""
     loop, number, scales = args
     alpha, beta, omega = unknowns * scales
 
@@ -157,10 +151,7 @@ def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
 def point_kernel(
     delta: Array, d: Array, number: Array, line: str, delay_model: str, find_ridge: Callable[..., Any]
 ) -> tuple[Array, ...]:
-    """The fields of `zwidth.boundary_point` for one point; ``line`` is row, lower or upper.
-
-    ``find_ridge(delta, d, delay_model)`` parts the lower from the upper side of the lobe.
-    """
+    """The fields of `zwidth.boundary_point` for one point; ``find_ridge`` parts the lower from the upper side."""
     inputs, is_row = (delta, d, number), line == "row"
     given = wall_status(*((0.0 * number, number) if is_row else (number, 0.0 * number)), delta, d)
     ok = given == Status.OK

@@ -203,11 +203,8 @@ def pick_points(points: Points, mask: np.ndarray) -> Points:
 
 
 def group_by(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> Iterator[tuple[Any, tuple[np.ndarray, ...], Any]]:
-    """The values of a key that broadcasts with arguments, the arguments of each, and the place of what they give.
-
-    Where the key varies along one axis the parts keep their layout; where it varies along several, the points are
-    listed one by one.
-    """
+    """The values of a key that broadcasts with arguments, the arguments of each, and the place of what they give."""
+    # Where the key varies along one axis the parts keep their layout; along several, the points are listed one by one.
     key = fold(key)
     # One value is the common case, and of no points it is 0.
     values = np.unique(key) if key.size else np.zeros(1)

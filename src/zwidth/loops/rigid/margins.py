@@ -139,11 +139,9 @@ def _on_the_side(margin: Array, edge: float, least: float, stable: Array, xp: An
 
 
 def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple[Array, Array]:
-    """The factor on the wall at which its ray leaves the stable set, and the frequency there.
-
-    The phase of L does not depend on the factor, and the gain crossover rises with it: the first zero of the phase
-    ends the stable part, or where there is none before z = -1 the line of that, where ``|L(-1)| = 1``.
-    """
+    """The factor on the wall at which its ray leaves the stable set, and the frequency there."""
+    # The phase of L does not depend on the factor, and the gain crossover rises with it: the first zero of the phase
+    # ends the stable part, or where there is none before z = -1 the line of that, where ``|L(-1)| = 1``.
 
     def phase(log_w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:
         # Times a positive factor: of order one on either side of sqrt(em), where for light damping the phase itself
@@ -182,11 +180,9 @@ def _falling(_: Array, slope: Array, step: Array) -> Array:
 
 
 def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> Array:
-    """The periods of delay up to the first loss of stability, for a stable wall.
-
-    With the fraction f fixed the wall bears fewer than ``nu(f) = phase(n = 0)/w_c - 1/2`` whole periods, and one period
-    more moves nothing but n: the samples of nu serve every period.
-    """
+    """The periods of delay up to the first loss of stability, for a stable wall."""
+    # With the fraction f fixed the wall bears fewer than ``nu(f) = phase(n = 0)/w_c - 1/2`` whole periods, and one
+    # period more moves nothing but n: the samples of nu serve every period.
     still = tuple(frozen(value, xp) for value in wall)
     whole, fraction = split_delay(d)
     grid = _grade_fractions(still[2], xp)

@@ -62,10 +62,8 @@ _TURN, _BEFORE, _BEHIND, _DIPS, _STEPS = 48, 32, 48, 5, 8
 
 
 def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:
-    """``|1 + L|^2`` at w in (0, pi]; in the notation of `size_and_phase` ``L = -W M Z e^(-j (n + 1/2) w)/(2 h |Z|^2)``.
-
-    With h = sin(w/2), the functions of the sampled delay and of w/2 are all that is not arithmetic.
-    """
+    """``|1 + L|^2`` at w in (0, pi], by ``L = -W M Z e^(-j (n + 1/2) w)/(2 h |Z|^2)``."""
+    # With h = sin(w/2), the functions of the sampled delay and of w/2 are all that is not arithmetic.
     xp = namespace(w, alpha)
     lag = (2.0 * here.whole + 1.0) * (0.5 * w)
     sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = _factors(w, alpha, beta, here)

@@ -127,11 +127,9 @@ def _wave(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
 
 
 def peak(a: Array, beta: Array, delay: Delay, rise: Array) -> Array:
-    """u of the one peak between w = 0 and pi, where it exists; ``rise`` is E at u = 0.
-
-    The start, from ``(1 - x cot x)/x^2 = 2 sum 1/(i^2 pi^2 - x^2)``, is within a few per cent. An error of u enters
-    the height squared.
-    """
+    """u of the one peak between w = 0 and pi, where it exists; ``rise`` is E at u = 0."""
+    # The start, from ``(1 - x cot x)/x^2 = 2 sum 1/(i^2 pi^2 - x^2)``, is within a few per cent. An error of u enters
+    # the height squared.
     f, k, _ = delay
     xp = namespace(a, f)
     period = k + f

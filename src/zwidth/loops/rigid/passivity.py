@@ -62,11 +62,9 @@ class PassiveTable(NamedTuple):
 
 @lru_cache(maxsize=256)
 def table(d: float) -> PassiveTable:
-    """The `PassiveTable` of one delay.
-
-    Between its directions ``needed/(beta + (width - first) alpha)`` is analytic in ``x/(x + width alpha)``, ``x = beta
-    - first alpha``, up to beta = infinity; its Chebyshev series falls by a factor of 4 a term, for every delay.
-    """
+    """The `PassiveTable` of one delay."""
+    # Between its directions ``needed/(beta + (width - first) alpha)`` is analytic in ``x/(x + width alpha)``, ``x =
+    # beta - first alpha``, up to beta = infinity; its Chebyshev series falls by a factor of 4 a term, for every delay.
     first, last_turn = directions(np.float64(d))
     width = 0.5 * (d + 0.5)
     span = last_turn - first
@@ -203,16 +201,12 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
 
 
 def passive_stiffness_slope(d: float) -> tuple[float, float]:
-    """The stiffest passive wall and its damping, both over delta, for one delay.
-
-    The condition is homogeneous in (alpha, beta, delta), so ``alpha_passive = slope * delta`` for every delta. For
-    whole d the damping has no effect on the peak where cos((d + 1) w) = 0: ``slope = 2 tan(pi/(4 (d + 1)))``. For a
-    held delay the direction is searched: the passive set is convex, so that it has one tip.
-    """
+    """The stiffest passive wall and its damping, both over delta, for one delay: the condition is homogeneous."""
     check_scalars({"d": d})
     delay = as_number("d", d, 0.0)
     period = delay + 1.0
     if period == np.floor(period):
+        # Where cos((d + 1) w) = 0 the damping has no effect on the peak.
         half = np.pi / (4.0 * period)
         slope = 2.0 * np.tan(half)
         return float(slope), float(slope * (0.25 / (period * np.sin(half) ** 2) - 0.5))
@@ -224,6 +218,7 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
         return alpha / needed, beta / needed
 
     lower, upper = -0.49 * np.pi, 0.49 * np.pi
+    # The passive set is convex, so that it has one tip.
     with np.errstate(all="ignore"):
         for _ in range(_ROUNDS):
             angles = np.linspace(lower, upper, 17)
@@ -267,12 +262,9 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
 
 
 def _passive_area_kernel(delta: Array, d: Array) -> Array:
-    """By direction: ``alpha = cos(theta)/(d + 1/2)``, ``beta = sin(theta)``.
-
-    Below the first of `directions` the damping that a wall needs is decided at omega = 0, above the last one (d < 2/9
-    only) at omega = pi, between them at one omega that rises with theta. It passes from one to the next without a jump,
-    for d = 0 all at once, and between them it is analytic in theta.
-    """
+    """By direction: ``alpha = cos(theta)/(d + 1/2)``, ``beta = sin(theta)``."""
+    # Below the first of `directions` what a wall needs is decided at omega = 0, above the last one (d < 2/9 only) at
+    # pi, between them at one omega that rises with theta, without a jump: what is needed is analytic in theta there.
     xp = namespace(delta, d)
     ok = valid_device(delta, d)
     safe_d = xp.where(ok, d, 1.0)

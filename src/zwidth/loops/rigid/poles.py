@@ -40,10 +40,7 @@ def companion(monic: Coefficients) -> Matrices:
 
 
 def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool = False) -> Roots:
-    """All poles along a new last axis of degree.poles; NaN where the input is out of range.
-
-    With ``spring``, for walls without virtual damping, one pole is 0 and the matrix a row smaller.
-    """
+    """All poles along a new last axis; for walls without virtual damping, ``spring``, the matrix is a row smaller."""
     matrices = _matrices(alpha, beta, delta, d, degree, spring)
     xp = namespace(matrices)
     z = _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices)

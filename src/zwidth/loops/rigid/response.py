@@ -106,11 +106,7 @@ def modes(alpha: float, beta: float, delta: float, d: float) -> Modes | None:
 
 
 def settling_time(alpha: float, beta: float, delta: float, d: float, band: float = SETTLING_BAND) -> float:
-    """The last instant at which a step response is outside the band round its final value, in periods.
-
-    NaN where the wall is not stable, where poles so nearly coincide that rounding hides their modes, for d > 500, and
-    where the motion is within the band for so many periods before its modes must be that the search is given up.
-    """
+    """The last instant, in periods, at which a step response is outside the band; NaN where none is known."""
     with np.errstate(all="ignore"):
         stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
     if not stable or d > LONGEST_SETTLING:
@@ -133,10 +129,7 @@ def settling_time(alpha: float, beta: float, delta: float, d: float, band: float
 
 
 def decay_time(rate: Array) -> Array:
-    """In what time a slowest pole that decays at a rate has decayed to 2 %; infinite where it does not decay.
-
-    An estimate of the settling time by one pole, ``ln 50/rate``: the others and their residues may delay or hasten it.
-    """
+    """An estimate of the settling time by the slowest pole alone, ``ln 50/rate``; infinite where it does not decay."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(rate > 0, -math.log(SETTLING_BAND) / rate, np.where(np.isnan(rate), np.nan, np.inf))
 
@@ -189,10 +182,8 @@ class StepResponse(NamedTuple):
 
 
 def _run(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> np.ndarray:
-    """Run the loop from rest: x and v at the start of every period, and the wall's force before and behind its change.
-
-    In plain floats: a period takes a microsecond or two, less than importing a compiler for most runs.
-    """
+    """Run the loop from rest: x and v at the start of every period, the wall's force before and behind its change."""
+    # In plain floats: a period takes a microsecond or two, less than importing a compiler for most runs.
     lag = find_degree(d).whole
     f = d - lag
     # x and v after each part of a period are linear in x, v and the force: three numbers a part.

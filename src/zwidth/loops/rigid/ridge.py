@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward, push_moving, store_once
+from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward, store_once
 from zwidth.loops.rigid.device import (
     ANY,
     GAP,
@@ -66,11 +66,9 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
 def follow(
     s: Array, plant: Plant, lag: Array, delay_model: str, kind: DelayClasses
 ) -> tuple[Array, Array, Array, Array]:
-    """alpha, beta, omega and s of a ridge known to be at ``s``, as they move with plant and lag.
-
-    One step of Newton's method, through which derivatives pass: it is exact to the first order. A corner stays at 1,
-    and at a maximum alpha moves as if s stood still.
-    """
+    """alpha, beta, omega and s of a ridge known to be at ``s``, as they move with plant and lag."""
+    # One step of Newton's method, through which derivatives pass: it is exact to the first order. A corner stays at 1,
+    # and at a maximum alpha moves as if s stood still.
     xp = namespace(s, plant.a2, lag)
     undelayed, curve, corner = is_undelayed(delay_model, kind), expand_curve(plant), s >= 1.0
     inside = xp.where(corner, 0.5, s)
@@ -132,9 +130,9 @@ def _jax_ridge() -> Any:
         def moving(plant: Plant, lag: Array) -> Ridge:
             return Ridge(*follow(ridge.s, plant, lag, delay_model, kind), ridge.last)
 
-        return ridge, push_moving(moving, primals[:2], tangents[:2])[1]
+        return ridge, jax.jvp(moving, primals[:2], tangents[:2])[1]
 
-    function.defjvp(rule, symbolic_zeros=True)
+    function.defjvp(rule)
     return function
 
 
@@ -248,11 +246,7 @@ def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses =
 def stiffness_slopes(
     found: RidgeSlopes, mass: Array, period: Array, delta: Array, d: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """K_max and what it gains per unit of mass, damping, period and delay, each with the other three held fixed.
-
-    ``dK/dm = (a - delta a_delta)/T^2``, ``dK/db = a_delta/T``, ``dK/dT = (delta a_delta - d a_d - 2 a) m/T^3``,
-    ``dK/dt_d = a_d m/T^3`` with ``a = alpha_max(delta, d)``.
-    """
+    """K_max and its derivatives in mass, damping, period and delay: see `zwidth.sensitivities`."""
     alpha, rate, change = found.point.alpha, 1.0 / period, delta * found.by_delta
     # No delay needs no product, which an infinite slope would make NaN.
     delayed = namespace(alpha).where(d > 0.0, d * found.by_d, 0.0)

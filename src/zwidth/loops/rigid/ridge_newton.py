@@ -151,10 +151,8 @@ class Corner(NamedTuple):
 
 
 def corner(curve: Curve, lag: Array) -> Corner:
-    """The corner: where the lobe reaches y = 1 with alpha > 0, the ridge if it is still rising there.
-
-    The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, mu > 0.
-    """
+    """The corner: where the lobe reaches y = 1 with alpha > 0, the ridge if it is still rising there."""
+    # The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, mu > 0.
     xp = namespace(curve.sigma, lag)
     E = sum(curve.E[1:], curve.E[0])
     H = curve.H[0] + curve.H[1]
@@ -246,10 +244,8 @@ def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tupl
 
 
 def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Array]:
-    """The same with a shrinking bracket.
-
-    For small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2).
-    """
+    """The same with a shrinking bracket."""
+    # For small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2).
     xp = namespace(curve.sigma, lag)
     # d = 0 may end at pi itself, where 1/sin omega is infinite.
     rest = xp.maximum(0.3 * xp.minimum(lag, 0.05) ** (2.0 / 3.0), epsilon(lag))

@@ -158,10 +158,10 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
         return radius < 1.0, Method.COMPANION, np.where(rough, Status.UNDECIDED, Status.OK)
     if method == "certified":
         # Loaded here: it needs an extra for its last resort.
-        from zwidth.loops.rigid.certified import certified_stable
+        from zwidth.loops.rigid.certified import prove_labels
 
-        proved = certified_stable(*points)
-        return proved.stable, Method.CERTIFIED, proved.status
+        stable, status = prove_labels(points)
+        return stable, Method.CERTIFIED, status
     if points.is_dense:
         return boundary_map(points), Method.CROSSOVER, None
     stable = evaluate_columns(stable_kernel, points.columns(), classify_delays(points.d))

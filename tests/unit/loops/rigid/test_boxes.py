@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from proved import certified_stable
 
 from zwidth.arrays import balls
 from zwidth.loops.rigid import certified_filter
-from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.device import phi_functions
 
 COUNT = 400

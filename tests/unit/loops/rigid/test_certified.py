@@ -8,16 +8,16 @@ import mpmath as mp
 import numpy as np
 import pytest
 from mpmath import mpf
+from proved import certified_stable
 from waiting import LONGEST
 
 import zwidth
 from zwidth.arrays import evaluate
 from zwidth.loops.rigid import certified
-from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.certified_filter import OPEN, SPECIAL, each_code, filter_walls, has_rows
 from zwidth.loops.rigid.crossover import Verdict
 from zwidth.loops.rigid.device import wall_status
-from zwidth.loops.rigid.folding import fold_arguments
+from zwidth.loops.rigid.folding import Points, fold_arguments
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -53,8 +53,12 @@ def test_every_reference_label_is_found():
     assert (result.status == Status.OK).all()
     np.testing.assert_array_equal(result.stable, points["stable"])
     # The others are within 1e-12 of the boundary.
-    assert (result.bits == 0).mean() > 0.9
-    assert (result.bits <= 128).all()
+    walls = Points(*(points[name] for name in NAMES))
+    left = each_code(walls) == OPEN
+    assert left.mean() < 0.1
+    for alpha, beta, delta, d in zip(*(column[left].tolist() for column in walls), strict=True):
+        found = certified.verdict(alpha, beta, delta, d, certified.BITS[0])
+        assert found.stable or found.unstable
 
 
 def test_every_adversarial_label_is_found():
@@ -65,7 +69,8 @@ def test_every_adversarial_label_is_found():
     )
     np.testing.assert_array_equal(result.stable, points["label"] == STABLE)
     # Hard points they are: some must be left to balls.
-    assert 0.02 < (result.bits > 0).mean() < 0.2
+    code = filter_walls(Points(*(points[name] for name in NAMES)))
+    assert 0.02 < (code & 3 == OPEN).mean() < 0.2
 
 
 @pytest.mark.usefixtures("early_compiler")
@@ -227,8 +232,6 @@ def test_shapes_broadcast_and_may_be_empty():
         certified_stable([0.1, 0.2], [0.1, 0.2, 0.3], 0.1, 1)
     with pytest.raises(InputError, match="alpha"):
         certified_stable("soft", 0.1, 0.1, 1)
-    with pytest.raises(InputError, match="max_bits"):
-        certified_stable(0.1, 0.1, 0.1, 1, max_bits=32)
 
 
 def test_without_balls_open_points_are_undecided(monkeypatch):
@@ -245,8 +248,8 @@ def test_without_balls_open_points_are_undecided(monkeypatch):
 
 def test_too_little_precision_is_undecided(monkeypatch):
     monkeypatch.setattr(certified, "verdict", lambda *_: Verdict(False, False))
-    result = certified_stable(0.6, 0.5, 0.0, 0.0, max_bits=256)
-    assert (result.status, result.stable, result.bits) == (Status.UNDECIDED, False, 256)
+    result = certified_stable(0.6, 0.5, 0.0, 0.0)
+    assert (result.status, result.stable) == (Status.UNDECIDED, False)
 
 
 @pytest.mark.usefixtures("early_compiler")
@@ -291,9 +294,8 @@ def test_strong_damping_and_fractions_next_to_nothing(d):
 def test_the_extra_is_loaded_only_when_needed():
     code = """
 import sys
-import zwidth.loops.rigid.certified as certified
-result = certified.certified_stable(0.3, 0.5, 0.0, 0)
-assert bool(result.stable), result
+import zwidth
+assert zwidth.is_stable(0.3, 0.5, 0.0, 0, method="certified")
 assert "flint" not in sys.modules
 assert "jax" not in sys.modules
 """
@@ -304,5 +306,5 @@ def test_no_setting_is_left_changed():
     import flint
 
     before = flint.ctx.prec
-    assert certified_stable(0.6, 0.5, 0.0, 0).bits == 128
+    assert certified.decide(0.6, 0.5, 0.0, 0.0) == (True, Status.OK)
     assert flint.ctx.prec == before

@@ -6,12 +6,12 @@ Those are held to poles in mpmath by test_certified_balls.py; the device's numbe
 import numpy as np
 import pytest
 from mpmath import mp, mpf
+from proved import certified_stable
 
 import oracles
 from zwidth.arrays import balls
 from zwidth.arrays.balls import Ball
 from zwidth.loops.rigid import certified, certified_filter
-from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.certified_filter import enclose_zero, enclosed_device, exp, functions, take_lag
 from zwidth.loops.rigid.crossover import gain_cubic, long_verdict, short_verdict
 from zwidth.loops.rigid.device import classify_delays, long_curve, short_curve
