@@ -307,7 +307,8 @@ def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, l
             style.use_logarithmic(bar.ax, "y", (image.norm.vmin, image.norm.vmax), _FEW_TICKS)
         bar.ax.tick_params(labelsize=8)
     exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
-    if output.look == "diverging" or (exact and output.look != "truth"):
+    low, high = _range(panels, name) or (output.center, output.center)
+    if (low < output.center < high) if output.look == "diverging" else (exact and output.look != "truth"):
         what = "passive" if name == "passivity_margin" else "stable"
         handles.append(style.line(f"edge of what is {what}", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):

@@ -149,3 +149,14 @@ def test_times_to_settle_end_at_the_edge(folder):
         assert ax.get_xscale() == "log"
         assert len(exact_lines(ax)) == 1
     assert "edge of what is stable" in [text.get_text() for text in axes[0].figure.legends[0].get_texts()]
+
+
+def test_a_plane_without_an_edge_names_none(tmp_path):
+    beta = {"linear": {"start": -0.4, "stop": 3.0, "num": 9}}
+    for name, start, told in (("all", 0.0, True), ("unstable", 2.0, False)):
+        axes = {"alpha": {"linear": {"start": start, "stop": 3.0, "num": 9}}, "beta": beta, "delta": 0.5, "d": 1}
+        assert run_sweeps(config_of(study(name, axes=axes, outputs=("decay_rate",))), tmp_path / name).ok
+        data, edges = opened(tmp_path / name, name)
+        (ax,) = draw_plane(data, "decay_rate", edges=edges)
+        legend = ax.figure.legends[0].get_texts() if ax.figure.legends else []
+        assert ("edge of what is stable" in [text.get_text() for text in legend]) == told
