@@ -189,15 +189,16 @@ class BestDamping(NamedTuple):
 
 
 def find_lowest(
-    cost: Callable[[np.ndarray], np.ndarray], low: float, high: float, samples: int = _SAMPLES, steps: int = _STEPS
+    cost: Callable[[np.ndarray], np.ndarray], low: float, high: float, samples: int = _SAMPLES, close: float = 0.0
 ) -> float:
     """Where a function with kinks and several dips is lowest: samples, then golden section around the lowest dips."""
-    grid = np.linspace(low, high, samples)
+    # None at all is the best damping of a passive wall without delay.
+    grid = np.union1d(np.linspace(low, high, samples), np.clip(0.0, low, high))
     # On the boundary itself nothing is gained.
     values = np.pad(cost(grid[1:-1]), 1, constant_values=math.inf)
     dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
     dips = dips[np.argsort(values[dips])][:_DIPS]
-    middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], steps)
+    middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], _STEPS, close)
     return float(middle[np.argmin(value)])
 
 
