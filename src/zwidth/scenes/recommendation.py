@@ -276,13 +276,10 @@ def _search(scene: SceneOptima, surplus: Surplus, most: float) -> tuple[float, f
         def cost(beta: Any) -> np.ndarray:
             return -np.min(list(surplus(stiffness, beta * unit).values()), axis=0)
 
-        columns = soft_dampings(scene, stiffness)
-        best = [find_lowest(cost, low, high, _SAMPLES, _NEAR) for low, high in columns]
-        values = [float(cost(beta)) for beta in best]
-        if not values:
-            return np.float64(-1.0)
-        dampings[stiffness] = best[int(np.argmin(values))] * unit
-        return np.float64(-min(values))
+        found = (find_lowest(cost, *ends, _SAMPLES, _NEAR) for ends in soft_dampings(scene, stiffness))
+        lowest, beta = min(found, default=(1.0, math.nan))
+        dampings[stiffness] = beta * unit
+        return np.float64(-lowest)
 
     high, above = np.float64(math.log(most)), spare(math.log(most))
     if above >= 0:

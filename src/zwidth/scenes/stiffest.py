@@ -190,8 +190,8 @@ class BestDamping(NamedTuple):
 
 def find_lowest(
     cost: Callable[[np.ndarray], np.ndarray], low: float, high: float, samples: int = _SAMPLES, close: float = 0.0
-) -> float:
-    """Where a function with kinks and several dips is lowest: samples, then golden section around the lowest dips."""
+) -> tuple[float, float]:
+    """How low a function with kinks and several dips is, and where: samples, then golden section in the lowest dips."""
     # None at all is the best damping of a passive wall without delay.
     grid = np.union1d(np.linspace(low, high, samples), np.clip(0.0, low, high))
     # On the boundary itself nothing is gained.
@@ -199,7 +199,7 @@ def find_lowest(
     dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
     dips = dips[np.argsort(values[dips])][:_DIPS]
     middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], _STEPS, close)
-    return float(middle[np.argmin(value)])
+    return min(zip(value.tolist(), middle.tolist(), strict=True))
 
 
 class SceneOptima(SceneAnswers):
@@ -396,5 +396,5 @@ class SceneOptima(SceneAnswers):
         columns = soft_dampings(self, stiffness, negative_damping)
         if not columns:
             return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
-        best = min((find_lowest(cost, low, high) for low, high in columns), key=lambda beta: float(cost(beta)))
+        _, best = min(find_lowest(cost, *ends) for ends in columns)
         return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)
