@@ -65,9 +65,12 @@ _GOLDEN = 0.3819660112501051
 
 
 def narrow_dips(
-    cost: Function, left: Array, middle: Array, right: Array, value: Array, steps: int
+    cost: Function, left: Array, middle: Array, right: Array, value: Array, steps: int, close: float = 0.0
 ) -> tuple[Array, Array]:
-    """Lowest places of a function between two others, and its values there, by golden section."""
+    """Lowest places of a function between two others, and its values there, by golden section.
+
+    In NumPy no longer than until each is known to the share ``close`` of itself.
+    """
     xp = namespace(left, value)
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -81,7 +84,10 @@ def narrow_dips(
         left, right = xp.where(is_right, left, end), xp.where(is_right, end, right)
         return left, xp.where(better, trial, middle), right, xp.where(better, reached, value)
 
-    _, middle, _, value = repeat(steps, step, (left, middle, right, value), xp)
+    def arrived(_: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
+        return bool(np.all(new[2] - new[0] <= close * np.abs(new[1])))
+
+    _, middle, _, value = repeat(steps, step, (left, middle, right, value), xp, arrived)
     return middle, value
 
 

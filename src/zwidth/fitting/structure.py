@@ -95,7 +95,8 @@ class Recordings:
         low[self.parts], high[self.parts] = np.reshape(ends, (-1, 2)).T
         # A little beyond 0 the model goes on, so that an optimum at 0 is no corner.
         count = max(log.force.size for log in self.logs)
-        low[1:3], high[1:3] = (-5.0 / count, -1.0), (50.0, self.longest)
+        # No faster than the fastest lag, whose pole it would meet there.
+        low[1:3], high[1:3] = (-5.0 / count, -1.0), (0.99 / LAGS[0], self.longest)
         return low, high
 
     def normalize(self, theta: np.ndarray, period: Any) -> DimensionlessDevice:

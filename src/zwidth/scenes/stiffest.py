@@ -187,16 +187,17 @@ class BestDamping(NamedTuple):
 
 
 def find_lowest(
-    cost: Callable[[np.ndarray], np.ndarray], low: float, high: float, samples: int = _SAMPLES, steps: int = _STEPS
-) -> float:
-    """Where a function with kinks and several dips is lowest: samples, then golden section around the lowest dips."""
-    grid = np.linspace(low, high, samples)
+    cost: Callable[[np.ndarray], np.ndarray], low: float, high: float, samples: int = _SAMPLES, close: float = 0.0
+) -> tuple[float, float]:
+    """How low a function with kinks and several dips is, and where: samples, then golden section in the lowest dips."""
+    # None at all is the best damping of a passive wall without delay.
+    grid = np.union1d(np.linspace(low, high, samples), np.clip(0.0, low, high))
     # On the boundary itself nothing is gained.
     values = np.pad(cost(grid[1:-1]), 1, constant_values=math.inf)
     dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
     dips = dips[np.argsort(values[dips])][:_DIPS]
-    middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], steps)
-    return float(middle[np.argmin(value)])
+    middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], _STEPS, close)
+    return min(zip(value.tolist(), middle.tolist(), strict=True))
 
 
 class SceneOptima(SceneAnswers):
@@ -393,5 +394,5 @@ class SceneOptima(SceneAnswers):
         columns = soft_dampings(self, stiffness, negative_damping)
         if not columns:
             return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
-        best = min((find_lowest(cost, low, high) for low, high in columns), key=lambda beta: float(cost(beta)))
+        _, best = min(find_lowest(cost, *ends) for ends in columns)
         return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)

@@ -57,6 +57,14 @@ def test_derivatives_are_those_of_differences(case, friction, order):
         np.testing.assert_allclose(slopes[:, k], found, atol=3e-6 * np.abs(found).max())
 
 
+def test_a_motion_is_one_where_damping_and_lag_end_their_ranges():
+    """As of a device that a spring holds: the pole of the lag and that of the damping would be one."""
+    model, theta = lay_out(*CASES["lag"])
+    low, high = model.bounds()
+    theta[1], theta[3] = high[1], low[3]
+    assert np.isfinite(model.follow(theta).position).all()
+
+
 def test_the_numbers_of_the_scene_move_with_theta_as_their_derivatives_say():
     model, theta = lay_out(*CASES["lag and modes"], order=2)
     velocity = zwidth.BackwardDifference()

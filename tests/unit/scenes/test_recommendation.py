@@ -84,6 +84,14 @@ def test_a_share_alone_has_the_damping_of_the_stiffest_wall():
     )
 
 
+@pytest.mark.parametrize("delay", [0.0, 1e-3, 2.5e-3])
+def test_a_passive_wall_is_as_stiff_as_the_device_is_damped(delay):
+    """The condition is homogeneous in K, B and b (docs/theory/passivity.md), however little of a column is passive."""
+    scene = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, delay))
+    usual, weak = (scene.replace(damping=damping).recommend(passive=True) for damping in (10.0, 1e-3))
+    assert weak.stiffness == pytest.approx(1e-4 * usual.stiffness, rel=1e-3)
+
+
 def test_the_wall_of_the_scene_does_not_matter():
     own = RIGID.replace(stiffness=1e3, virtual_damping=3.0).recommend(phase_margin=25)
     assert own.stiffness == RIGID.recommend(phase_margin=25).stiffness

@@ -196,7 +196,8 @@ class MeasuredLoop(LinearLoop):
     def margins(self, alpha: np.ndarray, beta: np.ndarray, *, with_delay: bool = True) -> Margins:
         """Margins on the measured curve in periods and radians a period; NaN for walls that are not surely decided.
 
-        The delay margin is that of a pure delay, phase over frequency.
+        The delay margin is that of a pure delay, phase over frequency; where no line shows what more gain brings to the
+        circle, the gain margin is the factor below which it is not beyond them.
         """
         decided = self.decide(alpha, beta, "auto", (alpha, beta))
         out = np.full((len(Margins._fields), *np.shape(alpha)), np.nan)
@@ -214,6 +215,10 @@ class MeasuredLoop(LinearLoop):
             k, share = _zeros(L.imag)
             at, real = c.w[k] + share * np.diff(c.w)[k], L.real[k] + share * np.diff(L.real)[k]
             places, sizes = at[real < 0], -real[real < 0]
+            if stable and not np.any(sizes < 1.0):
+                # What more gain brings to the circle is beyond the last line, and not before L may be so large there.
+                most = c.strongest * (abs(alpha) + abs(beta) * c.fast)
+                places, sizes = np.append(places, c.w[-1]), np.append(sizes, most)
             k, share = _zeros(np.log(np.abs(L)))
             at = c.w[k] + share * np.diff(c.w)[k]
             turns: Any = np.angle(-L[k]) + share * np.angle(L[k + 1] / L[k])

@@ -89,8 +89,10 @@ def name_islands(scene: Scene) -> dict[str, list[Any]]:
 def open_loop(scene: Scene, verdict: Assessment) -> dict[str, dict[str, Any]]:
     """The open loop L up to half the sampling rate as Nyquist curve and Bode plot, and where margins are taken."""
     cross, turned = verdict.gain_crossover, verdict.phase_crossover
-    frequency = np.geomspace(1e-4, 1.0, 600) * 0.5 / scene.timing.period
-    curve, (place,) = np.split(scene.frequency_response(frequency=np.append(frequency, cross)), [-1])
+    marked = np.array([cross, turned])
+    # Next to a resonance L turns far from a point to the next.
+    frequency = np.union1d(np.geomspace(1e-4, 1.0, 600) * 0.5 / scene.timing.period, marked[marked > 0])
+    curve, at = scene.frequency_response(frequency=frequency), frequency == cross
     # Between two points a long delay turns by more than half a turn: it is known, and left out meanwhile.
     delayed = 2.0 * np.pi * frequency * scene.timing.delay
     phase = np.unwrap(np.angle(curve * np.exp(1j * delayed))) - delayed
@@ -98,11 +100,11 @@ def open_loop(scene: Scene, verdict: Assessment) -> dict[str, dict[str, Any]]:
     phase = np.degrees(phase - 2.0 * np.pi * np.floor((phase[0] / np.pi + 1.5) / 2.0))
     with np.errstate(divide="ignore"):
         gain = 20.0 * np.log10(np.abs(curve))
-    at_cross = {"hertz": [cross], "gain": [0.0], "phase": [float(np.interp(cross, frequency, phase))]}
+    drawn = {"x": np.real(curve), "y": np.imag(curve), "hertz": frequency, "gain": gain, "phase": phase}
     return {
         "nyquist": {"x": np.real(curve), "y": np.imag(curve)},
         "bode": {"x": frequency, "gain": gain, "phase": phase},
-        "crossover": {"x": [place.real], "y": [place.imag], **at_cross},
+        "crossover": {name: column[at] for name, column in drawn.items()},
         "turned": {"hertz": [turned], "gain": [-20.0 * log10(verdict.gain_margin) if turned > 0 else nan]},
     }
 

@@ -169,6 +169,16 @@ def test_margins_are_those_of_the_model():
     assert np.isnan(measured(scene, DENSE, 1e-4).margins(*walls).gain_margin).all()
 
 
+@pytest.mark.parametrize("last", [95.0, 100.0, 110.0])
+def test_a_gain_margin_beyond_the_last_line_is_not_infinite(last):
+    """L turns negative at 115 Hz: of lines below nothing but a bound of the response beyond them is known."""
+    scene, wall = SCENES["rigid"], (500.0, 5.0)
+    known, found = scene.margins(*wall), measured(scene, np.linspace(1.0, last, 600)).margins(*wall)
+    assert 1.0 < found.gain_margin < known.gain_margin
+    assert found.gain_crossover == pytest.approx(known.gain_crossover, rel=1e-4)
+    assert found.phase_crossover == pytest.approx(last)
+
+
 QUESTIONS = {
     "poles": lambda scene: scene.poles(1e3, 1.0),
     "radius": lambda scene: scene.spectral_radius(1e3, 1.0),

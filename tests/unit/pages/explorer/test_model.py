@@ -155,11 +155,22 @@ def test_the_bode_plot_is_that_of_the_loop(delay):
     np.testing.assert_allclose(shown["phase"], np.degrees(np.unwrap(np.angle(prompt))) - late, atol=1e-5)
 
 
-def test_the_margins_stand_on_the_bode_plot():
-    scene = Controls().scene
+RINGING = zwidth.Device(0.1, 1.0, modes=[zwidth.Mode(frequency=40, damping_ratio=0.005, mass=-2.0)])
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Controls().scene,
+        # Its crossover is on the flank of a resonance, where the phase turns by degrees between points of the plot.
+        zwidth.Scene(RINGING, zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(5e3, 4.0)),
+    ],
+    ids=["rigid", "ringing"],
+)
+def test_the_margins_stand_on_the_bode_plot(scene):
     verdict = zwidth.assess(scene)
     shown = model.open_loop(scene, verdict)
-    assert shown["crossover"]["phase"][0] + 180 == pytest.approx(verdict.phase_margin, abs=0.01)
+    assert shown["crossover"]["phase"][0] + 180 == pytest.approx(verdict.phase_margin, abs=1e-6)
     loop = scene.frequency_response(frequency=shown["turned"]["hertz"])
     assert shown["turned"]["gain"] == pytest.approx(20 * np.log10(np.abs(loop)), abs=1e-6)
 
