@@ -338,8 +338,8 @@ class SceneAdvice(SceneOptima):
             >>> import zwidth
             >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
             >>> found = scene.recommend(phase_margin=30)
-            >>> print(f"{found.stiffness:.0f} N/m and {found.virtual_damping:.1f} N s/m")
-            8009 N/m and 33.4 N s/m
+            >>> print(f"{found.stiffness:.0f} N/m and {found.virtual_damping:.0f} N s/m")
+            8009 N/m and 33 N s/m
         """
         check_held(self)
         wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive)
