@@ -292,14 +292,14 @@ def _range(panels: Sequence[Panel], name: str, least: float = -np.inf) -> tuple[
 
 def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, label: str, *, outside: bool) -> None:
     handles: list[Any] = []
-    output = OUTPUTS[name]
+    output, ends = OUTPUTS[name], _range(panels, name)
     if output.look == "truth":
         for each, dash in (("stable", "-"), ("passive", "-.")):
             if each == name or each in panels[0].variables:
                 edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.8, "linestyle": dash}
                 handles.append(Patch(facecolor=SHADES[each], label=each, **edge))
     else:
-        low, high = _range(panels, name) or (image.norm.vmin, image.norm.vmax)
+        low, high = ends or (image.norm.vmin, image.norm.vmax)
         beyond = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
         extend = beyond[low < image.norm.vmin, high > image.norm.vmax]
         bar = axes[0].figure.colorbar(image, ax=list(axes), label=label, extend=extend)
@@ -307,8 +307,8 @@ def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, l
             style.use_logarithmic(bar.ax, "y", (image.norm.vmin, image.norm.vmax), _FEW_TICKS)
         bar.ax.tick_params(labelsize=8)
     exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
-    low, high = _range(panels, name) or (output.center, output.center)
-    if (low < output.center < high) if output.look == "diverging" else (exact and output.look != "truth"):
+    crossed = ends is not None and ends[0] < output.center < ends[1]
+    if crossed if output.look == "diverging" else (exact and output.look != "truth"):
         what = "passive" if name == "passivity_margin" else "stable"
         handles.append(style.line(f"edge of what is {what}", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):

@@ -170,8 +170,8 @@ def certify_again(found: OutermostPoles, tolerance: float, loop: Loop, fractiona
     """What was found, and the start that is farther from it."""
     slow, pair = slow_pole(loop), first_pair(loop, fractional)
     farther = np.abs(found.im - slow[1]) > np.abs(found.im - pair[1])
-    starts = [np.stack([leaf, np.where(farther, *both)]) for leaf, *both in zip(found[:2], slow, pair, strict=True)]
-    return _certify_largest((starts[0], starts[1]), _AGAIN, tolerance, loop, fractional)
+    re, im = (np.stack([leaf, np.where(farther, *both)]) for leaf, *both in zip(found[:2], slow, pair, strict=True))
+    return _certify_largest((re, im), _AGAIN, tolerance, loop, fractional)
 
 
 def bound_radius(found: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
