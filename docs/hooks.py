@@ -13,7 +13,8 @@ _NAME = re.compile(r'(?<!">)<code>(zwidth\.[\w.]+)</code>')
 
 
 # Formulas in the theory's pages stand as indented lines, as they are typed; columns are aligned by runs of spaces.
-_BLOCK = re.compile(r'<div class="highlight"><pre><span></span><code>(.*?)</code></pre></div>', re.DOTALL)
+# Code in such a block would be colored, by elements of its own.
+_BLOCK = re.compile(r'<div class="highlight"><pre><span></span><code>([^<]*)</code></pre></div>')
 _COLUMN = re.compile(r"\S+(?: {1,2}\S+)*")
 _TOKEN = re.compile(
     r"(?P<word>[a-z]+'s\b)|(?P<name>[A-Za-z]+\d*(?:_(?:\w+|\((?=[^()]*\))[^()]*\)))?'{0,2})|(?P<number>\d+(?:\.\d+)?)|(?P<space>\s+)"
@@ -21,6 +22,8 @@ _TOKEN = re.compile(
 )
 # Brackets of one size: taller ones would part the lines.
 _FLAT = ' stretchy="false"'
+# Signs that stand as near to their neighbors as they are typed.
+_CLOSE = f'{_FLAT} lspace="0" rspace="0"'
 _GREEK = {
     **{"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "zeta": "ζ", "eta": "η", "theta": "θ", "kappa": "κ"},
     **{"xi": "ξ", "pi": "π", "rho": "ρ", "tau": "τ", "phi": "φ", "psi": "ψ", "omega": "ω", "lambda": "λ", "mu": "μ"},
@@ -89,8 +92,9 @@ def _atom(tokens: list[tuple[str, str]], at: int, bare: bool = False) -> tuple[s
     """One name, number, sign or group from here, and the place behind it; a ``bare`` group is without parentheses."""
     kind, text = tokens[at]
     if kind == "space":
-        # Wide gaps part formulas on one line.
-        return ('<mspace width="2em"/>' if len(text) > 1 else '<mspace width="0.2em"/>'), at + 1
+        # Wide gaps part formulas on one line; others keep signs one below the other as they are typed.
+        parts = len(text) > 1 and tokens[at - 1][1] == ","
+        return f'<mspace width="{"2em" if parts else "0.2em"}"/>', at + 1
     if kind == "number":
         return f"<mn>{text}</mn>", at + 1
     if text == "sqrt" and tokens[at + 1 : at + 2] == [("sign", "(")]:
@@ -107,7 +111,7 @@ def _atom(tokens: list[tuple[str, str]], at: int, bare: bool = False) -> tuple[s
         close = {"(": ")", "{": "}", "[": "]"}[text]
         inside, behind = _row(tokens, at + 1, close)
         return (inside if bare else f"<mrow><mo{_FLAT}>{text}</mo>{inside}<mo{_FLAT}>{close}</mo></mrow>"), behind
-    return f"<mo{_FLAT if text == '|' else ''}>{_SIGNS.get(text, text)}</mo>", at + 1
+    return f"<mo{_CLOSE if text in '|/' else ''}>{_SIGNS.get(text, text)}</mo>", at + 1
 
 
 def _name(text: str) -> str:
@@ -126,7 +130,8 @@ def _name(text: str) -> str:
         return f"<mtext>{text}</mtext>"
     if index:
         low = "".join(_GREEK.get(part, part) for part in re.split(r"([A-Za-z]+)", index))
-        shown = f"<msub>{shown}<mn>{low}</mn></msub>"
+        kind = "mi" if len(low) == 1 and low.isalpha() else "mn"
+        shown = f"<msub>{shown}<{kind}>{low}</{kind}></msub>"
     return f"<msup>{shown}<mo>{'′' * len(primes)}</mo></msup>" if primes else shown
 
 

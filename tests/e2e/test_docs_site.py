@@ -51,6 +51,9 @@ TOO_WIDE = """async () => {
     return document.documentElement.scrollWidth > innerWidth;
 }"""
 
+CUT_OFF = """() => [...document.querySelectorAll(".formulas")]
+    .filter((each) => each.scrollWidth > each.clientWidth + 1).map((each) => each.textContent)"""
+
 
 def build(folder, site):
     """Build the project in a folder as scripts/docs does."""
@@ -151,6 +154,10 @@ def test_names_are_links_and_examples_are_code(site):
     scene = set(re.findall(r'id="zwidth\.Scene\.(\w+)"', pages["scene.html"]))
     assert scene >= {"is_stable", "max_stiffness"}
     assert not scene & {"check_parts", "loop", "whole_delay"}
+    for path in sorted((DOCS / "theory").glob("*.md")):
+        shown = (site / "theory" / f"{path.stem}.html").read_text(encoding="utf-8")
+        prompts = re.findall("^>>>", path.read_text(encoding="utf-8"), re.MULTILINE)
+        assert (path.stem, shown.count(">&gt;&gt;&gt;<")) == (path.stem, len(prompts))
     # What Markdown makes of ">>>" that nobody has told it is an example.
     assert [name for name, text in pages.items() if "<blockquote" in text] == []
     assert pages["stability.html"].count('class="gp"') > 10
@@ -159,7 +166,7 @@ def test_names_are_links_and_examples_are_code(site):
 def test_every_page_is_readable_and_asks_nobody_else(site, address, read):
     pages = sorted(path.relative_to(site).as_posix() for path in site.rglob("*.html"))
     assert len(pages) > 30
-    too_wide = []
+    too_wide, cut_off = [], []
     with read(WIDE) as page:
         for name in pages:
             page.set_viewport_size({"width": WIDE, "height": 900})
@@ -169,7 +176,11 @@ def test_every_page_is_readable_and_asks_nobody_else(site, address, read):
                 page.set_viewport_size({"width": width, "height": 900})
                 if page.evaluate(TOO_WIDE):
                     too_wide.append((name, width))
+                # On a telephone long formulas are moved to and fro.
+                if width == WIDE:
+                    cut_off += page.evaluate(CUT_OFF)
     assert too_wide == []
+    assert cut_off == []
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
