@@ -160,7 +160,9 @@ class Docstrings(griffe.Extension):
     """Says in Markdown what the docstrings say in plain text."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Name the section "Example:" as mkdocstrings does, and keep "> 0" at the start of a line from quoting it."""
+        """Name sections as mkdocstrings does and types once, and keep "> 0" at the start of a line from quoting it."""
         if obj.docstring:
             text = re.sub(r"^( *)Example:$", r"\1Examples:", obj.docstring.value, flags=re.MULTILINE)
+            # The signature says which type is returned.
+            text = re.sub(r"^( *Returns:\n +)[A-Z]\w+: ", r"\1", text, flags=re.MULTILINE)
             obj.docstring.value = re.sub(r"^( *)>(?!>)", r"\1\\>", text, flags=re.MULTILINE)

@@ -161,6 +161,10 @@ def test_names_are_links_and_examples_are_code(site):
     # What Markdown makes of ">>>" that nobody has told it is an example.
     assert [name for name, text in pages.items() if "<blockquote" in text] == []
     assert pages["stability.html"].count('class="gp"') > 10
+    # What a call returns is one thing, however many lines say what.
+    returned = [part for text in pages.values() for part in re.findall(r"(?s)Returns:.*?<ul>(.*?)</ul>", text)]
+    assert len(returned) > 50
+    assert {part.count("<li") for part in returned} == {1}
 
 
 def test_every_page_is_readable_and_asks_nobody_else(site, address, read):
