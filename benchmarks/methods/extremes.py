@@ -105,7 +105,7 @@ def report(delays: tuple[float, ...] = DELAYS) -> str:
         "# Which method holds where",
         "",
         'Labels of each method at the extremes, compared with `method="certified"`, which proves its labels. Devices',
-        f"of delta = {', '.join(f'{delta:g}' for delta in DELTAS)}. A cell has the number of wrong labels and, where",
+        f"of delta = {', '.join(map(_shortest, DELTAS))}. A cell has the number of wrong labels and, where",
         "the distance from the boundary is known, the farthest of them (relative, in alpha). Empty: not offered at",
         "such delays.",
         "",
@@ -113,22 +113,27 @@ def report(delays: tuple[float, ...] = DELAYS) -> str:
         "",
     ]
     for name in dict.fromkeys(outcome.group for outcome in found):
-        lines += [f"## {name[0].upper()}{name[1:]}", "", f"| method | {' | '.join(_delay(d) for d in delays)} |"]
-        lines += ["|---|" + "--:|" * len(delays)]
-        for method in METHODS:
-            cells = []
-            for d in delays:
-                mine = [o for o in found if (o.method, o.group, o.d) == (method, name, d)]
-                cells.append(_cell(mine[0]) if mine else "")
-            lines.append(f"| {method} | {' | '.join(cells)} |")
+        lines += [
+            f"## {name[0].upper()}{name[1:]}",
+            "",
+            f"| d | {' | '.join(METHODS)} |",
+            "|--:|" + "--:|" * len(METHODS),
+        ]
+        for d in delays:
+            mine = {outcome.method: _cell(outcome) for outcome in found if (outcome.group, outcome.d) == (name, d)}
+            lines.append(f"| {_delay(d)} | {' | '.join(mine.get(method, '') for method in METHODS)} |")
         lines.append("")
     return "\n".join(lines)
 
 
 def _delay(d: float) -> str:
     if d == np.nextafter(1.0, 0.0):
-        return "d = 1 - ulp"
-    return f"d = {d:g}"
+        return "1 - ulp"
+    return _shortest(d)
+
+
+def _shortest(number: float) -> str:
+    return min(f"{number:g}", repr(number), key=len)
 
 
 def _cell(outcome: Finding) -> str:

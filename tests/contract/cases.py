@@ -75,9 +75,11 @@ SI = {"mass": [0.1, 0.2, 1.0], "period": [1e-3, 1e-3, 2e-3]}
 SI_DEVICE = {**SI, "damping": [0.0, 10.0, 5.0], "delay": [0.0, 1e-3, 3e-3]}
 BAD_SI = {"mass": -1.0, "period": 0.0, "damping": -1.0, "delay": np.nan}
 BEYOND_SI = {"mass": 1e31, "period": 1e-31, "damping": 1e31, "delay": 1e31}
-WALLS = "alpha, beta 0 or 1e-60 to 1e60 in magnitude; delta 0 to 1e12; d 0 to 1e5"
-DEVICES = "delta 0 to 1e12; d 0 to 1e5"
-QUANTITIES = "SI quantities 0 or 1e-30 to 1e30; mass, period above 0"
+DOMAINS = {
+    (WALLS := "walls"): "a device, and alpha and beta 0 or 1e-60 to 1e60 in magnitude",
+    (DEVICES := "devices"): "delta 0 to 1e12, d 0 to 1e5",
+    (QUANTITIES := "quantities"): "in SI units, 0 or 1e-30 to 1e30, mass and period above 0",
+}
 
 
 def of_walls(call, **options):
@@ -112,11 +114,11 @@ CASES = [
         {**SI, **WALL},
         {"mass": -1.0, "delta": np.nan},
         {"mass": 1e31, "alpha": 1e61, "delta": 1e13},
-        domain=f"{WALLS}; {QUANTITIES}",
+        domain=f"{WALLS}, {QUANTITIES}",
         strict=True,
     ),
     of_walls(zwidth.char_poly, concrete=("d",), extra_axes=1),
-    of_walls(zwidth.poles, concrete=("d",), extra_axes=1, derivatives=1, domain=f"{WALLS}; at most 4,000 poles"),
+    of_walls(zwidth.poles, concrete=("d",), extra_axes=1, derivatives=1, domain=f"{WALLS}, at most 4,000 poles"),
     of_walls(zwidth.spectral_radius, single=1e-5),
     of_walls(zwidth.decay_rate),
     of_walls(zwidth.is_stable, derivatives=None, value="False where bad"),

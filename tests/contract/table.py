@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contract.cases import CASES, OTHERS, Case
+from contract.cases import CASES, DOMAINS, OTHERS, Case
 
 _HEAD = """# What every public function promises
 
@@ -21,29 +21,36 @@ tests of `tests/contract/test_contract.py`:
 - **Inside `jit` without x64.** float32 values to 2e-3 at moderate points, the same statuses; what lies beyond the
   domain is NaN there too.
 - **Derivatives** are finite at good points and NaN at bad ones. The first order is tested here, the second in the tests
-  of each function.
+  of each function, and so is the first of {elsewhere}.
 - **On a graphics processor.** Inside `jit` a function runs where JAX does, with these values and statuses: these tests
   pass on one, too. Called directly few points go to NumPy, and many to JAX in pieces made for a processor's caches: a
   million walls belong into your own `jit` there.
 
-| function | domain | bad points | bad number | status | in jit | derivatives | derivatives tested in |
-|---|---|---|---|---|---|---|---|
+Domains, of arguments that are finite:
+
+| domain | arguments |
+|---|---|
+{domains}
+| function | domain | bad points | bad number | status | in jit | derivatives |
+|---|---|---|---|---|---|---|
 """
 
 
 def page() -> str:
     """The whole page."""
     rows = "".join(_row(case) for case in CASES)
+    elsewhere = ", ".join(f"`{case.name}`" for case in CASES if case.gradient_in)
+    domains = "".join(f"| {name} | {said} |\n" for name, said in DOMAINS.items())
+    head = _HEAD.format(elsewhere=elsewhere, domains=domains)
     others = "".join(f"| `{name}` | {why} |\n" for name, why in sorted(OTHERS.items()))
     rest = "Functions that take no arrays point by point, or that a number has compiled:"
-    return f"{_HEAD}{rows}\n{rest}\n\n| function | takes, and where its promises are tested |\n|---|---|\n{others}"
+    return f"{head}{rows}\n{rest}\n\n| function | takes, and where its promises are tested |\n|---|---|\n{others}"
 
 
 def _row(case: Case) -> str:
     name = f"`{case.function}`{case.name.removeprefix(case.function)}"
     first = {key: values[0] for key, values in case.good.items()}
     status = "yes" if "status" in case.leaves(case.call(**first)) else "no"
-    where = case.gradient_in or "tests/contract"
     order = {None: "none", 1: "first", 2: "first, second"}[case.derivatives]
     concrete = f"yes, {', '.join(case.concrete)} concrete" if case.concrete else "yes"
     cells = (
@@ -54,6 +61,5 @@ def _row(case: Case) -> str:
         status,
         "refused" if case.refuses_tracing else concrete,
         order,
-        f"`{where}`" if case.derivatives else "",
     )
     return f"| {' | '.join(cells)} |\n"
