@@ -8,6 +8,7 @@ that, and lays nothing out. A scene picks its loop once (`zwidth.Scene.loop`); a
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, get_args
@@ -205,9 +206,9 @@ class LinearLoop:
         """``L = (alpha + beta F) G`` at angles."""
         return open_loop_response(self.roots, alpha, beta, circle(w)).value
 
-    def margins(self, alpha: np.ndarray, beta: np.ndarray, *, with_delay: bool = True) -> Margins:
-        """All margins, in periods and radians a period; that of the delay, which takes longest, may be left out."""
-        return linear_margins(self.chain, self.boundary, alpha, beta, with_delay)
+    def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
+        """Margins, in periods and radians a period; those that are not wanted may be NaN."""
+        return linear_margins(self.chain, self.boundary, alpha, beta, wanted)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """The device's own damping in excess of what passive walls need."""
@@ -294,13 +295,13 @@ class RigidLoop(LinearLoop):
         found = differentiate_rigid(make_plain(self.scene), negative)
         return super().sensitivities(negative) if found is None else found
 
-    def margins(self, alpha: np.ndarray, beta: np.ndarray, *, with_delay: bool = True) -> Margins:
+    def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
         device = self.scene.delta, self.scene.d
-        if with_delay:
+        if "delay_margin" in wanted:
             return margins(alpha, beta, *device)
         walls = np.broadcast_arrays(alpha, beta, *map(float, device))
         with np.errstate(all="ignore"):
-            return margins_kernel(*walls, with_delay=False, with_modulus=False)
+            return margins_kernel(*walls, with_delay=False, with_modulus="modulus_margin" in wanted)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         return passivity_margin(alpha, beta, self.scene.own_delta, self.scene.d)

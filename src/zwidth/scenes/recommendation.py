@@ -244,18 +244,18 @@ Surplus = Callable[[float, Any], dict[str, np.ndarray]]
 def _measure(scene: SceneOptima, wanted: Wanted) -> Surplus | None:
     """By how much walls have more than is wanted, by its name, negative for too little; None where nothing is."""
     own = float(scene.device.damping)
-    if not (wanted.gain_margin or wanted.phase_margin or wanted.passive):
+    asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
+    if not (asked or wanted.passive):
         return None
 
     def surplus(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
         alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
         stable, found = scene.loop.labels(alpha, beta), {}
-        if wanted.gain_margin or wanted.phase_margin:
-            margins = scene.loop.margins(alpha, beta, with_delay=False)
-            with np.errstate(all="ignore"):
-                gain = np.abs(np.log(margins.gain_margin))
+        if asked:
+            margins = scene.loop.margins(alpha, beta, asked)
             if wanted.gain_margin:
-                found["gain_margin"] = gain / math.log(wanted.gain_margin) - 1.0
+                with np.errstate(all="ignore"):
+                    found["gain_margin"] = np.abs(np.log(margins.gain_margin)) / math.log(wanted.gain_margin) - 1.0
             if wanted.phase_margin:
                 found["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
         if wanted.passive:

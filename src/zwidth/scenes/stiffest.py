@@ -174,6 +174,8 @@ Goal = Literal["fast", "robust"]
 
 # Samples across a column, how many of their dips are refined, and by how many steps of golden section.
 _SAMPLES, _DIPS, _STEPS = 66, 3, 52
+# The share of a first sample that tells whether a little damping is better than none.
+_HARDLY_ANY = 1e-9
 
 
 @shown()
@@ -192,12 +194,18 @@ def find_lowest(
     """How low a function with kinks and several dips is, and where: samples, then golden section in the lowest dips."""
     # None at all is the best damping of a passive wall without delay.
     grid = np.union1d(np.linspace(low, high, samples), np.clip(0.0, low, high))
-    # On the boundary itself nothing is gained.
+    # On the boundary itself nothing is gained; but none at all is an end as well, where the best may be.
     values = np.pad(cost(grid[1:-1]), 1, constant_values=math.inf)
+    if low == 0.0:
+        none, beside = cost(np.array([0.0, _HARDLY_ANY * grid[1]])).tolist()
+        values[0] = none if none <= beside else math.inf
     dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
     dips = dips[np.argsort(values[dips])][:_DIPS]
-    middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], _STEPS, close)
-    return min(zip(value.tolist(), middle.tolist(), strict=True))
+    found = [(float(values[0]), low)]
+    if dips.size:
+        middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], _STEPS, close)
+        found += zip(value.tolist(), middle.tolist(), strict=True)
+    return min(found)
 
 
 class SceneOptima(SceneAnswers):

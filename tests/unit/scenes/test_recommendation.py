@@ -92,6 +92,15 @@ def test_a_passive_wall_is_as_stiff_as_the_device_is_damped(delay):
     assert weak.stiffness == pytest.approx(1e-4 * usual.stiffness, rel=1e-3)
 
 
+def test_a_wall_that_damping_only_harms_has_none_at_all():
+    scene = RIGID.replace(velocity=zwidth.WindowedDifference(samples=15))
+    found = scene.recommend(gain_margin=2.0)
+    assert found.virtual_damping == 0.0
+    assert scene.margins(found.stiffness, 0.0).gain_margin == pytest.approx(2.0, rel=2e-4)
+    assert scene.margins(found.stiffness, 0.1).gain_margin < 2.0
+    assert "B = 0 N s/m" in found.lines()[0]
+
+
 def test_the_wall_of_the_scene_does_not_matter():
     own = RIGID.replace(stiffness=1e3, virtual_damping=3.0).recommend(phase_margin=25)
     assert own.stiffness == RIGID.recommend(phase_margin=25).stiffness

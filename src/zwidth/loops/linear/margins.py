@@ -13,7 +13,7 @@ Poles counted before and beyond must confirm the first of these delays.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -155,32 +155,44 @@ def open_loop_response(loop: LoopRoots, alpha: Array, beta: Array, at: CirclePoi
         return Jet(np.where(real, found.value.real + 0j, found.value), found.slope)
 
 
-def margins_of(wall: OpenLoop, stable: bool) -> Margins:
-    """The nearest crossovers, and the least distance from -1, of one wall; the delay margin is not asked for."""
-    w = wall.phase_crossovers()
-    sizes, rest = np.abs(wall.at(w).value), wall.at_rest()
-    if rest is not None and rest < 0:
-        w, sizes = np.append(w, 0.0), np.append(sizes, -rest)
-    crossed = wall.gain_crossovers()
-    nearest = find_nearest(stable, w, sizes, crossed, np.angle(-wall.at(crossed).value))
-    gain, phase, phase_at, gain_at = nearest
-    distance, closest = wall.least_distance()
-    return Margins(gain, phase, np.nan, distance, phase_at, gain_at, closest)
+def margins_of(wall: OpenLoop, stable: bool, wanted: Container[str]) -> Margins:
+    """The nearest crossovers, and the least distance from -1, of one wall; NaN for what nobody asks for.
+
+    That of the delay needs more than this loop.
+    """
+    found = Margins(*[np.nan] * len(Margins._fields))
+    if "gain_margin" in wanted:
+        w = wall.phase_crossovers()
+        sizes, rest = np.abs(wall.at(w).value), wall.at_rest()
+        if rest is not None and rest < 0:
+            w, sizes = np.append(w, 0.0), np.append(sizes, -rest)
+        gain, at = nearest_phase_crossover(stable, w, sizes)
+        found = found._replace(gain_margin=gain, phase_crossover=at)
+    if "phase_margin" in wanted:
+        w = wall.gain_crossovers()
+        phase, at = nearest_gain_crossover(stable, w, np.angle(-wall.at(w).value))
+        found = found._replace(phase_margin=phase, gain_crossover=at)
+    if "modulus_margin" in wanted:
+        distance, at = wall.least_distance()
+        found = found._replace(modulus_margin=distance, modulus_frequency=at)
+    return found
 
 
-def find_nearest(
-    stable: bool, places: np.ndarray, sizes: np.ndarray, crossed: np.ndarray, turns: Array
-) -> tuple[float, float, float, float]:
-    """Gain and phase margin and where they are taken, by the sizes of L where it is negative and its turns from -1."""
-    gain, phase_at, phase, gain_at = (np.inf if stable else 0.0), np.nan, (np.inf if stable else np.nan), np.nan
-    if places.size:
-        nearest = int(np.argmin(np.abs(np.log(sizes))))
-        gain, phase_at = 1.0 / sizes[nearest], places[nearest]
-    if crossed.size:
-        phases = np.degrees(np.abs(turns))
-        nearest = int(np.argmin(phases))
-        phase, gain_at = phases[nearest] * (1.0 if stable else -1.0), crossed[nearest]
-    return float(gain), float(phase), float(phase_at), float(gain_at)
+def nearest_phase_crossover(stable: bool, w: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
+    """The gain margin and where it is taken, of places where L is negative and of some size."""
+    if not w.size:
+        return np.inf if stable else 0.0, np.nan
+    nearest = int(np.argmin(np.abs(np.log(sizes))))
+    return float(1.0 / sizes[nearest]), float(w[nearest])
+
+
+def nearest_gain_crossover(stable: bool, w: np.ndarray, turns: Array) -> tuple[float, float]:
+    """The phase margin and where it is taken, of places where L is of size 1 and so far turned from -1."""
+    if not w.size:
+        return np.inf if stable else np.nan, np.nan
+    phases = np.degrees(np.abs(turns))
+    nearest = int(np.argmin(phases))
+    return float(phases[nearest] * (1.0 if stable else -1.0)), float(w[nearest])
 
 
 # Parts of a period at whose ends crossovers are looked for, and by how many of them a start may miss its own.
@@ -300,20 +312,20 @@ def _is_first_loss(chain: AnyChain, alpha: float, beta: float, margin: float) ->
 
 
 def linear_margins(
-    chain: AnyChain, boundary: Boundary, alpha: np.ndarray, beta: np.ndarray, with_delay: bool = True
+    chain: AnyChain, boundary: Boundary, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str]
 ) -> Margins:
-    """All margins of walls of one shape, periods and radians a period; NaN where a wall is out of range."""
+    """Margins of walls of one shape, periods and radians a period; NaN where a wall is out of range."""
     stable = label_walls(boundary, alpha, beta)
     inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
     delayed: list[DelayedLoop] = []
     # What a sampled device does between its samples is not known.
-    with_delay = with_delay and not chain.sampled
+    with_delay = "delay_margin" in wanted and not chain.sampled
     out = np.full((len(Margins._fields), *alpha.shape), np.nan)
     for place in np.ndindex(alpha.shape):
         a, b, good = float(alpha[place]), float(beta[place]), bool(stable[place])
         if not inside[place]:
             continue
-        found = margins_of(OpenLoop.lay_out(boundary.loop, a, b, boundary.w), good)
+        found = margins_of(OpenLoop.lay_out(boundary.loop, a, b, boundary.w), good, wanted)
         delay = 0.0 if with_delay else np.nan
         if good and with_delay:
             delayed = delayed or lay_delays(chain)

@@ -22,7 +22,10 @@ from zwidth.arrays.circle import Jet, circle, lag_jet, product_jet
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 
-_NODES, _ROUNDS, _MOST = 129, 80, 1 << 18
+_NODES, _MOST = 129, 1 << 18
+# Into how many parts an interval is cut that may hold the maximum, and how often.
+_PARTS, _ROUNDS = 16, 20
+_SHARES = np.arange(1, _PARTS)[:, None] / _PARTS
 # By how much more, relatively, no frequency may need for the search to end.
 _PROVED = 1e-13
 
@@ -167,25 +170,24 @@ def find_need(condition: PassivityCondition, alpha: float, beta: float) -> tuple
     stiff = max(alpha + beta * condition.spring, 0.0)
     w = np.concatenate([[0.0], np.geomspace(1e-6, 1e-2, 24), np.linspace(1e-2, np.pi, _NODES)[1:]])
     values = condition.needed(stiff, beta, w)
-    # Left to be inferred, round by round, they would cost the type checker eight seconds.
-    low: Array
-    high: Array
-    low, high, first, last = w[:-1], w[1:], values[:-1], values[1:]
+    # Intervals: both ends of each, and what they need.
+    ends, needs = np.stack([w[:-1], w[1:]]), np.stack([values[:-1], values[1:]])
     best, most = (float(values.max()), float(w[values.argmax()])), values
     for _ in range(_ROUNDS):
-        most = np.maximum(first, last) + condition.curvature(stiff, beta, low, high) * (high - low) ** 2 / 8.0
+        most = needs.max(0) + condition.curvature(stiff, beta, *ends) * np.diff(ends, axis=0)[0] ** 2 / 8.0
         open_ = most > best[0] + _PROVED * (abs(best[0]) + 1e-300)
         if not open_.any():
             return best
         if open_.sum() > _MOST:
             # Flat all over: what is left open is a bound, on the side of caution.
             break
-        low, high, first, last = low[open_], high[open_], first[open_], last[open_]
-        middle = 0.5 * (low + high)
-        inner = condition.needed(stiff, beta, middle)
-        best = max(best, (float(inner.max()), float(middle[inner.argmax()])))
-        low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
-        first, last = np.concatenate([first, inner]), np.concatenate([inner, last])
+        (low, high), needs = ends[:, open_], needs[:, open_]
+        places = low + (high - low) * _SHARES
+        inner = condition.needed(stiff, beta, places.ravel())
+        best = max(best, (float(inner.max()), float(places.flat[inner.argmax()])))
+        places = np.concatenate([[low], places, [high]])
+        values = np.concatenate([needs[:1], inner.reshape(_PARTS - 1, -1), needs[1:]])
+        ends, needs = (np.stack([part[:-1].ravel(), part[1:].ravel()]) for part in (places, values))
     return float(most.max()), best[1]
 
 

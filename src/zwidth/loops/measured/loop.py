@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from zwidth.arrays.roots import narrow_dips
 from zwidth.loops.linear.chain import AnyChain
-from zwidth.loops.linear.margins import find_nearest
+from zwidth.loops.linear.margins import nearest_gain_crossover, nearest_phase_crossover
 from zwidth.loops.linear.rows import Island, side_by_side
 from zwidth.loops.loop import LinearLoop, SlowestMotion
 from zwidth.loops.measured.curve import Decided, DecidedWalls, ResponseCurve
@@ -193,7 +194,7 @@ class MeasuredLoop(LinearLoop):
         S, F = self.walls.curve.at(w)
         return (alpha + beta * F) * S / (4.0 * np.sin(0.5 * w) ** 2)
 
-    def margins(self, alpha: np.ndarray, beta: np.ndarray, *, with_delay: bool = True) -> Margins:
+    def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
         """Margins on the measured curve in periods and radians a period; NaN for walls that are not surely decided.
 
         The delay margin is that of a pure delay, phase over frequency; where no line shows what more gain brings to the
@@ -222,7 +223,8 @@ class MeasuredLoop(LinearLoop):
             k, share = _zeros(np.log(np.abs(L)))
             at = c.w[k] + share * np.diff(c.w)[k]
             turns: Any = np.angle(-L[k]) + share * np.angle(L[k + 1] / L[k])
-            gain, phase, phase_at, gain_at = find_nearest(stable, places, sizes, at, turns)
+            gain, phase_at = nearest_phase_crossover(stable, places, sizes)
+            phase, gain_at = nearest_gain_crossover(stable, at, turns)
             delay = float(np.min(np.mod(turns, 2.0 * np.pi) / at, initial=np.inf)) if stable else 0.0
         closest = int(np.argmin(np.abs(1.0 + L)))
         return Margins(gain, phase, delay, float(abs(1.0 + L[closest])), phase_at, gain_at, float(c.w[closest]))
