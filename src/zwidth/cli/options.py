@@ -176,10 +176,8 @@ def _add_option(command: Command, path: str, required: bool = False) -> Command:
 
 
 def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]:
-    """The options that describe a scene, and perhaps its wall, which the command gets as ``scene``: a `zwidth.Scene`.
-
-    Where none is required it is None without any of them.
-    """
+    """The options that describe a scene, and perhaps its wall; the command gets a `zwidth.Scene` as ``scene``."""
+    # Where none is required it is None without any of them.
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
     return _take_options("scene", (*bare, *_PARTS), ("stiffness",), lambda given: build_scene(given, required))
 

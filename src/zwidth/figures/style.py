@@ -77,10 +77,8 @@ def house_style() -> Iterator[None]:
 
 @contextmanager
 def style_sheet(file: Path | None = None, size: Size | None = None) -> Iterator[None]:
-    """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given.
-
-    Of a size without a height type is as large as ever. Where there is a size already, it stays.
-    """
+    """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given."""
+    # Of a size without a height type is as large as ever. Where there is a size already, it stays.
     changes, known = _wanted.get()
     try:
         changes = changes if file is None else dict(rc_params_from_file(file, use_default_template=False))

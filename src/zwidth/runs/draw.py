@@ -34,11 +34,9 @@ _SURFACE = 6
 
 
 def make_edges(store: Store) -> Edges:
-    """What gives the outlines of the stable and the passive walls of a part of a sweep, at one device and delay.
-
-    The part is one of `zwidth.figures.grid.prepare`. Outlines are in its units, stiffness first. Of what is not a
-    plane of walls, and where nothing is proved, there are none.
-    """
+    """What gives the outlines of the stable and the passive walls of a part of a sweep, at one device and delay."""
+    # The part is one of `zwidth.figures.grid.prepare`. Outlines are in its units, stiffness first. Of what is not a
+    # plane of walls, and where nothing is proved, there are none.
     known = store.grid.coordinates()
     dims = [dim.replace(".", "_") for dim in store.grid.device_dims]
     at_device = cache(lambda place: _outline(store, place))
@@ -91,13 +89,12 @@ def draw_stores(
     progress: Callable[[Path], None] = lambda file: None,
     note: Callable[[str], None] = lambda text: None,
 ) -> tuple[Path, ...]:
-    """Draw the sweeps in a store, or in all stores of a folder, into ``figures`` beside them where ``out`` is left out.
-
-    ``at`` chooses slices, by name: the nearest value that the sweep has to one in the units of the store or with one,
-    as "1 ms", or the label of a device; of a parameter that is not given up to three values are shown. ``axes`` are the
-    parameters over ``x``, ``y``, ``hue`` and ``col``, chosen from the sweep where left out. ``progress`` is called with
-    every file, ``note`` with what a reader should know: other values than those wanted, stores without a figure.
-    """
+    """Draw the sweeps in a store, or in all stores of a folder, into ``figures`` beside them if ``out`` is left out."""
+    # ``at`` chooses slices, by name: the nearest value that the sweep has to one in the units of the store or with one,
+    # as "1 ms", or the label of a device; of a parameter that is not given up to three values are shown. ``axes`` are
+    # the parameters over ``x``, ``y``, ``hue`` and ``col``, chosen from the sweep where left out. ``progress`` is
+    # called with every file, ``note`` with what a reader should know: other values than those wanted, stores without a
+    # figure.
     folder = Path(os.fsdecode(path))
     stores = list_stores(folder)
     beside = folder.parent if stores == [folder] else folder

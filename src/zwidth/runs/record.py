@@ -93,10 +93,8 @@ class Record:
         return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
 
     def check_free(self, config: str, *, overwrite: bool, going_on: bool) -> None:
-        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with.
-
-        A run without its record is known by its configuration: the one of the text ``config``.
-        """
+        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with."""
+        # A run without its record is known by its configuration: the one of the text ``config``.
         if (self.folder.exists() or self.folder.is_symlink()) and not self.folder.is_dir():
             raise StoreExistsError(f"out: {self.folder} is a file, a folder is needed; choose another with --out DIR")
         check_folder(self.folder)
@@ -154,10 +152,8 @@ class Record:
         self._update({**about, "started": self.content.get("started", about["started"])})
 
     def keep_config(self, text: str, inputs: Mapping[str, bytes]) -> None:
-        """Write the configuration beside its results, and the files that it reads; what is somebody's own stays.
-
-        Where the folder held this configuration and no record, the record was lost: the run's files are its own.
-        """
+        """Write the configuration beside its results, and the files that it reads; what is somebody's own stays."""
+        # Where the folder held this configuration and no record, the record was lost: the run's files are its own.
         path, place = self.folder / CONFIG_FILE, self.folder / INPUTS
         digests = {name: hashlib.sha256(data).hexdigest() for name, data in inputs.items()}
         wanted = {name: data for name, data in inputs.items() if file_hash(place / name) != digests[name]}
@@ -204,10 +200,8 @@ class Record:
         ]
 
     def keep(self, stage: Path, entry: dict[str, Any]) -> None:
-        """Give the files in ``stage`` their names; when the study is done, take away what else it had before.
-
-        A file of somebody's own that has one of these names is a `StoreExistsError`.
-        """
+        """Give the files in ``stage`` their names; when the study is done, take away what else it had before."""
+        # A file of somebody's own that has one of these names is a `StoreExistsError`.
         before = self.entry(entry["name"]) or {}
         files = {path.name: file_hash(path) for path in sorted(stage.iterdir())}
         for file in files:
@@ -294,11 +288,9 @@ def file_hash(path: Path) -> str:
 
 
 def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[str, str]]:
-    """What a run keeps so that it can be repeated from its own folder, of a configuration's text without faults.
-
-    The text with the names of the copies; the copies' bytes by their names in the folder of inputs; and, by the names
-    that the configuration has, those that the text has now. A copy's own name stays as it is.
-    """
+    """What a run keeps so that it can be repeated from its own folder, of a configuration's text without faults."""
+    # The text with the names of the copies; the copies' bytes by their names in the folder of inputs; and, by the names
+    # that the configuration has, those that the text has now. A copy's own name stays as it is.
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}
     places = find_values(text, "csv") + [place for place in find_values(text, "device") if place[0].endswith(SUFFIXES)]

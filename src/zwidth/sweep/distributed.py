@@ -70,11 +70,9 @@ def _terminal_without_logs() -> Iterator[None]:
 
 
 def on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[Finished]:
-    """Do jobs on the workers of a scheduler, which must see the stores under the same path.
-
-    A worker that dies may take innocent chunks with it, those that it had just begun: what dask gives up is tried
-    again at the end, one by one, before it is called a failure.
-    """
+    """Do jobs on the workers of a scheduler, which must see the stores under the same path."""
+    # A worker that dies may take innocent chunks with it, those that it had just begun: what dask gives up is tried
+    # again at the end, one by one, before it is called a failure.
     given_up = []
     for finished in _submit_jobs(client, jobs, perform):
         if finished.error.startswith(_KILLED):

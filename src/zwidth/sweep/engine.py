@@ -74,12 +74,10 @@ def compute_sweeps(
     scheduler: str | None,
     progress: Callable[[Progress], None],
 ) -> Sweeps:
-    """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there (`check_stores`).
-
-    The folder is held by the caller; ``about`` has name, description and config for the stores' attributes; the options
-    are those of `zwidth.run`. A scheduler that does not answer, or whose workers do not see the folder, is an
-    `InputError`.
-    """
+    """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there."""
+    # The folder is held by the caller; ``about`` has name, description and config for the stores' attributes; the
+    # options are those of `zwidth.run`. A scheduler that does not answer, or whose workers do not see the folder, is an
+    # `InputError`.
     from zwidth.sweep.jobs import perform
 
     with ExitStack() as stack:

@@ -156,10 +156,8 @@ def differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, 
 
 @contextmanager
 def holding(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None]:
-    """Hold a folder of results, made where it is missing, while the block runs; a shard (i, n) shares it with others.
-
-    A `StoreBusyError` says which other run holds it.
-    """
+    """Hold a folder of results, made where it is missing, within the block; a shard (i, n) shares it with others."""
+    # A `StoreBusyError` says which other run holds it.
     check_folder(folder)
     with _opened(folder / LOCKS / "run") as run:
         if shard is None:

@@ -228,10 +228,8 @@ IMPORTING = Lock()
 def compute_details(
     scene: Scene, across: Range, up: Range, *, normalized: bool, of_device: bool, contact: bool
 ) -> Iterator[Update]:
-    """What takes longer than a drag, part by part; whoever asks may stop after each.
-
-    Contours cover ``across`` and ``up``. Wanted may be what hangs on the device alone, and a hit of the wall.
-    """
+    """What takes longer than a drag, part by part; whoever asks may stop after each."""
+    # Contours cover ``across`` and ``up``. Wanted may be what hangs on the device alone, and a hit of the wall.
     # The page shows millimeters.
     length = 1.0 if normalized else 1e3
     verdict = assess(scene)
