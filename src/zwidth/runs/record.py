@@ -22,6 +22,7 @@ from zwidth.config.reader import find_values
 from zwidth.parts.measured import SUFFIXES
 from zwidth.sweep.engine import refuse_changes, refuse_versions
 from zwidth.sweep.files import (
+    ELSEWHERE,
     LOCKS,
     check_folder,
     digest,
@@ -40,6 +41,7 @@ CONFIG_FILE = "config.yaml"
 INPUTS = "inputs"
 RUN_FORMAT = 2
 _SEAL = "record_sha256"
+_MOVE = f"move it away, or {ELSEWHERE}"
 
 # Beside those that can change a result.
 _PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
@@ -60,7 +62,7 @@ class Record:
         self._read()
 
     def _read(self) -> None:
-        where, remedy = self.folder / RUN_FILE, "choose another folder with --out DIR, or remove it"
+        where, remedy = self.folder / RUN_FILE, f"{ELSEWHERE}, or remove it"
         try:
             content = json.loads(where.read_text(encoding="utf-8"))
         except (FileNotFoundError, NotADirectoryError):
@@ -100,27 +102,20 @@ class Record:
         check_folder(self.folder)
         if going_on or not self.folder.is_dir():
             return
-        if self.exists:
-            if not overwrite:
-                raise StoreExistsError(
-                    f"out: {self.folder} already holds a run; choose another folder with --out DIR, go on with it with "
-                    "--resume, or replace it with --overwrite"
-                )
-            return
         # What a run without a record leaves; stores are refused or replaced one by one: they say what they are.
         names, known = [path.name for path in self.folder.iterdir()], (LOCKS, CONFIG_FILE, "figures")
         strange = [name for name in names if not name.endswith((SUFFIX, ".partial")) and name not in known]
-        if strange and self._holds_config(config):
-            if not overwrite:
-                raise StoreExistsError(
-                    f"out: {self.folder} holds a run of this configuration without its record {RUN_FILE}; replace its "
-                    "files with --overwrite, keep its sweeps with --resume, or choose another folder with --out DIR"
-                )
-        elif strange:
-            raise StoreExistsError(
-                f"out: {self.folder} is not empty and holds no run (no {RUN_FILE}), and no {CONFIG_FILE} of this "
-                "configuration; choose another folder with --out DIR"
-            )
+        why = ""
+        if strange and not self.exists and not self._holds_config(config):
+            why = f"is not empty and holds no run (no {RUN_FILE}), and no {CONFIG_FILE} of this configuration; "
+            why += ELSEWHERE
+        elif self.exists and not overwrite:
+            why = f"already holds a run; {ELSEWHERE}, go on with it with --resume, or replace it with --overwrite"
+        elif strange and not overwrite:
+            why = f"holds a run of this configuration without its record {RUN_FILE}; replace its files with "
+            why += f"--overwrite, keep its sweeps with --resume, or {ELSEWHERE}"
+        if why:
+            raise StoreExistsError(f"out: {self.folder} {why}")
 
     def _holds_config(self, text: str) -> bool:
         with suppress(OSError):
@@ -134,7 +129,7 @@ class Record:
         if self.content.get("format") != RUN_FORMAT:
             raise StoreError(
                 f"{self.folder}: an earlier release made this run and kept no checksums to go on from; start again "
-                "with --overwrite, or choose another folder with --out DIR"
+                f"with --overwrite, or {ELSEWHERE}"
             )
         if self.damaged:
             # Everything is computed again, and stores know by themselves what they are for.
@@ -160,10 +155,7 @@ class Record:
         known = {} if place.is_symlink() else self.content.get("inputs", {})
         strange = [name for name in wanted if name not in known and (place.is_symlink() or (place / name).exists())]
         if strange:
-            raise StoreExistsError(
-                f"out: {place / strange[0]} was not written by this run; move it away, or choose another folder with "
-                "--out DIR"
-            )
+            raise StoreExistsError(f"out: {place / strange[0]} was not written by this run; {_MOVE}")
         own = CONFIG_FILE in self.files()
         lost = not own and self._holds_config(text)
         self._update(({"inputs": {**known, **digests}} if digests else {}) | ({"lost": True} if lost else {}))
@@ -206,10 +198,7 @@ class Record:
         files = {path.name: file_hash(path) for path in sorted(stage.iterdir())}
         for file in files:
             if (self.folder / file).exists() and file not in self.files() and not self.content.get("lost"):
-                raise StoreExistsError(
-                    f"out: {self.folder / file} was not written by this run; move it away, or choose another folder "
-                    "with --out DIR"
-                )
+                raise StoreExistsError(f"out: {self.folder / file} was not written by this run; {_MOVE}")
         # First the names, so that a run that is killed between two files still knows them for its own.
         both = {**before.get("files", {}), **files}
         self.note({**entry, "state": "open", "files": both})
