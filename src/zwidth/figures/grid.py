@@ -205,20 +205,15 @@ def label_contours(
     # The range and the spacing of the axes must be set: where lines are on the page decides on what has room. Each
     # label covers its line with the shade behind it, and keeps away from the points (x, y) of other lines and marks.
     frame = ax.get_window_extent()
-    lines = [
-        _list_lines(ax, [np.asarray(part) for part in path.to_polygons(closed_only=False)])
-        for path in drawn.get_paths()
-    ]
+    lines = [_list_lines(ax, path.to_polygons(closed_only=False)) for path in drawn.get_paths()]
     taken = _list_lines(ax, [np.atleast_2d(points) for points in others if len(points)])
     placed: list[tuple[np.ndarray, np.ndarray]] = []
     for k, (level, own) in enumerate(zip(drawn.levels, lines, strict=True)):
         text = f"{level:.12g}"
         dots = ax.figure.dpi / 72.0 / _LEFT
         size = dots * _LABEL_FONT * np.array([0.62 * len(text) + 0.4, 1.3])
-        if not own:
-            continue
-        line = max(own, key=len)
-        if np.ptp(line, axis=0).max() < 1.5 * size[0]:
+        line = max(own, key=len, default=None)
+        if line is None or np.ptp(line, axis=0).max() < 1.5 * size[0]:
             continue
         off = [each for j, near in enumerate(lines) if j != k for each in near] + taken
         at = _find_place(line, size, frame, off, placed)
@@ -230,7 +225,7 @@ def label_contours(
         ax.text(x, y, text, fontsize=_LABEL_FONT, color=colors[k], ha="center", va="center", bbox=box, zorder=2.5)
 
 
-def _list_lines(ax: Axes, lines: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _list_lines(ax: Axes, lines: Sequence[Any]) -> list[np.ndarray]:
     """Lines in dots, their points so close that a label between two of them touches one."""
     found = []
     for line in lines:

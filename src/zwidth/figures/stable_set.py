@@ -139,10 +139,8 @@ def _changes(cells: np.ndarray) -> np.ndarray:
 
 def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
     """Outlines as they can be drawn on logarithmic axes: what is not positive lies beyond the frame."""
-    least = [
-        0.1 * min(limits) if scale == "log" else -np.inf
-        for scale, limits in ((ax.get_xscale(), ax.get_xlim()), (ax.get_yscale(), ax.get_ylim()))
-    ]
+    both = ax.xaxis, ax.yaxis
+    least = [0.1 * min(axis.get_view_interval()) if axis.get_scale() == "log" else -np.inf for axis in both]
     if not np.isfinite(least).any():
         return outlines
     return [(np.maximum(Path(_close(points)).interpolated(_BEND).vertices, least), hole) for points, hole in outlines]
