@@ -105,11 +105,8 @@ class DesignStudy(ComputedStudy):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        if not self.stiffness.values().min() > 0:
-            what = problem(
-                f"got {short(float(self.stiffness.values().min()))} {own_unit('N/m')}", "it must be greater than 0"
-            )
-            yield ("stiffness",), what
+        if not (least := float(self.stiffness.values().min())) > 0:
+            yield ("stiffness",), problem(f"got {short(least)} {own_unit('N/m')}", "it must be greater than 0")
         known = self._list_parameters()
         if self.find not in known:
             has = f"this device has {listing(known)}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
 from typing import Annotated, Any, Literal
 
@@ -166,7 +166,6 @@ class Poses(Strict, what="a table of poses"):
     up: str
     """Name of the one from bottom to top."""
 
-    _table: DeviceTable = PrivateAttr()
     # Name, unit and values of both.
     _coordinates: list[tuple[str, str, list[float]]] = PrivateAttr()
 
@@ -176,11 +175,11 @@ class Poses(Strict, what="a table of poses"):
 
     def limits(self) -> Iterable[LocatedProblem]:
         try:
-            self._table, columns = read_table({"csv": self.csv}), read_columns(find_file(self.csv))
+            table, columns = self.table, read_columns(find_file(self.csv))
             known = {name: (unit, place) for place, (name, unit) in enumerate(map(split_head, columns.heads))}
             chosen = {key: getattr(self, key) for key in ("across", "up")}
-            if set(self._table.columns) != {"mass", "damping"}:
-                what = f"got columns {' and '.join(self._table.columns)}"
+            if set(table.columns) != {"mass", "damping"}:
+                what = f"got columns {' and '.join(table.columns)}"
                 yield ("csv",), problem(what, _FORM, "give these two, and no other parameter")
             for key in (key for key, name in chosen.items() if name not in known):
                 remedy = suggestion(chosen[key], known, f"choose from {', '.join(known)}")
@@ -196,10 +195,10 @@ class Poses(Strict, what="a table of poses"):
         except InputError as error:
             yield ("csv",), problem(str(error).partition("; ")[0], _FORM, "complete the file")
 
-    @property
+    @cached_property
     def table(self) -> DeviceTable:
         """The masses and dampings."""
-        return self._table
+        return read_table({"csv": self.csv})
 
     def tabulate(self) -> dict[str, np.ndarray]:
         """The coordinates as columns, across and up."""
