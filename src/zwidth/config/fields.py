@@ -154,11 +154,8 @@ class Strict(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", defer_build=True)
 
-    what: ClassVar[str] = "a mapping"
-    """What the mapping describes, for messages."""
-
-    described_by: ClassVar[tuple[type[Strict], ...]] = ()
-    """Other models, which say what the fields of their names are."""
+    what: ClassVar[str] = "a mapping"  # that it describes, for messages
+    described_by: ClassVar[tuple[type[Strict], ...]] = ()  # other models, which say what the fields of their names are
 
     def __init_subclass__(cls, *, what: str = "", **config: Any) -> None:
         super().__init_subclass__(**config)

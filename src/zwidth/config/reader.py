@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,25 +51,26 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
     file = os.fsdecode(path)
     tree = _Tree(file, _read_text(file))
     with files_relative_to(Path(file).parent):
-        return _check(model, tree.data, tree.faults, file, tree.values, tree.keys)
+        return _check(model, tree.data, tree.faults, lambda found: locate(file, found, tree.values, tree.keys))
 
 
 def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
     """Check what a file would hold against a model; a fault then has a field and no place."""
     problems: list[LocatedProblem] = []
     simple = _simplify(data, (), problems)
-    return _check(model, simple, locate("", problems, {}, {}), "", {}, {})
+    return _check(model, simple, locate("", problems, {}, {}), lambda found: locate("", found, {}, {}))
 
 
-def _check(model: type[_Model], data: Any, faults: list[Fault], *places: Any) -> _Model:
-    """The model of plain values; else all faults, those known already and what `locate` makes of the others."""
+def _check(
+    model: type[_Model], data: Any, faults: list[Fault], place: Callable[[list[LocatedProblem]], list[Fault]]
+) -> _Model:
+    """The model of plain values; else all faults, those known already and those that are given their places."""
     found = None
     try:
         with use_kind(tells_rotary(data)):
             found = model.model_validate(data)
     except ValidationError as error:
-        file, *marks = places
-        faults = faults + locate(file, problems_of(error), *marks)
+        faults = faults + place(problems_of(error))
     if found is None or faults:
         raise ConfigFileError.of(faults)
     return found

@@ -84,9 +84,8 @@ class Quantity:
         if isinstance(value, int if self.whole else int | float) and not isinstance(value, bool):
             number = check_range(to_float(value), self.allowed, remedy=self.remedy)
             return value if self.whole else number
-        hint = (
-            f"write a {f'whole number such as {max(self.allowed.low, 10):g}' if self.whole else 'number such as 0.5'}"
-        )
+        example = f"whole number such as {max(self.allowed.low, 10):g}" if self.whole else "number such as 0.5"
+        hint = f"write a {example}"
         if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
             hint = f"write {value:.0f}"
         elif isinstance(value, str):

@@ -70,8 +70,8 @@ class ComputedStudy(Study):
     plan, and `compute`. `zwidth.studies.register` makes it known.
     """
 
+    # Whether the results depend on the scene beyond what the study has taken from it.
     reads_scene: ClassVar[bool] = False
-    """Whether the results depend on the scene beyond what the study has taken from it."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """Compute everything, in the file's scene and perhaps as its only study of this kind; drawing comes later."""
