@@ -145,12 +145,9 @@ def _by_device(
         step = max(1, _LAID_OUT // (rows * shape[2]))
         for start, row in product(range(0, group.size, step), range(0, shape[1], rows)):
             devices, alphas = group[start : start + step], slice(row, row + rows)
-            parameters = np.broadcast_arrays(
-                block.alpha[devices, alphas, None],
-                block.beta[devices, None, :],
-                block.delta[devices, None, None],
-                block.d[devices, None, None],
-            )
+            walls = block.alpha[devices, alphas, None], block.beta[devices, None, :]
+            device = block.delta[devices, None, None], block.d[devices, None, None]
+            parameters = np.broadcast_arrays(*walls, *device)
             columns = [parameter.ravel() for parameter in parameters]
             for result, leaf in zip(results, function(columns), strict=True):
                 result[devices, alphas] = leaf.reshape(parameters[0].shape)

@@ -58,10 +58,8 @@ def _terminal_without_logs() -> Iterator[None]:
     before = {logging.getLogger(name): logging.getLogger(name).handlers for name in (*names, "asyncio")}
     for logger, handlers in before.items():
         # With no handler at all Python itself would write to the terminal.
-        logger.handlers = [
-            logging.NullHandler(),
-            *(one for one in handlers if getattr(one, "stream", None) not in terminal),
-        ]
+        others = (one for one in handlers if getattr(one, "stream", None) not in terminal)
+        logger.handlers = [logging.NullHandler(), *others]
     try:
         yield
     finally:
