@@ -176,10 +176,8 @@ def _add_option(command: Command, path: str, required: bool = False) -> Command:
 
 
 def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]:
-    """The options that describe a scene, and perhaps its wall, which the command gets as ``scene``: a `zwidth.Scene`.
-
-    Where none is required it is None without any of them.
-    """
+    """The options that describe a scene, and perhaps its wall; the command gets a `zwidth.Scene` as ``scene``."""
+    # Where none is required it is None without any of them.
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
     return _take_options("scene", (*bare, *_PARTS), ("stiffness",), lambda given: build_scene(given, required))
 
@@ -258,12 +256,8 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     else:
         for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _HELD):
             raise click.UsageError(f"--device is given as a whole and holds {flag_of(path)}: give one of the two")
-    scene = Scene(
-        device,
-        Timing(**some("period", "rate", "delay")),
-        VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0)),
-        velocity=_make_velocity(given),
-    ).replace(**parts)
+    wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
+    scene = Scene(device, Timing(**some("period", "rate", "delay")), wall, _make_velocity(given)).replace(**parts)
     scene.check_parts()
     return scene
 

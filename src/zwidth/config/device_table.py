@@ -132,12 +132,10 @@ def _read_csv(raw: dict[str, Any]) -> DeviceTable:
 
 
 def _read_rows(name: str) -> list[tuple[int, list[str]]]:
-    """The header of a CSV file and the rows below it that hold something, each with its line.
-
-    Remarks above it begin with # or %, or are the ``sep=;`` of spreadsheets. Columns are separated by tabs, else
-    semicolons, else commas: the first of these that the header holds. Where commas do not separate, they may be decimal
-    signs.
-    """
+    """The header of a CSV file and the rows below it that hold something, each with its line."""
+    # Remarks above it begin with # or %, or are the ``sep=;`` of spreadsheets. Columns are separated by tabs, else
+    # semicolons, else commas: the first of these that the header holds. Where commas do not separate, they may be
+    # decimal signs.
     file = find_file(name)
     try:
         lines = read_lines(file, MAX_CSV_BYTES)

@@ -137,21 +137,15 @@ def locate(
     values: Mapping[FieldPath, tuple[int, int]],
     keys: Mapping[FieldPath, tuple[int, int]],
 ) -> list[Fault]:
-    """Give problems their places, from the places of the file's values and keys.
-
-    A field that is missing stands nowhere: it gets the place of the mapping that lacks it. Without a file none has one.
-    """
+    """Give problems their places, from the places of the file's values and keys."""
+    # A field that is missing stands nowhere: it gets the place of the mapping that lacks it. Without a file none has
+    # one.
     faults = []
-    for path, what in problems:
-        context = what.context or {}
-        place = keys.get(path) if context["on_key"] else None
-        above = path
-        while place is None:
-            place = values.get(above) or (None if above else (None, None))
-            above = above[:-1]
-        line, column = place
-        parts = (context["what"], context["allowed"], context["remedy"])
-        faults.append(Fault(file, line, column, dotted(path), *parts))
+    for path, found in problems:
+        what, allowed, remedy, on_key = (found.context or {}).values()
+        above = [keys.get(path) if on_key else None, *(values.get(path[:end]) for end in range(len(path), -1, -1))]
+        place = next(filter(None, above), (None, None))
+        faults.append(Fault(file, *place, dotted(path), what, allowed, remedy))
     return faults
 
 
@@ -160,11 +154,8 @@ class Strict(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", defer_build=True)
 
-    what: ClassVar[str] = "a mapping"
-    """What the mapping describes, for messages."""
-
-    described_by: ClassVar[tuple[type[Strict], ...]] = ()
-    """Other models, which say what the fields of their names are."""
+    what: ClassVar[str] = "a mapping"  # that it describes, for messages
+    described_by: ClassVar[tuple[type[Strict], ...]] = ()  # other models, which say what the fields of their names are
 
     def __init_subclass__(cls, *, what: str = "", **config: Any) -> None:
         super().__init_subclass__(**config)
@@ -323,13 +314,10 @@ def repeated(raw: Iterable[Any], remedy: str, allowed: str = "each value once") 
     """A problem for every plain value of a list that an earlier entry already holds."""
     seen: dict[Any, int] = {}
     for index, value in enumerate(raw):
-        if isinstance(value, bool) or not isinstance(value, str | int | float):
-            continue
-        if value in seen:
-            what = f"got {describe(value)} twice, here and at [{seen[value]}]"
-            yield (index,), problem(what, allowed, remedy)
-        else:
-            seen[value] = index
+        if isinstance(value, str | int | float) and not isinstance(value, bool):
+            first = seen.setdefault(value, index)
+            if first != index:
+                yield (index,), problem(f"got {describe(value)} twice, here and at [{first}]", allowed, remedy)
 
 
 Name = Annotated[str, BeforeValidator(_name), WithJsonSchema({"type": "string", "pattern": "^[a-z0-9_-]{1,64}$"})]

@@ -160,10 +160,8 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Stri
 
 
 def list_parts(owner: Any) -> dict[str, Any]:
-    """The parts that a device, a scene or a study has, by name: a section each, of the modes a list of them.
-
-    The first is a device that is no mass with damping, but given as a whole.
-    """
+    """The parts that a device, a scene or a study has, by name: a section each, of the modes a list of them."""
+    # The first is a device that is no mass with damping, but given as a whole.
     found = {name: getattr(owner, name, None) for name in ("device", *PART_NAMES)}
     return {name: section for name, section in found.items() if section is not None and section != []}
 

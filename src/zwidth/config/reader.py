@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 import os
 import re
-import stat
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,39 +50,35 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
     """Read a file and check all of it against a model; a `ConfigFileError` lists its faults."""
     file = os.fsdecode(path)
     tree = _Tree(file, _read_text(file))
-    problems = []
-    found = None
-    try:
-        with files_relative_to(Path(file).parent), use_kind(tells_rotary(tree.data)):
-            found = model.model_validate(tree.data)
-    except ValidationError as error:
-        problems = problems_of(error)
-    faults = tree.faults + locate(file, problems, tree.values, tree.keys)
-    if found is None or faults:
-        raise ConfigFileError.of(faults)
-    return found
+    with files_relative_to(Path(file).parent):
+        return _check(model, tree.data, tree.faults, lambda found: locate(file, found, tree.values, tree.keys))
 
 
 def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
     """Check what a file would hold against a model; a fault then has a field and no place."""
     problems: list[LocatedProblem] = []
+    simple = _simplify(data, (), problems)
+    return _check(model, simple, locate("", problems, {}, {}), lambda found: locate("", found, {}, {}))
+
+
+def _check(
+    model: type[_Model], data: Any, faults: list[Fault], place: Callable[[list[LocatedProblem]], list[Fault]]
+) -> _Model:
+    """The model of plain values; else all faults, those known already and those that are given their places."""
     found = None
     try:
-        simple = _simplify(data, (), problems)
-        with use_kind(tells_rotary(simple)):
-            found = model.model_validate(simple)
+        with use_kind(tells_rotary(data)):
+            found = model.model_validate(data)
     except ValidationError as error:
-        problems += problems_of(error)
-    if found is None or problems:
-        raise ConfigFileError.of(locate("", problems, {}, {}))
+        faults = faults + place(problems_of(error))
+    if found is None or faults:
+        raise ConfigFileError.of(faults)
     return found
 
 
 def tells_rotary(data: Any, key: str = "") -> bool:
-    """Whether values of a configuration are of rotary devices: a unit of theirs, ``rotary: true``, or one by its name.
-
-    All devices of a file are of one kind, so that what is told of one holds for all. A fit finds the kind in its logs.
-    """
+    """Whether values are of rotary devices: a unit of theirs, ``rotary: true``, or a device by its name."""
+    # All devices of a file are of one kind: what is told of one holds for all. A fit finds the kind in its logs.
     if isinstance(data, Mapping):
         return data.get("kind") != "fit" and any(tells_rotary(each, str(name)) for name, each in data.items())
     if isinstance(data, list):
@@ -134,17 +129,15 @@ def _fail(file: str, place: tuple[int, int] | None, *parts: str, path: FieldPath
 
 def _read_text(file: str) -> str:
     """The text of a file, or an error that says why there is none."""
+    place = Path(file)
+    if os.path.isdir(place):
+        raise _fail(file, None, "got a folder", "a configuration is one file", "name a .yaml file in it")
+    # A pipe or a device might never end.
+    if os.path.exists(place) and not os.path.isfile(place):
+        raise _fail(file, None, "got no regular file", "a configuration is one file", "save it to a file first")
     try:
-        mode = Path(file).stat().st_mode
-        if stat.S_ISDIR(mode):
-            raise _fail(file, None, "got a folder", "a configuration is one file", "name a .yaml file in it")
-        # A pipe or a device might never end.
-        if not stat.S_ISREG(mode):
-            raise _fail(file, None, "got no regular file", "a configuration is one file", "save it to a file first")
         with open(file, "rb") as stream:
             data = stream.read(MAX_FILE_BYTES + 1)
-    except ConfigFileError:
-        raise
     except PermissionError as error:
         raise _fail(file, None, "permission denied", "", "make the file readable") from error
     except (OSError, ValueError) as error:

@@ -76,12 +76,6 @@ class _PhysicalPlant(_Parts, SampledMass):
         return float(self.to_scene().delta)
 
     @property
-    def own_share(self) -> float:
-        """The part of delta that is the device's own, which alone makes walls passive for any hand."""
-        scene = self.to_scene()
-        return float(scene.own_delta / scene.delta) if scene.delta else 1.0
-
-    @property
     def d(self) -> float:
         """Delay in periods, exact where it is written in periods."""
         return self.delay.periods(self.period)

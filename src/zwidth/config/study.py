@@ -63,21 +63,12 @@ DelayModels = Annotated[tuple[DelayModel, ...], WrapValidator(members("delay mod
 class Study(Strict):
     """What all studies have."""
 
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")
-    """Fields that the file's scene supplies where the study leaves them out."""
-
+    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")  # what the file's scene supplies where they are left out
+    # Whether it answers for a device with a velocity filter, a hand or another part; it then has the field device.
     takes_parts: ClassVar[bool] = False
-    """Whether it answers for a device with a velocity filter, a hand or another part; it then has the field device."""
-
-    simulates: ClassVar[bool] = False
-    """Whether it answers for a velocity estimate without a linear form."""
-
-    method: ClassVar[str] = ""
-    """How it computes, and how far its numbers may be off: a sentence for the report of a run."""
-
-    point_bytes: ClassVar[int] = 80
-    """About how many bytes the result has for each point."""
-
+    simulates: ClassVar[bool] = False  # whether it answers for a velocity estimate without a linear form
+    method: ClassVar[str] = ""  # how it computes, and how far its numbers may be off: a sentence for a run's report
+    point_bytes: ClassVar[int] = 80  # about how many the result has for each point
     remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"
 
     name: Name

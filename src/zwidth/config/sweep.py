@@ -200,7 +200,7 @@ class SweepStudy(_Parts, HeldStudy):
         axes = raw.get("axes")
         if not isinstance(axes, dict):
             return raw
-        given = {key for key in axes if key in PARAMETERS} | _columns(axes.get("devices"))
+        given = _list_given(axes)
         if given & set(PHYSICAL):
             if not isinstance(scene, PhysicalScene):
                 return raw
@@ -217,8 +217,8 @@ class SweepStudy(_Parts, HeldStudy):
         axes = raw.get("axes")
         if not isinstance(axes, dict) or not scene.parts_beyond:
             return
-        keys = {key for key in axes if key in PARAMETERS} | _columns(axes.get("devices"))
-        if not keys & set(PHYSICAL) and not {"delta", "d"} <= keys:
+        given = _list_given(axes)
+        if not given & set(PHYSICAL) and not {"delta", "d"} <= given:
             what = f"got normalized axes for a scene with {' and '.join(list_parts(scene))}"
             raise problem(what, "its parts are in SI units", "choose axes such as 'stiffness' and 'virtual_damping'")
 
@@ -324,13 +324,10 @@ class SweepStudy(_Parts, HeldStudy):
         period = 1.0 / given.pop("rate") if "rate" in given else given.pop("period")
         delay = given.pop("delay", 0.0) * (period if self.axes.delay_in_periods else 1.0)
         parts = build_parts(self)
-        for name in given:
-            part = name.partition(".")[0]
-            if part in PARTS and part not in parts:
-                # Of its axes alone.
-                parts[part] = PARTS[part](
-                    **{path.partition(".")[2]: value for path, value in given.items() if path.startswith(f"{part}.")}
-                )
+        for part in (name for name in PARTS if name not in parts):
+            own = {name.partition(".")[2]: value for name, value in given.items() if name.startswith(f"{part}.")}
+            # Of its axes alone.
+            parts |= {part: PARTS[part](**own)} if own else {}
         device = Device(mass=given.pop("mass", 1.0), damping=given.pop("damping", 0.0), rotary=bool(self.rotary))
         return Scene(device, Timing(period=period, delay=delay)).replace(**parts, **given)
 
@@ -346,11 +343,10 @@ class SweepStudy(_Parts, HeldStudy):
         return self.axes.sizes
 
 
-def _columns(raw: Any) -> set[str]:
-    """The parameters of a table, as far as it can be read."""
-    if isinstance(raw, dict) and "csv" not in raw:
-        return set(raw) & set(PARAMETERS)
-    # Its faults are reported where the table itself is read.
+def _list_given(axes: dict[str, Any]) -> set[str]:
+    """The parameters of axes and of a table among them, as far as it can be read."""
+    raw, given = axes.get("devices"), set(axes)
+    # The table's faults are reported where it is read itself.
     with suppress(PydanticCustomError, ValidationError):
-        return set(read_table(raw).columns)
-    return set()
+        given |= set(raw if isinstance(raw, dict) and "csv" not in raw else read_table(raw).columns)
+    return given & set(PARAMETERS)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Annotated, Any, TypeAlias, cast
@@ -16,14 +16,7 @@ import numpy as np
 from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from zwidth.config.fields import (
-    LocatedProblem,
-    Strict,
-    problem,
-    problems_of,
-    repeated,
-    validation_error,
-)
+from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of, repeated, validation_error
 from zwidth.parts.checks import Span, read_span
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import describe, short, suggestion
@@ -65,7 +58,10 @@ class Quantity:
         try:
             if self.periods:
                 return read_span(value, self.allowed)
-            return self._read_number(value) if self.unit == "1" else self._read_quantity(value)
+            if self.unit == "1":
+                return self._read_number(value)
+            with use_kind(self.turns and is_rotary()):
+                return read_quantity(value, find_dimension(self.unit), self.allowed)[0]
         except UnusableValueError as error:
             raise problem(*error.parts) from None
 
@@ -88,9 +84,8 @@ class Quantity:
         if isinstance(value, int if self.whole else int | float) and not isinstance(value, bool):
             number = check_range(to_float(value), self.allowed, remedy=self.remedy)
             return value if self.whole else number
-        hint = (
-            f"write a {f'whole number such as {max(self.allowed.low, 10):g}' if self.whole else 'number such as 0.5'}"
-        )
+        example = f"whole number such as {max(self.allowed.low, 10):g}" if self.whole else "number such as 0.5"
+        hint = f"write a {example}"
         if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
             hint = f"write {value:.0f}"
         elif isinstance(value, str):
@@ -101,10 +96,6 @@ class Quantity:
             elif looks_like_number(value.split(" ")[0]):
                 hint = "this field has no unit; write the number alone"
         raise problem(f"got {describe(value)}", f"it must be {'a whole' if self.whole else 'one'} number", hint)
-
-    def _read_quantity(self, value: Any) -> float:
-        with use_kind(self.turns and is_rotary()):
-            return read_quantity(value, find_dimension(self.unit), self.allowed)[0]
 
     @property
     def schema(self) -> dict[str, Any]:
@@ -167,10 +158,6 @@ class Axis:
             return _SPACINGS[self.form](*self.entries, self.size)
         return np.array(self.entries, dtype=np.float64)
 
-    @property
-    def largest(self) -> float:
-        return max(self.entries)
-
     def spelling(self) -> Any:
         """The axis as a configuration file writes it."""
         written = [f"{value!r} periods" if self.in_periods else value for value in self.entries]
@@ -195,18 +182,17 @@ class _Spaced(Strict, what="an axis of equal steps or ratios"):
     def missing(cls, name: str) -> tuple[str, str]:
         return f"{cls.what} has start, stop and num", f"add {name!r}"
 
-    def limits(self) -> list[LocatedProblem]:
+    def limits(self) -> Iterator[LocatedProblem]:
         start, stop, num = self.start, self.stop, self.num
         if start == stop:
             where = "start and stop must differ"
-            return [(("stop",), problem(f"got {short(stop)}, as start", where, "write a number alone"))]
-        if not math.isfinite(stop - start):
+            yield ("stop",), problem(f"got {short(stop)}, as start", where, "write a number alone")
+        elif not math.isfinite(stop - start):
             allowed = "the distance from start to stop must be finite"
-            return [(("stop",), problem(f"got {short(stop)}", allowed, "bring the ends closer together"))]
+            yield ("stop",), problem(f"got {short(stop)}", allowed, "bring the ends closer together")
         # Neighbors must differ in float64, or the axis would hold one value twice.
-        if num > 1 and abs(stop - start) / (num - 1) <= 4 * np.spacing(max(abs(start), abs(stop))):
-            return [(("num",), problem(f"got {num}", "the steps are below float64's resolution", "lower num"))]
-        return []
+        elif abs(stop - start) / (num - 1) <= 4 * np.spacing(max(abs(start), abs(stop))):
+            yield ("num",), problem(f"got {num}", "the steps are below float64's resolution", "lower num")
 
 
 _SPACINGS: dict[str, Callable[..., np.ndarray]] = {"linear": np.linspace, "log": np.geomspace}

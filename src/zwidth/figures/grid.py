@@ -66,11 +66,10 @@ def in_order(data: Data) -> Data:
 
 
 def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
-    """Some variables of one family as they are drawn.
-
-    Only dimensions with two values or more remain, in rising order, single values of the others beside them. All is in
-    units with few digits, which the attribute ``units`` names. What was not computed is NaN; truth values are 0 and 1.
-    """
+    """Some variables of one family as they are drawn."""
+    # Only dimensions with two values or more remain, in rising order, single values of the others beside them. All is
+    # in units with few digits, which the attribute ``units`` names. What was not computed is NaN; truth values are 0
+    # and 1.
     family = OUTPUTS[names[0]].family
     status = STATUS_OF[family]
     data = data[[*names, status]]
@@ -106,11 +105,9 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
 def panels(
     data: xarray.Dataset, over: list[str], plane: Sequence[str] = (), col: str | None = None
 ) -> tuple[list[xarray.Dataset], int]:
-    """A part of a dataset for each panel, and how many panels are beside each other.
-
-    A panel has the dimensions ``over``, of which those of a ``plane`` resolve so many values and no more. The last two
-    others vary from panel to panel, or ``col`` alone, all others at their first value.
-    """
+    """A part of a dataset for each panel, and how many panels are beside each other."""
+    # A panel has the dimensions ``over``, of which those of a ``plane`` resolve so many values and no more. The last
+    # two others vary from panel to panel, or ``col`` alone, all others at their first value.
     free = [str(dim) for dim in next(iter(data.data_vars.values())).dims if dim not in over]
     if col is not None:
         data = data.isel(dict.fromkeys([dim for dim in free if dim != col], 0))
@@ -204,26 +201,19 @@ def draw_cells(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, **look: Any)
 def label_contours(
     ax: Axes, drawn: ContourSet, colors: Sequence[Any], shades: Sequence[Any], others: Sequence[np.ndarray] = ()
 ) -> None:
-    """Write the level of each contour, a round number, on its longest line where there is room, once.
-
-    The range and the spacing of the axes must be set: where lines are on the page decides on what has room. Each label
-    covers its line with the shade behind it, and keeps away from the points (x, y) of other lines and marks.
-    """
+    """Write the level of each contour, a round number, on its longest line where there is room, once."""
+    # The range and the spacing of the axes must be set: where lines are on the page decides on what has room. Each
+    # label covers its line with the shade behind it, and keeps away from the points (x, y) of other lines and marks.
     frame = ax.get_window_extent()
-    lines = [
-        _list_lines(ax, [np.asarray(part) for part in path.to_polygons(closed_only=False)])
-        for path in drawn.get_paths()
-    ]
+    lines = [_list_lines(ax, path.to_polygons(closed_only=False)) for path in drawn.get_paths()]
     taken = _list_lines(ax, [np.atleast_2d(points) for points in others if len(points)])
     placed: list[tuple[np.ndarray, np.ndarray]] = []
     for k, (level, own) in enumerate(zip(drawn.levels, lines, strict=True)):
         text = f"{level:.12g}"
         dots = ax.figure.dpi / 72.0 / _LEFT
         size = dots * _LABEL_FONT * np.array([0.62 * len(text) + 0.4, 1.3])
-        if not own:
-            continue
-        line = max(own, key=len)
-        if np.ptp(line, axis=0).max() < 1.5 * size[0]:
+        line = max(own, key=len, default=None)
+        if line is None or np.ptp(line, axis=0).max() < 1.5 * size[0]:
             continue
         off = [each for j, near in enumerate(lines) if j != k for each in near] + taken
         at = _find_place(line, size, frame, off, placed)
@@ -235,7 +225,7 @@ def label_contours(
         ax.text(x, y, text, fontsize=_LABEL_FONT, color=colors[k], ha="center", va="center", bbox=box, zorder=2.5)
 
 
-def _list_lines(ax: Axes, lines: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _list_lines(ax: Axes, lines: Sequence[Any]) -> list[np.ndarray]:
     """Lines in dots, their points so close that a label between two of them touches one."""
     found = []
     for line in lines:

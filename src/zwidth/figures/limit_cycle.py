@@ -43,14 +43,14 @@ def draw_limit_cycles(
         bounds: amplitudes between which a motion counts as a buzz, in m.
         axes: Axes of yours, one for each condition.
     """
-    arrays = grid_in_order(arrays, [name for name in AXES if name in arrays])
+    across, along = names = [name for name in AXES if name in arrays]
+    arrays = grid_in_order(arrays, names)
     labels = arrays["condition"].tolist()
-    across, along = (name for name in AXES if name in arrays)
     columns = len(labels) if len(labels) <= 3 else 2
     rows = -(-len(labels) // columns)
     size = (max(1.3 + 2.5 * columns, 5.6), 1.3 + 2.4 * rows) if len(labels) > 1 else (5.8, 4.3)
     panels = style.panels(axes, len(labels), *size, columns, sharex=True, sharey=True)
-    scales = {name: style.si_unit(arrays[name], AXES[name].unit) for name in (across, along)}
+    scales = {name: style.si_unit(arrays[name], AXES[name].unit) for name in names}
     beyond = _find_beyond(arrays, bounds)
     factor, meter = style.si_unit(np.sqrt(bounds[0] * bounds[1]), "m")
     norm = LogNorm(bounds[0] * factor, bounds[1] * factor)
@@ -65,14 +65,13 @@ def draw_limit_cycles(
         look: dict[str, Any] = {"shading": "nearest", "rasterized": True, "zorder": 1}
         image = ax.pcolormesh(x, y, shown.T, cmap=colors, norm=norm, **look)
         for one in curves(edges, "number", condition=label) if edges else ():
-            ends = (getattr(one, name) * scales[name][0] for name in (across, along))
+            ends = (getattr(one, name) * scales[name][0] for name in names)
             ax.plot(*ends, color=style.VERMILION, linewidth=1.2, label=f"linear, {one.number}", zorder=3)
         if len(labels) > 1:
             ax.set_title(style.literal(label))
         grid.scale_axis(ax, "x", x)
         grid.scale_axis(ax, "y", y)
-    names = [f"{AXES[name].axis_label}  in {scales[name][1]}" for name in (across, along)]
-    style.label_axes(panels, *names, once=axes is None)
+    style.label_axes(panels, *(f"{AXES[name].axis_label}  in {scales[name][1]}" for name in names), once=axes is None)
     figure = style.figure_of(panels)
     label = f"amplitude of the buzz  in {meter}"
     figure.colorbar(image, ax=list(panels), label=label, shrink=0.9, format=_PLAIN)
@@ -110,16 +109,16 @@ def draw_limit_cycle_curves(
         family: the name of the parameter that has a curve for each of its values; "" where there is none.
         axes: Axes of yours, those of the amplitudes first.
     """
-    arrays = grid_in_order(arrays, [name for name in AXES if name in arrays])
+    names = [name for name in AXES if name in arrays]
+    arrays = grid_in_order(arrays, names)
     labels = arrays["condition"].tolist()
-    (over,) = (name for name in AXES if name in arrays and name != family)
+    (over,) = (name for name in names if name != family)
     size = (max(1.0 + 2.7 * len(labels), 5.8), 4.8)
     panels = style.panels(axes, 2 * len(labels), *size, len(labels), sharex=True, sharey="row")
     scale, unit = style.si_unit(arrays[over], AXES[over].unit)
     # The curves along the axis before the last one.
-    turn = 1 if family and [name for name in AXES if name in arrays].index(family) else 0
-    cycles = {name: arrays[name] if arrays[name].ndim == 3 else arrays[name][:, None] for name in _CYCLES}
-    cycles = {name: values.swapaxes(1, 2) if turn else values for name, values in cycles.items()}
+    grids = {name: arrays[name] if family else arrays[name][:, None] for name in _CYCLES}
+    cycles = {name: values.swapaxes(1, 2) if names[-1] == family else values for name, values in grids.items()}
     buzzes = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
     factor, meter = style.si_unit(cycles["amplitude_m"][buzzes], "m")
     # Panels of a row share the axis: ticks that fit all of them.

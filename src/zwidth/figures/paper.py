@@ -68,8 +68,7 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     handles = style.delay_model_handles(stable)
     if passive:
         handles.append(style.line("passivity condition", style.DASH_DOTTED, 1.3, style.VERMILION))
-    if handles:
-        ax.legend(handles=handles, loc="upper left")
+    style.legend([ax], handles, outside=False, loc="upper left")
     return ax
 
 
@@ -122,8 +121,7 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
     _scale_stiffness(ax, shown[0].delta, columns["alpha_max"])
     style.label_ends(ax, shown, [path.alpha_max[-1] for path in shown], colors)
     ax.set(xlabel=style.DELTA_LABEL, ylabel=style.ALPHA_MAX_LABEL)
-    if handles := style.delay_model_handles(shown):
-        ax.legend(handles=handles, loc="upper left")
+    style.legend([ax], style.delay_model_handles(shown), outside=False, loc="upper left")
 
 
 def _scale_stiffness(ax: Axes, delta: np.ndarray, stiffness: np.ndarray) -> None:
@@ -186,8 +184,7 @@ def _draw_limit(ax: Axes, paths: list[Any], models: list[Any], colors: dict[floa
     ax.set_xlim(0.0, max(float(model.d.max()) for model in models))
     ax.set_ylim(0.0, 1.04 * max(float(model.slope.max()) for model in models))
     ax.set(xlabel=r"delay  $d = t_d/T$", ylabel=r"limit slope  $g(d)$")
-    if handles := style.delay_model_handles(models):
-        ax.legend(handles=handles, loc="upper right")
+    style.legend([ax], style.delay_model_handles(models), outside=False, loc="upper right")
 
 
 @draws_tables

@@ -115,11 +115,10 @@ def read_panel(part: xarray.Dataset, name: str, edges: Edges | None) -> Panel:
 
 def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
     """The output, and what is drawn along with it."""
-    shown = [each for each in ("stable", "passive") if each in (name, "passive" if name == "stable" else "")]
+    shown = ("stable", "passive") if name == "stable" else [each for each in _SMOOTH if each == name]
     smooth = [next((edge for edge in _SMOOTH[each] if edge in data), each) for each in shown]
-    beside = [*shown, *smooth]
-    beside += ["kind"] if OUTPUTS[name].family == "device" else []
-    data = grid.prepare(data, [name, *[each for each in dict.fromkeys(beside) if each in data and each != name]])
+    beside = [name, *shown, *smooth, *(["kind"] if OUTPUTS[name].family == "device" else [])]
+    data = grid.prepare(data, [each for each in dict.fromkeys(beside) if each in data])
     if name in ("settling_time", "gain_margin", "delay_margin"):
         data[name] = data[name].where(np.isfinite(data[name]) & (data[name] > 0))
     return data

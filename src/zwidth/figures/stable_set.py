@@ -130,22 +130,17 @@ def draw_exact(
 
 
 def _changes(cells: np.ndarray) -> np.ndarray:
-    """Cells that differ from one beside them."""
-
-    def around(both: np.ufunc) -> np.ndarray:
-        padded = np.pad(cells, 1, mode="edge")
-        rows = both(both(padded[:-2], padded[1:-1]), padded[2:])
-        return both(both(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
-
-    return around(np.logical_or) & ~around(np.logical_and)
+    """Cells that differ from one beside them: of all nine some are true and some are not."""
+    padded = np.pad(cells, 1, mode="edge").view(np.uint8)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    true = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+    return (true > 0) & (true < 9)
 
 
 def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
     """Outlines as they can be drawn on logarithmic axes: what is not positive lies beyond the frame."""
-    least = [
-        0.1 * min(limits) if scale == "log" else -np.inf
-        for scale, limits in ((ax.get_xscale(), ax.get_xlim()), (ax.get_yscale(), ax.get_ylim()))
-    ]
+    both = ax.xaxis, ax.yaxis
+    least = [0.1 * min(axis.get_view_interval()) if axis.get_scale() == "log" else -np.inf for axis in both]
     if not np.isfinite(least).any():
         return outlines
     return [(np.maximum(Path(_close(points)).interpolated(_BEND).vertices, least), hole) for points, hole in outlines]

@@ -77,10 +77,8 @@ def house_style() -> Iterator[None]:
 
 @contextmanager
 def style_sheet(file: Path | None = None, size: Size | None = None) -> Iterator[None]:
-    """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given.
-
-    Of a size without a height type is as large as ever. Where there is a size already, it stays.
-    """
+    """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given."""
+    # Of a size without a height type is as large as ever. Where there is a size already, it stays.
     changes, known = _wanted.get()
     try:
         changes = changes if file is None else dict(rc_params_from_file(file, use_default_template=False))
@@ -142,12 +140,13 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
         ax.set(xlabel=x, ylabel=y)
 
 
-def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, **keywords: Any) -> None:
-    """Explain what is drawn, above the panels in as many columns as fit, or within the first."""
-    if not outside or not handles:
-        if handles:
-            # Said, or matplotlib warns on a busy machine that it looks for the place.
-            axes[0].legend(handles=handles, loc="best")
+def legend(axes: np.ndarray | Sequence[Axes], handles: Sequence[Any], *, outside: bool, **keywords: Any) -> None:
+    """Explain what is drawn, if anything is, above the panels in as many columns as fit, or within the first."""
+    if not handles:
+        return
+    if not outside:
+        # Said, or matplotlib warns on a busy machine that it looks for the place.
+        axes[0].legend(handles=handles, loc=keywords.get("loc", "best"))
         return
     figure, columns = figure_of(axes), keywords.pop("ncols", 1)
     keywords = {"loc": "outside upper center"} | keywords | {"handles": handles}

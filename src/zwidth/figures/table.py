@@ -77,11 +77,9 @@ def grid_in_order(arrays: Mapping[str, np.ndarray], axes: Iterable[str]) -> dict
 
 
 def curves(table: Table, *keys: str, over: str = "", **wanted: object) -> list[Any]:
-    """The curves that lie below each other in a table: rows in a row that share the values of ``keys``.
-
-    Each has its columns as attributes: single values of the keys, arrays of the others, by rising values of the column
-    ``over`` where one is named. Rows without the wanted values are left out.
-    """
+    """The curves that lie below each other in a table: rows in a row that share the values of ``keys``."""
+    # Each has its columns as attributes: single values of the keys, arrays of the others, by rising values of the
+    # column ``over`` where one is named. Rows without the wanted values are left out.
     columns = select(table, **wanted)
     changes = [columns[key][1:] != columns[key][:-1] for key in keys]
     ends = np.flatnonzero(np.any(changes, axis=0)) + 1

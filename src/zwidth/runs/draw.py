@@ -34,13 +34,11 @@ _SURFACE = 6
 
 
 def make_edges(store: Store) -> Edges:
-    """What gives the outlines of the stable and the passive walls of a part of a sweep, at one device and delay.
-
-    The part is one of `zwidth.figures.grid.prepare`. Outlines are in its units, stiffness first. Of what is not a
-    plane of walls, and where nothing is proved, there are none.
-    """
-    known = store.grid.coordinates()
-    dims = [dim.replace(".", "_") for dim in store.grid.device_dims]
+    """What gives the outlines of the stable and the passive walls of a part of a sweep, at one device and delay."""
+    # The part is one of `zwidth.figures.grid.prepare`. Outlines are in its units, stiffness first. Of what is not a
+    # plane of walls, and where nothing is proved, there are none.
+    grid = store.plan.grid
+    known, dims = grid.coordinates(), [dim.replace(".", "_") for dim in grid.device_dims]
     at_device = cache(lambda place: _outline(store, place))
 
     def edges(part: xarray.Dataset) -> dict[str, Outlines]:
@@ -48,9 +46,8 @@ def make_edges(store: Store) -> Edges:
         if walls not in _PLANES:
             return {}
         places = [_find_place(known[dim][1], part[dim]) if dim in part.coords else 0 for dim in dims]
-        factors = [
-            part[dim].attrs["factor"] for dim in sorted(walls, key=lambda dim: dim not in ("alpha", "stiffness"))
-        ]
+        order = sorted(walls, key=lambda dim: dim not in ("alpha", "stiffness"))
+        factors = [part[dim].attrs["factor"] for dim in order]
         found = at_device(tuple(places))
         return {name: [(points * factors, hole) for points, hole in outlines] for name, outlines in found.items()}
 
@@ -65,7 +62,7 @@ def _find_place(values: np.ndarray, coordinate: xarray.DataArray) -> int:
 
 
 def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:
-    parameters = store.grid.scene_block(tuple(slice(k, k + 1) for k in place)).parameters
+    parameters = store.plan.grid.scene_block(tuple(slice(k, k + 1) for k in place)).parameters
     try:
         scene = store.study.make_scene({name: float(values[0]) for name, values in parameters.items()})
         if store.study.with_parts:
@@ -91,13 +88,12 @@ def draw_stores(
     progress: Callable[[Path], None] = lambda file: None,
     note: Callable[[str], None] = lambda text: None,
 ) -> tuple[Path, ...]:
-    """Draw the sweeps in a store, or in all stores of a folder, into ``figures`` beside them where ``out`` is left out.
-
-    ``at`` chooses slices, by name: the nearest value that the sweep has to one in the units of the store or with one,
-    as "1 ms", or the label of a device; of a parameter that is not given up to three values are shown. ``axes`` are the
-    parameters over ``x``, ``y``, ``hue`` and ``col``, chosen from the sweep where left out. ``progress`` is called with
-    every file, ``note`` with what a reader should know: other values than those wanted, stores without a figure.
-    """
+    """Draw the sweeps in a store, or in all stores of a folder, into ``figures`` beside them if ``out`` is left out."""
+    # ``at`` chooses slices, by name: the nearest value that the sweep has to one in the units of the store or with one,
+    # as "1 ms", or the label of a device; of a parameter that is not given up to three values are shown. ``axes`` are
+    # the parameters over ``x``, ``y``, ``hue`` and ``col``, chosen from the sweep where left out. ``progress`` is
+    # called with every file, ``note`` with what a reader should know: other values than those wanted, stores without a
+    # figure.
     folder = Path(os.fsdecode(path))
     stores = list_stores(folder)
     beside = folder.parent if stores == [folder] else folder

@@ -22,6 +22,7 @@ from zwidth.config.reader import find_values
 from zwidth.parts.measured import SUFFIXES
 from zwidth.sweep.engine import refuse_changes, refuse_versions
 from zwidth.sweep.files import (
+    ELSEWHERE,
     LOCKS,
     check_folder,
     digest,
@@ -40,6 +41,7 @@ CONFIG_FILE = "config.yaml"
 INPUTS = "inputs"
 RUN_FORMAT = 2
 _SEAL = "record_sha256"
+_MOVE = f"move it away, or {ELSEWHERE}"
 
 # Beside those that can change a result.
 _PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
@@ -60,7 +62,7 @@ class Record:
         self._read()
 
     def _read(self) -> None:
-        where, remedy = self.folder / RUN_FILE, "choose another folder with --out DIR, or remove it"
+        where, remedy = self.folder / RUN_FILE, f"{ELSEWHERE}, or remove it"
         try:
             content = json.loads(where.read_text(encoding="utf-8"))
         except (FileNotFoundError, NotADirectoryError):
@@ -93,36 +95,27 @@ class Record:
         return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
 
     def check_free(self, config: str, *, overwrite: bool, going_on: bool) -> None:
-        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with.
-
-        A run without its record is known by its configuration: the one of the text ``config``.
-        """
+        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with."""
+        # A run without its record is known by its configuration: the one of the text ``config``.
         if (self.folder.exists() or self.folder.is_symlink()) and not self.folder.is_dir():
             raise StoreExistsError(f"out: {self.folder} is a file, a folder is needed; choose another with --out DIR")
         check_folder(self.folder)
         if going_on or not self.folder.is_dir():
             return
-        if self.exists:
-            if not overwrite:
-                raise StoreExistsError(
-                    f"out: {self.folder} already holds a run; choose another folder with --out DIR, go on with it with "
-                    "--resume, or replace it with --overwrite"
-                )
-            return
         # What a run without a record leaves; stores are refused or replaced one by one: they say what they are.
         names, known = [path.name for path in self.folder.iterdir()], (LOCKS, CONFIG_FILE, "figures")
         strange = [name for name in names if not name.endswith((SUFFIX, ".partial")) and name not in known]
-        if strange and self._holds_config(config):
-            if not overwrite:
-                raise StoreExistsError(
-                    f"out: {self.folder} holds a run of this configuration without its record {RUN_FILE}; replace its "
-                    "files with --overwrite, keep its sweeps with --resume, or choose another folder with --out DIR"
-                )
-        elif strange:
-            raise StoreExistsError(
-                f"out: {self.folder} is not empty and holds no run (no {RUN_FILE}), and no {CONFIG_FILE} of this "
-                "configuration; choose another folder with --out DIR"
-            )
+        why = ""
+        if strange and not self.exists and not self._holds_config(config):
+            why = f"is not empty and holds no run (no {RUN_FILE}), and no {CONFIG_FILE} of this configuration; "
+            why += ELSEWHERE
+        elif self.exists and not overwrite:
+            why = f"already holds a run; {ELSEWHERE}, go on with it with --resume, or replace it with --overwrite"
+        elif strange and not overwrite:
+            why = f"holds a run of this configuration without its record {RUN_FILE}; replace its files with "
+            why += f"--overwrite, keep its sweeps with --resume, or {ELSEWHERE}"
+        if why:
+            raise StoreExistsError(f"out: {self.folder} {why}")
 
     def _holds_config(self, text: str) -> bool:
         with suppress(OSError):
@@ -136,7 +129,7 @@ class Record:
         if self.content.get("format") != RUN_FORMAT:
             raise StoreError(
                 f"{self.folder}: an earlier release made this run and kept no checksums to go on from; start again "
-                "with --overwrite, or choose another folder with --out DIR"
+                f"with --overwrite, or {ELSEWHERE}"
             )
         if self.damaged:
             # Everything is computed again, and stores know by themselves what they are for.
@@ -154,20 +147,15 @@ class Record:
         self._update({**about, "started": self.content.get("started", about["started"])})
 
     def keep_config(self, text: str, inputs: Mapping[str, bytes]) -> None:
-        """Write the configuration beside its results, and the files that it reads; what is somebody's own stays.
-
-        Where the folder held this configuration and no record, the record was lost: the run's files are its own.
-        """
+        """Write the configuration beside its results, and the files that it reads; what is somebody's own stays."""
+        # Where the folder held this configuration and no record, the record was lost: the run's files are its own.
         path, place = self.folder / CONFIG_FILE, self.folder / INPUTS
         digests = {name: hashlib.sha256(data).hexdigest() for name, data in inputs.items()}
         wanted = {name: data for name, data in inputs.items() if file_hash(place / name) != digests[name]}
         known = {} if place.is_symlink() else self.content.get("inputs", {})
         strange = [name for name in wanted if name not in known and (place.is_symlink() or (place / name).exists())]
         if strange:
-            raise StoreExistsError(
-                f"out: {place / strange[0]} was not written by this run; move it away, or choose another folder with "
-                "--out DIR"
-            )
+            raise StoreExistsError(f"out: {place / strange[0]} was not written by this run; {_MOVE}")
         own = CONFIG_FILE in self.files()
         lost = not own and self._holds_config(text)
         self._update(({"inputs": {**known, **digests}} if digests else {}) | ({"lost": True} if lost else {}))
@@ -204,18 +192,13 @@ class Record:
         ]
 
     def keep(self, stage: Path, entry: dict[str, Any]) -> None:
-        """Give the files in ``stage`` their names; when the study is done, take away what else it had before.
-
-        A file of somebody's own that has one of these names is a `StoreExistsError`.
-        """
+        """Give the files in ``stage`` their names; when the study is done, take away what else it had before."""
+        # A file of somebody's own that has one of these names is a `StoreExistsError`.
         before = self.entry(entry["name"]) or {}
         files = {path.name: file_hash(path) for path in sorted(stage.iterdir())}
         for file in files:
             if (self.folder / file).exists() and file not in self.files() and not self.content.get("lost"):
-                raise StoreExistsError(
-                    f"out: {self.folder / file} was not written by this run; move it away, or choose another folder "
-                    "with --out DIR"
-                )
+                raise StoreExistsError(f"out: {self.folder / file} was not written by this run; {_MOVE}")
         # First the names, so that a run that is killed between two files still knows them for its own.
         both = {**before.get("files", {}), **files}
         self.note({**entry, "state": "open", "files": both})
@@ -294,11 +277,9 @@ def file_hash(path: Path) -> str:
 
 
 def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[str, str]]:
-    """What a run keeps so that it can be repeated from its own folder, of a configuration's text without faults.
-
-    The text with the names of the copies; the copies' bytes by their names in the folder of inputs; and, by the names
-    that the configuration has, those that the text has now. A copy's own name stays as it is.
-    """
+    """What a run keeps so that it can be repeated from its own folder, of a configuration's text without faults."""
+    # The text with the names of the copies; the copies' bytes by their names in the folder of inputs; and, by the names
+    # that the configuration has, those that the text has now. A copy's own name stays as it is.
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}
     places = find_values(text, "csv") + [place for place in find_values(text, "device") if place[0].endswith(SUFFIXES)]

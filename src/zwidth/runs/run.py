@@ -228,18 +228,17 @@ class _Run:
         """Compute what is not done yet; whatever goes wrong is recorded, for the others do not depend on it."""
         for index, study in enumerate(pieces, start=1):
             event = StudyEvent(index, self.total, study.name, study.kind_name())
-            entry = self.record.entry(study.name)
-            faults = self.record.faults(study.name)
-            if entry is not None and entry["state"] == "done" and not faults:
-                kept: Any = {name: tuple(entry.get(name, ())) for name in ("files", "notes", "answer")}
-                self.results.append(StudyResult(study.name, event.kind, "kept", **kept))
-                self.tell(replace(event, result=self.results[-1]))
-                continue
-            self.repaired += [f"{study.name}: {fault}" for fault in faults if entry and entry["state"] == "done"]
+            entry, faults = self.record.entry(study.name), self.record.faults(study.name)
+            done = entry is not None and entry["state"] == "done"
+            self.repaired += [f"{study.name}: {fault}" for fault in faults if done]
             try:
-                self.tell(event)
-                LISTENER.set(lambda *parts, event=event: self.tell(replace(event, parts=parts)))
-                self.results.append(self._compute(study))
+                if entry is not None and done and not faults:
+                    kept: Any = {name: tuple(entry.get(name, ())) for name in ("files", "notes", "answer")}
+                    self.results.append(StudyResult(study.name, event.kind, "kept", **kept))
+                else:
+                    self.tell(event)
+                    LISTENER.set(lambda *parts, event=event: self.tell(replace(event, parts=parts)))
+                    self.results.append(self._compute(study))
                 self.tell(replace(event, result=self.results[-1]))
             except KeyboardInterrupt:
                 self.interrupted = True

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import product
+from itertools import groupby, product
+from operator import itemgetter
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -104,11 +105,8 @@ class DesignStudy(ComputedStudy):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        if not self.stiffness.values().min() > 0:
-            what = problem(
-                f"got {short(float(self.stiffness.values().min()))} {own_unit('N/m')}", "it must be greater than 0"
-            )
-            yield ("stiffness",), what
+        if not (least := float(self.stiffness.values().min())) > 0:
+            yield ("stiffness",), problem(f"got {short(least)} {own_unit('N/m')}", "it must be greater than 0")
         known = self._list_parameters()
         if self.find not in known:
             has = f"this device has {listing(known)}"
@@ -264,7 +262,7 @@ class FiltersStudy(ComputedStudy):
             yield ("noise_limit",), problem(what, "noise comes from the counts of the position", "add 'resolution'")
         if self.cutoff is not None:
             try:
-                LowPass(cutoff=self.cutoff.largest, order=self.order).estimate(self.device.period)
+                LowPass(cutoff=max(self.cutoff.entries), order=self.order).estimate(self.device.period)
             except InputError as error:
                 path, what = locate_refusal(error)
                 yield path[-1:], what
@@ -298,14 +296,17 @@ class FiltersStudy(ComputedStudy):
                 noise = find_velocity_noise(velocity, self.device.period, self.resolution)
                 row |= {"velocity_noise_m_per_s": noise, "force_noise_N": noise * abs(float(top.virtual_damping))}
             rows.append(row)
-        table = stack(rows)
-        drawn: dict[str, Any] = {"": partial(figures.draw_filters, table)}
+        drawn: dict[str, Any] = {"": partial(figures.draw_filters, stack(rows))}
         if self.resolution is not None:
             limit = np.nan if self.noise_limit is None else self.noise_limit
-            table = {**table, "best": _mark_best(table, limit)}
-            drawn["_noise"] = partial(figures.draw_filter_noise, table, limit)
-        best = [row for row, marked in zip(rows, table.get("best", ()), strict=False) if marked]
-        return Outcome(table=table, figures=drawn, answer=tuple(map(_spell_best, best)))
+            quiet = [row for row in rows if row["velocity_noise_m_per_s"] <= limit and np.isfinite(row[SI_COLUMNS[0]])]
+            # The stiffest wall of each damping; rows stand together by it.
+            own = groupby(quiet, itemgetter("damping_N_s_per_m"))
+            best = {id(max(those, key=itemgetter(SI_COLUMNS[0]))) for _, those in own}
+            rows = [{**row, "best": id(row) in best} for row in rows]
+            drawn["_noise"] = partial(figures.draw_filter_noise, stack(rows), limit)
+        answer = tuple(_spell_best(row) for row in rows if row.get("best"))
+        return Outcome(table=stack(rows), figures=drawn, answer=answer)
 
 
 def _spell_best(row: dict[str, Any]) -> str:
@@ -314,14 +315,3 @@ def _spell_best(row: dict[str, Any]) -> str:
     size = size if row["samples"] == row["samples"] else with_unit(row["cutoff_Hz"], "Hz")
     wall = f"K_max = {with_unit(round_safely(stiffness, 'below'), 'N/m')} at B = {with_unit(damping, 'N s/m')}"
     return f"b = {with_unit(row['damping_N_s_per_m'], 'N s/m')}: {row['estimate'].replace('_', ' ')}, {size}: {wall}"
-
-
-def _mark_best(table: Table, limit: float) -> np.ndarray:
-    """Which filter of each damping gives the stiffest wall within a limit of the noise."""
-    best = np.zeros(table["estimate"].size, bool)
-    quiet = table["velocity_noise_m_per_s"] <= limit
-    for damping in np.unique(table["damping_N_s_per_m"]):
-        own = np.flatnonzero(quiet & (table["damping_N_s_per_m"] == damping) & np.isfinite(table[SI_COLUMNS[0]]))
-        if own.size:
-            best[own[np.argmax(table[SI_COLUMNS[0]][own])]] = True
-    return best

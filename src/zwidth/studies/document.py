@@ -213,10 +213,8 @@ def config_json_schema() -> dict[str, Any]:
 
 
 def _tidy(schema: Any, shared: dict[str, Any]) -> Any:
-    """The schema without null, which stands for "not given" in the models and is never written in a file.
-
-    What is to be shared is moved to ``shared``, and a reference takes its place.
-    """
+    """The schema without null, which stands for "not given" in the models and is never written in a file."""
+    # What is to be shared is moved to ``shared``, and a reference takes its place.
     if isinstance(schema, list):
         return [_tidy(item, shared) for item in schema if item != {"type": "null"}]
     if not isinstance(schema, dict):

@@ -20,6 +20,7 @@ from zwidth.config.study import Study
 from zwidth.config.values import Axis, DelayAxis, DeltaAxis
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.scenes.assessment import name_kind
+from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.formatting import own_header, to_cell
 
@@ -69,8 +70,8 @@ class ComputedStudy(Study):
     plan, and `compute`. `zwidth.studies.register` makes it known.
     """
 
+    # Whether the results depend on the scene beyond what the study has taken from it.
     reads_scene: ClassVar[bool] = False
-    """Whether the results depend on the scene beyond what the study has taken from it."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """Compute everything, in the file's scene and perhaps as its only study of this kind; drawing comes later."""
@@ -121,25 +122,25 @@ _CHOICE = ("stiffness_fraction", "walls")
 
 def add_si_of_scene(table: Table, delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Table:
     """A table of walls, in SI units as well where delta and d are those of a rigid scene or device alone."""
-    device = _find_owner(delta, d, owner)
-    if device is None:
+    scene = _find_scene(delta, d, owner)
+    if scene is None:
         return table
-    stiffness, damping = device.to_scene().units
+    stiffness, damping = scene.units
     return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
 
 
 def share_of_device(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> float:
-    """The part of the damping delta that passivity counts on: without the hand, where they are those of a device."""
-    device = _find_owner(delta, d, owner)
-    return device.own_share if device is not None else 1.0
+    """The part of delta that is the device's own, which alone makes walls passive for any hand; else all of it."""
+    scene = _find_scene(delta, d, owner)
+    return float(scene.own_delta / scene.delta) if scene is not None and scene.delta else 1.0
 
 
-def _find_owner(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> PhysicalScene | PhysicalDevice | None:
-    """The rigid scene or device, where delta and d are those of it alone."""
+def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Scene | None:
+    """The scene of a rigid device in SI units, where delta and d are those of it alone."""
     if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.parts_beyond:
         return None
     alone = [axis.values().tolist() for axis in (delta, d)] == [[owner.delta], [owner.d]]
-    return owner if alone else None
+    return owner.to_scene() if alone else None
 
 
 def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:

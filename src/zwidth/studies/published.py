@@ -92,11 +92,9 @@ def _ridge(delta: float, d: float) -> tuple[float, float]:
 
 
 def line_appears() -> float:
-    """The delta from which, for d = 0, the line of a real pole at z = -1 bounds the stable set.
-
-    The boundary curve ends at omega = pi, in the corner where two poles meet at z = -1. The line starts there, so it
-    bounds the stable set (alpha > 0) from the delta on at which the corner crosses alpha = 0.
-    """
+    """The delta from which, for d = 0, the line of a real pole at z = -1 bounds the stable set."""
+    # The boundary curve ends at omega = pi, in the corner where two poles meet at z = -1. The line starts there, so it
+    # bounds the stable set (alpha > 0) from the delta on at which the corner crosses alpha = 0.
     # Slow to load, and no other kind of study has a use for it.
     from scipy.optimize import root_scalar
 
@@ -106,11 +104,9 @@ def line_appears() -> float:
 
 
 def corner_takes_over() -> float:
-    """The delta from which, for d = 0, the stiffest stable wall sits in the corner at z = -1.
-
-    For d = 0 the curve is a graph over beta, ``alpha = (1 - c + beta (phi2 + c psi) - beta^2 psi phi1)/(psi (1 + phi2
-    beta))``. Its maximum passes the corner, where the curve ends, when ``d alpha/d beta = 0`` there.
-    """
+    """The delta from which, for d = 0, the stiffest stable wall sits in the corner at z = -1."""
+    # For d = 0 the curve is a graph over beta, ``alpha = (1 - c + beta (phi2 + c psi) - beta^2 psi phi1)/(psi (1 + phi2
+    # beta))``. Its maximum passes the corner, where the curve ends, when ``d alpha/d beta = 0`` there.
     # Extended precision where the machine has it: in float64 rounding blurs the last two digits of this root.
     return float(bisect(lambda delta: _slope_at_corner(delta) < 0, np.longdouble(2.5), np.longdouble(6.0)))
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import WrapValidator
+from pydantic_core import PydanticCustomError
 
 from zwidth import figures
 from zwidth.config.fields import LocatedProblem, members, problem
@@ -121,10 +122,9 @@ class StepStudy(WallsStudy, ResponseStudy):
     def _wall_limits(self) -> Iterable[LocatedProblem]:
         """Walls that do not fit their device, each reported once."""
         least, most = WALL_RANGE
-        told: set[int] = set()
+        faults: dict[int, PydanticCustomError] = {}
         for number, (device, wall) in enumerate(self.pairs()):
-            index = number % len(self.walls or (None,))
-            if wall is None or index in told:
+            if wall is None:
                 continue
             if isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall):
                 allowed = "a wall in SI units needs a device with mass and period"
@@ -134,8 +134,8 @@ class StepStudy(WallsStudy, ResponseStudy):
                 fault = problem("got a wall that is out of range", allowed, "check the units")
             else:
                 continue
-            told.add(index)
-            yield ("walls", index), fault
+            faults.setdefault(number % len(self.walls or ()), fault)
+        yield from ((("walls", index), fault) for index, fault in faults.items())
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         walls = self.walls or (None,)
@@ -198,12 +198,8 @@ class RecommendStudy(ResponseStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         stem, label = "recommendation" if alone else f"{self.name}_recommendation", self.device.label or self.name
         bare = self.device.to_scene()
-        found = bare.recommend(
-            stiffness_fraction=self.stiffness_fraction,
-            gain_margin=self.gain_margin,
-            phase_margin=self.phase_margin,
-            passive=self.passive,
-        )
+        wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive")
+        found = bare.recommend(**{name: getattr(self, name) for name in wanted})
         told, notes, response = found.as_dict(), list(found.notes), None
         if not bare.parts_beyond and found.verdict is not None:
             # The wall as it was judged: from SI units and back, a last digit may be another.

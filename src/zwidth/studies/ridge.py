@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from functools import partial
+from functools import cached_property, partial
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -57,16 +58,13 @@ class RidgeStudy(CurvesStudy):
     """Show the small deltas in a panel of their own, as fig. 10 of the paper does."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        parts, notes = [], []
-        for model, delays in needed_models(self.delay_models, self.d.values()):
-            part, remarks = ridge_table(self.delta.values(), delays, model)
-            parts.append(part)
-            notes += remarks
+        needed = needed_models(self.delay_models, self.d.values())
+        parts, notes = zip(*(ridge_table(self.delta.values(), delays, model) for model, delays in needed), strict=True)
         table = stack(parts)
         drawn: dict[str, Any] = {"": partial(figures.draw_ridge, table, two_scalings=self.two_scalings)}
         if table["delta"].max() >= _STRONG_DAMPING:
             drawn["_slope"] = partial(figures.draw_slope, table, slope_table(table))
-        return Outcome(table=table, figures=drawn, notes=tuple(notes))
+        return Outcome(table=table, figures=drawn, notes=tuple(chain(*notes)))
 
 
 def ridge_table(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> tuple[Table, list[str]]:
@@ -75,11 +73,10 @@ def ridge_table(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> tuple[Ta
     points = alpha_max(deltas, delays, delay=delay)
     columns = {"alpha_max": points.alpha, "beta": points.beta, "omega": points.omega}
     columns["kind"] = np.array([RidgeKind(int(code)).name.lower() for code in points.kind])
-    failed = [(value, np.count_nonzero(points.status[delays == value] != Status.OK)) for value in d]
     notes = [
         f"alpha_max: {count} of {delta.size} points have no answer for d = {value:g} ({delay})"
-        for value, count in failed
-        if count
+        for value in d
+        if (count := np.count_nonzero(points.status[delays == value] != Status.OK))
     ]
     return {"d": delays, "delay_model": np.full(delays.size, delay), "delta": deltas, **columns}, notes
 
@@ -137,10 +134,8 @@ def find_edges(delta: float, d: float) -> dict[str, Outlines]:
 
 
 def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0) -> Iterator[dict[str, Any]]:
-    """The edge of the passive set of every device that has damping, as columns; without it nothing is passive.
-
-    ``share`` is the part of the damping that is the device's own: a hand's does not count.
-    """
+    """The edge of the passive set of every device that has damping, as columns; without it nothing is passive."""
+    # ``share`` is the part of the damping that is the device's own: a hand's does not count.
     for d in delays:
         alpha, beta = unit_outline(float(d))
         for delta in deltas[share * deltas > 0]:
@@ -171,7 +166,6 @@ class Poses(Strict, what="a table of poses"):
     up: str
     """Name of the one from bottom to top."""
 
-    _table: DeviceTable = PrivateAttr()
     # Name, unit and values of both.
     _coordinates: list[tuple[str, str, list[float]]] = PrivateAttr()
 
@@ -181,20 +175,18 @@ class Poses(Strict, what="a table of poses"):
 
     def limits(self) -> Iterable[LocatedProblem]:
         try:
-            self._table, columns = read_table({"csv": self.csv}), read_columns(find_file(self.csv))
+            table, columns = self.table, read_columns(find_file(self.csv))
             known = {name: (unit, place) for place, (name, unit) in enumerate(map(split_head, columns.heads))}
             chosen = {key: getattr(self, key) for key in ("across", "up")}
-            if set(self._table.columns) != {"mass", "damping"}:
-                what = f"got columns {' and '.join(self._table.columns)}"
+            if set(table.columns) != {"mass", "damping"}:
+                what = f"got columns {' and '.join(table.columns)}"
                 yield ("csv",), problem(what, _FORM, "give these two, and no other parameter")
             for key in (key for key, name in chosen.items() if name not in known):
                 remedy = suggestion(chosen[key], known, f"choose from {', '.join(known)}")
                 yield (key,), problem(f"got {describe(chosen[key])}", "it names a column of the file", remedy)
             if self.across == self.up:
-                yield (
-                    ("up",),
-                    problem(f"got {describe(self.up)}, as across", "a map has two coordinates", "name another"),
-                )
+                what = f"got {describe(self.up)}, as across"
+                yield ("up",), problem(what, "a map has two coordinates", "name another")
             found = [(name, *known[name]) for name in chosen.values() if name in known]
             values = columns.numbers([place for _, _, place in found])
             self._coordinates = [(name, unit, of.tolist()) for (name, unit, _), of in zip(found, values, strict=True)]
@@ -203,10 +195,10 @@ class Poses(Strict, what="a table of poses"):
         except InputError as error:
             yield ("csv",), problem(str(error).partition("; ")[0], _FORM, "complete the file")
 
-    @property
+    @cached_property
     def table(self) -> DeviceTable:
         """The masses and dampings."""
-        return self._table
+        return read_table({"csv": self.csv})
 
     def tabulate(self) -> dict[str, np.ndarray]:
         """The coordinates as columns, across and up."""

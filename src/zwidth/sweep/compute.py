@@ -55,23 +55,21 @@ def compute(family: Family, outputs: tuple[str, ...], block: Block, accuracy: fl
 
 def _devices(block: Block) -> dict[str, np.ndarray]:
     alpha, beta, _, kind, status = _map_pieces(alpha_max, (block.delta, block.d), _PIECE)
-    good = status == Status.OK
-    found = {
+    rate = block.mass / block.period
+    return {
         "alpha_max": alpha,
         "beta_at_max": beta,
-        "kind": np.where(good, kind, NOT_COMPUTED).astype(np.uint8),
+        "kind": np.where(status == Status.OK, kind, NOT_COMPUTED).astype(np.uint8),
         "ridge_status": status.astype(np.uint8),
+        "stiffness_max": alpha * rate / block.period,
+        "virtual_damping_at_max": beta * rate,
     }
-    if block.mass.size:
-        rate = block.mass / block.period
-        found |= {"stiffness_max": alpha * rate / block.period, "virtual_damping_at_max": beta * rate}
-    return found
 
 
 def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
     shape = (block.delta.size, block.alpha.shape[1], block.beta.shape[1])
     found: dict[str, np.ndarray] = {}
-    unproved = False
+    unproved, period = False, block.period[:, None, None]
     if RADIUS_OUTPUTS & set(outputs):
         if block.all_alpha.shape[1] * block.all_beta.shape[1] >= _SMALLEST_PLANE:
             area = Area(block.all_alpha, block.all_beta, block.delta, block.d, (block.betas, block.alphas))
@@ -84,15 +82,11 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
             radius, proved, rate = _by_device(listed, block, shape, leaves=3)
         found["spectral_radius"], unproved = radius, proved == 0
         # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
-        found["decay_rate"] = rate / block.period[:, None, None] if block.period.size else rate
-        found["margin"] = -np.expm1(-rate)
-        periods = decay_time(rate)
-        found["settling_time"] = periods * block.period[:, None, None] if block.period.size else periods
+        found |= {"decay_rate": rate / period, "margin": -np.expm1(-rate), "settling_time": decay_time(rate) * period}
     if MARGIN_OUTPUTS & set(outputs):
         compute = partial(_margins, "delay_margin" in outputs, "modulus_margin" in outputs)
         found |= dict(zip(_MARGINS, _by_device(compute, block, shape, leaves=4), strict=True))
-        if block.period.size:
-            found["delay_margin"] = found["delay_margin"] * block.period[:, None, None]
+        found["delay_margin"] = found["delay_margin"] * period
     if "stable" in outputs:
         found["stable"] = _stable(block, shape)
     if {"passive", "passivity_margin"} & set(outputs):
@@ -151,12 +145,9 @@ def _by_device(
         step = max(1, _LAID_OUT // (rows * shape[2]))
         for start, row in product(range(0, group.size, step), range(0, shape[1], rows)):
             devices, alphas = group[start : start + step], slice(row, row + rows)
-            parameters = np.broadcast_arrays(
-                block.alpha[devices, alphas, None],
-                block.beta[devices, None, :],
-                block.delta[devices, None, None],
-                block.d[devices, None, None],
-            )
+            walls = block.alpha[devices, alphas, None], block.beta[devices, None, :]
+            device = block.delta[devices, None, None], block.d[devices, None, None]
+            parameters = np.broadcast_arrays(*walls, *device)
             columns = [parameter.ravel() for parameter in parameters]
             for result, leaf in zip(results, function(columns), strict=True):
                 result[devices, alphas] = leaf.reshape(parameters[0].shape)

@@ -58,10 +58,8 @@ def _terminal_without_logs() -> Iterator[None]:
     before = {logging.getLogger(name): logging.getLogger(name).handlers for name in (*names, "asyncio")}
     for logger, handlers in before.items():
         # With no handler at all Python itself would write to the terminal.
-        logger.handlers = [
-            logging.NullHandler(),
-            *(one for one in handlers if getattr(one, "stream", None) not in terminal),
-        ]
+        others = (one for one in handlers if getattr(one, "stream", None) not in terminal)
+        logger.handlers = [logging.NullHandler(), *others]
     try:
         yield
     finally:
@@ -70,11 +68,9 @@ def _terminal_without_logs() -> Iterator[None]:
 
 
 def on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[Finished]:
-    """Do jobs on the workers of a scheduler, which must see the stores under the same path.
-
-    A worker that dies may take innocent chunks with it, those that it had just begun: what dask gives up is tried
-    again at the end, one by one, before it is called a failure.
-    """
+    """Do jobs on the workers of a scheduler, which must see the stores under the same path."""
+    # A worker that dies may take innocent chunks with it, those that it had just begun: what dask gives up is tried
+    # again at the end, one by one, before it is called a failure.
     given_up = []
     for finished in _submit_jobs(client, jobs, perform):
         if finished.error.startswith(_KILLED):

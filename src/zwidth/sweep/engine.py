@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from zwidth.config.sweep import SweepStudy
-from zwidth.sweep.files import differences, digest, versions
+from zwidth.sweep.files import ELSEWHERE, differences, digest, versions
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, attempt, in_workers
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.store import SUFFIX, Store, create
@@ -74,12 +74,10 @@ def compute_sweeps(
     scheduler: str | None,
     progress: Callable[[Progress], None],
 ) -> Sweeps:
-    """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there (`check_stores`).
-
-    The folder is held by the caller; ``about`` has name, description and config for the stores' attributes; the options
-    are those of `zwidth.run`. A scheduler that does not answer, or whose workers do not see the folder, is an
-    `InputError`.
-    """
+    """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there."""
+    # The folder is held by the caller; ``about`` has name, description and config for the stores' attributes; the
+    # options are those of `zwidth.run`. A scheduler that does not answer, or whose workers do not see the folder, is an
+    # `InputError`.
     from zwidth.sweep.jobs import perform
 
     with ExitStack() as stack:
@@ -127,9 +125,7 @@ def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool)
         if not path.exists():
             continue
         if not going_on:
-            raise StoreExistsError(
-                f"out: {path} exists already; go on with it with --resume, or choose another folder with --out DIR"
-            )
+            raise StoreExistsError(f"out: {path} exists already; go on with it with --resume, or {ELSEWHERE}")
         check_same(Store(path), study)
 
 
@@ -230,18 +226,16 @@ def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> Non
         ]
         more = len(changed) - _SHOWN_DIFFERENCES
         lines += [f"{where}: {more} more keys differ"] if more > 0 else []
-        remedy = f"{where}: change the configuration back, or choose another folder with --out DIR"
+        remedy = f"{where}: change the configuration back, or {ELSEWHERE}"
         raise StoreError("\n".join([*lines, remedy]))
 
 
 def refuse_versions(where: Path, old: dict[str, str]) -> None:
     """Refuse to go on with results of other releases: together they are not what either of them would compute."""
-    now = versions()
-    for key in (key for key in now if key != "python" and old.get(key) != now[key]):
-        raise StoreError(
-            f"{where}: made with {key} {old.get(key)}, now there is {now[key]}; install the same release, or choose "
-            "another folder with --out DIR"
-        )
+    for key, now in versions().items():
+        if key != "python" and old.get(key) != now:
+            what = f"{where}: made with {key} {old.get(key)}, now there is {now}"
+            raise StoreError(f"{what}; install the same release, or {ELSEWHERE}")
 
 
 def repair(store: Store, tasks: Iterable[Task]) -> list[str]:

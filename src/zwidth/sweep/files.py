@@ -50,6 +50,8 @@ _HOPELESS = frozenset(list(REMEDIES)[:6])
 _PACKAGES = ("jax", "jaxlib", "numpy")
 LOCKS = ".locks"
 """Name of the folder of locks in a folder of results."""
+ELSEWHERE = "choose another folder with --out DIR"
+"""What helps in every case."""
 
 # As long as a killed program may take to vanish, and a shard to write down who it is.
 _PATIENCE = 1.0
@@ -71,10 +73,10 @@ def check_folder(folder: Path) -> None:
     nearest = existing(folder)
     if not nearest.is_dir():
         where = "is a file" if nearest == folder.absolute() else f"cannot be made, for {nearest} is a file"
-        raise InputError(f"out: {folder} {where}; choose another folder with --out DIR")
+        raise InputError(f"out: {folder} {where}; {ELSEWHERE}")
     if not os.access(nearest, os.W_OK | os.X_OK):
         where = "is read-only" if nearest == folder.absolute() else f"cannot be made, for {nearest} is read-only"
-        raise InputError(f"out: {folder} {where}, at least to you; choose another folder with --out DIR")
+        raise InputError(f"out: {folder} {where}, at least to you; {ELSEWHERE}")
 
 
 def is_plain_name(name: str) -> bool:
@@ -156,10 +158,8 @@ def differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, 
 
 @contextmanager
 def holding(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None]:
-    """Hold a folder of results, made where it is missing, while the block runs; a shard (i, n) shares it with others.
-
-    A `StoreBusyError` says which other run holds it.
-    """
+    """Hold a folder of results, made where it is missing, within the block; a shard (i, n) shares it with others."""
+    # A `StoreBusyError` says which other run holds it.
     check_folder(folder)
     with _opened(folder / LOCKS / "run") as run:
         if shard is None:
@@ -203,9 +203,7 @@ def _busy(folder: Path, what: str) -> StoreBusyError:
             holders += [_read_holder(file)] if held and "process" in _read_holder(file) else []
     more = f", and {len(holders) - 1} more" if len(holders) > 1 else ""
     who = f" ({holders[0]}{more})" if holders else ""
-    return StoreBusyError(
-        f"out: {folder}: {what}{who}; wait until it ends, stop that process, or choose another folder with --out DIR"
-    )
+    return StoreBusyError(f"out: {folder}: {what}{who}; wait until it ends, stop that process, or {ELSEWHERE}")
 
 
 def _this_process() -> str:

@@ -24,7 +24,7 @@ class Block(NamedTuple):
     all_beta: np.ndarray
     alphas: slice  # which of them are the block's
     betas: slice
-    mass: np.ndarray  # in SI units, shape (D,); empty in a normalized sweep, likewise the period
+    mass: np.ndarray  # in SI units, shape (D,); 1 in a normalized sweep, likewise the period
     period: np.ndarray
     rows: int  # of one beta, in the whole grid
 
@@ -112,8 +112,8 @@ class Grid:
         given = self.scene_block(place)
         rows, none = self.size_of("device") * given.virtual_damping.shape[1], np.zeros(len(given.stiffness))
         if not self.physical:
-            device, walls = (given.parameters["delta"], given.parameters["d"]), given[1:]
-            return Block(*device, *walls, alphas, betas, np.empty(0), np.empty(0), rows)
+            delta, d = given.parameters["delta"], given.parameters["d"]
+            return Block(delta, d, *given[1:], alphas, betas, none + 1.0, none + 1.0, rows)
         mass, damping, delay = (given.parameters.get(name, none) for name in ("mass", "damping", "delay"))
         rate = given.parameters.get("rate")
         period = given.parameters["period"] if rate is None else 1.0 / rate

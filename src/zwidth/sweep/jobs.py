@@ -86,13 +86,13 @@ def perform(path: str, family: str, index: int) -> None:
     if store.is_done(task):
         return
     if store.study.with_parts:
-        block = store.grid.scene_block(task.place)
+        block = store.plan.grid.scene_block(task.place)
         values = compute_scenes(plan.family, plan.outputs, store.study, block)
     else:
         # Loads JAX, which a process that only hands out work has no use for.
         from zwidth.sweep.compute import compute
 
-        values = compute(plan.family, plan.outputs, store.grid.block(task.place), store.study.accuracy)
+        values = compute(plan.family, plan.outputs, store.plan.grid.block(task.place), store.study.accuracy)
     # A scheduler that restarts, or a run that goes on, may have handed it out twice.
     if not store.is_done(task):
         store.write(task, values)

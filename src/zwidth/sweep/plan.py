@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.config.sweep import SweepStudy
-from zwidth.sweep.files import check_folder, existing
+from zwidth.sweep.files import ELSEWHERE, check_folder, existing
 from zwidth.sweep.grid import Grid
 from zwidth.words.errors import ResourceError
 from zwidth.words.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
@@ -105,6 +105,7 @@ class Plan:
     """What a sweep will do."""
 
     study: SweepStudy
+    grid: Grid
     families: tuple[FamilyPlan, ...]
     methods: dict[str, tuple[str, str]]  # of every output that has a choice, and why it is that one
     model: str  # what is modelled, in words
@@ -172,7 +173,7 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     if not study.with_parts:
         part = "" if longest == math.floor(longest) else ", also in part of a period"
         model = f"damped mass, zero-order hold, held delay{part}: polynomials of degree up to {math.ceil(longest) + 3}"
-    return Plan(study, tuple(families), choose_methods(study), model, largest + _LAID_OUT_BYTES, disk, seconds)
+    return Plan(study, grid, tuple(families), choose_methods(study), model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
 def kept_plan(study: SweepStudy, kept: dict[str, Any]) -> Plan:
@@ -220,8 +221,8 @@ def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collec
         largest = max(new, key=lambda plan: plan.disk)
         raise ResourceError(
             f"out: {folder} has {_size(free)} free, but the results may take {_size(disk)}, most of them of "
-            f"studies[{largest.study.name}].axes ({largest.extent}); choose another folder with --out DIR, fewer "
-            "outputs or fewer values on an axis"
+            f"studies[{largest.study.name}].axes ({largest.extent}); {ELSEWHERE}, fewer outputs or fewer values on an "
+            "axis"
         )
     total = _machine_memory()
     memory = max(workers * (plan.memory + IDLE_MEMORY) for plan in plans)

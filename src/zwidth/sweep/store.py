@@ -24,7 +24,6 @@ import numpy as np
 
 from zwidth.config.sweep import SweepStudy
 from zwidth.sweep.files import checksum, content, digest, hidden_beside, remove_quietly, write_whole
-from zwidth.sweep.grid import Grid
 from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.words.errors import InputError, StoreError
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
@@ -98,10 +97,6 @@ class Store:
     @cached_property
     def plan(self) -> Plan:
         return kept_plan(self.study, self.attributes["plan"])
-
-    @cached_property
-    def grid(self) -> Grid:
-        return Grid(self.study)
 
     @cached_property
     def _arrays(self) -> dict[str, Any]:
@@ -225,11 +220,11 @@ def create(path: Path, attributes: dict[str, Any]) -> Store:
 @contextmanager
 def _build_beside(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
     """A complete store without chunks, beside ``path``; what is left of it goes when the block ends."""
-    study = SweepStudy.model_validate(attributes["study"])
-    plan, grid = kept_plan(study, attributes["plan"]), Grid(study)
+    plan = kept_plan(SweepStudy.model_validate(attributes["study"]), attributes["plan"])
+    grid = plan.grid
     with hidden_beside(path) as fresh:
         with silence_zarr():
-            _build(fresh, plan, grid)
+            _build(fresh, plan)
         files = sorted(file for file in fresh.rglob("*") if file.is_file() and file != fresh / "zarr.json")
         sums = {file.relative_to(fresh).as_posix(): checksum(file) for file in files}
         # The coordinates that are no dimension, as CF lists them.
@@ -245,14 +240,14 @@ def _build_beside(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
         yield fresh
 
 
-def _build(path: Path, plan: Plan, grid: Grid) -> None:
+def _build(path: Path, plan: Plan) -> None:
     """Write the coordinates and describe the variables."""
     import zarr
     from zarr.codecs import BloscCodec, ZstdCodec
     from zarr.codecs.numcodecs import PackBits
 
     group = zarr.create_group(path, zarr_format=3)
-    for name, (dims, values, attributes) in grid.coordinates().items():
+    for name, (dims, values, attributes) in plan.grid.coordinates().items():
         if values.dtype.kind == "U":
             values = values.astype(np.dtypes.StringDType())
         array = group.create_array(
@@ -280,7 +275,7 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
             output = OUTPUTS[name]
             attributes = {"long_name": output.long_name, **output.flags}
             if output.dtype == "float64":
-                attributes["units"] = own_unit(output.units_in(grid.physical))
+                attributes["units"] = own_unit(output.units_in(plan.grid.physical))
             attributes["ancillary_variables"] = STATUS_OF[family.family]
             group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
         kept = common | keeping["uint8"]

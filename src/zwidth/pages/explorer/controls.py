@@ -20,7 +20,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
 from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity, WindowedDifference
+from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, WindowedDifference
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import choose_damping
@@ -140,11 +140,8 @@ class Controls:
             # A form has the numbers that it names: without a spring, the damper beside it does nothing.
             idle = {f"{part}.{item.name}" for item in fields(PARTS[part]) if item.name not in PARTS[part].usual[form]}
             found = {name: value for name, value in found.items() if name not in idle}
-        choices = {
-            "mode": "physical",
-            "motion": "rotary" if self.rotary else "linear",
-            "velocity": type(scene.velocity).__name__,
-        }
+        choices = {"mode": "physical", "motion": "rotary" if self.rotary else "linear"}
+        choices |= {"velocity": type(scene.velocity).__name__}
         if isinstance(scene.device, LinearDevice):
             # It holds what a hand, a link or an actuator would add.
             return found | choices
@@ -202,12 +199,8 @@ class Controls:
                 self, scene=scene.replace(**{name: None if kind == "none" else self._make_usual(name, kind)})
             )
         cutoff = min(100.0, 0.1 / scene.timing.period)
-        estimates: dict[str, Velocity] = {
-            "BackwardDifference": BackwardDifference(),
-            "WindowedDifference": WindowedDifference(5),
-            "LowPass": LowPass(cutoff=cutoff),
-            "Butterworth": Butterworth(cutoff),
-        }
+        usual = BackwardDifference(), WindowedDifference(5), LowPass(cutoff=cutoff), Butterworth(cutoff)
+        estimates = {type(each).__name__: each for each in usual}
         if kind not in estimates:
             raise InputError(f"{name}: coefficients come with a configuration alone; choose another")
         return replace(self, scene=scene.replace(velocity=estimates[kind]))

@@ -69,10 +69,8 @@ def point_at(wall: tuple[float, float], across: Range, up: Range) -> dict[str, l
     sides = [int(value > high) - int(value < low) for value, (low, high) in zip(wall, (across, up), strict=True)]
     if not any(sides):
         return {"x": [], "y": [], "angle": [], "text": [], "align": []}
-    place = [
-        min(max(value, low + 0.03 * (high - low)), high - 0.03 * (high - low))
-        for value, (low, high) in zip(wall, (across, up), strict=True)
-    ]
+    ends = [(low + 0.03 * (high - low), high - 0.03 * (high - low)) for low, high in (across, up)]
+    place = [min(max(value, low), high) for value, (low, high) in zip(wall, ends, strict=True)]
     # A triangle points upwards before it is turned.
     turn, align = atan2(sides[1], sides[0]) - 0.5 * pi, "left" if place[0] < 0.5 * sum(across) else "right"
     return {"x": [place[0]], "y": [place[1]], "angle": [turn], "text": ["your wall"], "align": [align]}
@@ -228,10 +226,8 @@ IMPORTING = Lock()
 def compute_details(
     scene: Scene, across: Range, up: Range, *, normalized: bool, of_device: bool, contact: bool
 ) -> Iterator[Update]:
-    """What takes longer than a drag, part by part; whoever asks may stop after each.
-
-    Contours cover ``across`` and ``up``. Wanted may be what hangs on the device alone, and a hit of the wall.
-    """
+    """What takes longer than a drag, part by part; whoever asks may stop after each."""
+    # Contours cover ``across`` and ``up``. Wanted may be what hangs on the device alone, and a hit of the wall.
     # The page shows millimeters.
     length = 1.0 if normalized else 1e3
     verdict = assess(scene)

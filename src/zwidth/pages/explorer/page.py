@@ -234,10 +234,8 @@ class Page:
         self.update(dict(zip(names, place, strict=True)), rest=True)
 
     def update(self, changes: dict[str, Any], *, rest: bool, link: str | None = None) -> None:
-        """Show what follows a drag at once, and have the rest computed where the slider rests.
-
-        A link is the scene to begin with, as the page's address has it; an empty one is that of the first visit.
-        """
+        """Show what follows a drag at once, and have the rest computed where the slider rests."""
+        # A link is the scene to begin with, as the page's address has it; an empty one is that of the first visit.
         self.generation += 1
         try:
             with IMPORTING:

@@ -100,18 +100,12 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
     digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script)]
     path = where / CONFIG_FILE
     config = path.read_text(encoding="utf-8") if path.is_file() and not path.is_symlink() else ""
-    texts = {
-        "name": content.get("name", where.name),
-        "description": content.get("description") or "",
-        "started": content.get("started", ""),
-        "precision": content.get("precision", "float64"),
-        "release": content["versions"].get("zwidth", ""),
-        "digest": content.get("config_sha256", ""),
-    }
-    versions = content["versions"].items()
-    rows = [f'<th scope="row">{escape(name)}</th><td>{escape(str(version))}</td>' for name, version in versions]
+    versions = content["versions"]
+    rows = [f'<th scope="row">{escape(name)}</th><td>{escape(str(each))}</td>' for name, each in versions.items()]
+    told = ("name", "description", "started", "precision", "config_sha256")
     return Template(html).substitute(
-        {name: escape(str(text)) for name, text in texts.items()},
+        {name: escape(str(content[name])) for name in told},
+        release=escape(str(versions["zwidth"])),
         style=style,
         script=script,
         style_digest=digests[0],
