@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import CrossingLine, curve_at, zeros_of
 from zwidth.loops.linear.rows import Island, StablePieces, bound_intervals
@@ -94,7 +93,7 @@ class Border:
             alpha, beta = curve.alpha.copy(), curve.beta.copy()
             for k, end in ((0, 0.0), (-1, np.pi)):
                 if at[k] == end:
-                    alpha[k], beta[k] = self.at_end(end)
+                    alpha[k], beta[k] = b.limits[end]
             edges.append(Edge(at, alpha, beta, -1))
         return edges
 
@@ -120,20 +119,12 @@ class Border:
             within.append(w[[not any(e.w[0] - _BESIDE <= at <= e.w[-1] + _BESIDE for e in edges) for at in w]])
         return np.unique(np.concatenate(within))
 
-    def at_end(self, w: float) -> tuple[float, float]:
-        """The curve's limit at z = 1 or z = -1."""
-        at = circle(np.array([w]))
-        with np.errstate(all="ignore"):
-            q, f = self.boundary.loop.required_wall(at), self.boundary.loop.estimate.jet(at)
-            beta = q.slope[0].imag / f.slope[0].imag
-            return float(q.value[0].real - beta * f.value[0].real), float(beta)
-
     def _end(self, w: np.ndarray, piece: np.ndarray, k: int, side: int) -> float:
         """Where a run of nodes on the edge ends beyond its last node ``k``."""
         after = k + side
         if not 0 <= after < w.size:
             end = 0.0 if side < 0 else np.pi
-            return end if np.all(np.isfinite(self.at_end(end))) else float(w[k])
+            return end if np.all(np.isfinite(self.boundary.limits[end])) else float(w[k])
         if piece[after] != piece[k]:
             # Towards an angle at which the curve runs to infinity; it may leave the stable set before.
             limit = self.boundary.infinite[piece[k] if side > 0 else piece[k] - 1]
@@ -143,7 +134,7 @@ class Border:
     def _corner(self, inside: float, outside: float) -> float:
         """Where the curve stops to be an edge between two angles: another crossing of its row meets it there."""
         b = self.boundary
-        inside, outside = _narrow(b.borders, inside, outside, 1)
+        inside, outside = self._narrow(inside, outside, 1)
         ends = np.array([inside, outside])
         here = curve_at(b.loop, ends)
         rows = b.crossings(here.beta)
@@ -155,7 +146,15 @@ class Border:
             w = self._meeting(np.stack([ends, rows.w[:, other]]), gaps[:, other], other)
             if list(b.borders(np.array([w - _BESIDE * w, w + _BESIDE * w]))) in ([True, False], [False, True]):
                 return w
-        return _narrow(b.borders, inside, outside, _ROUNDS)[0]
+        return self._narrow(inside, outside, _ROUNDS)[0]
+
+    def _narrow(self, inside: float, outside: float, rounds: int) -> tuple[float, float]:
+        """Narrow the place at which the curve ceases to be an edge; many angles are looked at one time."""
+        for _ in range(rounds):
+            places = inside + (outside - inside) * _SHARES
+            first = int(np.argmin(np.append(self.boundary.borders(places), False)))
+            inside, outside = np.concatenate([[inside], places, [outside]])[first : first + 2].tolist()
+        return inside, outside
 
     def _meeting(self, ends: np.ndarray, gaps: np.ndarray, other: int) -> float:
         """Where the curve meets another crossing of its rows, by Newton's method."""
@@ -258,19 +257,6 @@ def _meetings(others: Sequence[CrossingLine], line: CrossingLine) -> list[float]
         for other in others
         if abs(other.f - line.f) > _PARALLEL * (abs(other.f) + abs(line.f))
     ]
-
-
-def _narrow(
-    holds: Callable[[np.ndarray], np.ndarray], inside: float, outside: float, rounds: int
-) -> tuple[float, float]:
-    """Narrow the place towards ``outside`` at which a condition ceases to hold; many places are asked at one time."""
-    for _ in range(rounds):
-        places = inside + (outside - inside) * _SHARES
-        held = holds(places)
-        first = int(np.argmin(held)) if not held.all() else held.size
-        inside = float(places[first - 1]) if first else inside
-        outside = float(places[first]) if first < held.size else outside
-    return inside, outside
 
 
 def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:

@@ -13,12 +13,12 @@ then that of F - F(1).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.circle import Jet, circle, lag_jet, product_jet
+from zwidth.arrays.circle import circle
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 
@@ -90,13 +90,12 @@ class PassivityCondition:
 
     def _quotient(self, w: np.ndarray) -> np.ndarray:
         """E; of a window's difference the mean of z^-1 to z^-window."""
-        at, f = circle(w), self.quotient
-        parts = product_jet(at, f.zeros, f.gain).over(product_jet(at, f.poles, 1.0)).times(lag_jet(at, -f.lag))
-        if f.window:
-            n, s = f.window, np.sin(0.5 * w)
+        n, value = self.quotient.window, replace(self.quotient, window=0).jet(circle(w)).value
+        if n:
+            s = np.sin(0.5 * w)
             mean = np.where(s == 0, 1.0, np.sin(0.5 * n * w) / (n * np.where(s == 0, 1.0, s)))
-            parts = parts.times(Jet(mean * np.exp(-0.5j * (n + 1) * w), 0.0 * w))
-        return parts.value
+            value = value * (mean * np.exp(-0.5j * (n + 1) * w))
+        return value
 
     def needed(self, alpha: float, beta: float, w: np.ndarray) -> np.ndarray:
         """The damping that each angle in [0, pi] asks for; alpha with the estimate's own spring, >= 0."""

@@ -78,17 +78,13 @@ def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     """The stiffest stable wall with alpha > 0 or None; ArithmeticError where the rows contradict what was found."""
     least = -np.inf if negative_damping else 0.0
     tops = _tops(border, least) if border.curved else []
-    for top in tops[:_MOST_TOPS]:
-        # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
-        if not _is_reached(border, top, least):
-            continue
-        found = _describe(border, top, negative_damping)
-        _refuse_stiffer(border, found.alpha, least)
-        return found
-    if len(tops) > _MOST_TOPS:
+    # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
+    top = next((top for top in tops[:_MOST_TOPS] if _is_reached(border, top, least)), None)
+    if top is None and len(tops) > _MOST_TOPS:
         raise ArithmeticError(f"none of the {_MOST_TOPS} highest of {len(tops)} tops holds")
-    _refuse_stiffer(border, 0.0, least)
-    return None
+    found = None if top is None else _describe(border, top, least)
+    _refuse_stiffer(border, 0.0 if found is None else found.alpha, least)
+    return found
 
 
 class _Top(NamedTuple):
@@ -125,9 +121,9 @@ def _tops(border: Border, least: float) -> list[_Top]:
     return sorted(found, key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta))
 
 
-def _describe(border: Border, top: _Top, negative: bool) -> BoundRidge:
+def _describe(border: Border, top: _Top, least: float) -> BoundRidge:
     alpha, beta, w = top[:3]
-    if not negative and beta == 0.0:
+    if beta == least:
         return BoundRidge(alpha, beta, w, w, _condition(w), Condition.NO_DAMPING)
     if top.inner:
         return BoundRidge(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
@@ -149,7 +145,7 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     if len(near) == 2 and away[near[1]] <= _MEETS * abs(alpha) and angles[1] - angles[0] > 1e-6:
         return BoundRidge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
     # A double pole at z = -1: the curve ends on the line there.
-    top, damping = border.at_end(np.pi)
+    top, damping = border.boundary.limits[np.pi]
     if not abs(top - alpha) <= _NEAR * abs(alpha):
         raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
     return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
