@@ -326,11 +326,11 @@ class SceneOptima(SceneAnswers):
         grid = sorted(known)
         values = [known[value] for value in grid]
         low, high = grid[0], grid[-1]
-        enough = [value >= 0 for value in values if not math.isnan(value)]
-        if not enough or not any(enough):
-            status = Status.UNREACHABLE if enough and len(enough) == len(values) else Status.NOT_CONVERGED
+        enough = [value >= 0 for value in values]
+        if not any(enough):
+            status = Status.NOT_CONVERGED if any(map(math.isnan, values)) else Status.UNREACHABLE
             return RequiredValue(math.nan, "nowhere", (), (low, high), status)
-        if len(enough) == len(values) and all(enough):
+        if all(enough):
             return RequiredValue(min(max(now, low), high), "everywhere", (), (low, high), Status.OK)
         found = tuple(
             _cross(surplus, grid[k], grid[k + 1])

@@ -89,8 +89,7 @@ class Border:
         for start, stop in _runs(held, piece):
             first, last = self._end(w, piece, start, -1), self._end(w, piece, stop, 1)
             at = np.unique(np.concatenate([[first], w[start : stop + 1], [last]]))
-            curve = curve_at(b.loop, np.clip(at, 1e-300, np.pi))
-            alpha, beta = curve.alpha.copy(), curve.beta.copy()
+            alpha, beta = curve_at(b.loop, at)[:2]
             for k, end in ((0, 0.0), (-1, np.pi)):
                 if at[k] == end:
                     alpha[k], beta[k] = b.limits[end]
@@ -125,11 +124,9 @@ class Border:
         if not 0 <= after < w.size:
             end = 0.0 if side < 0 else np.pi
             return end if np.all(np.isfinite(self.boundary.limits[end])) else float(w[k])
-        if piece[after] != piece[k]:
-            # Towards an angle at which the curve runs to infinity; it may leave the stable set before.
-            limit = self.boundary.infinite[piece[k] if side > 0 else piece[k] - 1]
-            return self._corner(float(w[k]), float(limit))
-        return self._corner(float(w[k]), float(w[after]))
+        # Towards an angle at which the curve runs to infinity it may leave the stable set before.
+        beyond = w[after] if piece[after] == piece[k] else self.boundary.infinite[min(piece[k], piece[k] + side)]
+        return self._corner(float(w[k]), float(beyond))
 
     def _corner(self, inside: float, outside: float) -> float:
         """Where the curve stops to be an edge between two angles: another crossing of its row meets it there."""
@@ -184,7 +181,7 @@ class Border:
         """The pieces that these edges enclose; what counts as soft is decided where edges pass alpha = 0."""
         b = self.boundary
         turns = np.array([(arc.first, arc.beta[np.argmin(arc.w)]) for arc in b.arcs]).reshape(-1, 2)
-        found = [np.array([beta for _, beta, _ in self.line_meetings()])]
+        found = [np.array([beta for _, beta, _ in self.line_meetings])]
         for edge in self.curved:
             found.append(edge.beta[[0, -1]])
             found.append(turns[(turns[:, 0] > edge.w[0]) & (turns[:, 0] < edge.w[-1]), 1])
@@ -238,15 +235,16 @@ class Border:
                 edges.append(Edge(np.full(2, line.w), line.q - both * line.f, both, place))
         return edges
 
-    def line_meetings(self) -> list[tuple[float, float, float]]:
-        """Corners of two lines: all other highest points are on the curve."""
+    @cached_property
+    def line_meetings(self) -> list[tuple[float, float, int]]:
+        """Corners of two lines, alpha, beta and the second line: all other highest points are on the curve."""
         b = self.boundary
         found = []
         for place, line in enumerate(b.lines):
             for beta in _meetings(b.lines[:place], line):
                 near = beta + 1e-9 * (1.0 + abs(beta)) * np.array([-1.0, 1.0])
                 if b.line_borders(place, near).any():
-                    found.append((float(line.q - beta * line.f), float(beta), line.w))
+                    found.append((float(line.q - beta * line.f), float(beta), place))
         return found
 
 

@@ -8,8 +8,10 @@ python-flint. With P of degree n and ``P*(z) = z^n P(1/z)``, all zeros of P lie 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from fractions import Fraction
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,23 +36,21 @@ def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tupl
     """Labels and statuses of walls of one shape, in SI units."""
     if not certified.available():
         raise InputError("method: 'certified' needs python-flint for this scene; pip install 'zwidth[certified]'")
-    known: dict[int, tuple[Any, Any, Any, bool]] = {}
+    polynomials = cache(lambda bits: _polynomials(scene))
     stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)
     for place in np.ndindex(stiffness.shape):
-        stable[place], status[place] = _decide(scene, float(stiffness[place]), float(damping[place]), known)
+        stable[place], status[place] = _decide(polynomials, float(stiffness[place]), float(damping[place]))
     return stable, status
 
 
-def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, Any]) -> tuple[bool, Status]:
+def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float) -> tuple[bool, Status]:
     import flint
 
     if not (np.isfinite(stiffness) and np.isfinite(damping)):
         return False, Status.INVALID_INPUT
     for bits in certified.BITS:
         with flint.ctx.workprec(bits):
-            if bits not in known:
-                known[bits] = _polynomials(scene)
-            D, N1, N2, rest = known[bits]
+            D, N1, N2, rest = polynomials(bits)
             p = D + N1 * flint.arb(stiffness) + N2 * flint.arb(damping)
             at_one = stiffness == 0 and rest
             if at_one:

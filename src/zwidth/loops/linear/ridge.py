@@ -108,10 +108,9 @@ def _tops(border: Border, least: float) -> list[_Top]:
             place = int(b.arc_at(edge.w[min(max(k, 1), max(last - 1, 0))]))
             found.append(_Top(float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), place, bool(0 < k < last)))
     # Straight edges end on the curve or on each other.
-    for alpha, beta, w in border.line_meetings():
+    for alpha, beta, line in border.line_meetings:
         if alpha > 0 and beta >= least:
-            line = next(k for k, line in enumerate(b.lines) if line.w == w)
-            found.append(_Top(alpha, beta, w, len(b.arcs) + line, False))
+            found.append(_Top(alpha, beta, b.lines[line].w, len(b.arcs) + line, False))
     if np.isfinite(least):
         # The upper ends of the row's stable intervals.
         row = bound_intervals(b, np.array([least]))
