@@ -17,7 +17,7 @@ from zwidth.parts.checks import read_texts
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import SceneAnswers, allows_negative
 from zwidth.words.errors import InputError, check_choice, describe_choice
-from zwidth.words.quantities import FIELDS
+from zwidth.words.quantities import FIELDS, WALL
 from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
@@ -105,8 +105,7 @@ def _read_stiffness(given: Any) -> float:
 
 
 def _present_value(scene: SceneAnswers, parameter: str) -> float:
-    known = scene.parameters()
-    known = {path: value for path, value in known.items() if path not in ("stiffness", "virtual_damping")}
+    known = {path: value for path, value in scene.parameters().items() if path not in WALL}
     known["rate"] = 1.0 / known["period"]
     if not isinstance(parameter, str) or parameter not in known:
         raise InputError(f"parameter: {describe_choice(parameter, tuple(known))}")

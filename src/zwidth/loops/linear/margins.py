@@ -162,8 +162,8 @@ def margins_of(wall: OpenLoop, stable: bool) -> Margins:
     if rest is not None and rest < 0:
         w, sizes = np.append(w, 0.0), np.append(sizes, -rest)
     crossed = wall.gain_crossovers()
-    nearest = find_nearest(stable, w, sizes, crossed, np.angle(-wall.at(crossed).value))
-    gain, phase, phase_at, gain_at = nearest
+    turns = np.angle(-wall.at(crossed).value)
+    gain, phase, phase_at, gain_at = find_nearest(stable, w, sizes, crossed, turns)
     distance, closest = wall.least_distance()
     return Margins(gain, phase, np.nan, distance, phase_at, gain_at, closest)
 

@@ -81,12 +81,11 @@ class PassivityCondition:
         top = float(estimate.gain) * zeta.polyfromroots([*-estimate.zeros, *[-1.0] * max(-estimate.lag, 0)]).real
         bottom = zeta.polyfromroots([*-estimate.poles, *[-1.0] * lag]).real
         rest = top[0] / bottom[0]
-        # (F - F(1))/(z - 1): without the constant coefficient, which the subtraction takes away.
+        # (F - F(1))/(z - 1): without the constant coefficient, which the subtraction takes away; 0 of a constant F.
         over = np.trim_zeros(zeta.polysub(top, rest * bottom)[1:], "b")
-        if not over.size:
-            return cls(Estimate(0, 0.0), float(rest), whole, float(d - whole))
-        roots = zeta.polyroots(over) + 0j if over.size > 1 else np.zeros(0, complex)
-        return cls(Estimate(0, over[-1], lag, -roots, estimate.poles), float(rest), whole, float(d - whole))
+        over = over if over.size else np.zeros(1)
+        quotient = Estimate(0, over[-1], lag, -zeta.polyroots(over) + 0j, estimate.poles)
+        return cls(quotient, float(rest), whole, float(d - whole))
 
     def _quotient(self, w: np.ndarray) -> np.ndarray:
         """E; of a window's difference the mean of z^-1 to z^-window."""

@@ -27,6 +27,7 @@ from zwidth.loops.linear.rows import bound_intervals
 from zwidth.loops.rigid.device import classify_delays
 from zwidth.loops.rigid.ridge import slopes_kernel, stiffness_slopes
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import WALL
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
@@ -192,8 +193,7 @@ def _is_reached(border: Border, top: _Top, least: float) -> bool:
 
 def _refuse_stiffer(border: Border, alpha: float, least: float) -> None:
     """Refuse a ridge above which rows of its piece hold a stable wall."""
-    rows, high = border.pieces.main_intervals()
-    highest = float(np.nanmax(high[rows >= least], initial=-np.inf))
+    highest = border.pieces.find_highest(least)
     if highest > alpha * (1.0 + _ABOVE):
         raise ArithmeticError(f"rows reach {highest!r}, the ridge {alpha!r}")
 
@@ -231,9 +231,8 @@ def differentiate(scene: Any, found: BoundRidge | None, status: Status) -> Scene
 def moving_paths(scene: Any) -> tuple[str, ...]:
     """The parameters of a scene, without the wall's, that K_max can be differentiated in."""
     paths = [path for path, value in scene.parameters().items() if not isinstance(value, int | np.integer)]
-    without = {"stiffness", "virtual_damping"}
-    if scene.operator is not None and scene.operator.rigid:
-        without.add("operator.coupling_damping")
+    rigid = scene.operator is not None and scene.operator.rigid
+    without = (*WALL, "operator.coupling_damping") if rigid else WALL
     return tuple(path for path in paths if path not in without)
 
 

@@ -229,12 +229,11 @@ class StablePieces:
         soft = reaches_down(found.low, found.high)
         return labels, np.unique(labels[soft])
 
-    def main_intervals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of the plane, and up to which alpha each is stable in a piece with soft walls; NaN where it is not."""
+    def find_highest(self, least: float) -> float:
+        """Up to which alpha rows with that much damping or more are stable in pieces with soft walls; else -inf."""
         rows, found = self._rows
-        labels, main = self._labels
-        high = np.where(np.isin(labels, main), found.high, -np.inf).max(1, initial=-np.inf)
-        return rows, np.where(np.isfinite(high), high, np.nan)
+        inside = np.isin(*self._labels) & np.isfinite(found.high) & (rows >= least)[:, None]
+        return float(np.max(found.high, where=inside, initial=-np.inf))
 
     def piece_at(self, beta: float, place: int) -> int:
         """The piece at the point of a row on one column of its crossings, -1 where none is beside it."""
