@@ -82,14 +82,15 @@ class Device(Part):
         if self.rotary is not None and not isinstance(self.rotary, bool):
             raise InputError(f"rotary: got {self.rotary!r}; True or False is needed")
         own = {name: getattr(self, name) for name in ("mass", "damping", "coupling")}
-        told = find_kind(own | {f"modes.{k}": mode for k, mode in enumerate(modes)})
+        own |= {f"modes.{k}": mode for k, mode in enumerate(modes)}
+        told = find_kind(own)
         rotary = told or False if self.rotary is None else self.rotary
         object.__setattr__(self, "modes", tuple(modes))
         for name, kind in {"coupling": Coupling, "actuator": Actuator}.items():
             part = getattr(self, name)
             if part is not None and not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a zwidth.{kind.__name__} is needed, or None")
-        check_kind(rotary, own | {f"modes.{k}": mode for k, mode in enumerate(modes)})
+        check_kind(rotary, own)
         with use_kind(rotary):
             super().__post_init__()
         object.__setattr__(self, "rotary", rotary)

@@ -6,7 +6,6 @@ their own: ``velocity.``, ``operator.``, ``coupling.``, ``actuator.``, ``modes.0
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import MISSING, fields, replace
 from typing import Any, ClassVar, Protocol, TypeVar
 
@@ -58,25 +57,18 @@ def find_parts(scene: Parts) -> dict[str, Any]:
     return {name: part for name, part in found.items() if part is not None}
 
 
-def _parts(scene: Parts) -> Iterator[tuple[str, str, Any]]:
-    """Every part there is: what its paths begin with, its field of the scene, and itself."""
-    for name in _BARE:
-        yield "", name, getattr(scene, name)
-    for name, part in find_parts(scene).items():
-        yield f"{name}.", name, part
+def _parts(scene: Parts) -> list[tuple[str, str, Any]]:
+    """Every part there is, the wall last: what its paths begin with, its field of the scene, and itself."""
+    *bare, wall = (("", name, getattr(scene, name)) for name in _BARE)
+    return [*bare, *((f"{name}.", name, part) for name, part in find_parts(scene).items()), wall]
 
 
 def list_parameters(scene: Parts) -> dict[str, Any]:
     """Every number of a scene by its dotted path, those of the wall last."""
-    found = {
-        (prefix + item.name, name): getattr(part, item.name)
-        for prefix, name, part in _parts(scene)
-        for item in fields(part)
-    }
-    ordered = sorted(found.items(), key=lambda item: item[0][1] == "wall")
+    found = {prefix + item.name: getattr(part, item.name) for prefix, _, part in _parts(scene) for item in fields(part)}
     return {
         path: value
-        for (path, _), value in ordered
+        for path, value in found.items()
         if is_jax(value) or (isinstance(value, int | float | np.number) and not isinstance(value, bool))
     }
 

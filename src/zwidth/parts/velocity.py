@@ -21,10 +21,6 @@ from zwidth.words.errors import InputError
 from zwidth.words.quantities import Range
 
 
-def _no_roots() -> np.ndarray:
-    return np.zeros(0, complex)
-
-
 @dataclass(frozen=True)
 class Estimate:
     """The velocity estimate F: a difference over ``window`` periods, then a filter.
@@ -36,8 +32,8 @@ class Estimate:
     window: int = 1
     gain: Any = 1.0
     lag: int = 0
-    zeros: Any = field(default_factory=_no_roots)
-    poles: Any = field(default_factory=_no_roots)
+    zeros: Any = field(default_factory=lambda: np.zeros(0, complex))
+    poles: Any = field(default_factory=lambda: np.zeros(0, complex))
 
     def jet(self, at: CirclePoints) -> Jet:
         """F and its derivative in w."""

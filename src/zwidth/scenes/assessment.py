@@ -292,11 +292,10 @@ def describe_islands(scene: SceneOptima) -> list[str]:
 def _stiffness(scene: SceneOptima) -> float:
     """K_max in N/m; NaN where there is none or it cannot be computed."""
     try:
-        wall = scene.max_stiffness()
+        return float(scene.max_stiffness().stiffness)
     except InputError:
         # At twice the rate a long delay may be more periods than the model is computed for.
-        return float("nan")
-    return float(wall.stiffness) if wall.status == Status.OK else float("nan")
+        return math.nan
 
 
 def _improve(scene: SceneOptima) -> Iterator[tuple[str, str, SceneOptima]]:

@@ -29,7 +29,7 @@ from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, fi
 from zwidth.scenes.wall_code import write_wall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
-from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
+from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, WALL, Range
 from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
@@ -47,7 +47,6 @@ _OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffn
 _UNITS = {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m"}
 _UNITS |= {"mass": "kg", "time": "s", "frequency": "Hz"}
 _EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
-_WALL = ("stiffness", "virtual_damping")
 _JUDGED = (
     *("alpha", "beta", "virtual_damping_lower", "virtual_damping_upper", "spectral_radius", "passive"),
     *("passivity_margin", "time_constant", "frequency", "gain_margin", "phase_margin", "delay_margin"),
@@ -135,7 +134,7 @@ class Recommendation:
 
         def holds(digits: int) -> bool:
             wall = rounded(digits)
-            return bool(self.scene.is_stable(*wall) and (surplus is None or min(surplus(*wall).values()) >= 0))
+            return bool(self.scene.is_stable(*wall)) and all(spare >= 0 for spare in surplus(*wall).values())
 
         digits = count_digits(holds)
         return *rounded(digits), digits
@@ -200,7 +199,7 @@ class Recommendation:
         """All of it as plain JSON values in SI units, with the normalized ones beside them; None where not known."""
         scene, verdict, top = self.scene, self.verdict, self.stiffest
         judged = {} if verdict is None else verdict.as_dict()
-        device = {name: value for name, value in scene.parameters().items() if name not in _WALL}
+        device = {name: value for name, value in scene.parameters().items() if name not in WALL}
         constant = math.nan if verdict is None or not verdict.stable else verdict.time_constant
         alpha, beta = scene.normalize_walls(top.stiffness, top.virtual_damping)
         found = {
@@ -241,12 +240,10 @@ class Recommendation:
 Surplus = Callable[[float, Any], dict[str, np.ndarray]]
 
 
-def _measure(scene: SceneOptima, wanted: Wanted) -> Surplus | None:
-    """By how much walls have more than is wanted, by its name, negative for too little; None where nothing is."""
+def _measure(scene: SceneOptima, wanted: Wanted) -> Surplus:
+    """By how much walls have more than is wanted beside a share of K_max, by its name, negative for too little."""
     own = float(scene.device.damping)
     asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
-    if not (asked or wanted.passive):
-        return None
 
     def surplus(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
         alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
@@ -355,10 +352,11 @@ class SceneAdvice(SceneOptima):
         usual = choose_damping(bare, top, most)
         limit, stiffness, damping = "stiffness_fraction", most, usual
         surplus = _measure(bare, wanted)
-        if surplus is not None and not (wanted.stiffness_fraction and min(surplus(most, usual).values()) >= 0):
+        spare = surplus(most, usual)
+        if spare and not (wanted.stiffness_fraction and min(spare.values()) >= 0):
             stiffness, damping = _search(bare, surplus, most)
             if math.isnan(stiffness):
-                asked = " and ".join(wanted.spell(name) for name in surplus(most, usual))
+                asked = " and ".join(map(wanted.spell, spare))
                 undamped = wanted.passive and bare.device.damping == 0
                 why = "without damping of the device no wall is passive" if undamped else "ask for less"
                 reason = f"none was found that keeps {asked}, however soft; {why}"

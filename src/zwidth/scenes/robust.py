@@ -28,10 +28,9 @@ from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
 
 _NAMES = ("mass", "damping", "period", "delay")
-# How far the proved bound may lie below what a device was found to limit it to.
-_TOLERANCE = 1e-6
-# Where that cannot be proved, looser ones are tried.
-_LOOSER = (1e-4, 1e-2, 0.1)
+# How far the proved bound may lie below what a device was found to limit it to, and what it is then; where that cannot
+# be proved, looser ones are tried.
+_BOUNDS = ((1e-6, Status.OK), *((looser, Status.UNDECIDED) for looser in (1e-4, 1e-2, 0.1)))
 # Parts of a box that are looked at before giving up, and at one time.
 _MOST_PARTS, _AT_ONCE = 1 << 18, 1 << 11
 # Rounds of proof and counterexample.
@@ -296,14 +295,14 @@ def _worst(low: np.ndarray, high: np.ndarray) -> tuple:
     """`robust_max_stiffness` of one box."""
     share = _lowest(_stiffest, _grid(low, high, 5), low, high)
     proved, status = np.nan, Status.UNDECIDED
-    for tolerance in (_TOLERANCE, *_LOOSER):
+    for tolerance, reached in _BOUNDS:
         for _ in range(_ROUNDS):
             target = float(_stiffest(_devices(share[None], low, high))[0]) * (1.0 - tolerance)
             holds, failing = _prove(
                 target, lambda centers, k=target: 0.5 * np.add(*_stable_dampings(k, centers)), low, high
             )
             if holds:
-                proved, status = target, Status.OK if tolerance == _TOLERANCE else Status.UNDECIDED
+                proved, status = target, reached
             if holds or not len(failing):
                 break
             starts = np.concatenate([share[None], _shares(failing, low, high)])
@@ -336,14 +335,13 @@ def _wall(low: np.ndarray, high: np.ndarray) -> tuple:
     """`robust_wall` of one box."""
     devices = _devices(_grid(low, high, 2), low, high)
     limit, middle = _best_wall(devices)
-    for tolerance in (_TOLERANCE, *_LOOSER):
+    for tolerance, status in _BOUNDS:
         for _ in range(_ROUNDS):
             stiffness = limit * (1.0 - tolerance)
             # A wall that is read and set is the one that is proved: no more digits than are printed.
             damping = float(f"{middle(stiffness):.{DIGITS}g}")
             holds, failing = _prove(stiffness, lambda centers, b=damping: np.full(len(centers), b), low, high)
             if holds:
-                status = Status.OK if tolerance == _TOLERANCE else Status.UNDECIDED
                 return stiffness, damping, limit, status
             if not len(failing):
                 break

@@ -17,7 +17,7 @@ from zwidth.parts.checks import read_texts
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import SceneAnswers, allows_negative
 from zwidth.words.errors import InputError, check_choice, describe_choice
-from zwidth.words.quantities import FIELDS
+from zwidth.words.quantities import FIELDS, WALL
 from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
@@ -105,8 +105,7 @@ def _read_stiffness(given: Any) -> float:
 
 
 def _present_value(scene: SceneAnswers, parameter: str) -> float:
-    known = scene.parameters()
-    known = {path: value for path, value in known.items() if path not in ("stiffness", "virtual_damping")}
+    known = {path: value for path, value in scene.parameters().items() if path not in WALL}
     known["rate"] = 1.0 / known["period"]
     if not isinstance(parameter, str) or parameter not in known:
         raise InputError(f"parameter: {describe_choice(parameter, tuple(known))}")
@@ -334,11 +333,11 @@ class SceneOptima(SceneAnswers):
         grid = sorted(known)
         values = [known[value] for value in grid]
         low, high = grid[0], grid[-1]
-        enough = [value >= 0 for value in values if not math.isnan(value)]
-        if not enough or not any(enough):
-            status = Status.UNREACHABLE if enough and len(enough) == len(values) else Status.NOT_CONVERGED
+        enough = [value >= 0 for value in values]
+        if not any(enough):
+            status = Status.NOT_CONVERGED if any(map(math.isnan, values)) else Status.UNREACHABLE
             return RequiredValue(math.nan, "nowhere", (), (low, high), status)
-        if len(enough) == len(values) and all(enough):
+        if all(enough):
             return RequiredValue(min(max(now, low), high), "everywhere", (), (low, high), Status.OK)
         found = tuple(
             _cross(surplus, grid[k], grid[k + 1])

@@ -15,6 +15,7 @@ from zwidth.parts.checks import check_whole
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError, check_choice, describe_choice
+from zwidth.words.quantities import WALL
 from zwidth.words.showing import shown
 
 # Of the interval in which the share of all devices lies.
@@ -107,10 +108,8 @@ def simulate_tolerances(
 
 
 def _draw(scene: Scene, tolerances: dict[str, Any], count: int, seed: int) -> dict[str, np.ndarray]:
-    wall = ("stiffness", "virtual_damping")
-    nominal = {
-        name: value for name, value in scene.parameters().items() if isinstance(value, float) and name not in wall
-    }
+    own = scene.parameters()
+    nominal = {name: value for name, value in own.items() if isinstance(value, float) and name not in WALL}
     generator = np.random.default_rng(seed)
     drawn = {}
     for name, given in tolerances.items():

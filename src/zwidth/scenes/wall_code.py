@@ -33,15 +33,9 @@ def _describe_call() -> tuple[str, str]:
     )
 
 
-class Section(NamedTuple):
-    """``top/bottom`` in powers of zeta, highest first and of one length, 2 or 3; the bottom begins with 1."""
-
-    top: tuple[float, ...]
-    bottom: tuple[float, ...]
-
-
-def find_sections(estimate: Estimate) -> list[Section]:
-    """What follows the window's difference; zeros at z = 1 come first, so that what comes after them stays small."""
+def find_sections(estimate: Estimate) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
+    """What follows the window's difference: tops and bottoms of one length, 2 or 3, the bottoms beginning with 1."""
+    # Zeros at z = 1 come first, so that what comes after them stays small.
     behind = [1.0] * abs(estimate.lag)
     zeros = _find_factors(np.append(estimate.zeros, behind if estimate.lag < 0 else []))
     poles = _find_factors(np.append(estimate.poles, behind if estimate.lag > 0 else []))
@@ -51,8 +45,7 @@ def find_sections(estimate: Estimate) -> list[Section]:
     zeros.sort(key=lambda factor: (-len(factor), abs(factor[-1])))
     # There are no more zeros than poles: each factor of the top finds a bottom that is as long.
     zeros += [(1.0,)] * (len(poles) - len(zeros))
-    pairs = zip(zeros, poles, strict=True)
-    return [Section((0.0,) * (len(bottom) - len(top)) + top, bottom) for top, bottom in pairs]
+    return [((0.0,) * (len(bottom) - len(top)) + top, bottom) for top, bottom in zip(zeros, poles, strict=True)]
 
 
 def _find_factors(roots: np.ndarray) -> list[tuple[float, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import IntEnum
 from html import escape
 from types import MappingProxyType
@@ -27,7 +27,7 @@ _FEW, _LINE, _ROWS = 4, 120, 40
 
 
 def shown(
-    only: Collection[str] = (),
+    only: Sequence[str] = (),
     picture: Callable[[Any], str] | None = None,
     missing: Mapping[str, str] = MappingProxyType({}),
     **units: Unit,
@@ -59,12 +59,13 @@ def shown(
             return line if len(line) <= _LINE else f"{kind.__name__}(\n    " + ",\n    ".join(parts) + ",\n)"
 
         def as_html(self: Any) -> str:
-            columns = _list_columns({name: getattr(self, name) for name in names})
-            below = picture(self) if picture else ""
-            if columns:
-                rows = [[spell_value(value, known.get(name, "")) for name, value in row.items()] for row in columns]
-                return write_table(kind.__name__, rows, list(columns[0])) + below
-            return write_table(kind.__name__, [[name, text] for name, text in spell(self).items()]) + below
+            columns, below = {name: getattr(self, name) for name in names}, picture(self) if picture else ""
+            if _is_table(columns.values()):
+                cells = [
+                    [spell_value(each, known.get(name, "")) for each in column] for name, column in columns.items()
+                ]
+                return write_table(kind.__name__, list(zip(*cells, strict=True)), names) + below
+            return write_table(kind.__name__, spell(self).items()) + below
 
         for name, method in (("__repr__", as_text), ("_repr_html_", as_html)):
             setattr(kind, name, in_own_units(method))
@@ -152,20 +153,16 @@ def _spell_range(array: np.ndarray, unit: Unit) -> str:
     return f"{' to '.join(dict.fromkeys(ends))}{nans}"
 
 
-def _list_columns(values: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows where every field is a column of one length that fits; else none."""
-    arrays = {name: np.asarray(value) for name, value in values.items() if isinstance(value, np.ndarray)}
-    sizes = {array.shape for array in arrays.values()}
-    if len(arrays) < len(values) or len(sizes) != 1 or len(next(iter(sizes))) != 1:
-        return []
-    (count,) = next(iter(sizes))
-    return [{name: array[k] for name, array in arrays.items()} for k in range(count)] if count <= _ROWS else []
+def _is_table(columns: Iterable[Any]) -> bool:
+    """Whether all are columns of one length that fits."""
+    shapes = {each.shape if isinstance(each, np.ndarray) else () for each in columns}
+    return len(shapes) == 1 and all(len(shape) == 1 and 0 < shape[0] <= _ROWS for shape in shapes)
 
 
-def write_table(title: str, rows: list[list[str]], head: list[str] | None = None) -> str:
+def write_table(title: str, rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
     """A table of HTML."""
 
-    def write(cells: list[str], tag: str) -> str:
+    def write(cells: Sequence[str], tag: str) -> str:
         return "<tr>" + "".join(f'<{tag} style="text-align:left">{escape(cell)}</{tag}>' for cell in cells) + "</tr>"
 
     lines = [f"<table><caption>{escape(title)}</caption>", *([write(head, "th")] if head else [])]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import CrossingLine, curve_at, zeros_of
 from zwidth.loops.linear.rows import Island, StablePieces, bound_intervals
@@ -90,11 +89,10 @@ class Border:
         for start, stop in _runs(held, piece):
             first, last = self._end(w, piece, start, -1), self._end(w, piece, stop, 1)
             at = np.unique(np.concatenate([[first], w[start : stop + 1], [last]]))
-            curve = curve_at(b.loop, np.clip(at, 1e-300, np.pi))
-            alpha, beta = curve.alpha.copy(), curve.beta.copy()
+            alpha, beta = curve_at(b.loop, at)[:2]
             for k, end in ((0, 0.0), (-1, np.pi)):
                 if at[k] == end:
-                    alpha[k], beta[k] = self.at_end(end)
+                    alpha[k], beta[k] = b.limits[end]
             edges.append(Edge(at, alpha, beta, -1))
         return edges
 
@@ -120,30 +118,20 @@ class Border:
             within.append(w[[not any(e.w[0] - _BESIDE <= at <= e.w[-1] + _BESIDE for e in edges) for at in w]])
         return np.unique(np.concatenate(within))
 
-    def at_end(self, w: float) -> tuple[float, float]:
-        """The curve's limit at z = 1 or z = -1."""
-        at = circle(np.array([w]))
-        with np.errstate(all="ignore"):
-            q, f = self.boundary.loop.required_wall(at), self.boundary.loop.estimate.jet(at)
-            beta = q.slope[0].imag / f.slope[0].imag
-            return float(q.value[0].real - beta * f.value[0].real), float(beta)
-
     def _end(self, w: np.ndarray, piece: np.ndarray, k: int, side: int) -> float:
         """Where a run of nodes on the edge ends beyond its last node ``k``."""
         after = k + side
         if not 0 <= after < w.size:
             end = 0.0 if side < 0 else np.pi
-            return end if np.all(np.isfinite(self.at_end(end))) else float(w[k])
-        if piece[after] != piece[k]:
-            # Towards an angle at which the curve runs to infinity; it may leave the stable set before.
-            limit = self.boundary.infinite[piece[k] if side > 0 else piece[k] - 1]
-            return self._corner(float(w[k]), float(limit))
-        return self._corner(float(w[k]), float(w[after]))
+            return end if np.all(np.isfinite(self.boundary.limits[end])) else float(w[k])
+        # Towards an angle at which the curve runs to infinity it may leave the stable set before.
+        beyond = w[after] if piece[after] == piece[k] else self.boundary.infinite[min(piece[k], piece[k] + side)]
+        return self._corner(float(w[k]), float(beyond))
 
     def _corner(self, inside: float, outside: float) -> float:
         """Where the curve stops to be an edge between two angles: another crossing of its row meets it there."""
         b = self.boundary
-        inside, outside = _narrow(b.borders, inside, outside, 1)
+        inside, outside = self._narrow(inside, outside, 1)
         ends = np.array([inside, outside])
         here = curve_at(b.loop, ends)
         rows = b.crossings(here.beta)
@@ -155,7 +143,15 @@ class Border:
             w = self._meeting(np.stack([ends, rows.w[:, other]]), gaps[:, other], other)
             if list(b.borders(np.array([w - _BESIDE * w, w + _BESIDE * w]))) in ([True, False], [False, True]):
                 return w
-        return _narrow(b.borders, inside, outside, _ROUNDS)[0]
+        return self._narrow(inside, outside, _ROUNDS)[0]
+
+    def _narrow(self, inside: float, outside: float, rounds: int) -> tuple[float, float]:
+        """Narrow the place at which the curve ceases to be an edge; many angles are looked at one time."""
+        for _ in range(rounds):
+            places = inside + (outside - inside) * _SHARES
+            first = int(np.argmin(np.append(self.boundary.borders(places), False)))
+            inside, outside = np.concatenate([[inside], places, [outside]])[first : first + 2].tolist()
+        return inside, outside
 
     def _meeting(self, ends: np.ndarray, gaps: np.ndarray, other: int) -> float:
         """Where the curve meets another crossing of its rows, by Newton's method."""
@@ -185,7 +181,7 @@ class Border:
         """The pieces that these edges enclose; what counts as soft is decided where edges pass alpha = 0."""
         b = self.boundary
         turns = np.array([(arc.first, arc.beta[np.argmin(arc.w)]) for arc in b.arcs]).reshape(-1, 2)
-        found = [np.array([beta for _, beta, _ in self.line_meetings()])]
+        found = [np.array([beta for _, beta, _ in self.line_meetings])]
         for edge in self.curved:
             found.append(edge.beta[[0, -1]])
             found.append(turns[(turns[:, 0] > edge.w[0]) & (turns[:, 0] < edge.w[-1]), 1])
@@ -239,15 +235,16 @@ class Border:
                 edges.append(Edge(np.full(2, line.w), line.q - both * line.f, both, place))
         return edges
 
-    def line_meetings(self) -> list[tuple[float, float, float]]:
-        """Corners of two lines: all other highest points are on the curve."""
+    @cached_property
+    def line_meetings(self) -> list[tuple[float, float, int]]:
+        """Corners of two lines, alpha, beta and the second line: all other highest points are on the curve."""
         b = self.boundary
         found = []
         for place, line in enumerate(b.lines):
             for beta in _meetings(b.lines[:place], line):
                 near = beta + 1e-9 * (1.0 + abs(beta)) * np.array([-1.0, 1.0])
                 if b.line_borders(place, near).any():
-                    found.append((float(line.q - beta * line.f), float(beta), line.w))
+                    found.append((float(line.q - beta * line.f), float(beta), place))
         return found
 
 
@@ -258,19 +255,6 @@ def _meetings(others: Sequence[CrossingLine], line: CrossingLine) -> list[float]
         for other in others
         if abs(other.f - line.f) > _PARALLEL * (abs(other.f) + abs(line.f))
     ]
-
-
-def _narrow(
-    holds: Callable[[np.ndarray], np.ndarray], inside: float, outside: float, rounds: int
-) -> tuple[float, float]:
-    """Narrow the place towards ``outside`` at which a condition ceases to hold; many places are asked at one time."""
-    for _ in range(rounds):
-        places = inside + (outside - inside) * _SHARES
-        held = holds(places)
-        first = int(np.argmin(held)) if not held.all() else held.size
-        inside = float(places[first - 1]) if first else inside
-        outside = float(places[first]) if first < held.size else outside
-    return inside, outside
 
 
 def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:

@@ -58,6 +58,7 @@ class Boundary:
     arcs: tuple[Arc, ...]
     lines: tuple[CrossingLine, ...]
     infinite: np.ndarray  # angles at which the curve runs to infinity
+    limits: dict[float, tuple[float, float]]  # alpha and beta where it has no point of its own, NaN where it has no end
 
     @classmethod
     def trace(cls, loop: LoopRoots) -> Boundary:
@@ -72,12 +73,13 @@ class Boundary:
         turns = zeros_of(loop, w, here.turn, "turn")
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
         lines += lines_at(loop, (0.0, np.pi))
-        limits = {0.0: np.nan, np.pi: np.nan} | {line.w: line.meeting for line in lines}
-        return cls(loop, w, tuple(cut_arcs(loop, w, here, poles, turns, limits)), tuple(lines), poles)
+        limits = dict.fromkeys([0.0, np.pi, *poles.tolist()], (np.nan, np.nan))
+        limits |= {line.w: (line.q - line.meeting * line.f, line.meeting) for line in lines}
+        return cls(loop, w, tuple(cut_arcs(loop, w, here, turns, limits)), tuple(lines), poles, limits)
 
     def crossings(self, beta: np.ndarray) -> Crossings:
         """Where the rows of these dampings, shape (rows,), cross the boundary."""
-        beta, sound = self._settle(beta)
+        beta, sound = self.settle(beta)
         steps = self._steps
         place, row, k = steps.meet(beta)
         w, alpha = self._solve(beta[row], place, k)
@@ -150,21 +152,18 @@ class Boundary:
     @cached_property
     def heights(self) -> tuple[np.ndarray, np.ndarray]:
         """Angles between which alpha is monotone along the curve, and alpha there; NaN where it runs to infinity."""
-        # Where the curve has no point of its own: it meets a line there, or runs to infinity in stiffness or damping.
-        limits = dict.fromkeys([0.0, np.pi, *self.infinite.tolist()], np.nan)
-        limits |= {line.w: line.q - line.meeting * line.f for line in self.lines}
         slope = curve_at(self.loop, self.w).alpha_slope
         tops = zeros_of(self.loop, self.w, slope, "alpha_slope")
         nodes = np.unique(np.concatenate([self.w, tops]))
         pieces, heights = [], []
-        for a, b in pairwise(sorted(limits)):
+        for a, b in pairwise(sorted(self.limits)):
             inner = nodes[(nodes > a) & (nodes < b)]
             inner = inner if inner.size else np.array([0.5 * (a + b)])
             # Towards an end at infinity the curve is looked at no further than this.
             probes = a + _PROBE * (inner[0] - a), b - _PROBE * (b - inner[-1])
             inner = np.concatenate([probes[:1], inner, probes[1:]])
             pieces.append(np.concatenate([[a], inner, [b]]))
-            heights.append(np.concatenate([[limits[a]], curve_at(self.loop, inner).alpha, [limits[b]]]))
+            heights.append(np.concatenate([self.limits[a][:1], curve_at(self.loop, inner).alpha, self.limits[b][:1]]))
         return np.concatenate(pieces), np.concatenate(heights)
 
     @property
@@ -172,11 +171,7 @@ class Boundary:
         """The angles besides 0 and pi at which ``Im(q - beta F)`` vanishes on every row."""
         return [line.w for line in self.lines if line.poles == 2]
 
-    def is_sound(self, beta: np.ndarray) -> np.ndarray:
-        """Whether the crossings of each row agree with the counts far below and far above."""
-        return self._settle(beta)[1]
-
-    def _settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows whose crossings lead from the count far below to that far above, and which ones do (V15)."""
         # A row within rounding of a turn of the curve may miss one of two arcs: a neighbor that does not stands for it.
         missed = self._missed(beta)
@@ -208,7 +203,7 @@ class Boundary:
         """Poles that have left below each wall, without those of one column of the crossings; and if that is sound."""
         # Most walls are far above or below where an arc crosses their row, which the nodes beside tell.
         but = np.broadcast_to(but, beta.shape)
-        beta, sound = self._settle(beta)
+        beta, sound = self.settle(beta)
         steps = self._steps
         place, row, k = steps.meet(beta)
         counted = but[row] != place
@@ -232,7 +227,7 @@ class Boundary:
         here = curve_at(self.loop, w)
         held = np.isfinite(here.alpha) & np.isfinite(here.beta)
         # Of a long delay's rows most hold no stable wall wherever: not enough poles enter on them.
-        held[held] = self.base + self._sum_leaving(self._settle(here.beta[held])[0], 0.0) <= 0
+        held[held] = self.base + self._sum_leaving(self.settle(here.beta[held])[0], 0.0) <= 0
         own, block = self.arc_at(w), max(1, _BLOCK // max(1, len(self.arcs)))
         for part in np.array_split(np.flatnonzero(held), 1 + held.sum() // block):
             passed, sound = self._passed(here.alpha[part], here.beta[part], own[part])
@@ -287,13 +282,7 @@ class _Steps(NamedTuple):
     @classmethod
     def join(cls, arcs: tuple[Arc, ...]) -> _Steps:
         """Lay the arcs of a boundary one after another."""
-        w, beta, alpha = (
-            np.concatenate([np.empty(0), *parts]) for parts in zip(*(arc[:3] for arc in arcs), strict=True)
-        )
-        straight, room = (
-            np.concatenate([np.append(parts[0][:1], part) for part in parts])
-            for parts in zip(*(arc[3:5] for arc in arcs), strict=True)
-        )
+        w, beta, alpha, straight, room = map(np.concatenate, zip(*(arc[:5] for arc in arcs), strict=True))
         sizes = [arc.w.size for arc in arcs]
         dampings, keys = np.unique(beta, return_inverse=True)
         keys = keys + np.repeat(np.arange(len(arcs)), sizes) * dampings.size

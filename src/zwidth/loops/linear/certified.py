@@ -8,8 +8,10 @@ python-flint. With P of degree n and ``P*(z) = z^n P(1/z)``, all zeros of P lie 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from fractions import Fraction
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,23 +36,21 @@ def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tupl
     """Labels and statuses of walls of one shape, in SI units."""
     if not certified.available():
         raise InputError("method: 'certified' needs python-flint for this scene; pip install 'zwidth[certified]'")
-    known: dict[int, tuple[Any, Any, Any, bool]] = {}
+    polynomials = cache(lambda bits: _polynomials(scene))
     stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)
     for place in np.ndindex(stiffness.shape):
-        stable[place], status[place] = _decide(scene, float(stiffness[place]), float(damping[place]), known)
+        stable[place], status[place] = _decide(polynomials, float(stiffness[place]), float(damping[place]))
     return stable, status
 
 
-def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, Any]) -> tuple[bool, Status]:
+def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float) -> tuple[bool, Status]:
     import flint
 
     if not (np.isfinite(stiffness) and np.isfinite(damping)):
         return False, Status.INVALID_INPUT
     for bits in certified.BITS:
         with flint.ctx.workprec(bits):
-            if bits not in known:
-                known[bits] = _polynomials(scene)
-            D, N1, N2, rest = known[bits]
+            D, N1, N2, rest = polynomials(bits)
             p = D + N1 * flint.arb(stiffness) + N2 * flint.arb(damping)
             at_one = stiffness == 0 and rest
             if at_one:
@@ -89,7 +89,7 @@ def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_
     period = exact.timing.period
     chain = chain_of(exact, (scene.d, int(scene.d)), _NOTHING)
     answer, device = _device(chain)
-    top, bottom = _estimate(scene.velocity, period)
+    top, bottom = _estimate(exact.velocity, period)
     unit = period * period / exact.mass
     whole = chain.whole + (1 if chain.d > chain.whole else 0)
     waiting = flint.arb_poly([0] * whole + device.coeffs())
@@ -177,26 +177,25 @@ def _estimate(velocity: Any, period: flint.arb) -> tuple[flint.arb_poly, flint.a
     """Numerator and denominator of F in SI units."""
     import flint
 
-    arb, z = flint.arb, flint.arb_poly([0, 1])
+    pi, z = flint.arb.pi(), flint.arb_poly([0, 1])
     if isinstance(velocity, VelocityFilter):
-        top, bottom = ([arb(value) for value in reversed(part)] for part in (velocity.numerator, velocity.denominator))
-        return flint.arb_poly(top), flint.arb_poly(bottom)
-    coded = period if velocity.coded_period is None else arb(float(velocity.coded_period))
+        top, bottom = (flint.arb_poly(list(part[::-1])) for part in (velocity.numerator, velocity.denominator))
+        return top, bottom
+    coded = period if velocity.coded_period is None else velocity.coded_period
     if isinstance(velocity, WindowedDifference):
         n = velocity.samples
         return (z**n - 1) * (1 / (n * coded)), z**n
     top, bottom = (z - 1) * (1 / coded), z
     if isinstance(velocity, LowPass):
         tau = velocity.time_constant
-        rate = 2 * arb.pi() * arb(float(velocity.cutoff)) * coded if tau is None else coded / arb(float(tau))
-        p = (-rate).exp()
+        p = (-2 * pi * velocity.cutoff * coded if tau is None else -coded / tau).exp()
         top, bottom = top * z ** (velocity.order - 1), (z - p) ** velocity.order
         return top * (1 - p) ** velocity.order, bottom
     if isinstance(velocity, Butterworth):
-        size = (arb.pi() * arb(float(velocity.cutoff)) * coded).tan()
+        size = (pi * velocity.cutoff * coded).tan()
         n, above, below = velocity.order, z - 1, (z + 1) * size
         for k in range(n // 2):
-            cosine = (arb.pi() * (2 * k + 1) / (2 * n)).sin()
+            cosine = (pi * (2 * k + 1) / (2 * n)).sin()
             bottom = bottom * (above * above + above * below * (2 * cosine) + below * below)
         if n % 2:
             bottom = bottom * (above + below)

@@ -13,7 +13,7 @@ small difference of large positions is ever formed, and the first number of the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
@@ -138,20 +138,13 @@ class Chain:
         seen, stiffness = compliance(self)
         poles = [_roots(stiffness), *(mode.poles for mode in self.modes)]
         pairs = [np.array([1.0, 2.0 * m.damping_ratio * m.rate, m.rate * m.rate], float) for m in self.modes]
-        if self.modes:
-            every = seen
-            for pair in pairs:
-                every = np.convolve(every, pair)
-            for k, mode in enumerate(self.modes):
-                others = stiffness / float(mode.mass)
-                for pair in pairs[:k] + pairs[k + 1 :]:
-                    others = np.convolve(others, pair)
-                every = np.polyadd(every, others)
-            seen = np.trim_zeros(every, "f")
+        seen = reduce(np.convolve, pairs, seen)
+        for k, mode in enumerate(self.modes):
+            seen = np.polyadd(seen, reduce(np.convolve, pairs[:k] + pairs[k + 1 :], stiffness / float(mode.mass)))
         if self.actuator is not None:
             lag = self.actuator
             poles.append(lag.poles if isinstance(lag, Resonance) else np.array([-float(lag)]))
-        return _roots(seen), np.concatenate(poles).astype(complex)
+        return _roots(np.trim_zeros(seen, "f")), np.concatenate(poles).astype(complex)
 
     def check(self) -> None:
         """Refuse what moves so fast that e^A keeps no digits."""

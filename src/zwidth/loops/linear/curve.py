@@ -139,8 +139,8 @@ class Arc(NamedTuple):
     w: np.ndarray
     beta: np.ndarray
     alpha: np.ndarray
-    straight: np.ndarray  # of each step: whether alpha may be interpolated in beta, else both ends' mean counts
-    room: np.ndarray  # of each step: how far alpha may be from that
+    straight: np.ndarray  # of the step to each: whether alpha may be interpolated in beta, else both ends' mean counts
+    room: np.ndarray  # of the step to each: how far alpha may be from that
     leaving: float  # poles that leave the circle as alpha rises past it: 2, or -2
 
     @property
@@ -150,13 +150,12 @@ class Arc(NamedTuple):
 
 
 def cut_arcs(
-    loop: LoopRoots, w: np.ndarray, here: CurvePoints, poles: np.ndarray, turns: np.ndarray, limits: dict[float, float]
+    loop: LoopRoots, w: np.ndarray, here: CurvePoints, turns: np.ndarray, limits: dict[float, tuple[float, float]]
 ) -> list[Arc]:
     """Cut the curve where beta turns or runs to infinity, and where Im F changes its sign."""
-    ends = np.unique(np.concatenate([list(limits), poles, turns]))
-    # Its dampings there; NaN where it runs to infinity.
-    betas = dict(zip(turns.tolist(), curve_at(loop, turns).beta.tolist(), strict=True)) | limits
-    betas |= dict.fromkeys(poles.tolist(), np.nan)
+    ends = np.unique(np.concatenate([list(limits), turns]))
+    betas = dict(zip(turns.tolist(), curve_at(loop, turns).beta.tolist(), strict=True))
+    betas |= {end: beta for end, (_, beta) in limits.items()}
     arcs, starts, stops = [], np.searchsorted(w, ends, "right").tolist(), np.searchsorted(w, ends, "left").tolist()
     for (a, b), start, stop in zip(pairwise(ends.tolist()), starts[:-1], stops[1:], strict=True):
         nodes, curve = w[start:stop], CurvePoints(*(values[start:stop] for values in here))
@@ -185,25 +184,20 @@ def cut_arcs(
         good[[0, -1]] = True
         if beta[0] <= beta[-1]:
             parts = [part[good] for part in parts]
-            arcs.append(Arc(*parts[:3], *_bands(*parts), leaving))
+            arcs.append(Arc(*parts[:3], *_bands(parts), leaving))
     return arcs
 
 
-def _bands(
-    w: np.ndarray,
-    beta: np.ndarray,
-    alpha: np.ndarray,
-    alpha_slope: np.ndarray,
-    beta_slope: np.ndarray,
-    size: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+def _bands(parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Where alpha may be between two nodes: `Arc.straight` and `Arc.room`."""
+    w, _, alpha, alpha_slope, beta_slope, size = parts
     # Where the slope of beta hardly changes over a step, a straight line misses alpha by an eighth of the step times
     # what alpha's slope changes, and by what beta bends; four times that is allowed. Elsewhere, more than both ends
     # differ.
     with np.errstate(all="ignore"):
-        bend = beta_slope[1:] / beta_slope[:-1]
+        bend = beta_slope / np.roll(beta_slope, 1)
         straight = (bend > 0.5) & (bend < 2.0)
-        rise, largest = np.abs(np.diff(alpha)), np.maximum(size[1:], size[:-1])
-        close = 0.5 * np.abs(np.diff(w) * np.diff(alpha_slope)) + np.abs(bend - 1.0) * rise + _ROUNDING * largest
+        step, rise, turn = (np.abs(np.diff(part, prepend=part[0])) for part in (w, alpha, alpha_slope))
+        largest = np.maximum(size, np.roll(size, 1))
+        close = 0.5 * step * turn + np.abs(bend - 1.0) * rise + _ROUNDING * largest
         return straight, np.where(straight, close, 1.5 * rise + _ROOM * largest)

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle
-from zwidth.arrays.roots import false_position, zeros_between
+from zwidth.arrays.roots import zeros_between
 from zwidth.arrays.xp import within
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import AnyChain
@@ -208,23 +208,15 @@ _TRIALS, _ROUNDED = 30, 1e-9
 _WITNESSES, _BEYOND = (0.25, 0.5, 0.75, 1.0 - 1e-5), 1.0 + 1e-5
 
 
-class DelayedLoop(NamedTuple):
-    """The loop of a chain at another delay, and the nodes of its curve."""
-
-    delay: np.float64
-    loop: LoopRoots
-    nodes: np.ndarray
-
-
-def lay_delays(chain: AnyChain) -> list[DelayedLoop]:
-    """The loops at delays up to a period longer than the own one: that, every eighth, just before a whole one."""
+def lay_delays(chain: AnyChain) -> dict[float, tuple[LoopRoots, np.ndarray]]:
+    """Loops and nodes at delays up to a period longer than the own one: that, every eighth, just before a whole one."""
     own = float(chain.d)
     fastest = -float(np.linalg.eigvals(chain.realize().A).real.min())
     early = 1.0 - _EARLY / fastest if fastest > _FAST else np.empty(0)
     grid = np.floor(own) + np.union1d(np.arange(_PARTS) / _PARTS, early)
     grid = np.concatenate([grid, grid + 1.0])
     delays = np.concatenate([[own], grid[(grid > own + 1e-9) & (grid < own + 1.0 - 1e-9)], [own + 1.0]])
-    return [DelayedLoop(delay, loop := loop_at(chain, delay), nodes_of(loop)) for delay in delays]
+    return {delay: (loop := loop_at(chain, delay), nodes_of(loop)) for delay in delays.tolist()}
 
 
 def loop_at(chain: AnyChain, delay: float) -> LoopRoots:
@@ -232,26 +224,24 @@ def loop_at(chain: AnyChain, delay: float) -> LoopRoots:
     return find_roots(replace(chain, d=float(delay), whole=int(np.floor(delay))))
 
 
-def delay_margin(chain: AnyChain, delayed: list[DelayedLoop], alpha: float, beta: float) -> float:
+def delay_margin(
+    chain: AnyChain, delayed: dict[float, tuple[LoopRoots, np.ndarray]], alpha: float, beta: float
+) -> float:
     """Periods of delay that a stable wall bears; infinite where no delay is too long, NaN where that is in doubt."""
-    wall = alpha, beta
-    laid = [OpenLoop.lay_out(each.loop, *wall, each.nodes) for each in delayed]
+    wall, delays = (alpha, beta), list(delayed)
+    laid = [OpenLoop.lay_out(loop, *wall, nodes) for loop, nodes in delayed.values()]
     crossed = [each.gain_crossovers() for each in laid]
     turns = [np.mod(np.angle(-each.at(w).value), 2.0 * np.pi) for each, w in zip(laid, crossed, strict=True)]
-    starts = _find_starts([float(each.delay) for each in delayed], crossed, turns)
-    ends = [_follow(chain, wall, w, delay) for w, delay in starts]
+    ends = [_follow(chain, wall, w, delay) for w, delay in _find_starts(delays, crossed, turns)]
+
+    def at_half_rate(delay: float) -> float:
+        return open_loop_response(loop_at(chain, delay), *wall, circle(np.array([np.pi]))).value[0].real
+
     last = np.array([each.L.value[-1].real for each in laid])
-    for k in np.flatnonzero((np.abs(last[1:]) > 1.0) != (np.abs(last[:-1]) > 1.0)):
-        low, high = delayed[k].delay, delayed[k + 1].delay
-        sign = 1.0 if abs(last[k]) > 1.0 else -1.0
-        at_low, at_high = sign * np.log(np.abs(last[k : k + 2]))
-
-        def size(delay: np.float64, sign: float = sign) -> np.float64:
-            L = open_loop_response(loop_at(chain, float(delay)), *wall, circle(np.array([np.pi])))
-            return sign * np.log(np.abs(L.value[0].real))
-
-        end = false_position(size, low, high, at_low, at_high, _TRIALS, 1e-13 * (1.0 + high))
-        ends.append(float(end) + (0 if last[k] < 0 else 1))
+    above = np.abs(last) - 1.0
+    k = np.flatnonzero((above[1:] > 0) != (above[:-1] > 0))
+    met = zeros_between(lambda at: np.abs([*map(at_half_rate, at)]) - 1.0, np.array(delays), above, k)
+    ends += (met + np.where(last[k] < 0, 0.0, 1.0)).tolist()
     ends = [end - float(chain.d) for end in ends if end > chain.d]
     if not ends:
         return np.nan if any(w.size for w in crossed) else np.inf
@@ -317,7 +307,7 @@ def linear_margins(
     """Margins of walls of one shape, periods and radians a period; NaN where a wall is out of range."""
     stable = label_walls(boundary, alpha, beta)
     inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
-    delayed: list[DelayedLoop] = []
+    delayed: dict[float, tuple[LoopRoots, np.ndarray]] = {}
     # What a sampled device does between its samples is not known.
     with_delay = "delay_margin" in wanted and not chain.sampled
     out = np.full((len(Margins._fields), *alpha.shape), np.nan)

@@ -13,12 +13,12 @@ then that of F - F(1).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.circle import Jet, circle, lag_jet, product_jet
+from zwidth.arrays.circle import circle
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 
@@ -84,22 +84,20 @@ class PassivityCondition:
         top = float(estimate.gain) * zeta.polyfromroots([*-estimate.zeros, *[-1.0] * max(-estimate.lag, 0)]).real
         bottom = zeta.polyfromroots([*-estimate.poles, *[-1.0] * lag]).real
         rest = top[0] / bottom[0]
-        # (F - F(1))/(z - 1): without the constant coefficient, which the subtraction takes away.
+        # (F - F(1))/(z - 1): without the constant coefficient, which the subtraction takes away; 0 of a constant F.
         over = np.trim_zeros(zeta.polysub(top, rest * bottom)[1:], "b")
-        if not over.size:
-            return cls(Estimate(0, 0.0), float(rest), whole, float(d - whole))
-        roots = zeta.polyroots(over) + 0j if over.size > 1 else np.zeros(0, complex)
-        return cls(Estimate(0, over[-1], lag, -roots, estimate.poles), float(rest), whole, float(d - whole))
+        over = over if over.size else np.zeros(1)
+        quotient = Estimate(0, over[-1], lag, -zeta.polyroots(over) + 0j, estimate.poles)
+        return cls(quotient, float(rest), whole, float(d - whole))
 
     def _quotient(self, w: np.ndarray) -> np.ndarray:
         """E; of a window's difference the mean of z^-1 to z^-window."""
-        at, f = circle(w), self.quotient
-        parts = product_jet(at, f.zeros, f.gain).over(product_jet(at, f.poles, 1.0)).times(lag_jet(at, -f.lag))
-        if f.window:
-            n, s = f.window, np.sin(0.5 * w)
+        n, value = self.quotient.window, replace(self.quotient, window=0).jet(circle(w)).value
+        if n:
+            s = np.sin(0.5 * w)
             mean = np.where(s == 0, 1.0, np.sin(0.5 * n * w) / (n * np.where(s == 0, 1.0, s)))
-            parts = parts.times(Jet(mean * np.exp(-0.5j * (n + 1) * w), 0.0 * w))
-        return parts.value
+            value = value * (mean * np.exp(-0.5j * (n + 1) * w))
+        return value
 
     def needed(self, alpha: float, beta: float, w: np.ndarray) -> np.ndarray:
         """The damping that each angle in [0, pi] asks for; alpha with the estimate's own spring, >= 0."""

@@ -10,6 +10,7 @@ delays the spectral radius comes from counting poles in circles.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -91,15 +92,11 @@ def evaluate(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> Polynom
     return PolynomialValue(own.value + pushed.value, own.slope + pushed.slope, largest)
 
 
-def _start(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
-    """Eigenvalues of the companion matrices, less 1."""
+def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
+    """Eigenvalues of the companion matrices, less 1, moved by Aberth's steps: Newton's, each pole off the others."""
     D, N1, N2 = affine_polynomial(loop)
     monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
-    return np.linalg.eigvals(companion(monic)) - 1.0 + 0j
-
-
-def _polish(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> Array:
-    """Aberth's steps: Newton's, from which each pole keeps off the others."""
+    zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j
     _take_steps(loop, alpha, beta, zeta, np.arange(len(zeta)))
     # Steps keep a real pair real and a conjugate one conjugate. Of two poles that are almost one eigenvalues may have
     # made the other kind, from which no step leads to them.
@@ -149,11 +146,7 @@ def poles_less_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
         walls = known[(beta[known] != 0) == damped]
         for k in range(0, walls.size, block):
             some = walls[k : k + block]
-            a, b = alpha[some], beta[some]
-            if damped:
-                out[some] = _polish(loop, a, b, _start(loop, a, b))
-            else:
-                out[some] = _springs(loop, a)
+            out[some] = _find_poles(loop, alpha[some], beta[some]) if damped else _springs(loop, alpha[some])
     # Steps leave rounding on real poles; those of a pair that meets there are 1e-8 apart.
     out = np.where(np.abs(np.imag(out)) <= _REAL * np.abs(out), np.real(out) + 0j, out)
     return out.reshape(*shape, order)
@@ -162,12 +155,9 @@ def poles_less_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
 def _springs(loop: LoopRoots, alpha: Array) -> Array:
     """Walls without damping: the poles of the estimate are in nobody's loop, and known."""
     f = loop.estimate
-    alone = LoopRoots(loop.gain, loop.lag, loop.zeros, loop.poles, Estimate(0))
-    none = np.zeros_like(alpha)
     idle = np.concatenate([-f.poles, -np.ones(max(f.window + f.lag, 0))])
-    return np.concatenate(
-        [_polish(alone, alpha, none, _start(alone, alpha, none)), np.broadcast_to(idle, (alpha.size, idle.size))], 1
-    )
+    found = _find_poles(replace(loop, estimate=Estimate(0)), alpha, np.zeros_like(alpha))
+    return np.concatenate([found, np.broadcast_to(idle, (alpha.size, idle.size))], 1)
 
 
 # In a difference of two numbers: what the rounding of either may leave of it.

@@ -27,6 +27,7 @@ from zwidth.loops.linear.rows import bound_intervals
 from zwidth.loops.rigid.device import classify_delays
 from zwidth.loops.rigid.ridge import slopes_kernel, stiffness_slopes
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import WALL
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
@@ -78,17 +79,13 @@ def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     """The stiffest stable wall with alpha > 0 or None; ArithmeticError where the rows contradict what was found."""
     least = -np.inf if negative_damping else 0.0
     tops = _tops(border, least) if border.curved else []
-    for top in tops[:_MOST_TOPS]:
-        # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
-        if not _is_reached(border, top, least):
-            continue
-        found = _describe(border, top, negative_damping)
-        _refuse_stiffer(border, found.alpha, least)
-        return found
-    if len(tops) > _MOST_TOPS:
+    # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
+    top = next((top for top in tops[:_MOST_TOPS] if _is_reached(border, top, least)), None)
+    if top is None and len(tops) > _MOST_TOPS:
         raise ArithmeticError(f"none of the {_MOST_TOPS} highest of {len(tops)} tops holds")
-    _refuse_stiffer(border, 0.0, least)
-    return None
+    found = None if top is None else _describe(border, top, least)
+    _refuse_stiffer(border, 0.0 if found is None else found.alpha, least)
+    return found
 
 
 class _Top(NamedTuple):
@@ -112,10 +109,9 @@ def _tops(border: Border, least: float) -> list[_Top]:
             place = int(b.arc_at(edge.w[min(max(k, 1), max(last - 1, 0))]))
             found.append(_Top(float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), place, bool(0 < k < last)))
     # Straight edges end on the curve or on each other.
-    for alpha, beta, w in border.line_meetings():
+    for alpha, beta, line in border.line_meetings:
         if alpha > 0 and beta >= least:
-            line = next(k for k, line in enumerate(b.lines) if line.w == w)
-            found.append(_Top(alpha, beta, w, len(b.arcs) + line, False))
+            found.append(_Top(alpha, beta, b.lines[line].w, len(b.arcs) + line, False))
     if np.isfinite(least):
         # The upper ends of the row's stable intervals.
         row = bound_intervals(b, np.array([least]))
@@ -125,9 +121,9 @@ def _tops(border: Border, least: float) -> list[_Top]:
     return sorted(found, key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta))
 
 
-def _describe(border: Border, top: _Top, negative: bool) -> BoundRidge:
+def _describe(border: Border, top: _Top, least: float) -> BoundRidge:
     alpha, beta, w = top[:3]
-    if not negative and beta == 0.0:
+    if beta == least:
         return BoundRidge(alpha, beta, w, w, _condition(w), Condition.NO_DAMPING)
     if top.inner:
         return BoundRidge(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
@@ -149,7 +145,7 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     if len(near) == 2 and away[near[1]] <= _MEETS * abs(alpha) and angles[1] - angles[0] > 1e-6:
         return BoundRidge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
     # A double pole at z = -1: the curve ends on the line there.
-    top, damping = border.at_end(np.pi)
+    top, damping = border.boundary.limits[np.pi]
     if not abs(top - alpha) <= _NEAR * abs(alpha):
         raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
     return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
@@ -197,8 +193,7 @@ def _is_reached(border: Border, top: _Top, least: float) -> bool:
 
 def _refuse_stiffer(border: Border, alpha: float, least: float) -> None:
     """Refuse a ridge above which rows of its piece hold a stable wall."""
-    rows, high = border.pieces.main_intervals()
-    highest = float(np.nanmax(high[rows >= least], initial=-np.inf))
+    highest = border.pieces.find_highest(least)
     if highest > alpha * (1.0 + _ABOVE):
         raise ArithmeticError(f"rows reach {highest!r}, the ridge {alpha!r}")
 
@@ -236,9 +231,8 @@ def differentiate(scene: Any, found: BoundRidge | None, status: Status) -> Scene
 def moving_paths(scene: Any) -> tuple[str, ...]:
     """The parameters of a scene, without the wall's, that K_max can be differentiated in."""
     paths = [path for path, value in scene.parameters().items() if not isinstance(value, int | np.integer)]
-    without = {"stiffness", "virtual_damping"}
-    if scene.operator is not None and scene.operator.rigid:
-        without.add("operator.coupling_damping")
+    rigid = scene.operator is not None and scene.operator.rigid
+    without = (*WALL, "operator.coupling_damping") if rigid else WALL
     return tuple(path for path in paths if path not in without)
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -37,22 +37,21 @@ class BoundIntervals(NamedTuple):
 
 def bound_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
     """Where the rows of these dampings, shape (rows,), are stable, and what of the boundary ends each interval."""
-    parts = [_some_intervals(boundary, beta[k : k + _ROWS]) for k in range(0, max(beta.size, 1), _ROWS)]
-    return parts[0] if len(parts) == 1 else join_rows(parts)
+    columns = lay_lines(partial(_some_intervals, boundary), _ROWS, beta)
+    return BoundIntervals(*columns[:4], *np.where(np.isnan(columns[4:]), -1.0, columns[4:]).astype(int))
 
 
-def join_rows(parts: Sequence[BoundIntervals], order: np.ndarray | slice = slice(None)) -> BoundIntervals:
-    """The rows of several parts in one, in an order of their own."""
-    most = max(part.low.shape[1] for part in parts)
-
-    def widen(column: np.ndarray, none: float) -> np.ndarray:
-        return np.pad(column, ((0, 0), (0, most - column.shape[1])), constant_values=none)
-
-    columns = zip(zip(*parts, strict=True), (*[np.nan] * 4, -1, -1), strict=True)
-    return BoundIntervals(*(np.concatenate([widen(c, none) for c in own])[order] for own, none in columns))
+def lay_lines(find: Callable[..., tuple[np.ndarray, ...]], together: int, *lines: np.ndarray) -> np.ndarray:
+    """What is found of lines, so many at a time: columns (lines, most of one), NaN where one has fewer."""
+    starts = range(0, max(lines[0].size, 1), together)
+    parts = [find(*(values[start : start + together] for values in lines)) for start in starts]
+    line, *found = (np.concatenate(column) for column in zip(*parts, strict=True))
+    line += np.repeat(starts, [part[0].size for part in parts])
+    return np.moveaxis(side_by_side(lines[0].size, line, np.stack(found, -1)), -1, 0)
 
 
-def _some_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
+def _some_intervals(boundary: Boundary, beta: np.ndarray) -> tuple[np.ndarray, ...]:
+    """One after another: the row that each is of, its ends, the angles there, and what of the boundary ends it."""
     known = np.where(np.isfinite(beta), beta, 0.0)
     found = boundary.crossings(known)
     order = np.argsort(found.alpha, axis=1)
@@ -68,9 +67,7 @@ def _some_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
     stable = (np.round(outside) == 0) & wide & (np.isfinite(beta) & found.sound)[:, None]
     # Neighbors that touch, where one pole leaves as another enters, stay apart: their common end is on the boundary.
     row, gap = np.nonzero(stable)
-    values = [part[row, gap] for both in (ends, w, met) for part in (both[:, :-1], both[:, 1:])]
-    columns = np.moveaxis(side_by_side(beta.size, row, np.stack(values, -1)), -1, 0)
-    return BoundIntervals(*columns[:4], *np.where(np.isnan(columns[4:]), -1.0, columns[4:]).astype(int))
+    return row, *(part[row, gap] for both in (ends, w, met) for part in (both[:, :-1], both[:, 1:]))
 
 
 def side_by_side(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -85,8 +82,8 @@ def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.n
     """Whether each wall is stable; arrays that broadcast. Dampings that repeat are solved once."""
     shape = np.broadcast_shapes(alpha.shape, beta.shape)
     rows, place = np.unique(beta, return_inverse=True)
-    sound = boundary.is_sound(np.where(np.isfinite(rows), rows, 0.0))
-    if rows.size * _FEW_WALLS > np.prod(shape) or not sound.all():
+    many = rows.size * _FEW_WALLS > np.prod(shape)
+    if many or not boundary.settle(np.where(np.isfinite(rows), rows, 0.0))[1].all():
         return _count_walls(boundary, *np.broadcast_arrays(alpha, beta))
     ends = bound_intervals(boundary, rows)
     place = place.reshape(beta.shape)
@@ -195,19 +192,18 @@ class StablePieces:
         rows = (corners[:-1, None] + np.diff(corners)[:, None] * _SHARES).ravel()
         across = np.linspace(corners[0], corners[-1], _ACROSS + 2)[1:-1] if corners.size else corners
         rows = np.unique(np.concatenate([rows, across]))
-        rows = rows[self.boundary.is_sound(rows)]
+        rows = rows[self.boundary.settle(rows)[1]]
         found = bound_intervals(self.boundary, rows)
         for _ in range(_HALVINGS):
             same = (found.below[1:] == found.below[:-1]).all(1) & (found.above[1:] == found.above[:-1]).all(1)
             parted = np.searchsorted(corners, rows[1:], side="left") != np.searchsorted(corners, rows[:-1], side="left")
             middle = 0.5 * (rows[1:] + rows[:-1])
             new = middle[~same & ~parted & (middle > rows[:-1]) & (middle < rows[1:])]
-            new = new[self.boundary.is_sound(new)]
+            new = new[self.boundary.settle(new)[1]]
             if not new.size:
                 break
-            order = np.argsort(np.append(rows, new))
-            found = join_rows((found, bound_intervals(self.boundary, new)), order)
-            rows = np.append(rows, new)[order]
+            rows = np.sort(np.append(rows, new))
+            found = bound_intervals(self.boundary, rows)
         return rows, found
 
     @cached_property
@@ -233,12 +229,11 @@ class StablePieces:
         soft = reaches_down(found.low, found.high)
         return labels, np.unique(labels[soft])
 
-    def main_intervals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of the plane, and up to which alpha each is stable in a piece with soft walls; NaN where it is not."""
+    def find_highest(self, least: float) -> float:
+        """Up to which alpha rows with that much damping or more are stable in pieces with soft walls; else -inf."""
         rows, found = self._rows
-        labels, main = self._labels
-        high = np.where(np.isin(labels, main), found.high, -np.inf).max(1, initial=-np.inf)
-        return rows, np.where(np.isfinite(high), high, np.nan)
+        inside = np.isin(*self._labels) & np.isfinite(found.high) & (rows >= least)[:, None]
+        return float(np.max(found.high, where=inside, initial=-np.inf))
 
     def piece_at(self, beta: float, place: int) -> int:
         """The piece at the point of a row on one column of its crossings, -1 where none is beside it."""

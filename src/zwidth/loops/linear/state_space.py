@@ -51,9 +51,8 @@ def _filter(estimate: Estimate) -> StateSpace:
     top = np.concatenate([np.zeros(bottom.size - top.size), top])
     A = np.eye(size, k=-1) + np.eye(size)
     B = np.zeros((size, 1))
-    if size:
-        A[0] -= bottom[1:]
-        B[0] = 1.0
+    A[:1] -= bottom[1:]
+    B[:1] = 1.0
     return StateSpace(A, B, (top[1:] - top[0] * bottom[1:])[None, :], top[:1, None])
 
 

@@ -16,13 +16,13 @@ curve winds around 0 equally often for every wall, which one wall in the middle 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.arrays.circle import circle
-from zwidth.loops.linear.rows import side_by_side
+from zwidth.loops.linear.rows import lay_lines, side_by_side
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 
@@ -212,14 +212,8 @@ class DecidedWalls:
 
     def _intervals(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> Decided:
         """Of rows or columns, so many at a time."""
-        size = max(1, _BLOCK // self.curve.w.size)
-        parts = [
-            self._some(free, fixed[part], least[part], most[part])
-            for part in (slice(start, start + size) for start in range(0, max(fixed.size, 1), size))
-        ]
-        line, *found = (np.concatenate(column) for column in zip(*parts, strict=True))
-        line += np.repeat(size * np.arange(len(parts)), [part[0].size for part in parts])
-        low, high, stable = np.moveaxis(side_by_side(fixed.size, line, np.stack(found, -1)), -1, 0)
+        together = max(1, _BLOCK // self.curve.w.size)
+        low, high, stable = lay_lines(partial(self._some, free), together, fixed, least, most)
         return Decided(low, high, stable == 1)
 
     def _some(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, ...]:
