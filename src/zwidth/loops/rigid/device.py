@@ -6,14 +6,8 @@ force to sampled position that is
 
     x/F = N(z) / (z^(1+n) (z - 1)(z - c))     with N(z) = z n0(z) + n1(z) = a2 z^2 + a1 z + a0,
 
-``phi2 z^2 + psi z`` at f = 0. All three coefficients are sums of positive terms, so none of them cancels:
-
-    t = 1 - f
-    a2 = t^2 phi2(delta t)
-    a1 = t^2 psi(delta t) + t f e^(-delta t) phi1(delta f) + f^2 phi2(delta f) + t f phi1(delta t) phi1(delta f)
-    a0 = e^(-delta t) f^2 psi(delta f)
-
-with the phi-functions of exponential integrators, ``c = e^-x``, ``phi1 = (1 - c)/x``, ``phi2 = (1 - phi1)/x``,
+``phi2 z^2 + psi z`` at f = 0. All three coefficients (docs/theory/model.md) are sums of positive terms, so none of them
+cancels, of the phi-functions of exponential integrators, ``c = e^-x``, ``phi1 = (1 - c)/x``, ``phi2 = (1 - phi1)/x``,
 ``psi = phi1 - phi2``, ``gap = phi2 - psi``. As printed, each quotient cancels for small x. Below `_SERIES_BELOW` phi1
 and gap are therefore ``e^(-x/2)`` times a power series in x^2 whose terms are all positive, which cancels nowhere and
 has the right derivatives at 0; ``phi2, psi = (phi1 +- gap)/2`` loses about one bit at the switch and none at 0. Above

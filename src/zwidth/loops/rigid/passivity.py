@@ -16,7 +16,7 @@ from zwidth.arrays.evaluate import FEW, as_number, check_scalars, evaluate, eval
 from zwidth.arrays.roots import integrate
 from zwidth.arrays.xp import frozen, horner, is_traced, namespace, nan_with_nan_slopes
 from zwidth.loops.rigid.device import ANY, DelayClasses, classify_delays, valid_device, valid_wall
-from zwidth.loops.rigid.folding import NAMES, fold_arguments, group_by
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by
 from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import Array, ArrayLike
@@ -115,17 +115,16 @@ def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, 
 def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
     """`passivity_margin` of many walls that share few delays; None where they do not."""
     laid = fold_arguments(values)
-    alpha, beta, delta, d = laid.points
+    d = laid.points.d
     if laid.points.size <= FEW or np.unique(d).size * FEW > laid.points.size:
         return None
     out = np.full(laid.points.shape, np.nan)
-    for delay, arrays, place in group_by((alpha, beta, delta), d):
+    for delay, arrays, place in group_by(laid.points, d):
         if not 0 <= delay <= LONGEST_DELAY:
             continue
-        whole = np.broadcast_shapes(*(array.shape for array in arrays))
-        columns = (a.reshape(1) if a.size == 1 else np.broadcast_to(a, whole).reshape(-1) for a in arrays)
-        known = map(np.atleast_1d, table(float(delay)).numbers())
-        out[place] = evaluate_columns(_map_kernel, [*columns, *known], route="jax").reshape(whole)
+        walls = Points(*arrays)
+        columns = [*walls.columns()[:3], *map(np.atleast_1d, table(float(delay)).numbers())]
+        out[place] = evaluate_columns(_map_kernel, columns, route="jax").reshape(walls.shape)
     return to_caller(laid.spread(out), values)
 
 
