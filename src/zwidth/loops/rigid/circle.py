@@ -130,10 +130,8 @@ def _cubic_zeros(at: _Circle, xp: Any) -> list[Array]:
 
 
 def _find_zero_between(piece: tuple[Array, ...], at: _Circle, xp: Any) -> Array:
-    """The zero of a monotone piece of a cubic: each step solves for the parabola that touches it twice.
-
-    A piece is its two ends and the values there.
-    """
+    """The zero of a monotone piece of a cubic: each step solves for the parabola that touches it twice."""
+    # A piece is its two ends and the values there.
     low, high, first, last = piece
     exists = (first < 0) != (last < 0)
     if xp is np and not np.any(exists):
@@ -249,10 +247,8 @@ def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> C
 def count_in_cell(
     log_r: Array, loop: Loop, half: tuple[Array, Array], fractional: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How many poles are outside ``|z| = e^log_r``, and whether that is so for every wall of a cell.
-
-    The walls are those whose alpha and beta differ by at most ``half`` from the loop's (docs/theory/maps.md, C4).
-    """
+    """How many poles are outside ``|z| = e^log_r``, and whether that is so for every wall of a cell."""
+    # The walls are those whose alpha and beta differ by at most ``half`` from the loop's (docs/theory/maps.md, C4).
     at = _circle(log_r, loop, fractional, np)
     a, b = half
     r, near, power = at.r, np.abs(at.near), loop.turns * log_r

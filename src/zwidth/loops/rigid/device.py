@@ -88,11 +88,9 @@ class Plant(NamedTuple):
 def held_plant(
     delta: Any, fraction: Any = None, functions: Functions = phi_functions, at: Any = None, at_t: Any = None
 ) -> Plant:
-    """Discretize for a delay whose fractional part is ``fraction``, in [0, 1), or None: N(z) = z (phi2 z + psi).
-
-    In any arithmetic whose phi-functions are given; ``at`` and ``at_t`` are these at delta and at delta (1 - fraction),
-    where somebody has them.
-    """
+    """Discretize for a delay whose fractional part is ``fraction``, in [0, 1), or None: N(z) = z (phi2 z + psi)."""
+    # In any arithmetic whose phi-functions are given; ``at`` and ``at_t`` are these at delta and at delta (1 -
+    # fraction), where somebody has them.
     at = functions(delta) if at is None else at
     if fraction is None:
         return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
