@@ -5,8 +5,8 @@ On maps of alpha and beta they come from series (`loops.rigid.pole_map`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -72,11 +72,9 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, route: 
             # Plain numbers are several times faster than arrays of one.
             found = [np.reshape(leaf, 1) for leaf in quick_kernel(*(column[0] for column in asked), fractional=kind)]
         elif route == "numpy" or (route == "auto" and size <= FEW):
-            lists = (
-                quick_kernel(*(column[some] for column in asked), fractional=kind)
-                for some in _in_lists(fill_up(np.arange(size)))
-            )
-            found = [np.concatenate(leaves)[:size] for leaves in zip(*lists, strict=True)]
+            full = [column[fill_up(np.arange(size))] for column in asked]
+            found = zip(*_in_lists(lambda some: quick_kernel(*some, fractional=kind), full), strict=True)
+            found = [np.concatenate(leaves)[:size] for leaves in found]
         else:
             # Always of one size: other batches may round differently.
             found = map_blocks(compile_columns(quick_kernel, (kind,)), asked, PIECE, exact=True)
@@ -94,23 +92,26 @@ def _finish_poles(columns: list[np.ndarray], poles: OutermostPoles, accuracy: fl
     for method, tolerance in attempts:
         if not left.size:
             break
-        unproved = []
-        for some in _in_lists(left):
+
+        def attempt(lists: list[np.ndarray], method: Any = method, tolerance: float = tolerance) -> np.ndarray:
+            (some,) = lists
             full = fill_up(some)
-            with np.errstate(all="ignore"):
-                loop = factor_loop(*(column[full] for column in columns), fractional=kind)
-                new = method(OutermostPoles(*(leaf[full] for leaf in poles)), tolerance, loop, kind)
+            loop = factor_loop(*(column[full] for column in columns), fractional=kind)
+            new = method(OutermostPoles(*(leaf[full] for leaf in poles)), tolerance, loop, kind)
             good = np.isfinite(new.re[: some.size])
             for whole, leaf in zip(poles, new, strict=True):
                 whole[some[good]] = leaf[: some.size][good]
-            unproved.append(some[~new.proved[: some.size]])
-        left = np.concatenate(unproved)
+            return some[~new.proved[: some.size]]
+
+        left = np.concatenate(_in_lists(attempt, [left]))
     return poles
 
 
-def _in_lists(places: np.ndarray) -> Iterator[np.ndarray]:
-    """Places of walls that are computed one after another: two threads take as long, or longer."""
-    return (places[start : start + _AT_ONCE] for start in range(0, max(places.size, 1), _AT_ONCE))
+def _in_lists(function: Callable[[list[np.ndarray]], Any], columns: list[np.ndarray]) -> list[Any]:
+    """The function's results for lists of walls, one after another: two threads take as long, or longer."""
+    starts = range(0, max(columns[0].size, 1), _AT_ONCE)
+    with np.errstate(all="ignore"):
+        return [function([column[start : start + _AT_ONCE] for column in columns]) for start in starts]
 
 
 def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
