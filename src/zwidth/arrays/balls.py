@@ -27,20 +27,20 @@ _ROOT_ERROR = 2.0 * UNIT
 
 
 class Ball:
-    """``mid`` within ``rad``; a radius of None says that ``mid`` is the number itself."""
+    """``mid`` within ``rad``."""
 
     __slots__ = ("mid", "rad")
     # NumPy then leaves ``array * ball`` to the ball.
     __array_ufunc__ = None
 
-    def __init__(self, mid: Any, rad: Any = None):
+    def __init__(self, mid: Any, rad: Any = 0.0):
         self.mid = mid
         self.rad = rad
 
     @property
     def radius(self) -> Any:
         """The distance from ``mid`` that no number of the ball exceeds."""
-        return 0.0 if self.rad is None else INFLATED * self.rad
+        return INFLATED * self.rad
 
     def lower(self) -> Any:
         """A float64 number below or at every number of the ball."""
@@ -54,15 +54,9 @@ class Ball:
         return Ball(abs(self.mid), self.rad)
 
     def __add__(self, other: Any) -> Ball:
-        if not isinstance(other, Ball):
-            other = Ball(other)
+        other = as_ball(other)
         mid = self.mid + other.mid
-        rad = UNIT * abs(mid) + TINY
-        if self.rad is not None:
-            rad = self.rad + rad
-        if other.rad is not None:
-            rad = other.rad + rad
-        return Ball(mid, rad)
+        return Ball(mid, _rounding(mid) + self.rad + other.rad)
 
     __radd__ = __add__
 
@@ -76,25 +70,17 @@ class Ball:
         if not isinstance(other, Ball):
             if isinstance(other, int | float) and abs(frexp(other)[0]) == 0.5:
                 # A power of two only moves the exponent.
-                rad = None if self.rad is None else self.rad * abs(other)
-                return Ball(self.mid * other, rad if abs(other) >= 1.0 else _total(rad, TINY))
+                return Ball(self.mid * other, self.rad * abs(other) + (TINY if abs(other) < 1.0 else 0.0))
             other = Ball(other)
         mid = self.mid * other.mid
-        rad = UNIT * abs(mid) + TINY
-        if self.rad is not None:
-            rad = abs(other.mid) * self.rad + rad
-        if other.rad is not None:
-            rad = (abs(self.mid) if self.rad is None else abs(self.mid) + self.rad) * other.rad + rad
-        return Ball(mid, rad)
+        return Ball(mid, _rounding(mid) + abs(other.mid) * self.rad + (abs(self.mid) + self.rad) * other.rad)
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Ball:
         other = as_ball(other)
         mid = self.mid / other.mid
-        spread = _total(self.rad, None if other.rad is None else abs(mid) * other.rad)
-        if spread is None:
-            return Ball(mid, _rounding(mid))
+        spread = self.rad + abs(mid) * other.rad
         # The divisor's smallest size: inflated, for it is a difference. Where it is not positive, nothing is known.
         least = abs(other.mid) - other.radius
         xp = namespace(least)
@@ -109,7 +95,7 @@ class Ball:
         mid = xp.sqrt(xp.where(self.mid > 0, self.mid, xp.nan))
         own = _ROOT_ERROR * mid + TINY
         # |sqrt x - sqrt m| = |x - m|/(sqrt x + sqrt m)
-        return Ball(mid, own if self.rad is None else self.rad / mid + own)
+        return Ball(mid, self.rad / mid + own)
 
     def __gt__(self, other: Any) -> Any:
         difference = self if _is_zero(other) else self - other
@@ -131,15 +117,6 @@ def _is_zero(value: Any) -> bool:
 
 def _rounding(mid: Array) -> Array:
     return UNIT * abs(mid) + TINY
-
-
-def _total(*parts: Any) -> Any:
-    """The sum of the radii that there are."""
-    total = None
-    for part in parts:
-        if part is not None:
-            total = part if total is None else total + part
-    return total
 
 
 class Form(Ball):

@@ -67,10 +67,8 @@ _GOLDEN = 0.3819660112501051
 def narrow_dips(
     cost: Function, left: Array, middle: Array, right: Array, value: Array, steps: int, close: float = 0.0
 ) -> tuple[Array, Array]:
-    """Lowest places of a function between two others, and its values there, by golden section.
-
-    In NumPy no longer than until each is known to the share ``close`` of itself.
-    """
+    """Lowest places of a function between two others, and its values there, by golden section."""
+    # In NumPy no longer than until each is known to the share ``close`` of itself.
     xp = namespace(left, value)
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -26,7 +26,7 @@ def random_balls(rng, exact):
 def members(ball, index):
     """The ends and the middle of one ball, exactly."""
     mid = flint.arb(float(ball.mid[index]))
-    if ball.rad is None:
+    if np.ndim(ball.rad) == 0:
         return [mid]
     rad = flint.arb(float(ball.rad[index]))
     return [mid - rad, mid, mid + rad]

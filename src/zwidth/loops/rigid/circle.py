@@ -3,14 +3,8 @@
 P = T + B as in `loops.rigid.crossover`, ``T = z^(1+n) (z - 1)(z - c)`` and ``B = M(z) (s z - beta)`` with
 s = alpha + beta and ``M = (a2 z + h)(1 + q/z)``, whose zeros are real and not positive. On ``z = r e^(j w)``,
 0 < w < pi, with x = sin^2(w/2) every factor has ``|z - a|^2 = (r - a)^2 + 4 r a x`` and an imaginary part of one sign.
-Hence
-
-- |T|^2 - |B|^2 is a quadratic in x (whole delays) or a cubic; its zeros in (0, 1) are the crossovers;
-- every argument is continuous where it is principal, and between crossovers that of P stays within a quarter turn of
-  that of the larger part. At a crossover the two differ by ``theta = arg T - arg B``; P continues with the other part
-  plus or minus 2 pi m, m the whole number nearest to theta/(2 pi).
-
-The number of zeros inside is the turn of P over pi; nothing in it grows with n. The logarithm of r is what is given, so
+Hence |T|^2 - |B|^2 is a quadratic in x (whole delays) or a cubic, every argument is continuous where it is principal,
+and the poles inside are counted as in docs/theory/one-crossover.md, Theorem 4. The logarithm of r is what is given, so
 that circles a hair beside the unit circle are told apart from it.
 """
 
@@ -136,10 +130,8 @@ def _cubic_zeros(at: _Circle, xp: Any) -> list[Array]:
 
 
 def _find_zero_between(piece: tuple[Array, ...], at: _Circle, xp: Any) -> Array:
-    """The zero of a monotone piece of a cubic: each step solves for the parabola that touches it twice.
-
-    A piece is its two ends and the values there.
-    """
+    """The zero of a monotone piece of a cubic: each step solves for the parabola that touches it twice."""
+    # A piece is its two ends and the values there.
     low, high, first, last = piece
     exists = (first < 0) != (last < 0)
     if xp is np and not np.any(exists):
@@ -162,13 +154,11 @@ def _find_zero_between(piece: tuple[Array, ...], at: _Circle, xp: Any) -> Array:
     return xp.where(exists, x, np.nan)
 
 
-def _only_zero(at: _Circle, fractional: bool, xp: Any) -> tuple[Array, Array | bool]:
-    """The one zero in (0, 1) of a difference whose signs at the ends differ, and whether it is known to be the one."""
+def _only_zero(at: _Circle, xp: Any) -> tuple[Array, Array]:
+    """The one zero in (0, 1) of a cubic whose signs at the ends differ, and whether it is known to be the one."""
     h0, h1, h2, h3 = at.h
     sign = xp.where(h0 > 0, 1.0, -1.0)
-    x = first_zero(tuple([sign * h for h in (at.h if fractional else at.h[:3])]))
-    if not fractional:
-        return x, True
+    x = first_zero(tuple([sign * h for h in at.h]))
     # Monotone, or with one extreme, or none inside; and the steps have arrived.
     alone = (h2 * h2 < 3.0 * h1 * h3) | (h1 * at.slope(1.0) < 0) | (xp.abs(h2) > 3.0 * xp.abs(h3)) | (h2 * h3 > 0)
     return x, alone & (xp.abs(at.value(x)) <= 8.0 * epsilon(x) * at.parts(x))
@@ -216,10 +206,8 @@ class Count(NamedTuple):
 
 
 def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> Count:
-    """How many poles are not inside ``|z| = e^log_r``.
-
-    With ``single`` nothing is sure where there is more than one crossover; that takes half of the time.
-    """
+    """How many poles are not inside ``|z| = e^log_r``."""
+    # With ``single``, for fractional delays, nothing is sure without one crossover alone; that takes half of the time.
     xp = namespace(log_r, loop.alpha)
     at = _circle(log_r, loop, fractional, xp)
     outer, ends_outer = at.first[0] > at.first[1], at.last[0] > at.last[1]
@@ -227,10 +215,9 @@ def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> C
     blur = 4.0 * eps * (loop.turns + 8.0)
     sure = ~(_may_cancel(at.first, blur) | _may_cancel(at.last, blur))
     if single:
-        x, alone = _only_zero(at, fractional, xp)
+        x, alone = _only_zero(at, xp)
         zeros = [xp.where(outer != ends_outer, x, -1.0)]
-        monotone = False if fractional else (at.h[1] * at.slope(1.0) > 0)
-        sure = sure & xp.where(outer != ends_outer, alone, monotone)
+        sure = sure & (outer != ends_outer) & alone
     else:
         zeros = _cubic_zeros(at, xp) if fractional else _quadratic_zeros(*at.h[:3], xp)
     start, stop, _ = _ends(at, loop, outer, ends_outer)
@@ -260,10 +247,8 @@ def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> C
 def count_in_cell(
     log_r: Array, loop: Loop, half: tuple[Array, Array], fractional: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How many poles are outside ``|z| = e^log_r``, and whether that is so for every wall of a cell.
-
-    The walls are those whose alpha and beta differ by at most ``half`` from the loop's (docs/theory/maps.md, C4).
-    """
+    """How many poles are outside ``|z| = e^log_r``, and whether that is so for every wall of a cell."""
+    # The walls are those whose alpha and beta differ by at most ``half`` from the loop's (docs/theory/maps.md, C4).
     at = _circle(log_r, loop, fractional, np)
     a, b = half
     r, near, power = at.r, np.abs(at.near), loop.turns * log_r

@@ -17,7 +17,7 @@ import numpy as np
 
 from zwidth.arrays.roots import bisect
 from zwidth.arrays.xp import frozen, horner, namespace, repeat, store_once
-from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, Plant, device, short_curve
+from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, device, short_curve
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (
     Angles,
@@ -197,9 +197,8 @@ def row_end(beta: Array, lobe: Lobe, delay_model: str, kind: DelayClasses) -> Ro
 def peak(lobe: Lobe, delay_model: str, kind: DelayClasses) -> Peak:
     """The largest alpha of the lobe: the ridge, which may be the corner."""
     here = lobe.here
-    plant = Plant(here.c, here.em, here.a2, here.a1, here.a0, here.gap)
     start = guess_start(here.delta, lobe.d, here.f, kind)
-    ridge = solve(plant, here.whole, start, delay_model if kind.fractional else "held", kind)
+    ridge = solve(here, here.whole, start, delay_model if kind.fractional else "held", kind)
     if lobe.short is None:
         return Peak(ridge.omega, ridge.alpha)
     y = ridge.s * ridge.s

@@ -6,14 +6,8 @@ force to sampled position that is
 
     x/F = N(z) / (z^(1+n) (z - 1)(z - c))     with N(z) = z n0(z) + n1(z) = a2 z^2 + a1 z + a0,
 
-``phi2 z^2 + psi z`` at f = 0. All three coefficients are sums of positive terms, so none of them cancels:
-
-    t = 1 - f
-    a2 = t^2 phi2(delta t)
-    a1 = t^2 psi(delta t) + t f e^(-delta t) phi1(delta f) + f^2 phi2(delta f) + t f phi1(delta t) phi1(delta f)
-    a0 = e^(-delta t) f^2 psi(delta f)
-
-with the phi-functions of exponential integrators, ``c = e^-x``, ``phi1 = (1 - c)/x``, ``phi2 = (1 - phi1)/x``,
+``phi2 z^2 + psi z`` at f = 0. All three coefficients (docs/theory/model.md) are sums of positive terms, so none of them
+cancels, of the phi-functions of exponential integrators, ``c = e^-x``, ``phi1 = (1 - c)/x``, ``phi2 = (1 - phi1)/x``,
 ``psi = phi1 - phi2``, ``gap = phi2 - psi``. As printed, each quotient cancels for small x. Below `_SERIES_BELOW` phi1
 and gap are therefore ``e^(-x/2)`` times a power series in x^2 whose terms are all positive, which cancels nowhere and
 has the right derivatives at 0; ``phi2, psi = (phi1 +- gap)/2`` loses about one bit at the switch and none at 0. Above
@@ -94,11 +88,9 @@ class Plant(NamedTuple):
 def held_plant(
     delta: Any, fraction: Any = None, functions: Functions = phi_functions, at: Any = None, at_t: Any = None
 ) -> Plant:
-    """Discretize for a delay whose fractional part is ``fraction``, in [0, 1), or None: N(z) = z (phi2 z + psi).
-
-    In any arithmetic whose phi-functions are given; ``at`` and ``at_t`` are these at delta and at delta (1 - fraction),
-    where somebody has them.
-    """
+    """Discretize for a delay whose fractional part is ``fraction``, in [0, 1), or None: N(z) = z (phi2 z + psi)."""
+    # In any arithmetic whose phi-functions are given; ``at`` and ``at_t`` are these at delta and at delta (1 -
+    # fraction), where somebody has them.
     at = functions(delta) if at is None else at
     if fraction is None:
         return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)

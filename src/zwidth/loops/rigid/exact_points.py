@@ -45,16 +45,7 @@ def bisect(function: Callable[..., Array], lower: Array, upper: Array, *args: An
         from jaxopt import Bisection
 
     lower, upper, args = jax.lax.stop_gradient((lower, upper, args))
-    solver = Bisection(
-        optimality_fun=function,
-        lower=lower,
-        upper=upper,
-        maxiter=_HALVINGS,
-        tol=0.0,
-        check_bracket=False,
-        unroll=False,
-        jit=True,
-    )
+    solver = Bisection(function, lower, upper, _HALVINGS, tol=0.0, check_bracket=False, unroll=False)
     root, state = solver.run(None, *args)
     return jax.lax.stop_gradient(root), state.sign != 0
 

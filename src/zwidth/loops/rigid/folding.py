@@ -55,11 +55,9 @@ def find_degree(d: float) -> Degree:
 def map_by_degree(
     kernel: Callable[..., Any], values: tuple[ArrayLike, ...], *static: Any, lead: bool = False, route: Route = "auto"
 ) -> Any:
-    """Apply ``kernel(alpha, beta, delta, d, degree, *static)``, elementwise, to points whose delays may differ.
-
-    Results that are vectors, along a last axis, come back in one array; shorter ones are filled with zeros in front
-    (``lead``, for coefficients) or NaN behind (for poles). By the route "numpy" the kernel gets all points of a degree.
-    """
+    """Apply ``kernel(alpha, beta, delta, d, degree, *static)``, elementwise, to points whose delays may differ."""
+    # Results that are vectors, along a last axis, come back in one array; shorter ones are filled with zeros in front
+    # (``lead``, for coefficients) or NaN behind (for poles). By "numpy" the kernel gets all points of a degree.
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
     traced = is_traced(*values)
@@ -78,10 +76,9 @@ def map_by_degree(
     columns: list[Any] = [xp.reshape(array, -1) for array in arrays]
     # What is beyond the range of the model must not decide the length of all others.
     defined = np.broadcast_to(np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0), shape).reshape(-1)
-    whole = np.floor(defined)
     parts, places = [], []
-    for code, picked, place in group_by(tuple(columns), 2.0 * whole + (defined != whole)):
-        degree = Degree(int(code // 2), bool(code % 2))
+    for delay, picked, place in group_by(tuple(columns), 0.5 * (np.floor(defined) + np.ceil(defined))):
+        degree = find_degree(delay)
         if traced or route == "numpy":
             with np.errstate(all="ignore"):
                 parts.append(kernel(*picked, degree, *static))

@@ -1,15 +1,8 @@
 """The physical damping that a passive wall of the rigid loop needs, for any delay: one maximum over frequency.
 
-Notation: ``d = n + f``, ``k = n + 1``, ``a = alpha/2``, ``b = beta + alpha/2``, ``u = 1 - cos w`` in (0, 2],
-``kappa = 4 f (1 - f)``, ``rho e^(-j phi) = (1 - f) + f e^(-jw)``, ``psi = k w + phi``. At one frequency the wall needs
-
-    N(w) = (A + sqrt(A^2 + kappa R))/2      A = rho (a cot(w/2) sin psi - b cos psi)
-                                            R = a^2 + (b^2 - a^2) u/2
-
-the larger root of ``N^2 - A N - kappa R/4 = 0``; for whole d simply A. Let alpha >= 0. Its supremum is at w = 0 for
-beta <= 0, else where psi <= pi, at the one peak there (docs/theory/passivity.md, P1 to P3).
-N is homogeneous in (alpha, beta), a polynomial in u under the root, and stationary where ``E = A' + kappa (b^2 - a^2)/
-(8 N)`` vanishes, a prime for d/du.
+What a wall needs at one frequency, N, where that is highest for alpha >= 0 (P1 to P3), and all letters stand in
+docs/theory/passivity.md. N is homogeneous in (alpha, beta), a polynomial in u under the root, and stationary where
+``E = A' + kappa (b^2 - a^2)/(8 N)`` vanishes, a prime for d/du.
 """
 
 from __future__ import annotations

@@ -51,10 +51,8 @@ _NONE = np.empty(0)
 
 
 def outermost_poles(columns: list[np.ndarray], accuracy: float, route: Route = "auto") -> OutermostPoles:
-    """The outermost poles of equally long columns of alpha, beta, delta and d.
-
-    By the routes "numpy" and "jax" a wall's pole does not depend on the others.
-    """
+    """The outermost poles of equally long columns of alpha, beta, delta and d."""
+    # By the routes "numpy" and "jax" a wall's pole does not depend on the others.
     fractional = columns[3] != np.floor(columns[3])
     if not fractional.any() or fractional.all():
         return _of_one_kind(columns, accuracy, bool(fractional.any()), route)
@@ -117,11 +115,9 @@ def _in_lists(function: Callable[[list[np.ndarray]], Any], columns: list[np.ndar
 
 
 def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
-    """The points as a map of one or several devices, where they are one that is large enough; a line is a map, too.
-
-    With it the caller's axes in the map's order, those of the devices, then beta's, then alpha's, of which a line lacks
-    one: it gets the first axis, which has to be of length 1; and its shape.
-    """
+    """The points as a map of one or several devices, where they are one that is large enough; a line is a map, too."""
+    # With it the caller's axes in the map's order, those of the devices, then beta's, then alpha's, of which a line
+    # lacks one: it gets the first axis, which has to be of length 1; and its shape.
     shape, alone = points.shape, []
     for name in ("beta", "alpha"):
         varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1] or [0]
@@ -154,10 +150,8 @@ class WallPoles(NamedTuple):
 
 
 def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPoles:
-    """The outermost poles of a map: by series, and where these fail wall by wall.
-
-    Nothing is compiled, and a wall's value does not depend on the others of its window.
-    """
+    """The outermost poles of a map: by series, and where these fail wall by wall."""
+    # Nothing is compiled, and a wall's value does not depend on the others of its window.
     found = follow_poles(area, accuracy, with_rate)
     (radius, rate, places), proved = found, np.ones(found.radius.shape, bool)
     columns, missing = area.walls(np.stack(places)), np.isnan(radius[places])

@@ -8,7 +8,7 @@ in (alpha, beta): one convex set for each delay, whatever the device. Where the 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from zwidth.arrays.evaluate import FEW, as_number, check_scalars, evaluate, eval
 from zwidth.arrays.roots import integrate
 from zwidth.arrays.xp import frozen, horner, is_traced, namespace, nan_with_nan_slopes
 from zwidth.loops.rigid.device import ANY, DelayClasses, classify_delays, valid_device, valid_wall
-from zwidth.loops.rigid.folding import NAMES, fold_arguments, group_by
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by
 from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import Array, ArrayLike
@@ -44,25 +44,9 @@ def _limit_margin(margin: Array, alpha: Array) -> Array:
     return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
 
 
-class PassiveTable(NamedTuple):
-    """What all walls of one delay need, as one polynomial of the direction."""
-
-    f: float
-    at_zero: float  # the slope in alpha of what is needed at w = 0, for whole d
-    first: float  # of the `directions`
-    width: float
-    last: float  # in the variable of the polynomial
-    limit: float  # the same, infinite where there is none
-    powers: list[float]
-
-    def numbers(self) -> list[float]:
-        """All of them in a row."""
-        return [*self[:-1], *self.powers]
-
-
 @lru_cache(maxsize=256)
-def table(d: float) -> PassiveTable:
-    """The `PassiveTable` of one delay."""
+def table(d: float) -> tuple[float, ...]:
+    """What all walls of one delay need, as one polynomial of the direction: what `_map_kernel` takes."""
     # Between its directions ``needed/(beta + (width - first) alpha)`` is analytic in ``x/(x + width alpha)``, ``x =
     # beta - first alpha``, up to beta = infinity; its Chebyshev series falls by a factor of 4 a term, for every delay.
     first, last_turn = directions(np.float64(d))
@@ -84,11 +68,13 @@ def table(d: float) -> PassiveTable:
     # By powers, whose coefficients fall as well: Clenshaw's sum loses two digits towards the ends.
     powers = np.polynomial.chebyshev.cheb2poly(terms)
     limit = float(last) if np.isfinite(span) else np.inf
-    return PassiveTable(d - np.floor(d), d + 0.5, float(first), width, float(last), limit, powers.tolist())
+    return d - np.floor(d), d + 0.5, float(first), width, float(last), limit, *powers.tolist()
 
 
 def _map_kernel(alpha: Array, beta: Array, delta: Array, *known: Any) -> Array:
-    """`passivity_margin` at one delay, given the numbers of its `PassiveTable`."""
+    """`passivity_margin` at one delay, given its `table`."""
+    # The fraction; the slope in alpha of what is needed at w = 0, for whole d; the first of the `directions`, a width,
+    # and the last one in the variable of the polynomial, twice: the limit is infinite where there is none.
     xp = namespace(alpha)
     f, at_zero, first, width, last, limit, *powers = known
     ok = valid_wall(alpha, beta, delta, 0.0 * delta)
@@ -109,23 +95,22 @@ def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, 
     if not 0 <= d <= LONGEST_DELAY:
         return np.full(alpha.shape, np.nan)
     with np.errstate(all="ignore"):
-        return _map_kernel(alpha, beta, delta, *table(d).numbers())
+        return _map_kernel(alpha, beta, delta, *table(d))
 
 
 def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
     """`passivity_margin` of many walls that share few delays; None where they do not."""
     laid = fold_arguments(values)
-    alpha, beta, delta, d = laid.points
+    d = laid.points.d
     if laid.points.size <= FEW or np.unique(d).size * FEW > laid.points.size:
         return None
     out = np.full(laid.points.shape, np.nan)
-    for delay, arrays, place in group_by((alpha, beta, delta), d):
+    for delay, arrays, place in group_by(laid.points, d):
         if not 0 <= delay <= LONGEST_DELAY:
             continue
-        whole = np.broadcast_shapes(*(array.shape for array in arrays))
-        columns = (a.reshape(1) if a.size == 1 else np.broadcast_to(a, whole).reshape(-1) for a in arrays)
-        known = map(np.atleast_1d, table(float(delay)).numbers())
-        out[place] = evaluate_columns(_map_kernel, [*columns, *known], route="jax").reshape(whole)
+        walls = Points(*arrays)
+        columns = [*walls.columns()[:3], *map(np.atleast_1d, table(float(delay)))]
+        out[place] = evaluate_columns(_map_kernel, columns, route="jax").reshape(walls.shape)
     return to_caller(laid.spread(out), values)
 
 

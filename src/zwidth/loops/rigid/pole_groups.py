@@ -106,11 +106,6 @@ class Group(NamedTuple):
         """How far logarithms of single poles may be off, and those of the disk of two (orders, cells)."""
         return (self.error + ROUNDING) * (self.disk / (1.0 - self.disk)) + ROUNDING * np.abs(self.re)
 
-    @property
-    def least(self) -> np.ndarray:
-        """The least size of a logarithm in the cell."""
-        return np.abs(self.re) - (self.re - self.low)
-
     def is_apart(self, other: Group) -> np.ndarray:
         """Whether no pole is in both groups."""
         places = [np.exp(group.re + 1j * group.im) for group in (self, other)]
@@ -227,7 +222,8 @@ def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional
     else:
         farthest = np.where(ratio > 1.02, np.log1p(-disk), -np.inf)
     group = Group(poles, re, im, a, f, w, disk[own], re + farthest.max(0), error, best)
-    most = wanted.allowed(np.maximum(group.least, _SLOW)) * (1.0 if poles == 1 else _FINER)
+    least = np.maximum(np.abs(re) - (re - group.low), _SLOW)
+    most = wanted.allowed(least) * (1.0 if poles == 1 else _FINER)
     return group._replace(order=(~(group.doubt <= most)).sum(0))
 
 

@@ -377,10 +377,8 @@ class _Level:
 
 
 def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> FollowedPoles:
-    """The outermost poles of a window of a map, NaN where no cell knows them well enough.
-
-    A wall's value does not depend on the window: cells lie on the whole map, and each is computed by itself.
-    """
+    """The outermost poles of a window of a map, NaN where no cell knows them well enough."""
+    # A wall's value does not depend on the window: cells lie on the whole map, and each is computed by itself.
     sizes, wanted = _sides(area.beta.shape[1], area.alpha.shape[1]), AllowedErrors(accuracy, with_rate)
     held = area.d != np.floor(area.d)
     canvas = _Canvas(area, sizes[0], with_rate)

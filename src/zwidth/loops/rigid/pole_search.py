@@ -182,10 +182,8 @@ def bound_radius(found: OutermostPoles, tolerance: float, loop: Loop, fractional
 
 
 def all_starts(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Both starts, then the slow one also put on the real axis or off it, which steps do not leave or meet: (4, loops).
-
-    Where the slow one is off the axis it is put on it, and the other way round.
-    """
+    """Both starts, then the slow one put on the real axis or off it, which steps do not leave or meet: (4, loops)."""
+    # Where the slow one is off the axis it is put on it, and the other way round.
     (slow, turn), pair = slow_pole(loop), first_pair(loop, fractional)
     other = np.where(turn > 0, 0.0, _OFF * pair[1])
     return np.stack([slow, pair[0], slow, 0.0 * slow]), np.stack([turn, pair[1], other, _BETWEEN * pair[1]])
@@ -233,10 +231,8 @@ class _Round(NamedTuple):
 
 
 def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
-    """The outermost pole, and whether it is proved to be it, and to be single: as `quick_kernel` and `search` find it.
-
-    Part by part; then those walls alone that this has left are searched for, as many at one time: one program for both.
-    """
+    """The outermost pole, and whether it is proved to be it, a single one: as `quick_kernel` and `search` find it."""
+    # Part by part; then those walls alone that this has left are searched for, as many at one time, by one program.
     import jax.numpy as xp
     from jax.lax import while_loop
 
@@ -264,11 +260,9 @@ def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
 
 
 def _find_part(begin: Any, end: Any, loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
-    """Some of the rounds of `_find_traced`, of some walls.
-
-    A step on a pole and a count, which take a compiler its time, stand in two loops that every round runs through: the
-    larger pole and its proof; where that leaves any wall, the halvings; the pole on the circle they lead to, its proof.
-    """
+    """Some of the rounds of `_find_traced`, of some walls."""
+    # A step on a pole and a count, which take a compiler its time, stand in two loops that every round runs through:
+    # the larger pole and its proof; where that leaves any wall, the halvings; the pole on the circle, and its proof.
     import jax.numpy as xp
     from jax.lax import fori_loop, while_loop
 
@@ -329,10 +323,8 @@ def _find_part(begin: Any, end: Any, loop: Loop, fractional: bool) -> tuple[Arra
 
 
 def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Array:
-    """The logarithm of the radius with its derivatives, inside somebody's transformation.
-
-    NaN where it was not found or the outermost pole is a multiple one.
-    """
+    """The logarithm of the radius with its derivatives, inside somebody's transformation."""
+    # NaN where it was not found or the outermost pole is a multiple one.
     xp = namespace(alpha, beta, delta, d)
     loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
     re, im, proved = _find_traced(frozen(loop, xp), fractional)

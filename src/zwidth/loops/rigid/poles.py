@@ -48,10 +48,7 @@ def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degre
 
 
 def _matrices(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Matrices:
-    xp, ok = namespace(alpha, beta, delta, d), valid_wall(alpha, beta, delta, d)
-    # Of what is out of range any numbers: its poles are spoiled in the end.
-    alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
-    monic = coefficients(alpha, beta, delta, xp.where(ok, d, float(degree.whole)), degree)
+    monic = coefficients(alpha, beta, delta, d, degree)
     return companion(monic[..., :-1] if spring else monic)
 
 

@@ -48,7 +48,10 @@ def affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
 
 def coefficients(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
     """Coefficients of P, highest power first, along a new last axis of degree.poles + 1; P is monic."""
-    parts = affine(delta, d, degree)
+    # Of what is out of range any numbers.
+    xp, ok = namespace(alpha, beta, delta, d), valid_wall(alpha, beta, delta, d)
+    alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
+    parts = affine(delta, xp.where(ok, d, float(degree.whole)), degree)
     return parts.D + alpha[..., None] * parts.N1 + beta[..., None] * parts.N2
 
 
@@ -135,8 +138,5 @@ def char_poly(
 
 
 def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
-    ok = valid_wall(alpha, beta, delta, d)
-    spoiled = nan_with_nan_slopes(ok, alpha, beta, delta, d)[..., None]
-    xp = namespace(alpha, beta, delta, d)
-    alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
-    return coefficients(alpha, beta, delta, xp.where(ok, d, float(degree.whole)), degree) + spoiled
+    spoiled = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    return coefficients(alpha, beta, delta, d, degree) + spoiled[..., None]

@@ -15,7 +15,7 @@ import numpy as np
 
 from zwidth.arrays.roots import newton
 from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
-from zwidth.loops.rigid.device import ANY, DelayClasses, Plant
+from zwidth.loops.rigid.device import ANY, DelayClasses, DeviceTerms, Plant
 from zwidth.words.types import Array
 
 
@@ -30,9 +30,9 @@ class Curve(NamedTuple):
     gap: Array  # N(-1)
 
 
-def expand_curve(plant: Plant) -> Curve:
+def expand_curve(plant: Plant | DeviceTerms) -> Curve:
     """The curve of one plant; every coefficient is free of cancellation where the ridge can be."""
-    c, em, a2, a1, a0, gap = plant
+    c, em, a2, a1, a0, gap = plant.c, plant.em, plant.a2, plant.a1, plant.a0, plant.gap
     sigma = a2 + a0
     at_one = sigma + a1
     E = (em * at_one, -2.0 * (4.0 * a0 - gap + em * sigma), 8.0 * a0)
@@ -263,7 +263,7 @@ def is_undelayed(delay_model: str, kind: DelayClasses) -> bool:
     return delay_model == "held" and not kind.long
 
 
-def solve(plant: Plant, lag: Array, start: Start, delay_model: str, kind: DelayClasses) -> Ridge:
+def solve(plant: Plant | DeviceTerms, lag: Array, start: Start, delay_model: str, kind: DelayClasses) -> Ridge:
     """The ridge of one plant behind ``lag`` periods (whole in the held model)."""
     xp = namespace(plant.a2, lag)
     undelayed = is_undelayed(delay_model, kind)
