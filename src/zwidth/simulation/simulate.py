@@ -281,15 +281,8 @@ def _missing(dtype: np.dtype) -> Any:
 
 def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     """The scenes that are different objects, and which of them each place of the batch has."""
-    array = np.empty((), object)
-    if isinstance(scenes, np.ndarray):
-        array = scenes
-    elif isinstance(scenes, Iterable):
-        listed = list(scenes)
-        array = np.empty(len(listed), object)
-        array[:] = listed
-    else:
-        array[()] = scenes
+    listed = isinstance(scenes, Iterable) and not isinstance(scenes, np.ndarray)
+    array = np.array(list(scenes) if listed else scenes, object)
     known: dict[int, int] = {}
     which = np.empty(array.shape, int)
     for place, scene in np.ndenumerate(array):
