@@ -155,13 +155,12 @@ def simulate(
         groups.setdefault(structure(scene), []).append(place)
     for places in groups.values():
         own = np.flatnonzero(np.isin(which, places))
-        if own.size:
-            rows = {name: column[own] for name, column in numbers.items()}
-            part = run_batch([known[k] for k in places], np.searchsorted(places, which[own]), rows, course)
-            for name, column in part.items():
-                if name not in found:
-                    found[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
-                found[name][own] = column
+        rows = {name: column[own] for name, column in numbers.items()}
+        part = run_batch([known[k] for k in places], np.searchsorted(places, which[own]), rows, course)
+        for name, column in part.items():
+            if name not in found:
+                found[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
+            found[name][own] = column
     for column in found.values():
         # What was put in place of a bad number is no one's motion.
         column[~good] = _missing(column.dtype)
