@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.fitting.buzz_search import (
     AS_GOOD,
     EXACT,
@@ -281,23 +280,18 @@ def _further(
     """The wall of the device's own boundary, B >= 0, after which K_max is known best."""
     # Where a device of another kind may be there, the wall at which the two differ most.
     onsets, theta = chosen.onsets, chosen.best.theta
-    scene, period, mass = chosen.scene(theta), onsets.period, np.exp(theta[0])
+    scene, period = chosen.scene(theta), onsets.period
     w = np.linspace(0.0, np.pi, _ANGLES + 2)[1:-1]
     # Slow loops have all of their boundary at low frequencies.
     w = np.concatenate([np.geomspace(1e-4, w[0], 60)[:-1], w])
-    estimate = scene.velocity.estimate(period)
-    f, q = estimate.jet(circle(w)).value, onsets.answer(theta).jet(circle(w)).value
-    rub = mass * q.imag / f.imag
-    kappa = mass * q.real - rub * f.real
+    stiffness, damping = scene.boundary(w / period)
     # Softer walls than a tenth of the stiffest are outside of what anybody measures well.
-    real = (rub >= 0) & (kappa > 0.1 * stiffest * period**2)
-    stiffness, damping = kappa[real] / period**2, rub[real] / period
-    if not stiffness.size:
+    real = (damping >= 0) & (stiffness > 0.1 * stiffest)
+    real[real] = find_edges(scene, stiffness[real], damping[real])
+    if not real.any():
         return None
-    edge = find_edges(scene, stiffness, damping)
-    if not edge.any():
-        return None
-    walls = replace(onsets, kappa=kappa[real][edge], rub=rub[real][edge], w=w[real][edge])
+    stiffness, damping, w = stiffness[real], damping[real], w[real]
+    walls = replace(onsets, kappa=stiffness * period**2, rub=damping * period, w=w)
     rows = walls.follow(theta).slopes()
     more = np.einsum("nki,k,nkj->nij", rows, precision, rows)
     after = np.linalg.solve(information + more, wanted[:, None])[..., 0] @ wanted
@@ -310,8 +304,8 @@ def _further(
             away = np.log(np.where(seen, [there.kappa / walls.kappa, there.w / walls.w], 1.0)) ** 2
             best = int(np.argmax(precision @ away))
     return FurtherExperiment(
-        float(damping[edge][best]),
-        float(stiffness[edge][best]),
-        float(walls.w[best] / (2 * np.pi * period)),
+        float(damping[best]),
+        float(stiffness[best]),
+        float(w[best] / (2 * np.pi * period)),
         float(np.sqrt(max(after[best], 0.0))),
     )

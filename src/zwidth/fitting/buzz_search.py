@@ -24,8 +24,6 @@ _BESIDE = 1e-6
 _KINDS = ((1, 0), (2, 0), (0, 1), (1, 1))
 # Few walls: what further numbers explain of noise more often than this is no evidence of them.
 _CHANCE = 0.003
-# Slopes promise squares at most so many times as large as they lead to, and near an optimum no less than this share.
-_HOPELESS, _STUCK = 1.2, 0.5
 # Residuals that are rounding alone.
 _ROUNDING = 1e-9
 # The dampings b T/m that are started from where nothing buzzes slowly, how many of the dips, and every which damping
@@ -36,29 +34,17 @@ _STARTS, _EVERY = 6, 4
 _BLIND = 1e6
 # Tolerances of a first look and of the end, and the evaluations they may take.
 _NEARLY, _ARRIVED, _MOST_STEPS = 1e-4, 1e-12, (100, 40)
-# Devices with parts that a first look leaves so many times as far away as others are no more followed.
-_FAR = 100.0
-# After so many devices in a row without such walls there is no way back.
-_LOST = 8
 _NAMES = ("mass", "damping", "delay")
 
 
 class Candidate(NamedTuple):
-    """A local best fit: theta, its sum of squares, residuals, what is held at 0, and whether all walls were found.
-
-    Last, the sum of squares where its slopes lead: as much at an optimum, far less where the search got stuck.
-    """
+    """A local best fit: theta, its sum of squares, residuals, what is held at 0, and whether all walls were found."""
 
     theta: np.ndarray
     squares: float
     residuals: np.ndarray
     held: tuple[str, ...]
     found: bool
-    ahead: float = np.inf
-
-
-class _LostError(Exception):
-    """No device around has such walls."""
 
 
 def weigh(slopes: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -82,21 +68,15 @@ def look_around(onsets: Onsets, weights: np.ndarray) -> list[tuple[Candidate, np
     else:
         starts = onsets.starts(_dampings(onsets), longest, _STARTS)
     near = [(_solve(onsets, weights, start, (), _NEARLY), start) for start in starts]
-    near = sorted(near, key=lambda each: each[0].squares)
-    return [each for each in near if not parts or (each[0].found and each[0].ahead <= _FAR * near[0][0].squares)]
+    return [each for each in sorted(near, key=lambda each: each[0].squares) if not parts or each[0].found]
 
 
-def find_candidates(
-    onsets: Onsets, weights: np.ndarray, near: Candidate, start: np.ndarray, most: float
-) -> list[Candidate]:
+def find_candidates(onsets: Onsets, weights: np.ndarray, near: Candidate, start: np.ndarray) -> list[Candidate]:
     """The local best fit there. Where damping or delay would be negative, those from the start with it held at 0."""
-    # None where its squares are more than ``most``: what is held leaves more.
     if near.found:
         free = _solve(onsets, weights, near.theta, ())
         if min(free.theta[1:3]) >= 0:
             return [free]
-        if free.squares > most:
-            return []
     ends = (_solve(onsets, weights, start, held) for held in ((1,), (2,), (1, 2)))
     return [end for end in ends if min(end.theta[1:3]) >= 0]
 
@@ -114,13 +94,12 @@ def _solve(
     from scipy.optimize import least_squares
 
     free = [k for k in range(onsets.unknowns) if k not in held]
-    theta, lost = start.copy(), 0
+    theta = start.copy()
     theta[list(held)] = 0.0
 
     @lru_cache(maxsize=1)  # The solver asks for values and slopes apart.
     @np.errstate(all="ignore")
     def evaluate(values: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, Followed | None, np.ndarray]:
-        nonlocal lost
         at = theta.copy()
         at[free] = values
         walls, ratios, good = None, 0.0, np.zeros(onsets.w.shape, bool)
@@ -128,9 +107,6 @@ def _solve(
             walls = onsets.follow(at)
             ratios = np.stack([np.log(walls.kappa / onsets.kappa), np.log(walls.w / onsets.w)], -1)
             good = walls.found & np.all(np.isfinite(ratios), -1)
-        lost = 0 if good.all() else lost + 1
-        if lost > _LOST:
-            raise _LostError
         # Where no such wall is found, as wrong as can be, and flat.
         return at, np.where(good[:, None], ratios, 10.0) * weights, walls, good
 
@@ -140,24 +116,20 @@ def _solve(
         slopes = walls.slopes() if walls else np.zeros((*good.shape, 2, onsets.unknowns))
         return weigh(np.where(good[:, None, None] & np.isfinite(slopes), slopes, 0.0), weights)[:, free]
 
-    names = tuple(_NAMES[k] for k in held)
-    try:
-        found = least_squares(
-            lambda x: evaluate(tuple(x))[1].ravel(),
-            theta[free],
-            differentiate,  # pyright: ignore[reportArgumentType]  (a function or a name)
-            method="lm",
-            x_scale="jac",
-            xtol=tolerance,
-            ftol=tolerance,
-            gtol=tolerance,
-            max_nfev=_MOST_STEPS[tolerance == _NEARLY],
-        )
-    except _LostError:
-        return Candidate(theta, np.inf, np.full((onsets.w.size, 2), np.nan), names, False)
+    found = least_squares(
+        lambda x: evaluate(tuple(x))[1].ravel(),
+        theta[free],
+        differentiate,  # pyright: ignore[reportArgumentType]  (a function or a name)
+        method="lm",
+        x_scale="jac",
+        xtol=tolerance,
+        ftol=tolerance,
+        gtol=tolerance,
+        max_nfev=_MOST_STEPS[tolerance == _NEARLY],
+    )
     at, residuals, _, good = evaluate(tuple(found.x))
-    rest = residuals.ravel() - found.jac @ (np.linalg.pinv(found.jac) @ residuals.ravel())
-    return Candidate(at, float((residuals**2).sum()), -residuals, names, bool(good.all()), float(rest @ rest))
+    names = tuple(_NAMES[k] for k in held)
+    return Candidate(at, float((residuals**2).sum()), -residuals, names, bool(good.all()))
 
 
 class FittedKind(NamedTuple):
@@ -242,14 +214,11 @@ def _try(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> FittedKind:
     # Parts are found where the walls tell their numbers; of a rigid device it is said which wall is missing.
     parts = onsets.lag + onsets.modes > 0
     for near, start in look_around(onsets, weights):
-        most = _HOPELESS * (kind.best.squares + AS_GOOD * kind.scale)
-        known = any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found)
-        # Where slopes promise much the search got stuck, and says nothing yet.
-        if near.found and (known or near.ahead > max(most, _STUCK * near.squares)):
+        if near.found and any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found):
             continue
-        for fit in find_candidates(onsets, weights, near, start, most if parts else np.inf):
+        for fit in find_candidates(onsets, weights, near, start):
             found.append(fit)
-            if not (fit.found and fit.squares < most and _at_edge(kind, fit)):
+            if not (fit.found and fit.squares < kind.best.squares + AS_GOOD * kind.scale and _at_edge(kind, fit)):
                 continue
             if not (parts and is_blind(weigh(onsets.follow(fit.theta).slopes(), weights))):
                 kind.equals.append(fit)

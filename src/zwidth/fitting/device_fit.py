@@ -153,15 +153,9 @@ class DeviceFit(DeviceEstimate):
         known = self.status == Status.OK or (self.status == Status.UNDECIDED and agreed)
         return (value, error) if known else (np.nan, np.nan)
 
-    @property
-    def stiffness_max(self) -> float:
-        """In N/m."""
-        return self._stiffest[0]
-
-    @property
-    def stiffness_error(self) -> float:
-        """In N/m."""
-        return self._stiffest[1]
+    # In N/m.
+    stiffness_max = property(lambda self: self._stiffest[0])
+    stiffness_error = property(lambda self: self._stiffest[1])
 
     @property
     def is_doubted(self) -> bool:
@@ -201,18 +195,17 @@ class DeviceFit(DeviceEstimate):
             name: ErrorBar(float(value - far if name in signed else np.maximum(0.0, value - far)), value + far)
             for name, (value, far) in reaches.items()
         }
+        (low, high), stiffness = bars["stiffness_max"], self.stiffness_max
         if self.hidden is not None and self.stiffness_error > 0:
-            bar = self._average(*self.hidden)
+            low, high = self._average(*self.hidden)
             # What is printed beside the interval lies in it, also where most devices have another K_max.
-            bars["stiffness_max"] = ErrorBar(min(bar.low, self.stiffness_max), max(bar.high, self.stiffness_max))
+            low, high = min(low, stiffness), max(high, stiffness)
         if self.damping_tried is not None and self.virtual_damping > self.damping_tried:
             # Beyond the dampings tried K_max is what the model says; it is at least what buzzed there.
-            bar, tried = bars["stiffness_max"], self.bear_tried(UPPER)
-            bars["stiffness_max"] = ErrorBar(min(bar.low, tried), bar.high)
+            low = min(low, self.bear_tried(UPPER))
         if self.lag is not None:
-            bar, more = bars["stiffness_max"], self.lag.stiffness_max - self.stiffness_max
-            bars["stiffness_max"] = ErrorBar(bar.low, bar.high + max(more, 0.0))
-        return bars
+            high += max(self.lag.stiffness_max - stiffness, 0.0)
+        return bars | {"stiffness_max": ErrorBar(low, high)}
 
     def _average(self, odds: float, ratios: np.ndarray) -> ErrorBar:
         """The interval of K_max over the device without a hidden resonance and those with one."""

@@ -11,10 +11,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from zwidth.arrays.circle import circle
 from zwidth.fitting.moving import recur
@@ -89,11 +88,6 @@ class PoleBank:
     kindred: np.ndarray  # how many times as large its errors are, as kindred as the encoder's
     absorbed: np.ndarray  # by how much it would move each number of theta
 
-    @property
-    def rates(self) -> npt.NDArray[np.complex128]:
-        """Poles of the continuous device, in periods."""
-        return _rates_of(self.ratio, self.frequency)
-
     def bound_modes(self) -> np.ndarray:
         """How much more than the whole mass a mode of each pole may move, at most."""
         near = np.convolve(
@@ -114,7 +108,7 @@ def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
     total, chance = float(rest @ rest), 2.0 * np.log(best.count)
     for share, frequency, ratio in islice(list_likeliest(banks, _ELSEWHERE), _TRIED):
         explained = share * noise
-        cleared = _filter_forces(best, ratio, _rates_of(ratio, np.array([frequency])))[..., 0].T
+        cleared = _filter_forces(best, _lay_poles(ratio, np.array([frequency])))[..., 0].T
         cleared, _ = np.linalg.qr(cleared - basis @ (basis.T @ cleared))
         along = cleared.T @ rest
         # In squares of standard errors, of errors as kindred as the encoder's and as the sums of neighbors are.
@@ -191,7 +185,10 @@ def respond_as_fitted(best: FittedModel, scene: Scene, banks: list[PoleBank]) ->
     response, slopes = _respond(best, scene.timing.period, lines)
     radius = np.zeros(lines.size)
     for bank in banks[:_RINGING]:
-        moved = _add_modes(best, lines, bank.rates[:, None]) - bank.absorbed[: best.model.parts.stop].T @ slopes.T
+        moved = (
+            _add_modes(best, lines, bank.frequency[:, None], bank.ratio)
+            - bank.absorbed[: best.model.parts.stop].T @ slopes.T
+        )
         radius = np.maximum(radius, np.max(np.abs(moved) * bank.bound_modes()[:, None], 0))
     return MeasuredDevice(lines / scene.timing.period, response, radius)
 
@@ -202,15 +199,16 @@ def weigh_resonances(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> 
     odds, drawn, share = _draw_modes(banks)
     # The first one is none, to compare with.
     which, share = np.append(drawn[0], drawn), np.append(0.0, share)[:, None]
-    rates = np.concatenate([bank.rates for bank in banks])[which, None]
+    poles = [[bank.frequency, np.full_like(bank.frequency, bank.ratio)] for bank in banks]
+    frequency, ratio = np.concatenate(poles, 1)[:, which, None]
     absorbed = np.concatenate([bank.absorbed[: best.model.parts.stop] for bank in banks], 1)[:, which].T[..., None]
     # Every resonance has lines of its own, within its width.
-    beside = (np.abs(rates) - rates.real * _BESIDE[::2]) / (2.0 * np.pi)
-    all_lines = _lay_lines(scene, _LITTLE)[None], np.clip(beside, _FIRST, _HIGHEST)
+    beside = np.clip(frequency * (1.0 + ratio * _BESIDE[::2]), _FIRST, _HIGHEST)
+    all_lines = _lay_lines(scene, _LITTLE)[None], beside
     responses, count = [], len(which)
     for lines in all_lines:
         response, slopes = _respond(best, period, lines)
-        responses.append(response + share * (_add_modes(best, lines, rates) - (slopes @ absorbed)[..., 0]))
+        responses.append(response + share * (_add_modes(best, lines, frequency, ratio) - (slopes @ absorbed)[..., 0]))
     lines = np.concatenate([np.broadcast_to(all_lines[0], (count, all_lines[0].size)), all_lines[1]], -1)
     order = np.argsort(lines, -1)
     lines, response = (np.take_along_axis(each, order, -1) for each in (lines, np.concatenate(responses, -1)))
@@ -228,10 +226,10 @@ def _lay_lines(scene: Scene, turn: float) -> np.ndarray:
     return lines[(lines >= _FIRST) & (lines <= _HIGHEST)]
 
 
-def _add_modes(best: FittedModel, lines: np.ndarray, rates: npt.NDArray[np.complex128]) -> np.ndarray:
+def _add_modes(best: FittedModel, lines: np.ndarray, frequency: np.ndarray, ratio: Any) -> np.ndarray:
     """What modes that move as the whole mass does add to its response."""
-    z, poles, (size, late) = np.exp(2j * np.pi * lines), np.exp(rates), _size_modes(best, rates)
-    return ((size / (z - poles) - size.conj() / (z - poles.conj())) / 2j - late / z) * z ** -float(int(best.theta[2]))
+    (g, delta, d), mode = best.theta[:3], (2.0 * np.pi * frequency, ratio, np.sqrt(1.0 - ratio**2))
+    return g * RequiredWall(delta, d, (), [mode]).add(circle(2.0 * np.pi * lines)).value
 
 
 def _draw_modes(banks: list[PoleBank]) -> tuple[float, np.ndarray, np.ndarray]:
@@ -254,8 +252,8 @@ def _respond(best: FittedModel, period: float, lines: np.ndarray) -> tuple[np.nd
     at = circle(2.0 * np.pi * lines.ravel())
 
     def answer(theta: np.ndarray) -> np.ndarray:
-        device = best.model.normalize(theta, period)
-        return (-(period**2) / device.mass / RequiredWall(*device[1:]).jet(at).value).reshape(lines.shape)
+        wall = RequiredWall(*best.model.normalize(theta, period)[1:])
+        return (-theta[0] / wall.jet(at).value).reshape(lines.shape)
 
     count, response = best.model.parts.stop, answer(best.theta)
     steps = _STEP * np.maximum(np.abs(best.theta[:count]), [1e-3 if k in (1, 2) else 0.0 for k in range(count)])
@@ -274,20 +272,23 @@ def _glimpse(best: FittedModel) -> FittedModel:
 
 def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, noise: float) -> PoleBank:
     """Compare the residuals with the forces filtered by poles of one damping ratio."""
-    parts = 1 if ratio == 1.0 else 2
+    # A mode of each pole that moves as the whole mass does: what the pole makes of the forces, and that of the last one,
+    # which moves it for less than a period.
     frequency = np.geomspace(_LOWEST, _HIGHEST, 1 + round(np.log(_HIGHEST / _LOWEST) / np.log(_APART[ratio])))
     bank = PoleBank(
         ratio, frequency, *np.zeros((4, frequency.size)), absorbed=np.zeros((best.theta.size, frequency.size))
     )
-    sizes, late = _size_modes(best, bank.rates)
-    last = _filter_forces(best, 1.0, np.array([-np.inf]))[0]
+    poles = _lay_poles(ratio, frequency)
+    unit, late = best.theta[0] / np.abs(poles) / poles, np.exp(-(best.theta[2] % 1.0) * poles)
+    size, late = unit * np.expm1(poles) * late, (unit * (1.0 - late)).imag
+    last = _filter_forces(best, np.array([-np.inf]))[0]
     last_shares = basis.T @ last
     last_cleared, numbers = last - basis @ last_shares, best.inverse.matrix @ basis / best.columns[1][:, None]
-    modes = np.stack([sizes.imag, sizes.real], -1)[:, -parts:]
+    modes = np.array([size.real] if ratio == 1.0 else [size.imag, size.real])
     count = max(1, _AT_ONCE // (2 * rest.size))
     for first in range(0, frequency.size, count):
         part = slice(first, first + count)
-        columns, mode = _filter_forces(best, ratio, bank.rates[part]), modes[part].T
+        columns, mode = _filter_forces(best, poles[part]), modes[:, part]
         shares = basis.T @ columns
         cleared = columns - basis @ shares
         own = np.linalg.norm(cleared, axis=1).min(0) <= _OWN * np.linalg.norm(columns, axis=1).max(0)
@@ -304,26 +305,18 @@ def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, 
     return bank
 
 
-def _rates_of(ratio: float, frequency: np.ndarray) -> npt.NDArray[np.complex128]:
-    """Poles of a damping ratio."""
-    return np.asarray(2.0 * np.pi * frequency * complex(-ratio, np.sqrt(1.0 - ratio**2)), np.complex128)
+def _lay_poles(ratio: float, frequency: np.ndarray) -> Any:
+    """Poles of a damping ratio, real ones as such."""
+    return 2.0 * np.pi * frequency * (-1.0 if ratio == 1.0 else complex(-ratio, np.sqrt(1.0 - ratio**2)))
 
 
-def _filter_forces(best: FittedModel, ratio: float, rates: np.ndarray) -> np.ndarray:
+def _filter_forces(best: FittedModel, poles: np.ndarray) -> np.ndarray:
     """What poles make of all forces, at the positions, a column each; imaginary parts behind the real ones."""
-    ends = np.cumsum([0, *(log.position.size for log in best.model.logs)])
-    whole, late = int(best.theta[2]), np.empty((1 if ratio == 1.0 else 2, rates.size, ends[-1]))
-    for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
-        force = np.append(0.0, log.force[:-1])
-        for k, pole in enumerate(np.exp(rates)):
-            moved = recur(pole, force)[log.skip - whole :][: end - start]
-            late[:, k, start:end] = [np.real(moved), np.imag(moved)][: len(late)]
-    return np.array([best.model.weigh(part.T) for part in late])
-
-
-def _size_modes(
-    best: FittedModel, rates: npt.NDArray[np.complex128]
-) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.float64]]:
-    """Of a mode of each pole that moves as the whole mass does, and what of it the last force alone moves not yet."""
-    unit, late = best.theta[0] / np.abs(rates) / rates, np.exp(-(best.theta[2] % 1.0) * rates)
-    return unit * (np.exp(rates) - 1.0) * late, (unit * (1.0 - late)).imag
+    whole, logs = int(best.theta[2]), best.model.logs
+    found = [
+        [recur(turn, np.append(0.0, log.force[:-1]))[log.skip - whole :][: log.position.size] for log in logs]
+        for turn in np.exp(poles).tolist()
+    ]
+    late: Any = np.array([np.concatenate(each) for each in found])
+    parts = [late.real, late.imag] if np.iscomplexobj(late) else [late]
+    return np.array([best.model.weigh(part.T) for part in parts])

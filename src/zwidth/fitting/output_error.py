@@ -21,10 +21,8 @@ from zwidth.fitting.structure import Recordings
 # for, for at 0 its slope is not seen.
 _DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)
 _FRICTIONS, LEAST = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35]), 1e-12
-# Without friction so many starts are followed whose delays lie so far apart, in periods.
-_STARTS, _APART = 3, 2
-# So many first positions of each log tell the starts, their mean over so many the first speed, so many delays at once.
-_GLIMPSE, _FIRST, _AT_ONCE = 600, 4, 32
+# So many first positions of each log tell the starts, so many delays at once.
+_GLIMPSE, _AT_ONCE = 600, 32
 # So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
 _ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
 # Devices with other parts are compared at this promised reduction.
@@ -209,34 +207,27 @@ def _start(model: Recordings) -> list[np.ndarray]:
         [np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)]
     )
 
-    def search(deltas: tuple[float, ...] = _DELTAS) -> list[tuple[float, float, int]]:
-        """The sums of squares of dampings and delays, the least first."""
+    def search(deltas: tuple[float, ...]) -> tuple[float, int]:
+        """The damping and the delay of the least sum of squares."""
         found = []
         for delta, some in product(deltas, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
             answers = np.swapaxes(_answer(early, delta, 0.0, base)[:, samples - some[:, None]], 0, 1)
             rests = _combine(answers, model.measured)[1]
             found += [(float(rest), delta, d) for rest, d in zip(rests, some.tolist(), strict=True)]
-        return sorted(found)
+        return min(found)[1:]
 
     def start(delta: float, d: float) -> np.ndarray:
         values = _combine(_answer(model, delta, d, base), model.measured)[0]
         return np.array([values[0], delta, d, *(values[0] * base[3:-1] + values[1:]), abs(values[0]) * base[-1]])
 
-    apart: list[tuple[float, int]] = []
-    for _, delta, d in search():
-        if all(abs(d - other) > _APART or delta != of for of, other in apart):
-            apart.append((delta, d))
-    glides = [refine(model, start(*one), (-1,), arrived=_NEAR) for one in apart[:_STARTS]]
-    starts = [min(glides, key=lambda found: found[1])[0]]
-    # From there on with the speeds and the constant force that were found.
-    firsts = [log.position[: 2 * _FIRST].reshape(2, -1).mean(1) for log in model.logs]
-    base[model.speeds] = np.diff(firsts)[:, 0] / _FIRST / starts[0][0]
+    delta, d = search(_DELTAS)
+    starts = [refine(model, start(delta, d), (-1,), arrived=_NEAR)[0]]
+    # From there on with the constant force that was found.
     base[-2] = starts[0][-2] / starts[0][0]
-    delta = apart[0][0]
     for friction in _FRICTIONS * model.largest:
         base[-1] = friction
         # The more friction, the less damping is left to find.
-        _, delta, d = search(_DELTAS[: _DELTAS.index(delta) + 2])[0]
+        delta, d = search(_DELTAS[: _DELTAS.index(delta) + 2])
         starts.append(start(delta, d))
     return starts
 

@@ -100,9 +100,12 @@ class Recordings:
         return low, high
 
     def normalize(self, theta: np.ndarray, period: Any) -> DimensionlessDevice:
-        """The device of theta."""
-        modes = theta[self.parts][self.lag :].reshape(-1, 3) / [1.0, 1.0, theta[0]]
-        return DimensionlessDevice(period**2 / theta[0], theta[1], theta[2], _read_lag(theta, self.lag), modes)
+        """The device of theta, or those of thetas along the first axis."""
+        modes = theta[self.parts][self.lag :].reshape(self.modes, 3, *theta.shape[1:]).copy()
+        modes[:, 2] /= theta[0]
+        lag = theta[3 : 3 + self.lag].copy()
+        lag[:1] /= 2.0 * lag[1] if self.lag == 2 else 1.0
+        return DimensionlessDevice(period**2 / theta[0], theta[1], theta[2], lag, modes)
 
     def follow(self, theta: np.ndarray) -> ModelledMotion:
         """The motion of theta in all logs."""
@@ -175,10 +178,8 @@ class Recordings:
 
     def _find_poles(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of thetas by the first axis: poles on and above the real axis, weights, and which state of modes, or -1."""
-        lag, modes = _read_lag(at, self.lag), at[self.parts][self.lag :]
-        modes = modes.reshape(self.modes, 3, at.shape[1]).copy()
-        modes[:, 2] /= at[0]
-        poles, weights = (np.array(each) for each in list_poles(at[1], lag, modes))
+        device = self.normalize(at, 1.0)
+        poles, weights = (np.array(each) for each in list_poles(device.delta, device.lag, device.modes))
         states, height = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), np.imag(poles[:, 0])
         # Of a pair half is followed, which counts twice.
         weights = weights * at[0] * (1.0 + (height > 0))[:, None]
@@ -203,13 +204,6 @@ def _delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.nda
     late, by = theta[3:4].sum() if order else 0.0, np.eye(2)[0, :order]
     most = log.skip - 1.5 - theta[2]
     return (float(late), by) if late < most else (float(most), 0.0 * by)
-
-
-def _read_lag(theta: np.ndarray, order: int) -> np.ndarray:
-    """An amplifier's time constant and damping ratio, of thetas along the first axis."""
-    lag = theta[3 : 3 + order].copy()
-    lag[:1] /= 2.0 * lag[1] if order == 2 else 1.0
-    return lag
 
 
 def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:

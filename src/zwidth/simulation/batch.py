@@ -22,6 +22,7 @@ from zwidth.simulation.lanes import (
     cut_period,
     lay_estimators,
     lay_machines,
+    lay_scenes,
     round_up,
 )
 from zwidth.simulation.result import OF_ENERGY, to_si
@@ -84,16 +85,13 @@ class Batch:
     def lay(self, places: np.ndarray) -> tuple[Lanes, Given]:
         """Some of the simulations side by side."""
         own, lane_of = np.unique(self.which[places], return_inverse=True)
-        if len(self.periods) == 1:
-            # One serves all lanes.
-            lane_of = np.zeros(1, int)
         course, options = self.course, self.options
         numbers = {name: part[places] for name, part in self.numbers.items()}
         shared = ("place", "motion")
         machine = Mechanics(*(part if name in shared else part[own] for name, part in self.machine._asdict().items()))
         period, mass = self.periods[self.which[places]], self.masses[self.which[places]]
         force = period * period / mass
-        late = self.late[own][lane_of]
+        late, fractions = (lay_scenes(part[own], lane_of) for part in (self.late, self.fractions))
         lanes = Lanes(
             alpha=numbers["stiffness"] * force,
             beta=numbers["virtual_damping"] * period / mass,
@@ -121,7 +119,7 @@ class Batch:
                 numbers["seed"],
                 numbers["jitter"] / period,
                 late,
-                self.fractions[own][lane_of],
+                fractions,
                 course.periods,
                 course.substeps,
             )

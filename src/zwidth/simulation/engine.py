@@ -150,13 +150,6 @@ def move(
     return after, moved
 
 
-class Extent(NamedTuple):
-    """How far every body went before the tail and in each of its halves, (3, bodies, lanes)."""
-
-    low: Array
-    high: Array
-
-
 class Summary(NamedTuple):
     """What is kept of a motion that is not recorded."""
 
@@ -165,7 +158,8 @@ class Summary(NamedTuple):
     exits: Array  # times the wall was left
     impact: Array  # velocity at the first sample in contact
     given: Array  # the most energy that the wall has given so far
-    extent: Extent
+    low: Array  # how far every body went before the tail and in each of its halves, (3, bodies, lanes)
+    high: Array
     turns: Array  # how often the velocity turned positive then, (3, lanes)
     first_turn: Array
     last_turn: Array
@@ -215,7 +209,7 @@ def begin(lanes: Lanes, positions: np.ndarray, velocities: np.ndarray, rings: tu
     program = Program(positions, _settle(lanes, positions[0], v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
     turns = np.zeros((3, x.size))
     never = zero + np.nan
-    summary = Summary(zero, zero, zero, never, zero, Extent(far, -far), turns, never, never)
+    summary = Summary(zero, zero, zero, never, zero, far, -far, turns, never, never)
     return State(BodyState(body, np.sign(velocities[0])), program, Work(zero, zero, zero, zero), summary)
 
 
@@ -264,8 +258,8 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     # A block goes on behind the last period. There is no half behind the last one, and what is written there is
     # dropped; to choose between old and new halves would copy all of them each period.
     going = given.k < ends[-1]
-    old = state._replace(summary=state.summary._replace(extent=summary.extent, turns=summary.turns))
-    after = jax.tree.map(partial(jnp.where, going), after, old)
+    old = state.summary._replace(low=summary.low, high=summary.high, turns=summary.turns)
+    after = jax.tree.map(partial(jnp.where, going), after, state._replace(summary=old))
     return after, (sensed, (reading, frames) if options.record else None)
 
 
@@ -279,16 +273,14 @@ def _summarize(
     turning = (v <= 0) & (next_v > 0)
     moment = k - v / jnp.where(next_v > v, next_v - v, 1.0)
     half = jnp.sum(k >= ends)
-    low, high = known.extent.low[half], known.extent.high[half]
     return Summary(
         jnp.fmax(known.deepest, places[0]),
         jnp.fmax(known.widest, jnp.abs(places).max(0)),
         known.exits + (state.program.touching & ~reading.touching),
         jnp.where(first, v, known.impact),
         jnp.fmax(known.given, work.wall),
-        Extent(
-            known.extent.low.at[half].set(jnp.fmin(low, places)), known.extent.high.at[half].set(jnp.fmax(high, places))
-        ),
+        known.low.at[half].set(jnp.fmin(known.low[half], places)),
+        known.high.at[half].set(jnp.fmax(known.high[half], places)),
         known.turns.at[half].add(turning),
         jnp.where(turning & (half > 0) & jnp.isnan(known.first_turn), moment, known.first_turn),
         jnp.where(turning & (half > 0), moment, known.last_turn),

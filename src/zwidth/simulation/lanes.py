@@ -118,10 +118,10 @@ class Lanes(NamedTuple):
     longest: Array  # step with friction
 
 
-def _lay(parts: Any, which: np.ndarray) -> Any:
+def lay_scenes(parts: Any, which: np.ndarray) -> Any:
     """One array a scene, along the first axis, as one a lane along the last; of length 1 where there is one scene."""
     if isinstance(parts, tuple):
-        return type(parts)(*(_lay(part, which) for part in parts))
+        return type(parts)(*(lay_scenes(part, which) for part in parts))
     last = np.moveaxis(parts, 0, -1)
     return last[..., which] if parts.shape[0] > 1 else last
 
@@ -149,7 +149,7 @@ def lay_estimators(estimates: Sequence[Estimate | FOAW], which: np.ndarray) -> E
             D = matrices.D[0, 0]
         window, bound = (each.window, 0.0) if isinstance(each, Estimate) else (each.samples, each.noise)
         columns.append((A, B, C, D, window, bound))
-    return _lay(Estimator(*map(np.array, zip(*columns, strict=True))), which)
+    return lay_scenes(Estimator(*map(np.array, zip(*columns, strict=True))), which)
 
 
 def cut_period(fractions: np.ndarray, substeps: int, pieces: int) -> np.ndarray:
@@ -180,7 +180,7 @@ def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, o
     ways = (machine.rate, machine.held) if options.friction else (machine.rate,)
 
     def lay(flows: Iterable[Flow]) -> Flow:
-        return Flow(*(np.stack(column) for column in zip(*(_lay(each, which) for each in flows), strict=True)))
+        return Flow(*(np.stack(column) for column in zip(*(lay_scenes(each, which) for each in flows), strict=True)))
 
     digits = Flow(*(np.zeros((1, 1, 1, 1, 1)) for _ in Flow._fields))
     if options.friction or options.jitter:
@@ -188,12 +188,12 @@ def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, o
         digits = lay(flow(way, machine.drain, times) for way in ways)
     longest = find_longest_steps(machine) if options.friction else np.array([2.0])
     return {
-        "rate": _lay(machine.rate, which),
+        "rate": lay_scenes(machine.rate, which),
         "place": machine.place[..., None],
         "motion": machine.motion[..., None],
-        "energy": _lay(machine.energy, which),
-        "durations": _lay(durations, which),
+        "energy": lay_scenes(machine.energy, which),
+        "durations": lay_scenes(durations, which),
         "pieces": lay(flow(way, machine.drain, durations) for way in ways),
         "digits": digits,
-        "longest": _lay(longest, which),
+        "longest": lay_scenes(longest, which),
     }

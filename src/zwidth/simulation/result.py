@@ -175,7 +175,7 @@ class Motion:
 
 def classify(known: Any, outlook: Any, course: Any) -> np.ndarray:
     """How motions end."""
-    wide = known.extent.high[1:] - known.extent.low[1:]
+    wide = known.high[1:] - known.low[1:]
     first, second = wide.max(1)
     # A tail of a period or two has not moved for want of time.
     still = (second <= _AT_REST * known.widest) & (first <= np.sqrt(_AT_REST) * known.widest) & (course.tail >= _STILL)
@@ -200,7 +200,7 @@ def to_si(
     state, reading, frame = found
     period, mass, instants = given.period, given.mass, given.instants
     known, force = state.summary, mass / period**2
-    low, high = (part[1:, 0] for part in known.extent)
+    low, high = (part[1:, 0] for part in (known.low, known.high))
     finite = np.isfinite(state.body.x).all(0)
     turns = known.turns[1:].sum(0)
     frequency = (turns - 1) / ((known.last_turn - known.first_turn) * period)

@@ -155,13 +155,12 @@ def simulate(
         groups.setdefault(structure(scene), []).append(place)
     for places in groups.values():
         own = np.flatnonzero(np.isin(which, places))
-        if own.size:
-            rows = {name: column[own] for name, column in numbers.items()}
-            part = run_batch([known[k] for k in places], np.searchsorted(places, which[own]), rows, course)
-            for name, column in part.items():
-                if name not in found:
-                    found[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
-                found[name][own] = column
+        rows = {name: column[own] for name, column in numbers.items()}
+        part = run_batch([known[k] for k in places], np.searchsorted(places, which[own]), rows, course)
+        for name, column in part.items():
+            if name not in found:
+                found[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
+            found[name][own] = column
     for column in found.values():
         # What was put in place of a bad number is no one's motion.
         column[~good] = _missing(column.dtype)
@@ -281,15 +280,8 @@ def _missing(dtype: np.dtype) -> Any:
 
 def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     """The scenes that are different objects, and which of them each place of the batch has."""
-    array = np.empty((), object)
-    if isinstance(scenes, np.ndarray):
-        array = scenes
-    elif isinstance(scenes, Iterable):
-        listed = list(scenes)
-        array = np.empty(len(listed), object)
-        array[:] = listed
-    else:
-        array[()] = scenes
+    listed = isinstance(scenes, Iterable) and not isinstance(scenes, np.ndarray)
+    array = np.array(list(scenes) if listed else scenes, object)
     known: dict[int, int] = {}
     which = np.empty(array.shape, int)
     for place, scene in np.ndenumerate(array):

@@ -125,6 +125,8 @@ def test_an_array_of_scenes_is_a_batch():
     scenes[:, 0] = SCENE, COUPLED
     found = zwidth.simulate(scenes, [1e3, 2e3], 5.0, start_position=1e-3, periods=50)
     assert found.position.shape == (2, 2, 50)
+    listed = zwidth.simulate([[SCENE], [COUPLED]], [1e3, 2e3], 5.0, start_position=1e-3, periods=50)
+    np.testing.assert_array_equal(listed.position, found.position)
     for row, scene in enumerate((SCENE, COUPLED)):
         alone = scene.simulate([1e3, 2e3], 5.0, start_position=1e-3, periods=50)
         np.testing.assert_allclose(found.position[row], alone.position, rtol=1e-12)
