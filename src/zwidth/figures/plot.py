@@ -65,12 +65,12 @@ def _draws(function: Callable[Parameters, Result]) -> Callable[Parameters, Resul
 
 
 def _axes(ax: Axes | None) -> Axes:
-    """The Axes to draw into; pyplot is loaded where it is asked for its own."""
+    """The Axes to draw into; pyplot is loaded where it is asked for its own, of a new figure if it has none."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt
 
-    return plt.gca()
+    return plt.gca() if plt.get_fignums() else plt.figure(layout="constrained").gca()
 
 
 def _two(axes: style.AnyAxes | None, rows: int, columns: int, size: tuple[float, float] | None) -> np.ndarray:
