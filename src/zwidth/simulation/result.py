@@ -179,6 +179,8 @@ def classify(known: Any, outlook: Any, course: Any) -> np.ndarray:
     first, second = wide.max(1)
     # A tail of a period or two has not moved for want of time.
     still = (second <= _AT_REST * known.widest) & (first <= np.sqrt(_AT_REST) * known.widest) & (course.tail >= _STILL)
+    # Commands that are still on their way may move again what has not moved for a while.
+    still &= ~(outlook.settles | outlook.grows) | (outlook.off <= _AT_REST * known.widest)
     alike = np.ptp(wide[:, 0], axis=0) <= _ALIKE * wide[:, 0].max(0)
     slow = (outlook.pace > _FOR_GOOD * course.periods) & (outlook.settles | outlook.grows)
     lasting = ~still & (known.turns[1:].min(0) >= _SWINGS) & (outlook.repeats | (alike & slow))
