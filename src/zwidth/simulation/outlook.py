@@ -104,7 +104,9 @@ def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int, bodies: bool) -
     own = ~linear & unstable & lanes.bilateral & endless & lanes.pulling & ~settles
     if own.any():
         grows[own] = _outgrows(take(group, own), take(loop, own), periods)
-    return Outlook(settles, grows, repeats, _is_restless(group, unstable), pace, off)
+    # Readings that repeat change in every cycle.
+    restless = _is_restless(group, unstable) | (repeats & ~exact)
+    return Outlook(settles, grows, repeats, restless, pace, off)
 
 
 def _measure(group: LaneGroup, away: np.ndarray) -> np.ndarray:

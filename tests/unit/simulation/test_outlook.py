@@ -284,3 +284,14 @@ def test_readings_that_are_said_to_repeat_do_so(name):
     assert steady.sum() > 20
     assert not np.any(steady & ~cyclic)
     assert np.mean(steady[cyclic]) > 0.5
+
+
+def test_who_repeats_by_now_but_was_wider_in_the_tail_is_restless():
+    """A window of three samples: the tail has the end of the impact, 9 um wide, and what goes on is 2.4 um wide."""
+    scene = SCENE.replace(damping=10.0, velocity=zwidth.WindowedDifference(3))
+    given = {"start_position": 1e-3, "resolution": 1.2395340354523154e-06, "record": False}
+    wall = 10577.713816316867, 12.84142590488951
+    now, later = (scene.simulate(*wall, **given, periods=periods) for periods in (1500, 12_000))
+    assert now.amplitude > 3.0 * later.amplitude
+    assert (now.outcome, later.outcome) == (CODES.RESTLESS, CODES.STEADY)
+    assert now.trend < 0.5
