@@ -42,6 +42,7 @@ class Outlook(NamedTuple):
     repeats: np.ndarray  # its readings repeat for good
     restless: np.ndarray  # has no place where it could come to rest
     pace: np.ndarray  # periods in which the linear loop decays by half or grows by as much; infinite if neither
+    off: np.ndarray  # how far the loop is from its rest, commands on their way among it, as a position
 
 
 @np.errstate(all="ignore")
@@ -51,7 +52,8 @@ def foresee(
     """What can be proved of lanes; ``known``, of which a proof is tried, ``sensed``, the last positions."""
     # A motion near the end of the range of floats overflows, and nothing is proved of it.
     no = np.zeros(push.size, bool)
-    outlook = Outlook(no, no.copy(), no.copy(), no.copy(), np.full(push.size, np.inf))
+    endless = np.full(push.size, np.inf)
+    outlook = Outlook(no, no.copy(), no.copy(), no.copy(), endless, endless.copy())
     if options.foaw or options.jitter or options.law is not None:
         return outlook
     late, window = (np.broadcast_to(np.asarray(part), push.size) for part in (lanes.late, lanes.estimator.window))
@@ -78,9 +80,11 @@ def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int, bodies: bool) -
     unstable = squarings < 0
     linear = exact & lanes.bilateral & endless & ~dry & lanes.pulling
     settles, grows = linear & (squarings > 0), linear & unstable
+    away = (loop.A @ group.state[..., None])[..., 0] + loop.pushed * group.push[:, None] - group.state
+    off = _measure(group, solve_lanes(np.eye(loop.A.shape[1]) - loop.A, away[..., None])[..., 0])
     if not bodies:
         # The poles of the loop are all that is known.
-        return Outlook(settles, grows, settles & False, settles & False, pace)
+        return Outlook(settles, grows, settles & False, settles & False, pace, off)
     stuck = dry & (group.slip == 0)
     # The decisions in force; what slips on feels a constant friction.
     modes = np.stack([exact & touching, touching, stuck], 1)
@@ -91,7 +95,8 @@ def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int, bodies: bool) -
     rubbed = group._replace(push=group.push - slip * motor.coulomb, slip=slip)
     for seen, wall, held in np.unique(modes[other], axis=0):
         own = other & (modes == (seen, wall, held)).all(1)
-        settles[own] = _settles(take(rubbed, own), (seen, wall, held), periods)
+        settles[own], far = _settles(take(rubbed, own), (seen, wall, held), periods)
+        off[own] = np.where(settles[own], far, off[own])
     repeats = linear & (squarings == 0) & ~settles
     own = ~exact & ~dry & ~settles
     if own.any() and not lanes.estimator.A.size:
@@ -99,11 +104,23 @@ def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int, bodies: bool) -
     own = ~linear & unstable & lanes.bilateral & endless & lanes.pulling & ~settles
     if own.any():
         grows[own] = _outgrows(take(group, own), take(loop, own), periods)
-    return Outlook(settles, grows, repeats, _is_restless(group, unstable), pace)
+    # Readings that repeat change in every cycle.
+    restless = _is_restless(group, unstable) | (repeats & ~exact)
+    return Outlook(settles, grows, repeats, restless, pace, off)
 
 
-def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> np.ndarray:
-    """Whether no decision changes any more: the wall is kept or left for good, the reading stays, no limit is met."""
+def _measure(group: LaneGroup, away: np.ndarray) -> np.ndarray:
+    """How far states are from their rest in position and readings, and in commands by the wall's force on a way."""
+    sent, force = group.sent, group.lanes.alpha + 2.0 * np.abs(group.lanes.beta * group.lanes.estimator.D)
+    places = np.abs(away[:, [0, *range(sent - group.window, sent)]]).max(-1)
+    return np.maximum(places, np.abs(away[:, sent:]).max(-1) / np.where(force > 0, force, 1.0))
+
+
+def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> tuple[np.ndarray, np.ndarray]:
+    """Whether no decision changes any more: the wall is kept or left for good, the reading stays, no limit is met.
+
+    And how far a body that is not held is from its rest.
+    """
     seen, wall, held = mode
     lanes, motor, bilateral, quantum = group.lanes, group.lanes.motor, group.lanes.bilateral, group.lanes.resolution
     m, late, sent, slip, n = group.bodies, group.late, group.sent, group.slip, group.state.shape[1]
@@ -137,6 +154,7 @@ def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> n
             fixed[:, 3] = fixed[:, 1]
     ends = np.einsum("lrn,ln->lr", rows, rest) + fixed
     # Where the map leads to another side of the wall there is nothing to bound.
+    off = np.zeros(len(reading)) if held else _measure(group, rest - group.state)
     settled = np.isfinite(ends).all(-1) & (bilateral | ((ends[:, 0] > 0) if wall else (drift <= 0)))
     # A body that slips on keeps its velocity's sign, at the samples and where the force changes between them.
     signed = np.zeros((len(reading), 2, n))
@@ -174,7 +192,7 @@ def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> n
         low = np.minimum(waiting.min(1), np.clip(low[:, 1], least, most))
         high = np.maximum(waiting.max(1), np.clip(high[:, 1], least, most))
         strongest = np.maximum(np.abs(low + group.push), np.abs(high + group.push))
-        return settled & (strongest <= motor.static * (1 - 1e-9))
+        return settled & (strongest <= motor.static * (1 - 1e-9)), off
     if wall:
         settled &= np.all((low[:, 1:3] >= np.stack([least, -motor.max_rate], 1)), axis=1)
         settled &= np.all((high[:, 1:3] <= np.stack([most, motor.max_rate], 1)), axis=1)
@@ -182,7 +200,7 @@ def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> n
         wide = np.maximum(high - ends, ends - low)[:, 3:]
         force = np.abs(ends[:, 3:] + group.push[:, None]) + _ROOM * wide
         settled &= np.all(force <= motor.static[:, None] * (1 - 1e-9), axis=1)
-    return settled
+    return settled, off
 
 
 def _is_restless(group: LaneGroup, unstable: np.ndarray) -> np.ndarray:

@@ -108,8 +108,9 @@ class Motion:
         outcome: a code of `zwidth.MotionKind`, what becomes of the motion, the hand pushing on as in the tail
             (docs/theory/simulation.md, T7). Proved: REST, no body moves more than 1e-9 of the widest motion in the
             tail's second half, nor will; DECAYING, it comes to rest; GROWING, it gets ever wider; STEADY, it goes on as
-            it is; RESTLESS, it never comes to rest, for there is no place where it could, and ``trend`` says how its
-            width changes; DIVERGED, beyond 1e100. UNCLEAR, none of these is shown. INVALID, ``status`` is not 0.
+            it is; RESTLESS, it never comes to rest, and ``trend`` says how its width changes: there is no place where
+            it could, or it repeats by now and was wider in the tail before; DIVERGED, beyond 1e100. UNCLEAR, none of
+            these is shown. INVALID, ``status`` is not 0.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
             within a period than are followed, or a force law gave no finite force.
     """
@@ -179,9 +180,12 @@ def classify(known: Any, outlook: Any, course: Any) -> np.ndarray:
     first, second = wide.max(1)
     # A tail of a period or two has not moved for want of time.
     still = (second <= _AT_REST * known.widest) & (first <= np.sqrt(_AT_REST) * known.widest) & (course.tail >= _STILL)
+    # Commands that are still on their way may move again what has not moved for a while.
+    still &= ~(outlook.settles | outlook.grows) | (outlook.off <= _AT_REST * known.widest)
     alike = np.ptp(wide[:, 0], axis=0) <= _ALIKE * wide[:, 0].max(0)
     slow = (outlook.pace > _FOR_GOOD * course.periods) & (outlook.settles | outlook.grows)
-    lasting = ~still & (known.turns[1:].min(0) >= _SWINGS) & (outlook.repeats | (alike & slow))
+    # What repeats by now may have been wider before: the tail's width is not that of what lasts.
+    lasting = ~still & (known.turns[1:].min(0) >= _SWINGS) & alike & (outlook.repeats | slow)
     growing = outlook.grows & ~still & ((wide[1, 0] >= wide[0, 0]) | (outlook.pace <= 2 * course.periods))
     kind = np.where(outlook.restless & (second > _AT_REST * known.widest), MotionKind.RESTLESS, MotionKind.UNCLEAR)
     kind = np.where(growing, MotionKind.GROWING, kind)

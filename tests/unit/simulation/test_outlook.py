@@ -232,6 +232,32 @@ def test_a_held_body_is_let_go_by_what_swings_behind_it():
     assert min(told, broken) > 20
 
 
+LATE = zwidth.Scene(zwidth.Device(mass=0.1, damping=1.0), zwidth.Timing(period=1e-3, delay=0.05))
+
+
+@pytest.mark.parametrize("damping", [5.0, 0.1])
+@pytest.mark.parametrize("more", [{}, {"resolution": 1e-6}, {"coulomb": 1e-4}, {"max_force": 100.0}])
+def test_who_has_not_moved_yet_is_not_at_rest_while_its_commands_are_on_their_way(damping, more):
+    """The first command arrives 50 periods after the start: until then nothing moves, whatever becomes of it."""
+    given: dict[str, Any] = {"stiffness": damping * 10.0, "virtual_damping": damping, "start_position": 1e-3, **more}
+    now, later = (LATE.simulate(**given, periods=periods) for periods in (40, 4000))
+    assert np.ptp(now.position) == 0.0
+    assert np.ptp(later.position) > 1e-4
+    assert now.outcome != CODES.REST
+    assert {now.outcome, later.outcome} & {CODES.UNCLEAR, CODES.RESTLESS} or now.outcome == later.outcome
+
+
+@pytest.mark.parametrize(("stiffness", "outcome"), [(0.5, CODES.DECAYING), (50.0, CODES.GROWING)])
+def test_who_was_moved_and_put_back_is_not_at_rest_while_its_commands_are_on_their_way(stiffness, outcome):
+    """A hand moves a device without damping forth and back within four periods; the wall answers 50 later."""
+    push = np.zeros(40)
+    push[:4] = 1.0, -1.0, -1.0, 1.0
+    free = LATE.replace(damping=0.0)
+    found = free.simulate(stiffness, 0.2 * stiffness**0.5, push_history=push, periods=40, tail=20)
+    assert np.ptp(found.position[20:]) < 1e-15
+    assert found.outcome == outcome
+
+
 # A hand on a spring balances its push by readings; one on none would be restless.
 READ = {
     "wall": (SCENE, 0.0),
@@ -258,3 +284,14 @@ def test_readings_that_are_said_to_repeat_do_so(name):
     assert steady.sum() > 20
     assert not np.any(steady & ~cyclic)
     assert np.mean(steady[cyclic]) > 0.5
+
+
+def test_who_repeats_by_now_but_was_wider_in_the_tail_is_restless():
+    """A window of three samples: the tail has the end of the impact, 9 um wide, and what goes on is 2.4 um wide."""
+    scene = SCENE.replace(damping=10.0, velocity=zwidth.WindowedDifference(3))
+    given = {"start_position": 1e-3, "resolution": 1.2395340354523154e-06, "record": False}
+    wall = 10577.713816316867, 12.84142590488951
+    now, later = (scene.simulate(*wall, **given, periods=periods) for periods in (1500, 12_000))
+    assert now.amplitude > 3.0 * later.amplitude
+    assert (now.outcome, later.outcome) == (CODES.RESTLESS, CODES.STEADY)
+    assert now.trend < 0.5

@@ -49,7 +49,7 @@ class Modes(NamedTuple):
 
     z: np.ndarray
     residue: np.ndarray
-    speed: np.ndarray  # velocity at the sample, of the mode that is 1 there
+    speed: np.ndarray  # velocity at the sample of the mode that is its residue there
     older: np.ndarray  # its force before and behind the instant at which the force changes
     newer: np.ndarray
     delta: float
@@ -58,7 +58,7 @@ class Modes(NamedTuple):
     def shape(self, t: np.ndarray) -> np.ndarray:
         """``r_i g_i(t)``, shape (instants, modes)."""
         t = np.asarray(t, dtype=float)[:, None]
-        return self.residue * move(1.0, self.speed, self.older, self.newer, t, self.delta, self.f)[0]
+        return move(self.residue, self.speed, self.older, self.newer, t, self.delta, self.f)[0]
 
     def deviation(self, time: np.ndarray) -> np.ndarray:
         """The deviation at any instants, in periods."""
@@ -89,13 +89,14 @@ def modes(alpha: float, beta: float, delta: float, d: float) -> Modes | None:
     power = degree.poles - np.arange(degree.poles)
     slope = np.sum(power[:, None] * monic[:-1, None] * z ** (power[:, None] - 1.0), axis=0)
     here = phi_functions(numbers[2])
-    lag = z ** (n + (2 if degree.fractional else 1))
-    residue = (here.phi2 * z + here.psi) * lag / (slope * (z - 1.0))
-    # The mode's force as computed at a sample of 1, and as it arrives n + 1 and n samples later.
-    computed = -(alpha + beta - beta / z)
-    newer, older = computed * z**-n, computed * z ** -(n + 1.0)
+    # All in the sizes of the residues: ``z^-n`` alone overflows next to 0.
+    share, ahead = (here.phi2 * z + here.psi) / (slope * (z - 1.0)), 2 if degree.fractional else 1
+    residue = share * z ** (n + ahead)
+    # The mode's force as computed at a sample of ``z^n``, and as it arrives n + 1 and n samples later.
+    computed = -(alpha + beta - beta / z) * share
+    newer, older = computed * z**ahead, computed * z ** (ahead - 1)
     reached, _ = move(0.0, 0.0, older, newer, np.float64(1.0), delta, f)
-    speed = (z - 1.0 - reached) / here.phi1
+    speed = ((z - 1.0) * residue - reached) / here.phi1
     found = Modes(z, residue, speed, older, newer, float(delta), float(f))
     # At rest at first; one period later under the applied force alone.
     exact = np.array([-1.0 / alpha, here.phi2 - 1.0 / alpha])

@@ -48,6 +48,15 @@ def test_no_later_instant_of_a_long_run_contradicts():
 
 
 @pytest.mark.parametrize(
+    "wall", [(2.1953505327853247, 11.591324520071204, 40.0, 30.5), (0.6006660802493176, 91.07577583447727, 800.0, 1.7)]
+)
+def test_a_pole_next_to_zero_hides_no_time(wall):
+    """``z^-n`` of it is beyond floats; its share of the motion is gone after a period."""
+    found = settling_time(*wall)
+    assert 0 <= found - last_outside(wall, int(2 * found + 100), 50) < 0.05
+
+
+@pytest.mark.parametrize(
     "wall", [(3.0, 0.0, 0.0, 4.0), (0.0, 0.5, 0.5, 1.0), (0.2, 0.4, 0.1, 501.0), (-0.1, 0.4, 0.1, 1)]
 )
 def test_no_time_where_there_is_none_or_it_is_not_known(wall):
