@@ -272,7 +272,7 @@ def _glimpse(best: FittedModel) -> FittedModel:
 
 def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, noise: float) -> PoleBank:
     """Compare the residuals with the forces filtered by poles of one damping ratio."""
-    # A mode of each pole that moves as the whole mass does: what the pole makes of the forces, and that of the last one,
+    # A mode of each pole that moves as the whole mass does: what the pole makes of the forces, and of the last one,
     # which moves it for less than a period.
     frequency = np.geomspace(_LOWEST, _HIGHEST, 1 + round(np.log(_HIGHEST / _LOWEST) / np.log(_APART[ratio])))
     bank = PoleBank(
