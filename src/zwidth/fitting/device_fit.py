@@ -153,9 +153,15 @@ class DeviceFit(DeviceEstimate):
         known = self.status == Status.OK or (self.status == Status.UNDECIDED and agreed)
         return (value, error) if known else (np.nan, np.nan)
 
-    # In N/m.
-    stiffness_max = property(lambda self: self._stiffest[0])
-    stiffness_error = property(lambda self: self._stiffest[1])
+    @property
+    def stiffness_max(self) -> float:
+        """In N/m."""
+        return self._stiffest[0]
+
+    @property
+    def stiffness_error(self) -> float:
+        """In N/m."""
+        return self._stiffest[1]
 
     @property
     def is_doubted(self) -> bool:
