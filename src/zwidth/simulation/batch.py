@@ -143,7 +143,8 @@ class Batch:
         lanes, given = self.lay(places)
         with compute_concretely():
             state, sensed, reading, frame = run_lanes(lanes, self.options, self.course, given, self.rings)
-            last, steady = lanes.push + np.zeros(places.size), self.numbers["noise"][places] == 0
+            last = lanes.push + np.zeros(places.size)
+            steady = (self.numbers["noise"][places] == 0) & (self.numbers["jitter"][places] == 0)
             if given.history is not None:
                 # A hand that still moves in the tail moves on.
                 tail = given.history[-self.course.tail :]

@@ -156,7 +156,7 @@ def cut_period(fractions: np.ndarray, substeps: int, pieces: int) -> np.ndarray:
     """How long the parts of a period are in which the force is constant, ``(scenes, substeps, pieces)``."""
     begin = np.arange(substeps) / substeps
     cut = np.clip(fractions[:, None] - begin, 0.0, 1.0 / substeps)
-    parts = [cut, 1.0 / substeps - cut] if pieces == 2 else [np.full_like(cut, 1.0 / substeps)]
+    parts = [cut, 1.0 / substeps - cut] if pieces > 1 else [np.full_like(cut, 1.0 / substeps)]
     return np.stack(parts, -1)
 
 

@@ -74,10 +74,11 @@ def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> tuple[np.ndarray
     axes = np.eye(size + 3)
     whole = halfway = np.broadcast_to(axes[:size], (at.size, size, size + 3))
     for j in range(options.substeps):
-        for piece in range(options.pieces):
+        pieces = change.shape[2]
+        for piece in range(pieces):
             part = change[:, j, piece]
             # Of two pieces the first feels the older command.
-            newer = piece + 1 == options.pieces
+            newer = piece + 1 == pieces
             given = part[..., size : size + 1] * axes[size + newer] + part[..., -1:] * axes[-1]
             whole = whole + part[..., :size] @ whole + given
             if not newer:

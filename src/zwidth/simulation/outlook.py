@@ -54,7 +54,7 @@ def foresee(
     no = np.zeros(push.size, bool)
     endless = np.full(push.size, np.inf)
     outlook = Outlook(no, no.copy(), no.copy(), no.copy(), endless, endless.copy())
-    if options.foaw or options.jitter or options.law is not None:
+    if options.foaw or options.law is not None:
         return outlook
     late, window = (np.broadcast_to(np.asarray(part), push.size) for part in (lanes.late, lanes.estimator.window))
     finite = np.isfinite(state.body.x).all(0)

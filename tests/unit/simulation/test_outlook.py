@@ -232,6 +232,17 @@ def test_a_held_body_is_let_go_by_what_swings_behind_it():
     assert min(told, broken) > 20
 
 
+@pytest.mark.parametrize("more", [{}, {"resolution": 1e-5, "coulomb": 0.05}], ids=str)
+def test_what_is_proved_of_a_motion_hangs_on_its_own_jitter_alone(more):
+    scene = SCENE.replace(delay=1.4e-3)
+    given = {"start_position": 1e-3, "periods": 1500, "record": False, **more}
+    walls = [[float(TOP.stiffness) * share] for share in (0.3, 1.2)], float(TOP.virtual_damping)
+    alone, beside_it = (scene.simulate(*walls, jitter=jitter, **given).outcome for jitter in (0.0, [0.0, 2e-5]))
+    assert CODES.UNCLEAR not in alone
+    np.testing.assert_array_equal(beside_it[:, 0], alone[:, 0])
+    assert set(beside_it[:, 1]) <= {CODES.UNCLEAR, CODES.DIVERGED}
+
+
 LATE = zwidth.Scene(zwidth.Device(mass=0.1, damping=1.0), zwidth.Timing(period=1e-3, delay=0.05))
 
 
