@@ -89,6 +89,28 @@ def narrow_dips(
     return middle, value
 
 
+# How many dips between samples are refined, and by how many steps at most; and the share of the first sample at which a
+# function tells whether it falls from 0.
+_DIPS, _STEPS, _HARDLY_ANY = 3, 52, 1e-9
+
+
+def find_lowest(cost: Function, low: float, high: float, samples: int, close: float = 0.0) -> tuple[float, float]:
+    """How low a function with kinks and several dips is in NumPy, and where: samples, then golden section."""
+    # At 0 it may have a kink. Ends do not count, but 0 where it rises from there.
+    grid = np.union1d(np.linspace(low, high, samples), np.clip(0.0, low, high))
+    values = np.pad(cost(grid[1:-1]), 1, constant_values=np.inf)
+    if low == 0.0:
+        none, beside = cost(np.array([0.0, _HARDLY_ANY * grid[1]])).tolist()
+        values[0] = none if none <= beside else np.inf
+    dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
+    dips = dips[np.argsort(values[dips])][:_DIPS]
+    found = [(float(values[0]), low)]
+    if dips.size:
+        middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], _STEPS, close)
+        found += zip(value.tolist(), middle.tolist(), strict=True)
+    return min(found)
+
+
 class _Bracket(NamedTuple):
     low: Any
     high: Any

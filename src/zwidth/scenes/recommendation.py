@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.roots import false_position
+from zwidth.arrays.roots import false_position, find_lowest
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
@@ -25,7 +25,7 @@ from zwidth.scenes.assessment import (
     name_kind,
     round_margin,
 )
-from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, find_lowest, soft_dampings
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, soft_dampings
 from zwidth.scenes.wall_code import write_wall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
-from zwidth.arrays.roots import narrow_dips
+from zwidth.arrays.roots import find_lowest
 from zwidth.arrays.xp import is_jax, is_traced
 from zwidth.loops.linear.margins import OpenLoop
 from zwidth.loops.linear.ridge import SceneSensitivities
@@ -171,10 +171,8 @@ def _cross(surplus: Callable[[float], float], low: float, high: float) -> Crossi
 
 Goal = Literal["fast", "robust"]
 
-# Samples across a column, how many of their dips are refined, and by how many steps of golden section.
-_SAMPLES, _DIPS, _STEPS = 66, 3, 52
-# The share of a first sample that tells whether a little damping is better than none.
-_HARDLY_ANY = 1e-9
+# Samples across a column.
+_SAMPLES = 66
 
 
 @shown()
@@ -185,26 +183,6 @@ class BestDamping(NamedTuple):
     spectral_radius: float
     modulus_margin: float
     status: Status
-
-
-def find_lowest(
-    cost: Callable[[np.ndarray], np.ndarray], low: float, high: float, samples: int = _SAMPLES, close: float = 0.0
-) -> tuple[float, float]:
-    """How low a function with kinks and several dips is, and where: samples, then golden section in the lowest dips."""
-    # None at all is the best damping of a passive wall without delay.
-    grid = np.union1d(np.linspace(low, high, samples), np.clip(0.0, low, high))
-    # On the boundary itself nothing is gained; but none at all is an end as well, where the best may be.
-    values = np.pad(cost(grid[1:-1]), 1, constant_values=math.inf)
-    if low == 0.0:
-        none, beside = cost(np.array([0.0, _HARDLY_ANY * grid[1]])).tolist()
-        values[0] = none if none <= beside else math.inf
-    dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
-    dips = dips[np.argsort(values[dips])][:_DIPS]
-    found = [(float(values[0]), low)]
-    if dips.size:
-        middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], _STEPS, close)
-        found += zip(value.tolist(), middle.tolist(), strict=True)
-    return min(found)
 
 
 class SceneOptima(SceneAnswers):
@@ -401,5 +379,5 @@ class SceneOptima(SceneAnswers):
         columns = soft_dampings(self, stiffness, negative_damping)
         if not columns:
             return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
-        _, best = min(find_lowest(cost, *ends) for ends in columns)
+        _, best = min(find_lowest(cost, *ends, _SAMPLES) for ends in columns)
         return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)
