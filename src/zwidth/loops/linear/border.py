@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.curve import CrossingLine, curve_at, zeros_of
+from zwidth.loops.linear.curve import CrossingLine, CurvePoints, curve_at, zeros_of
 from zwidth.loops.linear.rows import Island, StablePieces, bound_intervals
 from zwidth.words.errors import InputError
 from zwidth.words.showing import shown
@@ -85,9 +85,9 @@ class Border:
         w = np.unique(np.concatenate([w, tops]))
         piece = np.searchsorted(b.infinite, w)
         held = b.borders(w)
-        edges = []
-        for start, stop in _runs(held, piece):
-            first, last = self._end(w, piece, start, -1), self._end(w, piece, stop, 1)
+        edges, runs = [], _runs(held, piece)
+        ends = self._ends(w, piece, np.array(runs, int).reshape(-1, 2))
+        for (start, stop), (first, last) in zip(runs, ends, strict=True):
             at = np.unique(np.concatenate([[first], w[start : stop + 1], [last]]))
             alpha, beta = curve_at(b.loop, at)[:2]
             for k, end in ((0, 0.0), (-1, np.pi)):
@@ -118,63 +118,76 @@ class Border:
             within.append(w[[not any(e.w[0] - _BESIDE <= at <= e.w[-1] + _BESIDE for e in edges) for at in w]])
         return np.unique(np.concatenate(within))
 
-    def _end(self, w: np.ndarray, piece: np.ndarray, k: int, side: int) -> float:
-        """Where a run of nodes on the edge ends beyond its last node ``k``."""
-        after = k + side
-        if not 0 <= after < w.size:
-            end = 0.0 if side < 0 else np.pi
-            return end if np.all(np.isfinite(self.boundary.limits[end])) else float(w[k])
+    def _ends(self, w: np.ndarray, piece: np.ndarray, runs: np.ndarray) -> np.ndarray:
+        """Where runs of nodes on the edge, by their first and last, end beyond these: (runs, 2)."""
+        b = self.boundary
+        ends, after = w[runs], runs + np.array([-1, 1])
+        for k, (end, last) in enumerate(((0.0, 0), (np.pi, w.size - 1))):
+            if np.all(np.isfinite(b.limits[end])):
+                ends[runs[:, k] == last, k] = end
+        within = (after >= 0) & (after < w.size)
+        after = np.where(within, after, runs)
         # Towards an angle at which the curve runs to infinity it may leave the stable set before.
-        beyond = w[after] if piece[after] == piece[k] else self.boundary.infinite[min(piece[k], piece[k] + side)]
-        return self._corner(float(w[k]), float(beyond))
+        infinite = np.append(b.infinite, np.nan)[piece[runs] + np.array([-1, 0])]
+        beyond = np.where(piece[after] == piece[runs], w[after], infinite)
+        ends[within] = self._corners(ends[within], beyond[within])
+        return ends
 
-    def _corner(self, inside: float, outside: float) -> float:
-        """Where the curve stops to be an edge between two angles: another crossing of its row meets it there."""
+    def _corners(self, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
+        """Where the curve stops to be an edge between pairs of angles: another crossing of its row meets it there."""
         b = self.boundary
         inside, outside = self._narrow(inside, outside, 1)
-        ends = np.array([inside, outside])
-        here = curve_at(b.loop, ends)
+        ends = np.stack([inside, outside])
+        here = curve_at(b.loop, ends.ravel())
         rows = b.crossings(here.beta)
-        gaps = rows.alpha - here.alpha[:, None]
-        gaps[:, int(b.arc_at(ends[0]))] = np.nan
-        meets = np.flatnonzero(np.sign(gaps[0]) * np.sign(gaps[1]) == -1)
-        if meets.size == 1:
-            other = int(meets[0])
-            w = self._meeting(np.stack([ends, rows.w[:, other]]), gaps[:, other], other)
-            if list(b.borders(np.array([w - _BESIDE * w, w + _BESIDE * w]))) in ([True, False], [False, True]):
-                return w
-        return self._narrow(inside, outside, _ROUNDS)[0]
+        gaps = (rows.alpha - here.alpha[:, None]).reshape(*ends.shape, rows.alpha.shape[1])
+        gaps[:, np.arange(inside.size), b.arc_at(inside)] = np.nan
+        meets = np.sign(gaps[0]) * np.sign(gaps[1]) == -1
+        k, other = np.flatnonzero(meets.sum(1) == 1), meets.argmax(1)
+        other, found = other[k], np.full(inside.size, np.nan)
+        both = np.stack([ends[:, k], rows.w.reshape(gaps.shape)[:, k, other]])
+        found[k] = w = self._meet(both, gaps[:, k, other], other)
+        beside = b.borders((w + _BESIDE * w * np.array([[-1.0], [1.0]])).ravel()).reshape(2, -1)
+        found[k[beside[0] == beside[1]]] = np.nan
+        left = np.flatnonzero(np.isnan(found))
+        found[left] = self._narrow(inside[left], outside[left], _ROUNDS)[0]
+        return found
 
-    def _narrow(self, inside: float, outside: float, rounds: int) -> tuple[float, float]:
-        """Narrow the place at which the curve ceases to be an edge; many angles are looked at one time."""
-        for _ in range(rounds):
-            places = inside + (outside - inside) * _SHARES
-            first = int(np.argmin(np.append(self.boundary.borders(places), False)))
-            inside, outside = np.concatenate([[inside], places, [outside]])[first : first + 2].tolist()
+    def _narrow(self, inside: np.ndarray, outside: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
+        """Narrow the places at which the curve ceases to be an edge; many angles are looked at one time."""
+        for _ in range(rounds if inside.size else 0):
+            places = inside[:, None] + (outside - inside)[:, None] * np.pad(_SHARES, 1, constant_values=(0.0, 1.0))
+            places[:, -1] = outside
+            held = self.boundary.borders(places[:, 1:-1].ravel()).reshape(inside.size, -1)
+            first = np.argmin(np.pad(held, ((0, 0), (0, 1))), axis=1)[:, None]
+            inside, outside = (np.take_along_axis(places, first + step, 1)[:, 0] for step in (0, 1))
         return inside, outside
 
-    def _meeting(self, ends: np.ndarray, gaps: np.ndarray, other: int) -> float:
-        """Where the curve meets another crossing of its rows, by Newton's method."""
-        # ``ends`` has the angles of both between which they meet, ``gaps`` how far their alphas are apart there.
+    def _meet(self, ends: np.ndarray, gaps: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Where the curve meets other crossings of its rows, by Newton's method."""
+        # ``ends`` (2, 2, meetings) has the angles of the curve and of the crossing between which they meet, ``gaps``
+        # how far their alphas are apart there.
         b = self.boundary
-        line = b.lines[other - len(b.arcs)] if other >= len(b.arcs) else None
+        numbers = np.array([*[(np.nan, np.nan)] * len(b.arcs), *((line.q, line.f) for line in b.lines)])
+        (q, f), straight = numbers[other].T, other >= len(b.arcs)
         low, high = ends.min(1), ends.max(1)
         w = ends[:, 0] + gaps[0] / (gaps[0] - gaps[1]) * (ends[:, 1] - ends[:, 0])
+        on = np.ones(other.size, bool)
         for _ in range(_STEPS):
-            at = curve_at(b.loop, w)
+            if not on.any():
+                break
+            at = CurvePoints(*(part.reshape(w.shape) for part in curve_at(b.loop, w.ravel())))
             with np.errstate(all="ignore"):
                 beta_slope = at.turn / at.fall**2
-                if line is not None:
-                    step = (line.q - at.beta * line.f - at.alpha) / (at.alpha_slope + line.f * beta_slope)
-                    step[1] = 0.0
-                else:
-                    gap, apart = np.diff(at.alpha)[0], np.diff(at.beta)[0]
-                    across = gap * beta_slope[::-1] - apart * at.alpha_slope[::-1]
-                    step = across / (at.alpha_slope[0] * beta_slope[1] - at.alpha_slope[1] * beta_slope[0])
-                before, w = w, np.clip(w + step, low, high)
-            if not abs(w[0] - before[0]) > _ARRIVED * w[0]:
-                break
-        return float(w[0])
+                along = (q - at.beta[0] * f - at.alpha[0]) / (at.alpha_slope[0] + f * beta_slope[0])
+                gap, apart = np.diff(at.alpha, axis=0), np.diff(at.beta, axis=0)
+                across = gap * beta_slope[::-1] - apart * at.alpha_slope[::-1]
+                across /= at.alpha_slope[0] * beta_slope[1] - at.alpha_slope[1] * beta_slope[0]
+                step = np.where(straight, np.stack([along, 0.0 * along]), across)
+            new = np.where(on, np.clip(w + step, low, high), w)
+            on &= np.abs(new[0] - w[0]) > _ARRIVED * new[0]
+            w = new
+        return w[0]
 
     @cached_property
     def pieces(self) -> StablePieces:
