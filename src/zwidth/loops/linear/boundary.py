@@ -21,6 +21,7 @@ from zwidth.arrays.circle import ON_CIRCLE, circle, depths
 from zwidth.loops.linear.curve import (
     Arc,
     CrossingLine,
+    bands,
     circle_zeros,
     curve_at,
     cut_arcs,
@@ -268,8 +269,8 @@ class _Steps(NamedTuple):
     w: np.ndarray
     beta: np.ndarray
     alpha: np.ndarray
-    straight: np.ndarray
-    room: np.ndarray
+    straight: np.ndarray  # of the step to each: whether alpha may be interpolated in beta, else both ends' mean counts
+    room: np.ndarray  # of the step to each: how far alpha may be from that
     keys: np.ndarray  # of each node: its arc, then its place among the dampings of all
     dampings: np.ndarray
     first: np.ndarray  # of each arc: its first node in these
@@ -282,7 +283,7 @@ class _Steps(NamedTuple):
     @classmethod
     def join(cls, arcs: tuple[Arc, ...]) -> _Steps:
         """Lay the arcs of a boundary one after another."""
-        w, beta, alpha, straight, room = map(np.concatenate, zip(*(arc[:5] for arc in arcs), strict=True))
+        w, beta, *rest = map(np.concatenate, zip(*(arc[:6] for arc in arcs), strict=True))
         sizes = [arc.w.size for arc in arcs]
         dampings, keys = np.unique(beta, return_inverse=True)
         keys = keys + np.repeat(np.arange(len(arcs)), sizes) * dampings.size
@@ -290,7 +291,7 @@ class _Steps(NamedTuple):
         order = np.argsort(ends, axis=None)
         ends, first = (ends, order, ends.ravel()[order]), np.cumsum([0, *sizes[:-1]])
         own = np.array([(arc.leaving, arc.first) for arc in arcs]).T
-        return cls(w, beta, alpha, straight, room, keys, dampings, first, *ends, *own)
+        return cls(w, beta, rest[0], *bands(w, *rest), keys, dampings, first, *ends, *own)
 
     def sum_met(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
         """The sum of weights of the arcs that rows meet; a row through an end of arcs as the row just above it."""

@@ -62,8 +62,8 @@ def nodes_of(loop: LoopRoots) -> np.ndarray:
     nodes, low, high = [w], w[:-1], w[1:]
     for _ in range(_ROUNDS):
         half = 0.5 * (high - low)
-        wide = 2.0 * half * loop.turning(low + half, half) > _STEP * 16.0
-        wide |= 2.0 * half * loop.turning(low + half, 0.0 * half) > _STEP
+        steps = 2.0 * half * loop.turning(low + half, half * np.array([[1.0], [0.0]]))
+        wide = (steps > _STEP * np.array([[16.0], [1.0]])).any(0)
         if not wide.any():
             break
         middle = (low + half)[wide]
@@ -139,8 +139,9 @@ class Arc(NamedTuple):
     w: np.ndarray
     beta: np.ndarray
     alpha: np.ndarray
-    straight: np.ndarray  # of the step to each: whether alpha may be interpolated in beta, else both ends' mean counts
-    room: np.ndarray  # of the step to each: how far alpha may be from that
+    alpha_slope: np.ndarray  # in w, as beta's
+    beta_slope: np.ndarray
+    size: np.ndarray  # that of `CurvePoints`
     leaving: float  # poles that leave the circle as alpha rises past it: 2, or -2
 
     @property
@@ -184,13 +185,15 @@ def cut_arcs(
         good[[0, -1]] = True
         if beta[0] <= beta[-1]:
             parts = [part[good] for part in parts]
-            arcs.append(Arc(*parts[:3], *_bands(parts), leaving))
+            arcs.append(Arc(*parts, leaving))
     return arcs
 
 
-def _bands(parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Where alpha may be between two nodes: `Arc.straight` and `Arc.room`."""
-    w, _, alpha, alpha_slope, beta_slope, size = parts
+def bands(
+    w: np.ndarray, alpha: np.ndarray, alpha_slope: np.ndarray, beta_slope: np.ndarray, size: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of the steps to nodes whether alpha may be interpolated in beta, else both ends' mean counts; and within what."""
+    # Of arcs one after another: their ends have no alpha.
     # Where the slope of beta hardly changes over a step, a straight line misses alpha by an eighth of the step times
     # what alpha's slope changes, and by what beta bends; four times that is allowed. Elsewhere, more than both ends
     # differ.
