@@ -7,11 +7,11 @@ well: real poles, and pairs of undamped devices at one frequency.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from zwidth.arrays.circle import ON_CIRCLE, circle, depths
 from zwidth.arrays.roots import zeros_between
@@ -106,20 +106,18 @@ class CrossingLine(NamedTuple):
         return self.poles * np.sign(self.f_turn) * np.where(beta < self.meeting, 1.0, -1.0)
 
 
-def lines_at(loop: LoopRoots, angles: Iterable[float]) -> list[CrossingLine]:
+def lines_at(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
     """The lines of zeros of Im F where q is real as well: at z = 1 and -1, inside of undamped devices and windows."""
     # There is none where q or F is infinite: where the device does not move, say.
-    lines = []
-    for w in angles:
-        at, end = circle(np.array([w])), w in (0.0, np.pi)
-        with np.errstate(all="ignore"):
-            q, f = loop.required_wall(at), loop.estimate.jet(at)
-        numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
-        infinite = np.any(np.abs(at.before + loop.zeros) <= (ON_CIRCLE if end else 1e-9))
-        real = end or abs(q.value[0].imag) <= _NONE * abs(q.value[0])
-        if real and not infinite and np.all(np.isfinite(numbers)):
-            lines.append(CrossingLine(float(w), *map(float, numbers), poles=1 if end else 2))
-    return lines
+    w = np.array(angles, float)
+    at, end = circle(w), (w == 0.0) | (w == np.pi)
+    with np.errstate(all="ignore"):
+        q, f = loop.required_wall(at), loop.estimate.jet(at)
+        real = end | (np.abs(q.value.imag) <= _NONE * np.abs(q.value))
+    numbers = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
+    near = np.abs(at.before[:, None] + loop.zeros) <= np.where(end, ON_CIRCLE, 1e-9)[:, None]
+    found = np.flatnonzero(real & ~near.any(1) & np.isfinite(numbers).all(1))
+    return [CrossingLine(*numbers[k].tolist(), poles=1 if end[k] else 2) for k in found]
 
 
 def circle_zeros(loop: LoopRoots) -> np.ndarray:
