@@ -104,7 +104,8 @@ class Border:
         few = [w for w in few if not any(low <= w[0] and w[-1] <= high for low, high in filled)]
         filled += [(w[0], w[-1]) for w in few]
         within = [np.empty(0), *(np.linspace(w[0], w[-1], _FILLED)[1:-1] for w in few)]
-        ends = np.sort(np.concatenate([edge.beta[[0, -1]] for edge in edges])) if edges else np.empty(0)
+        # An undamped mode's angles may be too few for any of these nodes: beside the ends of arcs, then.
+        ends = np.sort(np.concatenate([part.beta[[0, -1]] for part in edges or b.arcs]))
         ends = ends[np.isfinite(ends)]
         if not ends.size:
             return np.empty(0)

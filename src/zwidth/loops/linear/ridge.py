@@ -83,7 +83,9 @@ def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     top = next((top for top in tops[:_MOST_TOPS] if _is_reached(border, top, least)), None)
     if top is None and len(tops) > _MOST_TOPS:
         raise ArithmeticError(f"none of the {_MOST_TOPS} highest of {len(tops)} tops holds")
-    found = None if top is None else _describe(border, top, least)
+    # Of a corner the edge that moves less along the circle tells more digits.
+    same = [other for other in tops[tops.index(top) :] if other.alpha >= top.alpha * (1.0 - _ABOVE)] if top else []
+    found = next((wall for other in same if (wall := _describe(border, other, least))), None)
     _refuse_stiffer(border, 0.0 if found is None else found.alpha, least)
     return found
 
@@ -121,7 +123,7 @@ def _tops(border: Border, least: float) -> list[_Top]:
     return sorted(found, key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta))
 
 
-def _describe(border: Border, top: _Top, least: float) -> BoundRidge:
+def _describe(border: Border, top: _Top, least: float) -> BoundRidge | None:
     alpha, beta, w = top[:3]
     if beta == least:
         return BoundRidge(alpha, beta, w, w, _condition(w), Condition.NO_DAMPING)
@@ -136,8 +138,8 @@ def _condition(w: float) -> Condition:
     return Condition.MINUS_ONE if w == np.pi else Condition.PAIR
 
 
-def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
-    """The two conditions that meet at a corner."""
+def _corner(border: Border, alpha: float, beta: float) -> BoundRidge | None:
+    """The two conditions that meet at a corner; None where rounding keeps them apart."""
     found = border.boundary.crossings(np.array([beta]))
     away = np.abs(found.alpha[0] - alpha)
     near = [int(k) for k in np.argsort(np.where(np.isnan(away), np.inf, away))[:2]]
@@ -146,9 +148,8 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
         return BoundRidge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
     # A double pole at z = -1: the curve ends on the line there.
     top, damping = border.boundary.limits[np.pi]
-    if not abs(top - alpha) <= _NEAR * abs(alpha):
-        raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
-    return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
+    is_end = abs(top - alpha) <= _NEAR * abs(alpha)
+    return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY) if is_end else None
 
 
 def _conditions(loop: LoopRoots, wall: BoundRidge) -> tuple[np.ndarray, list[int]]:

@@ -3,13 +3,14 @@
 import subprocess
 import sys
 
+import any_loop
 import jax
 import numpy as np
 import pytest
 from waiting import LONGEST
 
 import zwidth
-from zwidth import Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
+from zwidth import Actuator, Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
 from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.linear.ridge import BoundRidge, Condition, find_ridge, moving_paths
 from zwidth.words.errors import InputError, TracedDelayError
@@ -63,6 +64,22 @@ def test_the_curve_borders_the_stable_walls_beside_it(delay, damping, velocity):
     assert clear.mean() > 0.95
     assert 50 < borders.sum() < 0.5 * borders.size
     np.testing.assert_array_equal(borders[clear], np.minimum(*sides)[clear] == 0)
+
+
+def test_a_mode_without_damping_leaves_few_angles():
+    # Its stable walls lie between two nodes of the curve, and their top is a corner that a digit of the angle moves.
+    device = Device(
+        3.4,
+        coupling=Coupling(mass=0.0733, stiffness=190755.0, sensor="tip"),
+        actuator=Actuator(68.4, order=2, damping_ratio=0.655),
+    )
+    scene = Scene(device, Timing(0.0065483, 0.0), velocity=Butterworth(1.404))
+    wall = scene.max_stiffness()
+    assert wall.status == Status.OK
+    K, B = wall.stiffness * np.array([0.5, 1.0 - 1e-5, 1.0 + 1e-5, 1.5]), wall.virtual_damping
+    np.testing.assert_array_equal(scene.is_stable(K, B), [True, True, False, False])
+    # By the eigenvalues of the closed loop's matrix, where these know.
+    assert any_loop.spectral_radius(scene, K[0], B) < 1.0 < any_loop.spectral_radius(scene, K[-1], B)
 
 
 def test_an_island_of_negative_damping_does_not_count():
