@@ -14,6 +14,8 @@ from zwidth.words.types import Array
 
 # Nearer to the circle than this a root of the loop is on it: an undamped mode, or a zero of an undamped device.
 ON_CIRCLE = 1e-12
+# And nearer than this it is there but for rounding.
+_UNDAMPED = 4.0 * np.finfo(float).eps
 
 
 class Jet(NamedTuple):
@@ -77,8 +79,13 @@ def product_jet(at: CirclePoints, offsets: Any, factor: Any) -> Jet:
     slope = 0.0 * at.z
     turn = 1j * at.z
     for offset in offsets:
-        # Next to z = -1 the sum around z = 1 has lost its phase.
-        left = isinstance(offset, np.number) and offset.real > 1.0
-        one = at.after + (offset - 2.0) if left else at.before + offset
+        number = isinstance(offset, np.number)
+        if number and offset.imag and abs(abs(1.0 - offset) - 1.0) < _UNDAMPED:
+            # Next to a root on the circle a sum has lost its phase, too.
+            angle, xp = np.angle(1.0 - offset), namespace(at.w)
+            one = 2j * xp.sin(0.5 * (at.w - angle)) * xp.exp(0.5j * (at.w + angle))
+        else:
+            # Next to z = -1 that around z = 1 has.
+            one = at.after + (offset - 2.0) if number and offset.real > 1.0 else at.before + offset
         value, slope = value * one, slope * one + value * turn
     return Jet(value, slope)

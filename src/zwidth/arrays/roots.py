@@ -144,11 +144,14 @@ def false_position(
         # A scalar of NumPy is five times faster than an array of no dimension.
         trial = xp.where(inside, trial, 0.5 * (at.low + at.high))[()]
         value = function(trial)
-        # A point that is done keeps its value: it must not depend on the points beside it.
-        above, better = value > 0, (xp.abs(value) < xp.abs(at.value)) & ~done(at)
+        above = value > 0
+        low, high = xp.where(above, trial, at.low), xp.where(above, at.high, trial)
+        # Of a jump the best one is what is left of the bracket, too. A point that is done keeps its value: it must not
+        # depend on the points beside it.
+        better = ((xp.abs(value) < xp.abs(at.value)) | (at.best < low) | (at.best > high)) & ~done(at)
         return k + 1, _Bracket(
-            xp.where(above, trial, at.low),
-            xp.where(above, at.high, trial),
+            low,
+            high,
             xp.where(above, value, xp.where(at.side < 0, 0.5 * at.at_low, at.at_low)),
             xp.where(above, xp.where(at.side > 0, 0.5 * at.at_high, at.at_high), value),
             xp.where(above, 1.0, -1.0) + 0.0 * value,

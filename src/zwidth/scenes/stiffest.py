@@ -207,10 +207,11 @@ class SceneOptima(SceneAnswers):
             NaN where it is not 0: NO_BOUNDARY where no such wall with K > 0 is stable.
 
         Numerics:
-            Closed form for a rigid device. Otherwise the highest point of all edges of the stable set (50 to 150 ms),
-            about 1e-13 relative, refused where rows of the plane contradict it. Inside a JAX transformation it is
-            finished by optimistix, with implicit derivatives in every parameter of every part. The delay and, with
-            one, the period must be plain numbers there (`TracedDelayError`).
+            Closed form for a rigid device. Otherwise the highest point of all edges of the stable set, about 1e-13
+            relative (a mode that decays by less than 1e-3 in a period costs digits, but for one without damping),
+            refused where rows of the plane contradict it. Inside a JAX transformation it is finished by optimistix,
+            with implicit derivatives in every parameter of every part. The delay and, with one, the period must be
+            plain numbers there (`TracedDelayError`).
 
         Example:
             >>> import zwidth

@@ -116,13 +116,16 @@ class Boundary:
             ahead = (row.ratio < 0) == rising[here]
             below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
             with np.errstate(all="ignore"):
-                new = x - row.ratio / row.ratio_slope
+                move = -row.ratio / row.ratio_slope
+            new = x + move
             good = (new >= below[here]) & (new <= above[here]) & (step % 6 != 5)
             # Who has arrived at an end of the bracket may leave it by rounding.
             good |= np.abs(new - x) <= _ARRIVED * x
             new = np.where(good, np.clip(new, below[here], above[here]), 0.5 * (below[here] + above[here]))
-            # A step so short leaves rounding: each next one would be its square.
-            found[here], alpha[here] = new, row.alpha + (new - x) * row.alpha_slope
+            # A step so short leaves rounding: each next one would be its square. Beside an undamped mode that of the
+            # angle is too much for alpha.
+            move = np.where(new == x + move, move, new - x)
+            found[here], alpha[here] = new, row.alpha + move * row.alpha_slope
             on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
             if not on.any():
                 break

@@ -20,7 +20,9 @@ import numpy as np
 from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.evaluate import evaluate
 from zwidth.loops.linear.border import Border
+from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import chain_of
+from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.linear.held import hold
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import bound_intervals
@@ -34,6 +36,8 @@ from zwidth.words.types import Array
 
 # How far apart, as shares of alpha, two crossings of a corner are, and from a corner where the curve ends at z = -1.
 _MEETS, _NEAR = 1e-8, 1e-5
+# Steps to a corner at most, and the one, as a share of beta, after which it is reached.
+_STEPS, _ARRIVED = 4, 1e-15
 # By what share rounding may make a row's wall stiffer.
 _ABOVE = 1e-7
 # Rows next to a top, as shares of the plane, that must reach nearly as high; and how many tops are looked at.
@@ -83,9 +87,7 @@ def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     top = next((top for top in tops[:_MOST_TOPS] if _is_reached(border, top, least)), None)
     if top is None and len(tops) > _MOST_TOPS:
         raise ArithmeticError(f"none of the {_MOST_TOPS} highest of {len(tops)} tops holds")
-    # Of a corner the edge that moves less along the circle tells more digits.
-    same = [other for other in tops[tops.index(top) :] if other.alpha >= top.alpha * (1.0 - _ABOVE)] if top else []
-    found = next((wall for other in same if (wall := _describe(border, other, least))), None)
+    found = None if top is None else _describe(border, top, least)
     _refuse_stiffer(border, 0.0 if found is None else found.alpha, least)
     return found
 
@@ -123,7 +125,7 @@ def _tops(border: Border, least: float) -> list[_Top]:
     return sorted(found, key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta))
 
 
-def _describe(border: Border, top: _Top, least: float) -> BoundRidge | None:
+def _describe(border: Border, top: _Top, least: float) -> BoundRidge:
     alpha, beta, w = top[:3]
     if beta == least:
         return BoundRidge(alpha, beta, w, w, _condition(w), Condition.NO_DAMPING)
@@ -138,18 +140,37 @@ def _condition(w: float) -> Condition:
     return Condition.MINUS_ONE if w == np.pi else Condition.PAIR
 
 
-def _corner(border: Border, alpha: float, beta: float) -> BoundRidge | None:
-    """The two conditions that meet at a corner; None where rounding keeps them apart."""
-    found = border.boundary.crossings(np.array([beta]))
-    away = np.abs(found.alpha[0] - alpha)
-    near = [int(k) for k in np.argsort(np.where(np.isnan(away), np.inf, away))[:2]]
-    angles = sorted(float(found.w[0, k]) for k in near)
-    if len(near) == 2 and away[near[1]] <= _MEETS * abs(alpha) and angles[1] - angles[0] > 1e-6:
-        return BoundRidge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
+def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
+    """The two conditions that meet at a corner."""
+    # By Newton's method on rows: an edge's end is as far off, beside an undamped mode, as a digit of its angle tells.
+    (w, other), heights, slopes = _nearest_two(border.boundary, alpha, beta)
+    for _ in range(_STEPS):
+        step = (heights[1] - heights[0]) / ((slopes[0] - slopes[1]) or np.inf)
+        if not _ARRIVED * abs(beta) < abs(step) <= _NEAR * abs(beta):
+            break
+        alpha, beta = heights[0] + slopes[0] * step, beta + step
+        (w, other), heights, slopes = _nearest_two(border.boundary, alpha, beta)
+    w, other = sorted((w, other))
+    if abs(heights[1] - heights[0]) <= _MEETS * abs(alpha) and other - w > 1e-6:
+        return BoundRidge(alpha, beta, w, other, _condition(w), _condition(other))
     # A double pole at z = -1: the curve ends on the line there.
     top, damping = border.boundary.limits[np.pi]
-    is_end = abs(top - alpha) <= _NEAR * abs(alpha)
-    return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY) if is_end else None
+    if not abs(top - alpha) <= _NEAR * abs(alpha):
+        raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
+    return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
+
+
+def _nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[float], ...]:
+    """Angles of the two crossings of a row that are nearest to a wall, their alphas and the slopes of these in beta."""
+    found = b.crossings(np.array([beta]))
+    away = np.abs(found.alpha[0] - alpha)
+    near = np.argsort(np.where(np.isnan(away), np.inf, away))[:2]
+    here = curve_at(b.loop, found.w[0, near])
+    with np.errstate(all="ignore"):
+        slopes = here.alpha_slope * here.fall**2 / here.turn
+    for k in np.flatnonzero(near >= len(b.arcs)):
+        slopes[k] = -b.lines[near[k] - len(b.arcs)].f
+    return found.w[0, near].tolist(), found.alpha[0, near].tolist(), slopes.tolist()
 
 
 def _conditions(loop: LoopRoots, wall: BoundRidge) -> tuple[np.ndarray, list[int]]:

@@ -82,6 +82,16 @@ def test_a_mode_without_damping_leaves_few_angles():
     assert any_loop.spectral_radius(scene, K[0], B) < 1.0 < any_loop.spectral_radius(scene, K[-1], B)
 
 
+def test_a_corner_on_the_curve_of_a_mode_without_damping():
+    # Along that curve angles differ by rounding. Expected: both conditions of the corner at 50 digits (mpmath).
+    device = Device(0.0393, coupling=Coupling(mass=0.00545, stiffness=27.0))
+    hand = Operator(mass=0.04, stiffness=95.0, coupling_stiffness=170000.0)
+    wall = Scene(device, Timing(0.000143), velocity=WindowedDifference(8), operator=hand).max_stiffness()
+    assert (wall.status, wall.kind) == (Status.OK, RidgeKind.CORNER)
+    assert wall.stiffness == pytest.approx(71106.137068322691, rel=1e-11)
+    assert wall.virtual_damping == pytest.approx(83.445589797423724, rel=1e-11)
+
+
 def test_an_island_of_negative_damping_does_not_count():
     free = WINDOW.replace(damping=0.0)
     for negative in (False, True):
