@@ -151,7 +151,10 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
         alpha, beta = heights[0] + slopes[0] * step, beta + step
         (w, other), heights, slopes = _nearest_two(border.boundary, alpha, beta)
     w, other = sorted((w, other))
-    if abs(heights[1] - heights[0]) <= _MEETS * abs(alpha) and other - w > 1e-6:
+    # Of the place in beta the flatter one makes the less of alpha.
+    apart = abs(slopes[0] - slopes[1])
+    flat = min(1.0, min(map(abs, slopes)) / apart) if apart > 0 else 1.0
+    if flat * abs(heights[1] - heights[0]) <= _MEETS * abs(alpha) and other - w > 1e-6:
         return BoundRidge(alpha, beta, w, other, _condition(w), _condition(other))
     # A double pole at z = -1: the curve ends on the line there.
     top, damping = border.boundary.limits[np.pi]

@@ -226,8 +226,11 @@ class StablePieces:
             piece = piece[piece]
         labels = np.full(there.shape, -1)
         labels[there] = piece
-        soft = reaches_down(found.low, found.high)
-        return labels, np.unique(labels[soft])
+        # One that narrows towards K = 0 holds soft walls in no row but the last.
+        low, high = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(low, piece, found.low[there])
+        np.maximum.at(high, piece, found.high[there])
+        return labels, np.flatnonzero(reaches_down(low, high))
 
     def find_highest(self, least: float) -> float:
         """Up to which alpha rows with that much damping or more are stable in pieces with soft walls; else -inf."""
