@@ -144,11 +144,12 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     angles = sorted(float(found.w[0, k]) for k in near)
     if len(near) == 2 and away[near[1]] <= _MEETS * abs(alpha) and angles[1] - angles[0] > 1e-6:
         return BoundRidge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
-    # A double pole at z = -1: the curve ends on the line there.
-    top, damping = border.boundary.limits[np.pi]
-    if not abs(top - alpha) <= _NEAR * abs(alpha):
-        raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
-    return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
+    # A double pole at z = -1, or at z = 1 of a device that moves against its force: the curve ends on the line there.
+    for w in (np.pi, 0.0):
+        top, damping = border.boundary.limits[w]
+        if abs(top - alpha) <= _NEAR * abs(alpha):
+            return BoundRidge(top, damping, w, w, _condition(w), Condition.STATIONARY)
+    raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
 
 
 def _conditions(loop: LoopRoots, wall: BoundRidge) -> tuple[np.ndarray, list[int]]:
