@@ -21,16 +21,15 @@ from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE
-from zwidth.words.rotation import is_rotary, use_kind
+from zwidth.words.rotation import is_rotary, own_unit, use_kind
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
 # By default the longest delay, in periods.
 _LONGEST = 20
-# The masses of devices, in kg: outside a unit is suspected.
-_LIGHTEST, _HEAVIEST = 2e-3, 10.0
-# The longest way in m and the largest force in N of a device.
-_FARTHEST, _STRONGEST = 3.0, 1e3
+# The lightest and the heaviest device, the longest way and the largest force, linear and rotary: beyond, a unit is
+# suspected.
+_USUAL = {False: (2e-3, 10.0, 3.0, 1e3), True: (1e-8, 10.0, 100.0, 300.0)}
 # Positions beyond the past forces.
 _FEWEST = 20
 # Fewer positions than this are explained by other devices as well, far outside of the errors.
@@ -241,29 +240,35 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
     if theta[0] <= 0:
         raise InputError(
             f"force: the device runs away from it, as if its mass were {with_unit(period**2 / theta[0], 'kg')}; "
-            "turn the sign of the force, or of the position"
+            "turn the sign of the force, or of the position; a velocity given as a position looks so too"
         )
     left = squares / float(rest @ rest)
     if left > _UNEXPLAINED and best.excess > _SMOOTH:
         raise InputError(
             f"force: it leaves {plain(100 * np.sqrt(left), 2)} % of the motion unexplained, and that is smooth, not "
             "noise: something else pushes, as a hand, a spring, a stop or gravity along the way, the motor gives less "
-            "than is commanded, or samples are missing; record every sample of the device left alone"
+            "than is commanded, a column holds something else, as a velocity or the other one's numbers, or samples "
+            "are missing; record every sample of the device left alone"
         )
 
 
 def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Recording, ...]) -> list[str]:
     mass, damping, delay = scene.device.mass, scene.device.damping, scene.timing.delay
     doubts, residuals = [], best.residuals
-    if not is_rotary() and not _LIGHTEST <= mass <= _HEAVIEST:
-        light = "the position may be in mm, or the force in kN"
-        slip = light if mass < _LIGHTEST else "the force may be in mN, or the time in ms"
-        doubts.append(f"a mass of {with_unit(mass, 'kg')} is far from any device; {slip}: m, N and s are meant")
+    lightest, heaviest, farthest, strongest = _USUAL[is_rotary()]
+    place, newton, fine = own_unit("m"), own_unit("N"), "degrees or counts" if is_rotary() else "mm"
+    if not lightest <= mass <= heaviest:
+        light = f"the position may be in {fine}, or the force in k{newton}"
+        slip = light if mass < lightest else f"the force may be in m{newton}, or the time in ms"
+        what = f"a mass of {with_unit(mass, 'kg')} is far from any device"
+        doubts.append(f"{what}; {slip}: {place}, {newton} and s are meant")
     way, push = max(float(np.ptp(log.position)) for log in logs), best.model.largest
-    if not is_rotary() and way > _FARTHEST:
-        doubts.append(f"a way of {with_unit(way, 'm')} is far from any device; the position may be in mm: m is meant")
-    if not is_rotary() and push > _STRONGEST:
-        doubts.append(f"a force of {with_unit(push, 'N')} is far from any device; it may be in mN: N is meant")
+    if way > farthest:
+        what = f"a way of {with_unit(way, 'm')} is far from any device"
+        doubts.append(f"{what}; the position may be in {fine}: {place} is meant")
+    if push > strongest:
+        what = f"a force of {with_unit(push, 'N')} is far from any device"
+        doubts.append(f"{what}; it may be in m{newton}: {newton} is meant")
     if errors[0] > VAGUE * mass:
         doubts.append(MASS_OPEN)
     if residuals.size < _FEW:

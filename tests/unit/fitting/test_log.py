@@ -153,6 +153,18 @@ def test_units_off_by_a_thousand_are_doubted(scale, unit):
     assert any(f"in {unit}" in doubt for doubt in fit.doubts)
 
 
+@pytest.mark.parametrize("inertia, scale, unit", [(0.05, 1e-3, "mN m"), (1e-4, 57.3, "degrees"), (1e-6, 1e4, "counts")])
+def test_units_of_a_rotary_axis_are_doubted(inertia, scale, unit):
+    rng = np.random.default_rng(10)
+    force = 500 * inertia * steps_to_and_fro(rng, 400)
+    angle = move(inertia, 20 * inertia, 1e-3, force)
+    assert zwidth.fit_log(PERIOD, angle, force, rotary=True).doubts == ()
+    # A torque a thousand times as large is as if the angle were so much smaller.
+    fit = zwidth.fit_log(PERIOD, scale * angle, force, rotary=True)
+    assert any(unit in doubt for doubt in fit.doubts)
+    assert np.isnan(fit.safe_wall().stiffness)
+
+
 @pytest.mark.parametrize("delay", [0.0, 1.4e-3])
 def test_friction_comes_back_from_a_simulated_motion(delay):
     force = 2.0 * steps_to_and_fro(np.random.default_rng(11), 600, 40)

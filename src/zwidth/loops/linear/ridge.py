@@ -156,18 +156,19 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     flat = min(1.0, min(map(abs, slopes)) / apart) if apart > 0 else 1.0
     if flat * abs(heights[1] - heights[0]) <= _MEETS * abs(alpha) and other - w > 1e-6:
         return BoundRidge(alpha, beta, w, other, _condition(w), _condition(other))
-    # A double pole at z = -1: the curve ends on the line there.
-    top, damping = border.boundary.limits[np.pi]
-    if not abs(top - alpha) <= _NEAR * abs(alpha):
-        raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
-    return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
+    # A double pole at z = -1, or at z = 1 of a device that moves against its force: the curve ends on the line there.
+    for w in (np.pi, 0.0):
+        top, damping = border.boundary.limits[w]
+        if abs(top - alpha) <= _NEAR * abs(alpha):
+            return BoundRidge(top, damping, w, w, _condition(w), Condition.STATIONARY)
+    raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
 
 
 def _nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[float], ...]:
     """Angles of the two crossings of a row that are nearest to a wall, their alphas and the slopes of these in beta."""
     found = b.crossings(np.array([beta]))
     away = np.abs(found.alpha[0] - alpha)
-    near = np.argsort(np.where(np.isnan(away), np.inf, away))[:2]
+    near = np.resize(np.argsort(np.where(np.isnan(away), np.inf, away))[:2], 2)
     here = curve_at(b.loop, found.w[0, near])
     with np.errstate(all="ignore"):
         slopes = here.alpha_slope * here.fall**2 / here.turn

@@ -134,7 +134,7 @@ ANY = DelayClasses(True, True, True)
 def classify_delays(d: Any) -> DelayClasses:
     """The `DelayClasses` of an array of delays, `ANY` where they are traced; what is no delay counts as short."""
     if isinstance(d, float | int):
-        return DelayClasses(not d >= 1, d >= 1, d % 1 != 0)
+        return DelayClasses(not d >= 1, d >= 1, isinstance(d, float) and not d.is_integer())
     if is_traced(d):
         return ANY
     d = as_float64("d", d)

@@ -344,3 +344,20 @@ def test_slopes_next_to_a_parameter_of_0_are_those_at_0():
     # In steps of a thousandth of themselves, rounding moved those in both dampings by 4e-3, that in the delay by 7e-6.
     for path in ("damping", "coupling.damping", "delay", "coupling.stiffness"):
         assert beside[path] == pytest.approx(at_zero[path], rel=1e-7)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.5e-3, 1e-3])
+@pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=20.8)], ids=repr)
+def test_a_device_that_moves_against_its_force_bears_what_its_own_spring_does(velocity, delay):
+    # A pole comes to z = 1 where the wall's spring is as stiff as the device's own, whatever the damping.
+    device = zwidth.LinearDevice(([-1.0], [0.1, 20.0, 1e3]))
+    scene = zwidth.Scene(device, zwidth.Timing(1e-3, delay), velocity=velocity)
+    top = scene.max_stiffness(negative_damping=True)
+    assert (top.status, top.stiffness) == (Status.OK, pytest.approx(1e3, rel=1e-12))
+    softer = (1.0 - 1e-6) * top.stiffness
+    assert scene.is_stable(softer, (1.0 - 1e-3) * top.virtual_damping)
+    assert scene.decide_stability(softer, (1.0 - 1e-3) * top.virtual_damping, method="certified").stable
+    assert not scene.is_stable((1.0 + 1e-9) * top.stiffness, np.linspace(-60.0, 60.0, 601)).any()
+    slopes = scene.sensitivities(negative_damping=True)
+    assert slopes.status == Status.OK
+    np.testing.assert_allclose(list(slopes.per.values()), 0.0, atol=1e-3)

@@ -31,6 +31,13 @@ def test_every_method_holds_where_it_says(d, monkeypatch):
         assert np.isnan(outcome.farthest) or outcome.farthest <= HELD[outcome.method], outcome
 
 
+@pytest.mark.parametrize("d", [np.float64(np.inf), np.float64(np.nan), np.float64(-np.inf), np.inf])
+def test_what_is_no_delay_has_a_status_and_no_warning(d):
+    # The remainder of NumPy's infinity by 1 warns.
+    assert not zwidth.is_stable(0.1, 0.4, 0.1, d)
+    assert zwidth.alpha_max(0.1, d).status == Status.INVALID_INPUT
+
+
 def test_softer_walls_at_the_damping_of_a_corner_are_stable():
     """There the lobe meets the line of z = -1, at y = 1 but for rounding errors, and both end the row."""
     random = np.random.default_rng(5)
