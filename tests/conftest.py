@@ -54,12 +54,21 @@ def pytest_configure(config: pytest.Config) -> None:
     # Files begin in the order in which they are collected, the long ones of tests/contract and tests/e2e before those
     # of tests/unit: pytest-xdist would begin with those of the most tests, and a process would end with the longest.
     config.option.loadscopereorder = False
+    # What is imported and collected stays: Python need not look for garbage in it again and again.
+    gc.set_threshold(1_000_000)
 
 
 def pytest_collection_finish() -> None:
     """Python looks for garbage less often: tracing makes so many objects that every sixth second went into it."""
     gc.collect()
     gc.set_threshold(50_000, 20, 20)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish() -> None:
+    """What is there at the end is looked through once: pytest, and then Python, would do so again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)

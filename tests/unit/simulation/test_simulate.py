@@ -107,22 +107,24 @@ def test_many_walls_on_friction_move_as_alone(tip, delay):
             assert_again(getattr(together, name)[place], getattr(alone, name), name)
 
 
-@pytest.mark.parametrize("delay", [0.0, 1.0, 0.3, 2.75, 100.0])
-def test_a_command_acts_its_delay_later_and_substeps_change_nothing(delay):
-    scene = zwidth.Scene(SCENE.device, zwidth.Timing(1e-3, delay * 1e-3))
-    fine, coarse = run(scene, substeps=20, stiffness=100.0), run(scene, stiffness=100.0)
-    late = round(20 * delay)
-    expected = np.append(np.zeros(late), np.repeat(fine.command, 20))[: 20 * 200]
-    # Of two compiled programs: one may round a product and a sum once where the other does twice.
-    np.testing.assert_allclose(fine.wall_force, expected, rtol=1e-12, atol=1e-15 * np.abs(expected).max())
-    for name in ("position", "velocity", "energy", "wall_work", "damping_loss"):
-        value = getattr(coarse, name)
-        assert getattr(fine, name)[::20] == pytest.approx(value, rel=0, abs=1e-12 * np.abs(value).max())
+# Those of whole periods side by side, and those that act within one: a program for each.
+@pytest.mark.parametrize("delays", [(0.0, 1.0, 100.0), (0.3, 2.75)], ids=["whole", "within"])
+def test_a_command_acts_its_delay_later_and_substeps_change_nothing(delays):
+    scenes = [zwidth.Scene(SCENE.device, zwidth.Timing(1e-3, delay * 1e-3)) for delay in delays]
+    fine, coarse = run(scenes, substeps=20, stiffness=100.0), run(scenes, stiffness=100.0)
+    for k, delay in enumerate(delays):
+        late = round(20 * delay)
+        expected = np.append(np.zeros(late), np.repeat(fine.command[k], 20))[: 20 * 200]
+        # Of two compiled programs: one may round a product and a sum once where the other does twice.
+        np.testing.assert_allclose(fine.wall_force[k], expected, rtol=1e-12, atol=1e-15 * np.abs(expected).max())
+        for name in ("position", "velocity", "energy", "wall_work", "damping_loss"):
+            value = getattr(coarse, name)[k]
+            assert getattr(fine, name)[k, ::20] == pytest.approx(value, rel=0, abs=1e-12 * np.abs(value).max())
 
 
-@pytest.mark.parametrize(
-    "velocity",
-    [
+def test_the_estimate_is_right_from_the_first_sample_of_a_device_that_comes_on_a_line():
+    # In one batch, which compiles a program for the linear ones and one for the adaptive one.
+    velocities = (
         zwidth.BackwardDifference(),
         zwidth.WindowedDifference(15),
         zwidth.LowPass(time_constant=0.3, order=2),
@@ -130,27 +132,28 @@ def test_a_command_acts_its_delay_later_and_substeps_change_nothing(delay):
         zwidth.VelocityFilter([900.0, -900.0], [1.0, -0.999]),
         zwidth.VelocityFilter([1000.0, -999.0], [1.0, 0.0, 0.0]),
         zwidth.FOAW(1e-6, 12),
-    ],
-)
-def test_the_estimate_is_right_from_the_first_sample_of_a_device_that_comes_on_a_line(velocity):
-    device = zwidth.Device(0.1, 0.0)
-    scene = zwidth.Scene(device, zwidth.Timing(1e-3, 0.0), velocity=velocity)
-    motion = run(scene, stiffness=0.0, virtual_damping=0.0, start_position=2e-3, start_velocity=0.05)
-    expected = np.full(200, 0.05)
-    if isinstance(velocity, zwidth.VelocityFilter):
-        top, bottom = velocity_polynomials(scene)
-        expected = scipy.signal.lfilter(top, bottom, 2e-3 + 5e-5 * np.arange(-60_000, 200))[-200:]
-    assert motion.estimated_velocity == pytest.approx(expected, rel=1e-10)
+    )
+    scenes = [
+        zwidth.Scene(zwidth.Device(0.1, 0.0), zwidth.Timing(1e-3, 0.0), velocity=velocity) for velocity in velocities
+    ]
+    motions = run(scenes, stiffness=0.0, virtual_damping=0.0, start_position=2e-3, start_velocity=0.05)
+    for scene, estimated in zip(scenes, motions.estimated_velocity, strict=True):
+        expected = np.full(200, 0.05)
+        if isinstance(scene.velocity, zwidth.VelocityFilter):
+            top, bottom = velocity_polynomials(scene)
+            expected = scipy.signal.lfilter(top, bottom, 2e-3 + 5e-5 * np.arange(-60_000, 200))[-200:]
+        assert estimated == pytest.approx(expected, rel=1e-10), scene.velocity
 
 
 def test_filters_are_those_of_scipy_on_what_was_measured():
-    for velocity in (zwidth.LowPass(cutoff=40.0), zwidth.Butterworth(60.0, 3), zwidth.WindowedDifference(7)):
-        scene = zwidth.Scene(SCENE.device, SCENE.timing, velocity=velocity)
-        motion = run(scene, noise=1e-4, resolution=3e-5, start_position=9e-5)
+    velocities = zwidth.LowPass(cutoff=40.0), zwidth.Butterworth(60.0, 3), zwidth.WindowedDifference(7)
+    scenes = [zwidth.Scene(SCENE.device, SCENE.timing, velocity=velocity) for velocity in velocities]
+    motions = run(scenes, noise=1e-4, resolution=3e-5, start_position=9e-5)
+    for scene, measured, estimated in zip(scenes, motions.measured, motions.estimated_velocity, strict=True):
         top, bottom = velocity_polynomials(scene)
         past = scipy.signal.lfilter_zi(top, bottom) * 9e-5
-        expected, _ = scipy.signal.lfilter(top, bottom, motion.measured, zi=past)
-        assert motion.estimated_velocity == pytest.approx(expected, rel=0, abs=1e-11 * np.abs(expected).max())
+        expected, _ = scipy.signal.lfilter(top, bottom, measured, zi=past)
+        assert estimated == pytest.approx(expected, rel=0, abs=1e-11 * np.abs(expected).max())
 
 
 def fit_ends(counts, bound, longest):
