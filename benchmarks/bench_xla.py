@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure what each trick of `arrays.xp` gains: the same work with it and without, in turns, in one process.
+"""Measure what each trick of `words.xp` gains: the same work with it and without, in turns, in one process.
 
     python benchmarks/bench_xla.py [--points 65536] [--runs 15] [--only TEXT]
 
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from methods.clock import time_calls
-from zwidth.arrays import evaluate, xp
+from zwidth.arrays import evaluate
 from zwidth.loops.rigid import (
     certified_filter,
     circle,
@@ -33,6 +33,7 @@ from zwidth.loops.rigid import (
     pole_search as radius,
 )
 from zwidth.loops.rigid.device import ANY
+from zwidth.words import xp
 
 Make = Callable[[], Callable[..., Any]]
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.xp import namespace
 from zwidth.words.types import Array
+from zwidth.words.xp import namespace
 
 UNIT = 2.0**-53
 TINY = 2.0**-1000

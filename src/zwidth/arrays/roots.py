@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import along, frozen, namespace, repeat
 from zwidth.words.types import Array
+from zwidth.words.xp import along, frozen, namespace, repeat
 
 Function = Callable[[Array], Array]
 Sloped = Callable[[Array], tuple[Array, Array]]

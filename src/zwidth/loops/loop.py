@@ -15,12 +15,9 @@ from typing import Any, ClassVar, NamedTuple, get_args
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import check_scalars
-from zwidth.arrays.xp import is_jax, is_traced, namespace, nan_beyond
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.chain import AnyChain, chain_of
 from zwidth.loops.linear.held import find_roots
 from zwidth.loops.linear.margins import linear_margins, open_loop_response
 from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
@@ -39,11 +36,14 @@ from zwidth.loops.rigid.ridge import RidgePoint, alpha_max
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import Stability, StabilityMethod, decide_stability, is_stable
 from zwidth.loops.variants import RIGID_PARAMETERS, RigidVariants, Variants
+from zwidth.parts.chain import AnyChain, chain_of
+from zwidth.parts.circle import circle
 from zwidth.parts.paths import AnyScene, list_parameters, replace_parameters
 from zwidth.words.errors import InputError, ZwidthError
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array, DelayModel
+from zwidth.words.xp import is_jax, is_traced, namespace, nan_beyond
 
 
 class SlowestMotion(NamedTuple):

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, evaluate, join_shapes
-from zwidth.arrays.xp import is_jax, is_traced, namespace, nan_unless, within
 from zwidth.parts.checks import accept_units, in_periods
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, SI_RANGE, SIZES
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
+from zwidth.words.xp import is_jax, is_traced, namespace, nan_unless, within
 
 
 @shown()

@@ -10,10 +10,11 @@ import numpy as np
 from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.rows import Island
-from zwidth.loops.linear.state_space import StateSpace, closed_loop, delayed_device, open_loop
+from zwidth.loops.linear.state_space import closed_loop, delayed_device, open_loop
 from zwidth.loops.rigid.margins import Margins
 from zwidth.loops.rigid.verdict import STABILITY_METHODS, Stability, StabilityMethod
 from zwidth.parts.checks import read_texts
+from zwidth.parts.state_space import StateSpace
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.base import SceneParts

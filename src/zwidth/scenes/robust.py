@@ -15,7 +15,6 @@ import numpy as np
 from zwidth.arrays.balls import quantities
 from zwidth.arrays.evaluate import as_float64, join_shapes
 from zwidth.arrays.roots import bisect
-from zwidth.arrays.xp import is_traced
 from zwidth.loops.normalization import normalize, quantity_status
 from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.certified_filter import stable_everywhere
@@ -26,6 +25,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
+from zwidth.words.xp import is_traced
 
 _NAMES = ("mass", "damping", "period", "delay")
 # How far the proved bound may lie below what a device was found to limit it to, and what it is then; where that cannot

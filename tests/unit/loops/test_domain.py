@@ -4,10 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from zwidth.arrays.xp import nan_unless, nan_with_nan_slopes
 from zwidth.loops.rigid.device import device_status, wall_status
 from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
 from zwidth.words.status import Status
+from zwidth.words.xp import nan_unless, nan_with_nan_slopes
 
 
 @pytest.mark.parametrize("place, end", [(0, LARGEST_DAMPING), (1, LONGEST_DELAY)])

@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import ON_CIRCLE, circle, depths
 from zwidth.loops.linear.curve import (
     Arc,
     CrossingLine,
@@ -29,6 +28,7 @@ from zwidth.loops.linear.curve import (
     zeros_of,
 )
 from zwidth.loops.linear.roots import LoopRoots
+from zwidth.parts.circle import ON_CIRCLE, circle, depths
 
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
 _MOST_STEPS, _ARRIVED = 120, 1e-10

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.loops.linear.chain import AnyChain, chain_of
-from zwidth.loops.linear.system import System
 from zwidth.loops.rigid import certified
+from zwidth.parts.chain import AnyChain, chain_of
 from zwidth.parts.linear_device import LinearDevice
+from zwidth.parts.system import System
 from zwidth.parts.velocity import Butterworth, Estimate, LowPass, VelocityFilter, WindowedDifference
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import ON_CIRCLE, circle, depths
 from zwidth.arrays.roots import zeros_between
 from zwidth.loops.linear.roots import LoopRoots
+from zwidth.parts.circle import ON_CIRCLE, circle, depths
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
 _STEP = 0.08

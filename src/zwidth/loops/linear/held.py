@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import CirclePoints, circle, lag_jet
-from zwidth.arrays.xp import frozen, namespace, repeat
 from zwidth.loops.linear.certified import prove_zeros
-from zwidth.loops.linear.chain import AnyChain, Chain, is_zero
 from zwidth.loops.linear.roots import LoopRoots, step_apart
-from zwidth.loops.linear.system import System
 from zwidth.loops.rigid.device import Plant, factor_numerator, held_plant
+from zwidth.parts.chain import AnyChain, Chain, is_zero
+from zwidth.parts.circle import CirclePoints, circle, lag_jet
+from zwidth.parts.system import System
+from zwidth.words.xp import frozen, namespace, repeat
 
 # Continuous zeros slower than this a period lead to sampled ones; Aberth's steps at most, and the last one's share.
 _SLOW, _MOST_STEPS, _ARRIVED = 0.1, 30, 1e-13

@@ -20,19 +20,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import CirclePoints, Jet, circle
 from zwidth.arrays.roots import zeros_between
-from zwidth.arrays.xp import within
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.chain import AnyChain
 from zwidth.loops.linear.curve import nodes_of
 from zwidth.loops.linear.held import find_roots
 from zwidth.loops.linear.poles import log_radius
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import label_walls
 from zwidth.loops.rigid.margins import Margins
+from zwidth.parts.chain import AnyChain
+from zwidth.parts.circle import CirclePoints, Jet, circle
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
+from zwidth.words.xp import within
 
 # Halvings beside a zero of the wall, and how much of itself the wall may change from node to node.
 _HALVINGS, _SHARE = 40, 0.25

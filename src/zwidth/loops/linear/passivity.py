@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
+from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 

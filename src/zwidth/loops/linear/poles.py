@@ -15,16 +15,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import Jet
-from zwidth.arrays.xp import within
 from zwidth.loops.linear.roots import LoopRoots, affine_polynomial, closed_loop_roots, step_apart
 from zwidth.loops.rigid.counting import count_poles
 from zwidth.loops.rigid.pole_step import square
 from zwidth.loops.rigid.poles import companion
+from zwidth.parts.circle import Jet
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import MOST_POLES, WALL_RANGE
 from zwidth.words.types import Array
+from zwidth.words.xp import within
 
 # Aberth's steps at most, and the step, in units of the pole's own distance from z = 1, that ends them.
 _STEPS, _ARRIVED = 60, 4e-16

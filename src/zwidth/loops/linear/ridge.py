@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.evaluate import evaluate
 from zwidth.loops.linear.border import Border
-from zwidth.loops.linear.chain import chain_of
 from zwidth.loops.linear.held import hold
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import bound_intervals
 from zwidth.loops.rigid.device import classify_delays
 from zwidth.loops.rigid.ridge import slopes_kernel, stiffness_slopes
+from zwidth.parts.chain import chain_of
+from zwidth.parts.circle import CirclePoints, circle, lag_jet
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import WALL
 from zwidth.words.showing import shown

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zwidth.arrays.circle import ON_CIRCLE, CirclePoints, Jet, circle, depths, lag_jet, product_jet
 from zwidth.loops.rigid.polynomial import Affine
+from zwidth.parts.circle import ON_CIRCLE, CirclePoints, Jet, circle, depths, lag_jet, product_jet
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 

@@ -16,20 +16,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import broadcast_traced
-from zwidth.arrays.xp import is_traced, nan_with_nan_slopes
-from zwidth.loops.linear.chain import AnyChain, chain_of
 from zwidth.loops.linear.held import required_wall, respond
 from zwidth.loops.linear.ridge import Condition, moving_paths
 from zwidth.loops.rigid.exact_points import polish
 from zwidth.loops.rigid.ridge import RidgePoint
+from zwidth.parts.chain import AnyChain, chain_of
 from zwidth.parts.checks import in_periods
+from zwidth.parts.circle import circle
 from zwidth.parts.paths import replace_parameters
 from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
+from zwidth.words.xp import is_traced, nan_with_nan_slopes
 
 # A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
 _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.roots import narrow_dips
-from zwidth.loops.linear.chain import AnyChain
 from zwidth.loops.linear.margins import nearest_gain_crossover, nearest_phase_crossover
 from zwidth.loops.linear.rows import Island, side_by_side
 from zwidth.loops.loop import LinearLoop, SlowestMotion
@@ -18,6 +17,7 @@ from zwidth.loops.measured.curve import Decided, DecidedWalls, ResponseCurve
 from zwidth.loops.rigid.margins import Margins
 from zwidth.loops.rigid.ridge import RidgePoint
 from zwidth.loops.rigid.verdict import Stability, StabilityMethod
+from zwidth.parts.chain import AnyChain
 from zwidth.words.errors import InputError
 from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array

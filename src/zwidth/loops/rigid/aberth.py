@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from zwidth.arrays.xp import epsilon, namespace, nan_with_nan_slopes, repeat, store_once
 from zwidth.loops.rigid.circle import Loop, factor_loop
 from zwidth.loops.rigid.device import valid_wall
 from zwidth.loops.rigid.folding import Degree
 from zwidth.loops.rigid.pole_step import Pair, join
 from zwidth.words.types import Array, Radii, RadiiFirst, Reals, Roots, RootsFirst
+from zwidth.words.xp import epsilon, namespace, nan_with_nan_slopes, repeat, store_once
 
 # With half as many more as there are poles, all but some 2 walls in 1,000 are settled.
 _FIRST_STEPS = 9

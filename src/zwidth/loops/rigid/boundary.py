@@ -9,7 +9,6 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_number, check_scalars, evaluate
 from zwidth.arrays.roots import follow_root, integrate
-from zwidth.arrays.xp import frozen, namespace, nan_with_nan_slopes, store_once, tree_map
 from zwidth.loops.rigid.curve import column_end, creeps, frequency, lobe, on_line, peak, row_end, wall
 from zwidth.loops.rigid.device import DelayClasses, classify_delays, valid_device, wall_status
 from zwidth.loops.rigid.polynomial import Wall, check_delay_model, frequency_boundary, frequency_loop
@@ -19,6 +18,7 @@ from zwidth.words.errors import InputError, check_choice
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, DelayModel, Vertices
+from zwidth.words.xp import frozen, namespace, nan_with_nan_slopes, store_once, tree_map
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
 

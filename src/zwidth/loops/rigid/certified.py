@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.arrays.xp import horner
 from zwidth.loops.rigid.certified_filter import OPEN, STABLE, UNSTABLE, filter_walls
 from zwidth.loops.rigid.crossover import Lag, Verdict, first_zero, long_verdict, short_verdict
 from zwidth.loops.rigid.device import DeviceTerms, PhiFunctions, held_plant, wall_status
 from zwidth.loops.rigid.folding import Points, pick_points
 from zwidth.words.status import Status
+from zwidth.words.xp import horner
 
 if TYPE_CHECKING:
     import flint

@@ -15,7 +15,6 @@ import numpy as np
 
 from zwidth.arrays.balls import TINY, UNIT, Ball, Form, chord
 from zwidth.arrays.evaluate import evaluate_columns
-from zwidth.arrays.xp import COSINE, SINE, fit_arcsine, horner, namespace, store_once
 from zwidth.loops.rigid.crossover import Lag, first_zero, long_verdict, short_verdict
 from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, classify_delays, device, phi_functions, wall_status
 from zwidth.loops.rigid.folding import Points, pick_points
@@ -23,6 +22,7 @@ from zwidth.loops.rigid.row_limit import row_limits
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
+from zwidth.words.xp import COSINE, SINE, fit_arcsine, horner, namespace, store_once
 
 UNSTABLE, STABLE, OPEN = 0, 1, 2
 # Added to the code where alpha or beta is 0 or a value is out of range: XLA takes numbers below 2^-1022 for zero, and

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import angle, apply_each, epsilon, find_turn, namespace, nan_unless, repeat
 from zwidth.loops.rigid.crossover import first_zero
 from zwidth.loops.rigid.device import factor_numerator, held_plant, split_delay, valid_wall
 from zwidth.words.types import Array
+from zwidth.words.xp import angle, apply_each, epsilon, find_turn, namespace, nan_unless, repeat
 
 # Steps of the bracketed Newton iteration for the zeros of the cubic.
 _CUBIC_STEPS = 6

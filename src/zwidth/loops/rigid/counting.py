@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import join_shapes, to_caller
-from zwidth.arrays.xp import is_traced, namespace
 from zwidth.words.errors import InputError
 from zwidth.words.types import Array, ArrayLike, Counts, RootsLike
+from zwidth.words.xp import is_traced, namespace
 
 # Concrete batches run in blocks of this many loops: their intermediate arrays then stay in the cache.
 _BLOCK = 1 << 9

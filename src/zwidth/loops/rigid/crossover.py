@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import follow_root
-from zwidth.arrays.xp import ARCSINE, COSINE, SINE, find_turn, frozen, horner, namespace, roots, within
 from zwidth.loops.rigid.device import ANY, DelayClasses, DeviceTerms, device, long_curve, short_curve
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
+from zwidth.words.xp import ARCSINE, COSINE, SINE, find_turn, frozen, horner, namespace, roots, within
 
 # From its start the zero of the cubic is within 11 %; each step squares that.
 _NEWTON_STEPS = 4

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import bisect
-from zwidth.arrays.xp import frozen, horner, namespace, repeat, store_once
 from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, device, short_curve
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (
@@ -31,6 +30,7 @@ from zwidth.loops.rigid.row_limit import (
     turn_angles,
 )
 from zwidth.words.types import Array
+from zwidth.words.xp import frozen, horner, namespace, repeat, store_once
 
 # From starts within 28 % (the cubic for n = 0) and 0.3 % of x.
 _CUBIC_STEPS, _COLUMN_STEPS = 4, 3

@@ -23,11 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64
-from zwidth.arrays.xp import horner, is_traced, namespace, nan_unless, within
 from zwidth.loops.normalization import quantity_status
 from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
+from zwidth.words.xp import horner, is_traced, namespace, nan_unless, within
 
 _SERIES_BELOW = 2.5
 # The first term left out is below 1.25^22/23! = 6e-21 of the sum, and of its first two derivatives.

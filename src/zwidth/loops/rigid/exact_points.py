@@ -23,14 +23,14 @@ import jax
 import jax.numpy as jnp
 import optimistix
 
-from zwidth.arrays.circle import circle
-from zwidth.arrays.xp import nan_with_nan_slopes, store_once
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import device_status, wall_status
 from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.ridge_newton import corner, expand_curve
+from zwidth.parts.circle import circle
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
+from zwidth.words.xp import nan_with_nan_slopes, store_once
 
 # Each step halves the bracket: 52 of them leave one unit in the last place of a float64.
 _HALVINGS = 52

@@ -24,10 +24,10 @@ from zwidth.arrays.evaluate import (
     join_shapes,
     to_caller,
 )
-from zwidth.arrays.xp import is_traced, tree_map
 from zwidth.words.errors import TracedDelayError
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import ArrayLike
+from zwidth.words.xp import is_traced, tree_map
 
 NAMES: tuple[str, ...] = ("alpha", "beta", "delta", "d")
 

@@ -12,12 +12,12 @@ import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.roots import false_position, follow_root, narrow_dips
-from zwidth.arrays.xp import along, apply_each, epsilon, frozen, horner, namespace, nan_with_nan_slopes, store_once
 from zwidth.loops.rigid.crossover import stable_at
 from zwidth.loops.rigid.device import ANY, DeviceTerms, device, short_curve, split_delay, valid_wall
 from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, gain_frequency, modulus, size_and_phase
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
+from zwidth.words.xp import along, apply_each, epsilon, frozen, horner, namespace, nan_with_nan_slopes, store_once
 
 # Steps of false position at most; every sixth one halves the bracket.
 _STEPS = 240

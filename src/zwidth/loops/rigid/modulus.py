@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.roots import follow_root, newton
-from zwidth.arrays.xp import along, apply_each, frozen, namespace, store_once
 from zwidth.loops.rigid.crossover import gain_crossover
 from zwidth.loops.rigid.device import DeviceTerms
 from zwidth.words.types import Array
+from zwidth.words.xp import along, apply_each, frozen, namespace, store_once
 
 
 def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:

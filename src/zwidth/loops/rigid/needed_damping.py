@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import newton
-from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace
 from zwidth.loops.rigid.device import ANY, DelayClasses, split_delay
 from zwidth.words.types import Array
+from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace
 
 # Of the peak, from its fit; of the direction from which it exists, from twice its beta at most.
 _STEPS, _DIRECTION_STEPS = 3, 12

@@ -14,12 +14,12 @@ import numpy as np
 
 from zwidth.arrays.evaluate import FEW, as_number, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.roots import integrate
-from zwidth.arrays.xp import frozen, horner, is_traced, namespace, nan_with_nan_slopes
 from zwidth.loops.rigid.device import ANY, DelayClasses, classify_delays, valid_device, valid_wall
 from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by
 from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import Array, ArrayLike
+from zwidth.words.xp import frozen, horner, is_traced, namespace, nan_with_nan_slopes
 
 # Chebyshev terms: the last one is below 1e-16 for every delay.
 _TERMS = 30

@@ -12,7 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import follow_root
-from zwidth.arrays.xp import (
+from zwidth.loops.rigid.circle import Loop, count, factor_loop
+from zwidth.loops.rigid.device import valid_wall
+from zwidth.loops.rigid.pole_step import halley_step, join, move_pole, newton_step, value_at
+from zwidth.words.types import Array
+from zwidth.words.xp import (
     angle,
     apply_each,
     epsilon,
@@ -23,10 +27,6 @@ from zwidth.arrays.xp import (
     repeat,
     store_once,
 )
-from zwidth.loops.rigid.circle import Loop, count, factor_loop
-from zwidth.loops.rigid.device import valid_wall
-from zwidth.loops.rigid.pole_step import halley_step, join, move_pole, newton_step, value_at
-from zwidth.words.types import Array
 
 # Steps on both starts, then on the larger of the two; where that was not enough, on it and the other one, then on all.
 _BOTH, _LARGER, _AGAIN, _PATIENT = 2, 3, 6, 10

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import COSINE, SINE, epsilon, horner, namespace, store_once
 from zwidth.loops.rigid.circle import Loop
 from zwidth.words.types import Array
+from zwidth.words.xp import COSINE, SINE, epsilon, horner, namespace, store_once
 
 # Rounding errors of P in units of the sum of its parts' moduli: of its factors, and of the angle p im.
 _ROUNDING = 16.0

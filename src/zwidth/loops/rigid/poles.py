@@ -9,7 +9,6 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, map_blocks, to_caller
-from zwidth.arrays.xp import is_traced, namespace, nan_with_nan_slopes, repeat
 from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, product_form, split, with_zero
 from zwidth.loops.rigid.device import valid_wall, wall_status
 from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
@@ -19,6 +18,7 @@ from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, Coefficients, Matrices, Reals, Roots, RootsFirst
+from zwidth.words.xp import is_traced, namespace, nan_with_nan_slopes, repeat
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 

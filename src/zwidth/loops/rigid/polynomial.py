@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from zwidth.arrays.xp import namespace, nan_with_nan_slopes
 from zwidth.loops.rigid.device import Plant, held_plant, split_delay, valid_wall
 from zwidth.loops.rigid.folding import Degree, map_by_degree
 from zwidth.loops.rigid.ridge_newton import expand_curve, wall, wave_at
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
+from zwidth.words.xp import namespace, nan_with_nan_slopes
 
 
 class Affine(NamedTuple):

@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward, store_once
 from zwidth.loops.rigid.device import (
     ANY,
     GAP,
@@ -37,6 +36,7 @@ from zwidth.words.errors import check_choice
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
+from zwidth.words.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward, store_once
 
 
 def _chi(x: Array, gap: Array) -> Array:

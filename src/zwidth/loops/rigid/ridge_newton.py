@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import newton
-from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
 from zwidth.loops.rigid.device import ANY, DelayClasses, DeviceTerms, Plant
 from zwidth.words.types import Array
+from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
 
 
 class Curve(NamedTuple):

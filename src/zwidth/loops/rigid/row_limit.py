@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import FEW, Route, evaluate_columns
-from zwidth.arrays.xp import COSINE, SINE, horner, namespace, nan_beyond, repeat
 from zwidth.loops.rigid.device import DeviceTerms, device, long_curve, short_curve
 from zwidth.loops.rigid.folding import Points, group_by
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
+from zwidth.words.xp import COSINE, SINE, horner, namespace, nan_beyond, repeat
 
 # From the starting points below each sequence doubles its digits a step: 6 steps end a lobe, the last one to confirm;
 # 2 leave a row with some 2e-9 of its frequency, which the step in alpha behind them squares.

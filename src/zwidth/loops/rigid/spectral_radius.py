@@ -7,7 +7,6 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import broadcast, check_scalars, evaluate, to_caller
-from zwidth.arrays.xp import is_traced, namespace
 from zwidth.loops.rigid.device import classify_delays
 from zwidth.loops.rigid.folding import NAMES
 from zwidth.loops.rigid.outermost_poles import ACCURACY, find_poles
@@ -16,6 +15,7 @@ from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.loops.rigid.polynomial import check_has_poles
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import Array, ArrayLike, DelayModel
+from zwidth.words.xp import is_traced, namespace
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
 

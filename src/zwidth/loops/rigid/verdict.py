@@ -7,7 +7,6 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
-from zwidth.arrays.xp import is_traced
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import classify_delays, wall_status
 from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments
@@ -18,6 +17,7 @@ from zwidth.words.errors import InputError, check_choice
 from zwidth.words.showing import shown
 from zwidth.words.status import Method, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
+from zwidth.words.xp import is_traced
 
 StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
 STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.arrays.circle import circle
 from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.linear.held import required_wall, sampled
+from zwidth.parts.circle import circle
 
 T = 1e-3
 Draw = Callable[[float, float], float]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.arrays.circle import circle
+from zwidth.parts.circle import circle
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 

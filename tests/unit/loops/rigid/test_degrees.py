@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zwidth.arrays.xp import namespace
 from zwidth.loops.rigid.folding import Degree, find_degree, map_by_degree
 from zwidth.words.errors import TracedDelayError
+from zwidth.words.xp import namespace
 
 DELAYS = np.array([2.0, 0.0, 0.5, 2.0, np.nan, 1e-300, 7.25, 0.0, -1.0, np.inf])
 DEGREES = [(2, False), (0, False), (0, True), (2, False), (0, False), (0, True), (7, True), (0, False)]

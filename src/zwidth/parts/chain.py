@@ -18,12 +18,12 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.xp import namespace
-from zwidth.loops.linear.system import FASTEST, Realization, System
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.paths import Parts
+from zwidth.parts.system import FASTEST, Realization, System
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
+from zwidth.words.xp import namespace
 
 
 class Body(NamedTuple):

@@ -3,7 +3,7 @@
 import jax
 import pytest
 
-from zwidth.arrays.xp import find_turn
+from zwidth.words.xp import find_turn
 
 
 @pytest.mark.parametrize("x", [0.1, 0.5, 0.9])

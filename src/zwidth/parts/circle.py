@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import frozen, namespace
 from zwidth.words.types import Array
+from zwidth.words.xp import frozen, namespace
 
 # Nearer to the circle than this a root of the loop is on it: an undamped mode, or a zero of an undamped device.
 ON_CIRCLE = 1e-12
