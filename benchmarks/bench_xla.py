@@ -20,7 +20,8 @@ import numpy as np
 
 from methods.clock import time_calls
 from zwidth.arrays import evaluate
-from zwidth.loops.rigid import (
+from zwidth.arrays.held_mass import ANY
+from zwidth.rigid import (
     certified_filter,
     circle,
     crossover,
@@ -29,10 +30,9 @@ from zwidth.loops.rigid import (
     ridge,
     ridge_newton,
 )
-from zwidth.loops.rigid import (
+from zwidth.rigid import (
     pole_search as radius,
 )
-from zwidth.loops.rigid.device import ANY
 from zwidth.words import xp
 
 Make = Callable[[], Callable[..., Any]]

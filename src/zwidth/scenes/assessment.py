@@ -9,13 +9,13 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.loops.linear.passivity import find_obstacle
-from zwidth.loops.rigid.margins import Margins
+from zwidth.linear.passivity import find_obstacle
 from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
+from zwidth.words.results import Margins
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
