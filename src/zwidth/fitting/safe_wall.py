@@ -19,8 +19,7 @@ import numpy as np
 
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
-from zwidth.linear.held import Sampled
-from zwidth.linear.state_space import delay_force
+from zwidth.linear.held import Sampled, delay_force
 from zwidth.parts.chain import Body, Chain, Resonance
 from zwidth.parts.circle import circle
 from zwidth.parts.state_space import StateSpace, estimate_matrices, in_series

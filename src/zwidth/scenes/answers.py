@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
+from zwidth.linear.held import closed_loop, delayed_device, open_loop
 from zwidth.linear.passivity import find_obstacle
 from zwidth.linear.rows import Island
-from zwidth.linear.state_space import closed_loop, delayed_device, open_loop
 from zwidth.parts.checks import read_texts
 from zwidth.parts.state_space import StateSpace
 from zwidth.parts.velocity import BackwardDifference
