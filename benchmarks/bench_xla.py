@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure what each trick of `arrays.xp` gains: the same work with it and without, in turns, in one process.
+"""Measure what each trick of `words.xp` gains: the same work with it and without, in turns, in one process.
 
     python benchmarks/bench_xla.py [--points 65536] [--runs 15] [--only TEXT]
 
@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from methods.clock import time_calls
-from zwidth.arrays import evaluate, xp
-from zwidth.loops.rigid import (
+from zwidth.arrays import evaluate
+from zwidth.arrays.held_mass import ANY
+from zwidth.rigid import (
     certified_filter,
     circle,
     crossover,
@@ -29,10 +30,10 @@ from zwidth.loops.rigid import (
     ridge,
     ridge_newton,
 )
-from zwidth.loops.rigid import (
+from zwidth.rigid import (
     pole_search as radius,
 )
-from zwidth.loops.rigid.device import ANY
+from zwidth.words import xp
 
 Make = Callable[[], Callable[..., Any]]
 

@@ -127,7 +127,7 @@ def scenes() -> Answers:
             stiffness = K * 10.0 ** random.uniform(-2, 0.1, 30)
             damping = random.uniform(-0.2, 1.5, 30) * (abs(float(np.nan_to_num(top.virtual_damping))) + size)
             yield from flatten(f"{name}.max_stiffness", top)
-            for question in ("is_stable", "decide_stability", "spectral_radius", "poles", "pole_table"):
+            for question in ("is_stable", "decide_stability", "spectral_radius", "poles"):
                 yield from ask(f"{name}.{question}", getattr(scene, question), stiffness, damping)
             for question in ("is_passive", "passivity_margin"):
                 yield from ask(f"{name}.{question}", getattr(scene, question), stiffness, damping)

@@ -1,5 +1,6 @@
 """Every public name, once: what loads it on first use, and what type checkers read."""
 
+from .arrays.counting import count_poles as count_poles
 from .arrays.kernel_cache import use_compilation_cache as use_compilation_cache
 from .figures import plot as plot
 from .fitting.buzz import BuzzPoint as BuzzPoint
@@ -15,31 +16,6 @@ from .fitting.log import fit_log as fit_log
 from .fitting.respond import ResponseEstimate as ResponseEstimate
 from .fitting.respond import respond as respond
 from .fitting.safe_wall import SafeWall as SafeWall
-from .loops.normalization import denormalize as denormalize
-from .loops.normalization import normalize as normalize
-from .loops.rigid.boundary import BoundaryPoint as BoundaryPoint
-from .loops.rigid.boundary import StableRegion as StableRegion
-from .loops.rigid.boundary import boundary as boundary
-from .loops.rigid.boundary import boundary_point as boundary_point
-from .loops.rigid.boundary import stable_area as stable_area
-from .loops.rigid.boundary import stable_region as stable_region
-from .loops.rigid.counting import count_poles as count_poles
-from .loops.rigid.margins import Margins as Margins
-from .loops.rigid.margins import margins as margins
-from .loops.rigid.passivity import is_passive as is_passive
-from .loops.rigid.passivity import passive_area as passive_area
-from .loops.rigid.passivity import passivity_margin as passivity_margin
-from .loops.rigid.poles import poles as poles
-from .loops.rigid.polynomial import char_poly as char_poly
-from .loops.rigid.response import StepResponse as StepResponse
-from .loops.rigid.response import step_response as step_response
-from .loops.rigid.ridge import RidgePoint as RidgePoint
-from .loops.rigid.ridge import alpha_max as alpha_max
-from .loops.rigid.ridge import stiffness_slope as stiffness_slope
-from .loops.rigid.spectral_radius import decay_rate as decay_rate
-from .loops.rigid.spectral_radius import spectral_radius as spectral_radius
-from .loops.rigid.verdict import decide_stability as decide_stability
-from .loops.rigid.verdict import is_stable as is_stable
 from .parts import devices as devices
 from .parts.actuator import Actuator as Actuator
 from .parts.device import Coupling as Coupling
@@ -56,6 +32,28 @@ from .parts.velocity import LowPass as LowPass
 from .parts.velocity import VelocityFilter as VelocityFilter
 from .parts.velocity import WindowedDifference as WindowedDifference
 from .parts.wall import VirtualWall as VirtualWall
+from .rigid.boundary import BoundaryPoint as BoundaryPoint
+from .rigid.boundary import StableRegion as StableRegion
+from .rigid.boundary import boundary as boundary
+from .rigid.boundary import boundary_point as boundary_point
+from .rigid.boundary import stable_area as stable_area
+from .rigid.boundary import stable_region as stable_region
+from .rigid.margins import margins as margins
+from .rigid.normalization import denormalize as denormalize
+from .rigid.normalization import normalize as normalize
+from .rigid.passivity import is_passive as is_passive
+from .rigid.passivity import passive_area as passive_area
+from .rigid.passivity import passivity_margin as passivity_margin
+from .rigid.poles import poles as poles
+from .rigid.polynomial import char_poly as char_poly
+from .rigid.response import StepResponse as StepResponse
+from .rigid.response import step_response as step_response
+from .rigid.ridge import alpha_max as alpha_max
+from .rigid.ridge import stiffness_slope as stiffness_slope
+from .rigid.spectral_radius import decay_rate as decay_rate
+from .rigid.spectral_radius import spectral_radius as spectral_radius
+from .rigid.verdict import decide_stability as decide_stability
+from .rigid.verdict import is_stable as is_stable
 from .runs import run as run
 from .runs.report.page import write_report as write_report
 from .scenes.answers import to_control as to_control
@@ -90,6 +88,8 @@ from .words.errors import PrecisionWarning as PrecisionWarning
 from .words.errors import StoreExistsError as StoreExistsError
 from .words.errors import TracedDelayError as TracedDelayError
 from .words.errors import ZwidthError as ZwidthError
+from .words.results import Margins as Margins
+from .words.results import RidgePoint as RidgePoint
 from .words.status import RidgeKind as RidgeKind
 from .words.status import Status as Status
 

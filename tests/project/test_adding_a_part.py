@@ -55,7 +55,7 @@ EDITS = {
         ),
         "from zwidth.parts.operator": f"{IMPORT}from zwidth.parts.operator",
     },
-    "loops/linear/chain.py": {
+    "parts/chain.py": {
         "    links = []\n": (
             "    links = []\n"
             "    if (mount := scene.mount) is not None:\n"

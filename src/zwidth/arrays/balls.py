@@ -11,19 +11,28 @@ certain for every number of the balls; NaN, and a radius that overflowed, make n
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from math import frexp
 from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.xp import namespace
 from zwidth.words.types import Array
+from zwidth.words.xp import namespace
 
 UNIT = 2.0**-53
 TINY = 2.0**-1000
 # What the rounding of radii may have lost.
 INFLATED = 1.0 + 2.0**-30
 _ROOT_ERROR = 2.0 * UNIT
+
+# Precisions of python-flint, one after the other until one is enough.
+BITS = tuple(128 << k for k in range(7))
+
+
+def available() -> bool:
+    """Whether python-flint is installed."""
+    return find_spec("flint") is not None
 
 
 class Ball:

@@ -20,10 +20,10 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from zwidth.arrays.threads import run_in_threads
-from zwidth.arrays.xp import WIDE, is_jax, is_traced, known_options, store_once, tree_map
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
+from zwidth.words.xp import WIDE, is_jax, is_traced, known_options, store_once, tree_map
 
 # The types whose conversion needs no check; bool and 0-d arrays take the long way.
 _PLAIN = frozenset({float, int, np.float64})

@@ -1,4 +1,4 @@
-"""Zeros and integrals of functions of one unknown, elementwise, one text for NumPy and JAX.
+"""Zeros and integrals of functions of one unknown, elementwise, one text for NumPy and JAX; of several under JAX.
 
 The number of steps is fixed, so that no point of a batch waits for another, and none depends on those beside it.
 """
@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import along, frozen, namespace, repeat
 from zwidth.words.types import Array
+from zwidth.words.xp import along, frozen, namespace, repeat
 
 Function = Callable[[Array], Array]
 Sloped = Callable[[Array], tuple[Array, Array]]
@@ -22,6 +22,8 @@ _HALVINGS = 60
 _SMALL = 1e-11
 # A phase in radians, which false position is for, is not known better.
 _ROUNDING = 1e-15
+# Of optimistix.
+_NEWTON_STEPS = 16
 
 
 def bisect(holds: Function, low: Array, high: Array, *, geometric: bool = False) -> Array:
@@ -239,3 +241,13 @@ def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes:
         pieces.append((low[..., None] + half * (node + 1.0), half * weight))
     points, weights = (xp.concatenate(parts, axis=-1) for parts in zip(*pieces, strict=True))
     return xp.sum(function(points) * weights, axis=-1)
+
+
+def polish(residual: Callable[[Array, Any], Array], start: Array, args: Any) -> Array:
+    """The zero of real equations next to a start by optimistix' Newton method, differentiable in ``args``."""
+    import jax.numpy as jnp
+    import optimistix
+
+    tolerance = float(16 * jnp.finfo(start.dtype).eps)
+    solver = optimistix.Newton(rtol=tolerance, atol=tolerance)
+    return optimistix.root_find(residual, solver, start, args=args, max_steps=_NEWTON_STEPS, throw=False).value

@@ -231,10 +231,6 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
     callback=read_pairs,
     help="Draw this slice, as in --at delta=0.1 --at delay=1ms.",
 )
-@click.option("--x", metavar="NAME", help="The parameter from left to right.")
-@click.option("--y", metavar="NAME", help="The parameter from bottom to top, of a plane.")
-@click.option("--hue", metavar="NAME", help="Draw curves, one for each value of this parameter.")
-@click.option("--col", metavar="NAME", help="A panel for each value of this parameter, all others at their first.")
 @click.option("--format", "formats", multiple=True, type=click.Choice(("png", "svg", "pdf")), default=("png", "svg"),
               help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
 @click.option("--dpi", type=click.IntRange(10, 2400), help="Dots an inch.")
@@ -253,10 +249,9 @@ def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, *
     """
     from zwidth.runs.draw import draw_stores
 
-    axes = {role: drawing.pop(role) for role in ("x", "y", "hue", "col")}
     told: dict[str, Any] = {"note": lambda text: click.echo(f"zwidth: {text}", err=True)}
     told |= {} if as_json else {"progress": lambda file: click.echo(f"wrote {file}")}
-    files = draw_stores(folder, out, at=at, axes=axes, **drawing, **told)
+    files = draw_stores(folder, out, at=at, **drawing, **told)
     if as_json:
         print_json({"files": [str(file) for file in files]})
     if not files:

@@ -10,7 +10,6 @@ from typing import Annotated, Any, ClassVar, TypeAlias
 import numpy as np
 from pydantic import ConfigDict, WrapValidator
 
-from zwidth.arrays.xp import within
 from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
 from zwidth.config.fields import LocatedProblem, listing, problem
 from zwidth.config.parts import SimulatedVelocityField, build_parts, list_parts, locate_refusal, make_parts_base
@@ -25,6 +24,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
 from zwidth.words.quantities import LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
 from zwidth.words.types import DelayModel
+from zwidth.words.xp import within
 
 _Parts: Any = make_parts_base("the difference of two samples", "none")
 

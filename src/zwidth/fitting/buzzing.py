@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.fitting.device_estimate import DimensionlessDevice
 from zwidth.fitting.required_wall import RequiredWall
 from zwidth.fitting.structure import LAGS, RATIOS, TURNS
+from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate, Velocity
 
 # Newton's steps towards w, the longest of them as a share of w, the last one's share (it squares), and the share

@@ -13,11 +13,11 @@ from typing import Any, cast
 import numpy as np
 
 from zwidth.fitting.respond import SURE, find_nominal_limit
-from zwidth.loops.measured.loop import MeasuredLoop
 from zwidth.parts.checks import check_number
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
+from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError

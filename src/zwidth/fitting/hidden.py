@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall
 from zwidth.fitting.structure import Recordings
-from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
 from zwidth.parts.actuator import Actuator
+from zwidth.parts.circle import circle
 from zwidth.parts.measured import MeasuredDevice
+from zwidth.scenes.measured_curve import LEAST_DAMPING_RATIO
 from zwidth.scenes.scene import Scene
 
 # Frequencies of the bank over the sampling rate; damping ratios with the steps of their frequencies, the last one that

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.loops.rigid.device import PhiFunctions, phi_functions
+from zwidth.arrays.held_mass import PhiFunctions, phi_functions
 
 
 class Pieces(NamedTuple):

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.circle import CirclePoints, Jet
-from zwidth.loops.rigid.device import Plant, held_plant, split_delay
-from zwidth.loops.rigid.ridge import plant_slopes
+from zwidth.arrays.held_mass import Plant, held_plant, split_delay
+from zwidth.parts.circle import CirclePoints, Jet
+from zwidth.rigid.ridge import plant_slopes
 from zwidth.words.types import Array
 
 # A double pole has no partial fractions.

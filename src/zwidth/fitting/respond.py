@@ -17,9 +17,9 @@ from zwidth.fitting.columns import LoggedMotion, join_logs
 from zwidth.fitting.encoder import find_resolution
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.recordings import find_runs, read_logs
-from zwidth.loops.measured.loop import MeasuredLoop
 from zwidth.parts.checks import check_number
 from zwidth.parts.measured import MeasuredDevice
+from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError

@@ -17,16 +17,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
-from zwidth.loops.linear.chain import Body, Chain, Resonance
-from zwidth.loops.linear.held import Sampled
-from zwidth.loops.linear.state_space import StateSpace, delay_force, estimate_matrices, in_series
-from zwidth.loops.rigid.device import device_status
-from zwidth.loops.variants import RigidVariants
+from zwidth.linear.held import Sampled, delay_force
+from zwidth.parts.chain import Body, Chain, Resonance
+from zwidth.parts.circle import circle
+from zwidth.parts.state_space import StateSpace, estimate_matrices, in_series
 from zwidth.parts.velocity import BackwardDifference, Estimate
+from zwidth.rigid.normalization import device_status
 from zwidth.scenes.tolerances import borne_by
+from zwidth.scenes.variants import RigidVariants
 from zwidth.simulation.flow import flow
 from zwidth.words.quantities import SI_RANGE
 from zwidth.words.showing import shown

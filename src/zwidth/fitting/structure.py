@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.arrays.held_mass import phi_functions
 from zwidth.fitting.device_estimate import DimensionlessDevice
 from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.fitting.moving import ModelledMotion, Recording, recur
 from zwidth.fitting.required_wall import list_poles
-from zwidth.loops.rigid.device import phi_functions
 
 # Of differences to both sides: of delta and of a followed pole absolute, of all else relative.
 _STEP = 1e-6

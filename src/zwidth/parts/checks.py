@@ -11,13 +11,13 @@ from typing import Any, ClassVar, Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
-from zwidth.arrays.xp import frozen, is_jax, namespace
 from zwidth.words.errors import InputError, UnusableValueError, check_choice
 from zwidth.words.formatting import describe, short
 from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, PARAMETERS, Range
 from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.types import Array
 from zwidth.words.units import TIME, find_dimension, read_quantity, tell_kind, to_float
+from zwidth.words.xp import frozen, is_jax, namespace
 
 
 def in_periods(delay: Array, period: Array) -> Array:

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
-from zwidth.arrays.xp import is_jax
 from zwidth.parts.actuator import Actuator
 from zwidth.parts.device import Coupling, Device
 from zwidth.parts.linear_device import LinearDevice
@@ -21,6 +20,7 @@ from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity, name_estimate
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError, describe_choice
+from zwidth.words.xp import is_jax
 
 
 class Parts(Protocol):

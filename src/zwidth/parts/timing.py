@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from zwidth.arrays.xp import is_jax
 from zwidth.parts.checks import Part, Span, check_number, check_span, in_periods
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, DelayModel
+from zwidth.words.xp import is_jax
 
 
 @dataclass(frozen=True, repr=False)

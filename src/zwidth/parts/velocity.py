@@ -14,11 +14,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.circle import CirclePoints, Jet, lag_jet, product_jet
-from zwidth.arrays.xp import is_jax, namespace
 from zwidth.parts.checks import Part
+from zwidth.parts.circle import CirclePoints, Jet, lag_jet, product_jet
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import Range
+from zwidth.words.xp import is_jax, namespace
 
 
 @dataclass(frozen=True)

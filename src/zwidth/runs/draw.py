@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.figures.curves import draw_curves, draw_outlines, find_family
-from zwidth.figures.grid import choose_axes, list_varied
+from zwidth.figures.grid import choose_axes
 from zwidth.figures.plane import Edges, draw_plane
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.style import Size, save, style_sheet
@@ -80,7 +80,6 @@ def draw_stores(
     out: str | os.PathLike[str] | None = None,
     *,
     at: Mapping[str, float | str] | None = None,
-    axes: Mapping[str, str | None] | None = None,
     formats: Sequence[str] = ("png", "svg"),
     dpi: float | None = None,
     size: Size | None = None,
@@ -90,17 +89,15 @@ def draw_stores(
 ) -> tuple[Path, ...]:
     """Draw the sweeps in a store, or in all stores of a folder, into ``figures`` beside them if ``out`` is left out."""
     # ``at`` chooses slices, by name: the nearest value that the sweep has to one in the units of the store or with one,
-    # as "1 ms", or the label of a device; of a parameter that is not given up to three values are shown. ``axes`` are
-    # the parameters over ``x``, ``y``, ``hue`` and ``col``, chosen from the sweep where left out. ``progress`` is
-    # called with every file, ``note`` with what a reader should know: other values than those wanted, stores without a
-    # figure.
+    # as "1 ms", or the label of a device; of a parameter that is not given up to three values are shown. ``progress``
+    # is called with every file, ``note`` with what a reader should know: other values than those wanted, stores without
+    # a figure.
     folder = Path(os.fsdecode(path))
     stores = list_stores(folder)
     beside = folder.parent if stores == [folder] else folder
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))
     # As stores spell them.
     wanted = {name.replace(".", "_"): value for name, value in (at or {}).items()}
-    given = {role: name.replace(".", "_") for role, name in (axes or {}).items() if name}
     datasets = {store: open_dataset(store).reset_coords(drop=True) for store in stores}
     for store in (store for store, data in datasets.items() if not data.attrs["complete"]):
         note(f"{store.name}: chunks are missing and left blank; 'zwidth run CONFIG --resume' computes them")
@@ -109,13 +106,12 @@ def draw_stores(
     if unknown:
         raise InputError(f"at: no sweep in {folder} varies {unknown[0]!r}; choose from {', '.join(known)}")
     slices = {store: _cut(store, data, wanted, note) for store, data in datasets.items()}
-    _check_axes(given, slices)
     files = []
     with style_sheet(style, size):
         for store, data in slices.items():
-            drawn = list(figures_of(data, given, make_edges(Store(store))))
+            drawn = list(figures_of(data, make_edges(Store(store))))
             if not drawn:
-                note(f"{store.name}: no figure, for {_explain_absence(data, given)}")
+                note(f"{store.name}: no figure, for {_explain_absence(data)}")
             for name, draw in drawn:
                 target.mkdir(parents=True, exist_ok=True)
                 stem = target / f"{store.name.removesuffix(SUFFIX)}_{name}"
@@ -125,50 +121,25 @@ def draw_stores(
     return tuple(files)
 
 
-def _check_axes(axes: Mapping[str, str], slices: Mapping[Path, xarray.Dataset]) -> None:
-    """Refuse axes that no sweep has, or that exclude each other."""
-    varied = sorted({str(dim) for data in slices.values() for dim, size in data.sizes.items() if size > 1})
-    if "y" in axes and "hue" in axes:
-        raise InputError("y, hue: got both; a plane has y, curves have a hue, give one of them")
-    for role, name in axes.items():
-        first = next(other for other, value in axes.items() if value == name)
-        if first != role:
-            raise InputError(f"{role}: got {name!r}, which is {first} already; choose another")
-        if name not in varied:
-            others = f"choose from {', '.join(varied)}" if varied else "a single point is left"
-            raise InputError(f"{role}: no sweep that is drawn varies {name!r}; {others}")
-        if name == "device" and role in ("x", "y"):
-            raise InputError(f"{role}: devices have no order; draw them with hue or col")
-
-
-def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
+def _explain_absence(data: xarray.Dataset) -> str:
     # A store lists its dimensions in any order.
     varied = [name for name in ("device", *VARIABLES) if data.sizes.get(name, 0) > 1]
-    missing = [name for name in axes.values() if name not in varied]
-    why = f"not over {', '.join(missing)}" if missing else "which draws none of its outputs"
-    return f"it varies over {', '.join(varied)}, {why}" if varied else "it is a single point"
+    return f"it varies over {', '.join(varied)}, which draws none of its outputs" if varied else "it is a single point"
 
 
-def figures_of(
-    data: xarray.Dataset, axes: Mapping[str, str] | None = None, edges: Edges | None = None
-) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The name of each figure of a sweep, or of a part of one, and what draws it, over axes by what they are."""
-    given = dict(axes or {})
+def figures_of(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """The name of each figure of a sweep, or of a part of one, and what draws it."""
     # A store lists its variables in any order.
     for name in OUTPUTS:
         if name not in data or name == "kind" or (name == "passive" and "stable" in data):
             continue
-        if not set(given.values()) <= set(list_varied(data, name)):
-            continue
-        x, y, col = (given.get(role) for role in ("x", "y", "col"))
-        over = choose_axes(data, name, x, y, but=(given.get("hue"), col))
+        over = choose_axes(data, name)
         few = OUTPUTS[name].family == "device" and min((data.sizes[axis] for axis in over), default=0) < _SURFACE
-        if y or (len(over) == 2 and not few and "hue" not in given):
-            if len(over) == 2:
-                yield name, partial(draw_plane, data, name, edges=edges, **given)
+        if len(over) == 2 and not few:
+            yield name, partial(draw_plane, data, name, edges=edges)
         elif over and OUTPUTS[name].dtype == "float64":
-            yield name, partial(draw_curves, data, name, **given)
-    if not given and find_family(data):
+            yield name, partial(draw_curves, data, name)
+    if find_family(data):
         yield "boundaries", partial(draw_outlines, data, edges=edges)
 
 

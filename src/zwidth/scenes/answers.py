@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
-from zwidth.loops.linear.passivity import find_obstacle
-from zwidth.loops.linear.poles import log_size, poles_less_one
-from zwidth.loops.linear.rows import Island
-from zwidth.loops.linear.state_space import StateSpace, closed_loop, delayed_device, open_loop
-from zwidth.loops.rigid.margins import Margins
-from zwidth.loops.rigid.verdict import STABILITY_METHODS, Stability, StabilityMethod
+from zwidth.linear.held import closed_loop, delayed_device, open_loop
+from zwidth.linear.passivity import find_obstacle
+from zwidth.linear.rows import Island
 from zwidth.parts.checks import read_texts
+from zwidth.parts.state_space import StateSpace
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
+from zwidth.rigid.verdict import STABILITY_METHODS, StabilityMethod
 from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import InputError, check_choice
+from zwidth.words.results import Margins, Stability
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
 
@@ -28,16 +28,6 @@ if TYPE_CHECKING:
 # K or B of walls, texts with a unit as well; None means those of the scene's own wall.
 Walls: TypeAlias = ArrayLike | None
 Wall: TypeAlias = float | str | None
-
-
-@shown(frequency="Hz", time_constant="s")
-class PoleTable(NamedTuple):
-    """Poles, the slowest first, and the motions they stand for; arrays with a last axis of poles."""
-
-    z: np.ndarray
-    frequency: np.ndarray  # at which it oscillates, in Hz; half the sampling rate for a negative real pole
-    damping_ratio: np.ndarray  # -Re s/|s| with s = log(z)/T; negative for a growing motion
-    time_constant: np.ndarray  # -1/Re s in s; negative for a growing one, infinite on the unit circle
 
 
 @shown(phase_margin="degrees", delay_margin="s", phase_crossover="Hz", gain_crossover="Hz", modulus_frequency="Hz")
@@ -70,20 +60,6 @@ class SceneAnswers(SceneParts):
         is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
         """
         return self.loop.poles(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
-
-    def pole_table(self, stiffness: Walls = None, virtual_damping: Walls = None) -> PoleTable:
-        """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        zeta: Array = poles_less_one(self.loop.roots, alpha, beta)
-        size, period = log_size(zeta), self.timing.period
-        order = np.argsort(-size, axis=-1, kind="stable")
-        zeta, size = (np.take_along_axis(values, order, -1) for values in (zeta, size))
-        turn = np.abs(np.arctan2(zeta.imag, 1.0 + zeta.real))
-        with np.errstate(all="ignore"):
-            # A pole at z = 0 is gone after one period.
-            ratio = np.where(np.isneginf(size), 1.0, -size / np.hypot(size, turn))
-            ratio = np.where((size == 0) & (turn == 0), 0.0, ratio)
-            return PoleTable(1.0 + zeta, turn / (2.0 * np.pi * period), ratio, -period / size)
 
     def spectral_radius(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
@@ -167,7 +143,7 @@ class SceneAnswers(SceneParts):
 
         Numerics:
             Closed form for a rigid device with the backward difference. Otherwise by the signed crossings of each
-            row (`loops.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
+            row (`linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
             costs some microseconds and a stiffness next to nothing.
         """
         if method != "auto":
@@ -228,7 +204,7 @@ class SceneAnswers(SceneParts):
         """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is out of range.
 
         Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
-        (`loops.linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
+        (`linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
         motor the motor's own damping counts, which is sufficient and not necessary; with the sensor at the tip, with an
         actuator and with modes there is no such condition, and InputError says so. A wall that pushes has at most its
         K T.

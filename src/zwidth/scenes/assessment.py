@@ -9,13 +9,13 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.loops.linear.passivity import find_obstacle
-from zwidth.loops.rigid.margins import Margins
+from zwidth.linear.passivity import find_obstacle
 from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
+from zwidth.words.results import Margins
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
@@ -339,26 +339,6 @@ def _double_rate(scene: SceneOptima) -> SceneOptima:
     if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:
         changes["velocity.coded_period"] = scene.velocity.coded_period / 2
     return scene.replace(**changes)
-
-
-class FrictionRule(NamedTuple):
-    """Stiffnesses up to which viscous damping, and Coulomb friction, pay for sampling and for quantization."""
-
-    by_damping: float | None  # 2 b/T; None where there is no damping
-    by_friction: float | None  # 2 f_c/Q; None where friction or resolution is not given
-    stiffness: float | None  # the lower of the two, which is the rule; None where one of them is missing
-
-
-def friction_rule(
-    *, damping: float, period: float, friction: float | None = None, resolution: float | None = None
-) -> FrictionRule:
-    """Up to which K in N/m a wall without virtual damping and delay is passive: ``K <= min(2 b/T, 2 f_c/Q)``."""
-    # Viscous damping b pays for sampling, Coulomb friction f_c in N for quantization in steps of Q in m. A sufficient
-    # condition for a spring alone, on a rigid device (Abbott, Okamura 2005, IEEE Trans. Robotics 21(5), 952-964).
-    by_damping = 2.0 * damping / period if damping else None
-    by_friction = None if friction is None or resolution is None else 2.0 * friction / resolution
-    lower = None if by_damping is None or by_friction is None else min(by_damping, by_friction)
-    return FrictionRule(by_damping, by_friction, lower)
 
 
 def passive_edge(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:

@@ -9,9 +9,6 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 
-from zwidth.loops.loop import LinearLoop, RigidLoop, make_plain
-from zwidth.loops.measured.loop import MeasuredLoop
-from zwidth.loops.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.checks import Part, check_kind
 from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
@@ -21,6 +18,9 @@ from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import NoWall, VirtualWall
+from zwidth.rigid.normalization import Normalized, Physical, denormalize, normalize
+from zwidth.scenes.loop import LinearLoop, RigidLoop, make_plain
+from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.words.errors import InputError
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown

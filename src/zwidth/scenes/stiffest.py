@@ -10,9 +10,8 @@ from typing import Any, Literal, NamedTuple, cast, get_args
 import numpy as np
 
 from zwidth.arrays.roots import find_lowest
-from zwidth.arrays.xp import is_jax, is_traced
-from zwidth.loops.linear.margins import OpenLoop
-from zwidth.loops.linear.ridge import SceneSensitivities
+from zwidth.linear.margins import OpenLoop
+from zwidth.linear.ridge import SceneSensitivities
 from zwidth.parts.checks import read_texts
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import SceneAnswers, allows_negative
@@ -23,6 +22,7 @@ from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.units import to_float
+from zwidth.words.xp import is_jax, is_traced
 
 # By what share a row may end below the stiffest wall that is on it.
 _ROUNDED = 1e-6

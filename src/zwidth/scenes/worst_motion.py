@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.passivity import PassivityCondition, find_need
-from zwidth.parts.checks import check_whole
+from zwidth.linear.passivity import PassivityCondition, find_need
 from zwidth.parts.velocity import Estimate
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import SceneAnswers, one_wall
@@ -21,7 +20,8 @@ from zwidth.scenes.base import of_scene
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
-_SHORTEST, _LONGEST = 8, 1 << 22
+# Periods that are tried.
+_SHORTEST, _LONGEST = 8, 1 << 20
 # The largest sampled position, in m.
 _PEAK = 1e-3
 # Eight rounding errors of each term; a filter's own are seen where it is given the same motion at another scale.
@@ -53,7 +53,7 @@ class WorstMotion(NamedTuple):
 
 @of_scene
 def worst_motion(
-    scene: SceneAnswers, stiffness: float | None = None, virtual_damping: float | None = None, *, longest: int = 1 << 20
+    scene: SceneAnswers, stiffness: float | None = None, virtual_damping: float | None = None
 ) -> WorstMotion:
     """Return a motion over which device and wall give energy, the proof that the wall is not passive.
 
@@ -64,7 +64,6 @@ def worst_motion(
             prescribed.
         stiffness: K of the wall in N/m, one number; the scene's own wall where neither is given.
         virtual_damping: B of the wall in N s/m, one number.
-        longest: the most periods that are tried, 8 to 4194304.
 
     Returns:
         `WorstMotion`: ``time``, ``position``, ``velocity``, ``force``, ``energy``, arrays of one length. The largest
@@ -94,7 +93,6 @@ def worst_motion(
         >>> print(f"{motion.frequency:.0f} Hz, {1e6 * motion.energy[-1]:.2f} µJ")
         0 Hz, -435.13 µJ
     """
-    longest = check_whole("longest", longest, _SHORTEST, _LONGEST)
     given = resolve_wall(scene.wall, stiffness, virtual_damping)
     alpha, beta = one_wall(*scene.normalize_walls(*given))
     wall = np.asarray(given[0], float).item(), np.asarray(given[1], float).item()
@@ -112,7 +110,7 @@ def worst_motion(
     # A push; between the samples as slow as at them.
     kinds += [(None, np.inf)] if stiff < 0 else []
     periods = _SHORTEST
-    while periods <= longest:
+    while periods <= _LONGEST:
         for w, damping in kinds:
             motion = _move(scene, wall, _sampled_position(w, periods), damping)
             if motion is not None and w is None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import compute_concretely
 from zwidth.arrays.threads import run_in_threads
-from zwidth.loops.linear.chain import chain_of
+from zwidth.parts.chain import chain_of
 from zwidth.parts.device import Device
 from zwidth.parts.paths import Parts, replace_parameters
 from zwidth.parts.velocity import FOAW, BackwardDifference

@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth.arrays.xp import known_options
 from zwidth.simulation.flow import Flow
 from zwidth.simulation.lanes import Course, Given, Lanes, Options
 from zwidth.simulation.motion import BodyState, advance, dot, slide, times
 from zwidth.words.types import Array
+from zwidth.words.xp import known_options
 
 # Samples that a cycle of readings is looked for in.
 CYCLE = 256

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.chain import Resonance, body_position
-from zwidth.loops.linear.system import System
+from zwidth.parts.chain import Resonance, body_position
+from zwidth.parts.system import System
 from zwidth.words.errors import InputError
 
 # Of series in a matrix of norm up to 1/2: the first term left out is below 1e-19 of the whole.

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.loops.linear.state_space import estimate_matrices
+from zwidth.parts.state_space import estimate_matrices
 from zwidth.parts.velocity import FOAW, Estimate
 from zwidth.simulation.flow import DIGITS, Flow, Mechanics, flow
 from zwidth.words.errors import InputError

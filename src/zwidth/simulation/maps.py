@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import tree_map
 from zwidth.simulation.lanes import Lanes, Options
+from zwidth.words.xp import tree_map
 
 # Squarings of a map, at most; rounding hides slower motions.
 _SQUARINGS = 36

@@ -10,7 +10,6 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, compute_concretely, join_shapes
 from zwidth.arrays.threads import processors
-from zwidth.arrays.xp import is_traced
 from zwidth.parts.checks import check_whole, read_texts
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.measured import MeasuredDevice
@@ -23,6 +22,7 @@ from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
 from zwidth.words.rotation import in_own_units
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
+from zwidth.words.xp import is_traced
 
 Contact = Literal["bilateral", "unilateral", "push_only"]
 CONTACTS: tuple[Contact, ...] = ("bilateral", "unilateral", "push_only")

@@ -26,7 +26,7 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
-from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, summarize_stiffest, track
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, summarize_stiffest, track
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, round_safely, short, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
@@ -209,7 +209,7 @@ class DesignStudy(ComputedStudy):
         elif len(needed.crossings) > 1:
             yield f"{wanted}: K_max passes it at {len(needed.crossings)} values of {self.find}; the nearest is given"
 
-    def _trace(self, nominal: Scene, low: float, high: float) -> Table:
+    def _trace(self, nominal: Scene, low: float, high: float) -> dict[str, np.ndarray]:
         """K_max over the parameter; NaN where a value is refused or no wall is stable."""
         rows = []
         for value in np.geomspace(low, high, self.num).tolist():

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 from pydantic import WrapValidator
@@ -24,7 +24,6 @@ from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.formatting import own_header, to_cell
 
-Table: TypeAlias = dict[str, np.ndarray]
 Item = TypeVar("Item")
 
 # Whom a study that takes long tells how many of its parts are done, and of how many.
@@ -42,7 +41,7 @@ def track(parts: Sequence[Item]) -> Iterator[Item]:
 class Outcome:
     """The result of one study."""
 
-    table: Table = field(default_factory=dict)  # columns of the study's CSV file, all of one length
+    table: dict[str, np.ndarray] = field(default_factory=dict)  # columns of the study's CSV file, all of one length
     arrays: dict[str, np.ndarray] = field(default_factory=dict)  # of the study's npz file
     # What draws each figure and returns its Axes, by what its file name adds to the study's name.
     figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
@@ -120,7 +119,9 @@ class WallsStudy(ComputedStudy):
 _CHOICE = ("stiffness_fraction", "walls")
 
 
-def add_si_of_scene(table: Table, delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Table:
+def add_si_of_scene(
+    table: dict[str, np.ndarray], delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None
+) -> dict[str, np.ndarray]:
     """A table of walls, in SI units as well where delta and d are those of a rigid scene or device alone."""
     scene = _find_scene(delta, d, owner)
     if scene is None:
@@ -148,7 +149,7 @@ def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
     return {**found, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 
 
-def csv_text(table: Table) -> str:
+def csv_text(table: dict[str, np.ndarray]) -> str:
     """A table as CSV; numbers are written with all digits that tell them apart, texts so that no program runs them."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")

@@ -19,15 +19,15 @@ from zwidth.config.study import DelayModels, HeldStudy, register
 from zwidth.config.values import Delay, quantity_of
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.table import SI_COLUMNS, stack
-from zwidth.loops.rigid.boundary import stable_region
-from zwidth.loops.rigid.passivity import passive_stiffness_slope
-from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
-from zwidth.loops.rigid.verdict import is_stable
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
+from zwidth.rigid.boundary import stable_region
+from zwidth.rigid.passivity import passive_stiffness_slope
+from zwidth.rigid.ridge import alpha_max, stiffness_slope
+from zwidth.rigid.verdict import is_stable
 from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
-from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, Table, share_of_device
+from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, share_of_device
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, name_wall, plain, round_safely, suggestion, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
@@ -67,7 +67,7 @@ class RidgeStudy(CurvesStudy):
         return Outcome(table=table, figures=drawn, notes=tuple(chain(*notes)))
 
 
-def ridge_table(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> tuple[Table, list[str]]:
+def ridge_table(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> tuple[dict[str, np.ndarray], list[str]]:
     """The stiffest stable walls over ``delta``, delay by delay, and notes about points without an answer."""
     deltas, delays = np.tile(delta, d.size), np.repeat(d, delta.size)
     points = alpha_max(deltas, delays, delay=delay)
@@ -91,7 +91,7 @@ def needed_models(models: tuple[DelayModel, ...], d: np.ndarray) -> list[tuple[D
     return chosen
 
 
-def slope_table(table: Table) -> Table:
+def slope_table(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The slope g(d) that alpha_max/delta of a ridge's table tends to, over its delays and those between them."""
     longest = max(1, math.ceil(table["d"].max()))
     d = np.union1d(np.linspace(0.0, longest, longest * _SLOPE_SAMPLES + 1), table["d"])

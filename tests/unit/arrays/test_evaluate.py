@@ -13,8 +13,8 @@ import pytest
 
 from zwidth.arrays import evaluate as module
 from zwidth.arrays.evaluate import FEW, as_float64, broadcast, check_scalars, evaluate, evaluate_columns, map_blocks
-from zwidth.arrays.xp import is_jax, is_traced, known_options, namespace
 from zwidth.words.errors import InputError, PrecisionWarning
+from zwidth.words.xp import is_jax, is_traced, known_options, namespace
 
 ROUTES = ("auto", "numpy", "jax")
 

@@ -5,10 +5,10 @@ import pytest
 from measured_devices import OTHERS, PERIOD, OtherDevice, TrueDevice
 
 import zwidth
-from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import Onsets
 from zwidth.fitting.device_estimate import DimensionlessDevice, differentiate, name_numbers
 from zwidth.fitting.words import choose_wall, describe_fit, write_scene
+from zwidth.parts.circle import circle
 from zwidth.words.status import Status
 
 VELOCITY = zwidth.BackwardDifference()

@@ -35,7 +35,6 @@ QUESTIONS = {
     "decide_stability": lambda scene, *wall: scene.decide_stability(*wall),
     "decide_stability, certified": lambda scene, *wall: scene.decide_stability(*wall, method="certified"),
     "poles": lambda scene, *wall: scene.poles(*wall),
-    "pole_table": lambda scene, *wall: scene.pole_table(*wall),
     "spectral_radius": lambda scene, *wall: scene.spectral_radius(*wall),
     "margins": lambda scene, *wall: scene.margins(*wall),
     "passivity_margin": lambda scene, *wall: scene.passivity_margin(*wall),

@@ -1,7 +1,5 @@
 """Figures of sweeps as somebody wants them: slices, axes, kinds of files, sizes, and why there are none."""
 
-import re
-
 import matplotlib
 import numpy as np
 import pytest
@@ -43,13 +41,13 @@ def drawn(monkeypatch, tmp_path):
     found, notes = {}, []
     monkeypatch.setattr(draw, "save", lambda axes, stem, *_, **__: found.setdefault(stem.name, axes) is None or (stem,))
 
-    def draw_over(path, at=None, **axes):
+    def draw_at(path, at=None):
         found.clear()
         notes.clear()
-        draw_stores(path, tmp_path, at=at, axes=axes, note=notes.append)
+        draw_stores(path, tmp_path, at=at, note=notes.append)
         return found, notes
 
-    return draw_over
+    return draw_at
 
 
 @pytest.mark.parametrize(
@@ -77,15 +75,10 @@ def test_a_value_beyond_half_a_step_is_refused(folder, drawn, wanted):
         draw._nearest(open_dataset(folder / "ridge.zarr").isel(mass=[0]), "mass", 0.11)
 
 
-def test_curves_over_the_axes_that_are_wanted(folder, drawn):
-    found, notes = drawn(folder, x="rate", hue="delay", col="mass")
-    assert list(found) == ["ridge_stiffness_max"]
-    assert notes == [
-        "point.zarr: no figure, for it is a single point",
-        "walls.zarr: no figure, for it varies over d, delta, alpha, beta, not over rate, delay, mass",
-    ]
-    kept = open_dataset(folder / "ridge.zarr").stiffness_max.isel(damping=0)
-    axes = found["ridge_stiffness_max"]
+def test_curves_over_the_axes_that_are_wanted(folder):
+    data = open_dataset(folder / "ridge.zarr")
+    axes = draw_curves(data, "stiffness_max", x="rate", hue="delay", col="mass")
+    kept = data.stiffness_max.isel(damping=0)
     assert len(axes) == 3
     for mass, ax in enumerate(axes):
         assert len(ax.lines) == 2
@@ -94,10 +87,10 @@ def test_curves_over_the_axes_that_are_wanted(folder, drawn):
             np.testing.assert_allclose(line.get_ydata(), kept.isel(mass=mass, delay=delay).values / 1e3, rtol=1e-15)
 
 
-def test_a_plane_over_the_axes_that_are_wanted(folder, drawn):
-    found, _ = drawn(folder / "ridge.zarr", x="rate", y="mass", col="delay")
-    axes = found["ridge_stiffness_max"]
-    kept = open_dataset(folder / "ridge.zarr").stiffness_max.isel(damping=0)
+def test_a_plane_over_the_axes_that_are_wanted(folder):
+    data = open_dataset(folder / "ridge.zarr")
+    axes = draw_plane(data, "stiffness_max", x="rate", y="mass", col="delay")
+    kept = data.stiffness_max.isel(damping=0)
     for delay, ax in enumerate(axes):
         np.testing.assert_allclose(
             ax.collections[0].get_array(), kept.isel(delay=delay).transpose("mass", "rate").values / 1e3, rtol=1e-15
@@ -116,28 +109,10 @@ def test_an_axis_alone_leaves_the_others_to_the_program(folder):
     np.testing.assert_array_equal(axes[1].lines[2].get_ydata(), data.margin.isel(d=0, beta=1, alpha=2).values)
 
 
-@pytest.mark.parametrize(
-    "axes, says",
-    [
-        ({"x": "mas"}, "x: no sweep that is drawn varies 'mas'; choose from .*mass"),
-        ({"hue": "mass", "col": "mass"}, "col: got 'mass', which is hue already; choose another"),
-        ({"y": "mass", "hue": "delay"}, "y, hue: got both; a plane has y, curves have a hue"),
-    ],
-)
-def test_axes_that_cannot_be_are_refused(folder, drawn, axes, says):
-    with pytest.raises(InputError, match=says):
-        drawn(folder, **axes)
-
-
-def test_an_axis_that_a_slice_took_away_is_refused(folder, drawn):
-    with pytest.raises(InputError, match="x: no sweep that is drawn varies 'mass'; choose from damping, delay, rate"):
-        drawn(folder / "ridge.zarr", {"mass": 0.1}, x="mass")
-
-
 def test_files_of_the_kind_size_and_style_that_are_wanted(folder, tmp_path, capsys):
     sheet = tmp_path / "mine.mplstyle"
     sheet.write_text("lines.linewidth: 4\n", encoding="utf-8")
-    words = ["--x", "rate", "--hue", "mass", "--at", "delay=0", "--at", "damping=1", "--style", sheet]
+    words = ["--at", "delay=0", "--at", "damping=1", "--style", sheet]
     words += ["--format", "png", "--format", "pdf", "--dpi", "50", "--size", "6x3"]
     before = dict(matplotlib.rcParams)
     assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
@@ -174,21 +149,9 @@ def test_kinds_of_files_that_cannot_be_are_refused(folder, tmp_path, capsys, wor
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    "store, words, why",
-    [
-        ("point", [], "point.zarr: no figure, for it is a single point"),
-        (
-            "walls",
-            ["--x", "delta", "--hue", "d", "--at", "alpha=0.1", "--at", "beta=0.1", "--at", "d=0"],
-            "hue: no sweep that is drawn varies 'd'; choose from delta",
-        ),
-    ],
-)
-def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys, store, words, why):
-    code = main_of("figures", folder / f"{store}.zarr", *words, "--out", tmp_path / "out")
-    assert code == (2 if words else 1)
-    assert re.search(re.escape(why), capsys.readouterr().err)
+def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys):
+    assert main_of("figures", folder / "point.zarr", "--out", tmp_path / "out") == 1
+    assert "point.zarr: no figure, for it is a single point" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -8,7 +8,7 @@ import scipy.linalg
 from independent_scenes import KINDS, closed_loop_matrix, continuous, flow, random_scene, random_walls
 
 import zwidth
-from zwidth.loops.linear.poles import spectral_radius
+from zwidth.linear.poles import log_size, poles_less_one, spectral_radius
 from zwidth.words.errors import InputError
 from zwidth.words.status import Method, Status
 
@@ -85,7 +85,7 @@ def test_a_radius_within_rounding_takes_the_side_of_the_label_and_one_that_contr
 
 def test_slow_poles_keep_their_digits():
     """By the series of the slowest root: b/K (1 - K (m/b^2 + (T/2 + t_d)/b)), here with K = 1e-6 N/m."""
-    slow = FILTERED.pole_table(1e-6).time_constant[0]
+    slow = zwidth.assess(FILTERED.replace(wall=zwidth.VirtualWall(1e-6))).time_constant
     assert slow == pytest.approx(3.0 / 1e-6 * (1 - 1e-6 * (0.1 / 9.0 + 1.5e-3 / 3.0)), rel=1e-13)
 
 
@@ -127,15 +127,6 @@ def response(model, w):
 def test_negative_feedback_around_the_open_loop_has_the_closed_poles():
     loop, closed = FILTERED.open_loop(5e3, 5.0), FILTERED.state_space(5e3, 5.0)
     np.testing.assert_allclose(closed.A, loop.A - loop.B @ loop.C, atol=1e-9)
-
-
-def test_the_pole_table():
-    table = FILTERED.pole_table([1e3, 5e3], 2.0)
-    s = np.log(table.z[:, 0]) / 1e-3
-    np.testing.assert_allclose(table.frequency[:, 0], np.abs(s.imag) / (2 * np.pi), rtol=1e-9)
-    np.testing.assert_allclose(table.damping_ratio[:, 0], -s.real / np.abs(s), rtol=1e-7)
-    np.testing.assert_allclose(table.time_constant[:, 0], -1 / s.real, rtol=1e-7)
-    assert np.all(np.diff(np.abs(table.z)) <= 1e-15)
 
 
 def test_shapes_and_what_is_not_finite():
@@ -187,5 +178,5 @@ def test_poles_that_are_almost_one_are_told_apart():
         alpha = min(0.25 * delta**2 * 10 ** rng.uniform(-1, 6), 1e-3)
         scene = zwidth.Scene(zwidth.Device(mass, damping), zwidth.Timing(period, rng.integers(12) * period))
         stiffness = alpha * mass / period**2
-        slowest = -period / scene.pole_table(stiffness).time_constant[0]
+        slowest = log_size(poles_less_one(scene.loop.roots, *scene.normalize_walls(stiffness, 0.0))).max()
         assert slowest == pytest.approx(np.log1p(scene.spectral_radius(stiffness) - 1), rel=1e-6, abs=3e-16)

@@ -10,7 +10,7 @@ import pytest
 from scipy import signal
 
 import zwidth
-from zwidth.arrays.circle import circle
+from zwidth.parts.circle import circle
 from zwidth.scenes.wall_code import find_sections, write_wall
 
 BUTTER: Any = signal.butter(3, 60.0, fs=1000.0)

@@ -8,6 +8,7 @@ from independent_scenes import random_scene, velocity_polynomials
 from tolerances import WORST_ENERGY, WORST_NEED
 
 import zwidth
+from zwidth.scenes import worst_motion
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -200,15 +201,17 @@ def test_nothing_is_given_without_a_wall_or_on_the_edge():
     assert zwidth.worst_motion(scene.replace(damping=0.0), 1.0, 1e-3).status == Status.OK
 
 
-def test_too_short_a_motion_is_not_taken_for_a_proof():
+def test_too_short_a_motion_is_not_taken_for_a_proof(monkeypatch):
     scene = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 5e-3))
     wall = scaled(scene, (8e3, 3.0), 1 + 1e-6)
-    short = zwidth.worst_motion(scene, *wall, longest=64)
+    with monkeypatch.context() as patched:
+        patched.setattr(worst_motion, "_LONGEST", 64)
+        short = zwidth.worst_motion(scene, *wall)
     assert short.status == Status.NOT_CONVERGED
     assert np.isnan(short.missing_damping)
     # Beyond what rounding lets be told.
     wall = scaled(scene, (8e3, 3.0), 1 + 1e-14)
-    assert zwidth.worst_motion(scene, *wall, longest=1 << 16).status != Status.OK
+    assert zwidth.worst_motion(scene, *wall).status != Status.OK
 
 
 def test_energy_that_rounding_can_come_to_is_no_proof():
@@ -226,8 +229,6 @@ def test_what_is_refused():
         zwidth.worst_motion(scene, np.nan)
     with pytest.raises(InputError, match="one wall of finite numbers"):
         zwidth.worst_motion(scene, [1.0, 2.0])  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="longest: got 4; a whole number from 8"):
-        zwidth.worst_motion(scene, 1.0, longest=4)
     coupling = zwidth.Coupling(0.05, 20e3, 1.0, "tip")
     with pytest.raises(InputError, match="with the sensor at the tip: there is no passivity condition"):
         zwidth.worst_motion(zwidth.Scene(zwidth.Device(0.1, 10.0, coupling), zwidth.Timing(1e-3)), 1e3)

@@ -1,0 +1,203 @@
+"""Stability of any scene that is never guessed: its characteristic polynomial in balls, decided by Schur and Cohn.
+
+Every number of the scene and of the wall is taken as exact; only the delay in periods is the float64 quotient that the
+scene uses. The chain's matrix exponential, its characteristic polynomial and the velocity estimate are balls of
+python-flint. With P of degree n and ``P*(z) = z^n P(1/z)``, all zeros of P lie inside the unit circle exactly if
+``|P(0)| < |lead|`` and those of ``(lead P - P(0) P*)/z`` do. Where a comparison is not certain, the precision doubles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from fractions import Fraction
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zwidth.arrays.balls import BITS, available
+from zwidth.parts.chain import AnyChain, chain_of
+from zwidth.parts.linear_device import LinearDevice
+from zwidth.parts.system import System
+from zwidth.parts.velocity import Butterworth, Estimate, LowPass, VelocityFilter, WindowedDifference
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
+
+if TYPE_CHECKING:
+    import flint
+
+# What is right to float64.
+_FLOAT_BITS = 60
+_NOTHING = Estimate(0, 0.0)
+
+
+def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Labels and statuses of walls of one shape, in SI units."""
+    if not available():
+        raise InputError("method: 'certified' needs python-flint for this scene; pip install 'zwidth[certified]'")
+    polynomials = cache(lambda bits: _polynomials(scene))
+    stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)
+    for place in np.ndindex(stiffness.shape):
+        stable[place], status[place] = _decide(polynomials, float(stiffness[place]), float(damping[place]))
+    return stable, status
+
+
+def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float) -> tuple[bool, Status]:
+    import flint
+
+    if not (np.isfinite(stiffness) and np.isfinite(damping)):
+        return False, Status.INVALID_INPUT
+    for bits in BITS:
+        with flint.ctx.workprec(bits):
+            D, N1, N2, rest = polynomials(bits)
+            p = D + N1 * flint.arb(stiffness) + N2 * flint.arb(damping)
+            at_one = stiffness == 0 and rest
+            if at_one:
+                # z = 1 is a pole; the others decide whether it is the only one not inside.
+                p = p // flint.arb_poly([-1, 1])
+            verdict = all_inside(p)
+        if verdict is not None:
+            return (False, Status.ON_BOUNDARY if verdict else Status.OK) if at_one else (verdict, Status.OK)
+    return False, Status.UNDECIDED
+
+
+def all_inside(p: flint.arb_poly) -> bool | None:
+    """Whether all zeros lie inside the unit circle; None where the balls are too wide to tell."""
+    import flint
+
+    while p.degree() > 0:
+        first, last = p[0], p[p.degree()]
+        if first == 0:
+            p = flint.arb_poly(p.coeffs()[1:])
+            continue
+        gap = abs(last) - abs(first)
+        if not gap > 0:
+            return False if gap < 0 else None
+        coefficients = p.coeffs()
+        mirrored = flint.arb_poly(coefficients[::-1])
+        reduced = (p * (1 / last) - mirrored * (first / last / last)).coeffs()
+        p = flint.arb_poly(reduced[1 : len(coefficients)])
+    return True
+
+
+def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly, bool]:
+    """D, N1 and N2 of ``P = D + K N1 + B N2`` in SI units, and whether K = 0 leaves a pole at z = 1 exactly."""
+    import flint
+
+    exact = _exact(scene)
+    period = exact.timing.period
+    chain = chain_of(exact, (scene.d, int(scene.d)), _NOTHING)
+    answer, device = _device(chain)
+    top, bottom = _estimate(exact.velocity, period)
+    unit = period * period / exact.mass
+    whole = chain.whole + (1 if chain.d > chain.whole else 0)
+    waiting = flint.arb_poly([0] * whole + device.coeffs())
+    # F(1) is exactly 0 where a sum of exact fractions is; all other estimates are differences.
+    own = isinstance(scene.velocity, VelocityFilter)
+    rest = chain.free and (not own or sum(map(Fraction, scene.velocity.numerator)) == 0)
+    return waiting * bottom, answer * bottom * unit, answer * top * unit, rest
+
+
+def _exact(part: Any) -> Any:
+    """A scene, or a part of one, with exact balls for numbers, past the checks of these."""
+    import flint
+
+    if isinstance(part, tuple):
+        return tuple(map(_exact, part))
+    if isinstance(part, LinearDevice) or not is_dataclass(part):
+        # A linear device is exact by itself.
+        return flint.arb(part) if isinstance(part, float) else part
+    # Without what the part has computed from its numbers.
+    made = object.__new__(type(part))
+    for item in fields(part):
+        object.__setattr__(made, item.name, _exact(getattr(part, item.name)))
+    return made
+
+
+def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -> tuple[float, np.ndarray]:
+    """The gain of the sampled response of a linear device, and ``1 - z`` of its zeros, right to float64."""
+    # What the aliases of fast poles leave of slow zeros is not to be had in floats.
+    import flint
+
+    for bits in BITS:
+        with flint.ctx.workprec(bits):
+            ball = flint.arb(period)
+            response, _ = _device(System(device, ball, flint.arb(device.mass), *delay, _NOTHING))
+            coefficients = response.coeffs()
+            while coefficients and coefficients[-1].contains(0):
+                # What no precision tells from 0 is 0 once the others are known far beyond float64.
+                coefficients.pop()
+            if coefficients and coefficients[-1].rel_accuracy_bits() > _FLOAT_BITS:
+                try:
+                    offsets = flint.arb_poly(coefficients)(flint.arb_poly([1, -1]))
+                    roots = flint.acb_poly(offsets).roots(tol=2.0 ** (-bits // 3))
+                except ValueError:
+                    roots = None
+                if roots is not None and all(root.rel_accuracy_bits() > _FLOAT_BITS for root in roots):
+                    return float(coefficients[-1]), np.array([complex(root) for root in roots], complex)
+    raise InputError("device: its zeros between samples cannot be told from each other; leave out what hardly answers")
+
+
+def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
+    """Numerator and denominator of G without its whole periods of delay."""
+    import flint
+
+    rate, push, _ = (array.tolist() for array in chain.realize())
+    size = len(push)
+
+    def flow(time: flint.arb) -> tuple[flint.arb_mat, flint.arb_mat]:
+        rows = [[time * value for value in (*row, force)] for row, force in zip(rate, push, strict=True)]
+        whole = flint.arb_mat([*rows, [0] * (size + 1)]).exp()
+        return (
+            flint.arb_mat([[whole[i, j] for j in range(size)] for i in range(size)]),
+            flint.arb_mat([[whole[i, size]] for i in range(size)]),
+        )
+
+    if chain.sampled:
+        step, full = flint.arb_mat(rate), flint.arb_mat([[value] for value in push])
+    else:
+        step, full = flow(flint.arb(1))
+    device = step.charpoly()
+
+    def numerator(state: flint.arb_mat) -> flint.arb_poly:
+        """``C adj(z - A) push``, by the lemma of the determinant; C is the first number of the state."""
+        changed = flint.arb_mat(step)
+        for k in range(size):
+            changed[k, 0] = changed[k, 0] - state[k, 0]
+        return changed.charpoly() - device
+
+    if chain.d == chain.whole:
+        return numerator(full), device
+    late = flow(1 - flint.arb(float(chain.d - chain.whole)))[1]
+    return flint.arb_poly([0, 1]) * numerator(late) + numerator(full - late), device
+
+
+def _estimate(velocity: Any, period: flint.arb) -> tuple[flint.arb_poly, flint.arb_poly]:
+    """Numerator and denominator of F in SI units."""
+    import flint
+
+    pi, z = flint.arb.pi(), flint.arb_poly([0, 1])
+    if isinstance(velocity, VelocityFilter):
+        top, bottom = (flint.arb_poly(list(part[::-1])) for part in (velocity.numerator, velocity.denominator))
+        return top, bottom
+    coded = period if velocity.coded_period is None else velocity.coded_period
+    if isinstance(velocity, WindowedDifference):
+        n = velocity.samples
+        return (z**n - 1) * (1 / (n * coded)), z**n
+    top, bottom = (z - 1) * (1 / coded), z
+    if isinstance(velocity, LowPass):
+        tau = velocity.time_constant
+        p = (-2 * pi * velocity.cutoff * coded if tau is None else -coded / tau).exp()
+        top, bottom = top * z ** (velocity.order - 1), (z - p) ** velocity.order
+        return top * (1 - p) ** velocity.order, bottom
+    if isinstance(velocity, Butterworth):
+        size = (pi * velocity.cutoff * coded).tan()
+        n, above, below = velocity.order, z - 1, (z + 1) * size
+        for k in range(n // 2):
+            cosine = (pi * (2 * k + 1) / (2 * n)).sin()
+            bottom = bottom * (above * above + above * below * (2 * cosine) + below * below)
+        if n % 2:
+            bottom = bottom * (above + below)
+        top = top * below**n
+    return top, bottom

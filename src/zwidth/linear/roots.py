@@ -1,0 +1,101 @@
+"""A loop by its roots and as polynomials (any loop): what its device answers, what its velocity estimate answers.
+
+Normalized to T = 1 and m = 1, the loop of a wall is affine in (alpha, beta),
+
+    P(z) = D + alpha N1 + beta N2 = 0   exactly where   alpha + beta F(z) = q(z) = -1/G(z)
+
+with G from the wall's force to the sampled position and F from position to the velocity estimate. Roots are kept by
+their offsets ``1 - root``: next to z = 1, where slow loops live, a root itself has lost its digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from zwidth.arrays.polynomials import Affine
+from zwidth.parts.circle import ON_CIRCLE, CirclePoints, Jet, circle, depths, lag_jet, product_jet
+from zwidth.parts.velocity import Estimate
+from zwidth.words.types import Array
+
+
+@dataclass(frozen=True)
+class LoopRoots:
+    """A loop without its wall: ``G(z) = gain prod(z - zeros)/(z^lag prod(z - poles))`` and the velocity estimate F."""
+
+    gain: float
+    lag: int
+    zeros: Array
+    poles: Array
+    estimate: Estimate
+
+    def required_wall(self, at: CirclePoints) -> Jet:
+        """``q = -1/G``: what the wall must answer to put a pole at z."""
+        over = product_jet(at, self.poles, -1.0).over(product_jet(at, self.zeros, self.gain))
+        return over.times(lag_jet(at, self.lag))
+
+    def response(self, at: CirclePoints) -> Jet:
+        """G: the sampled position that the wall's force leads to."""
+        over = product_jet(at, self.zeros, self.gain).over(product_jet(at, self.poles, 1.0))
+        return over.times(lag_jet(at, -self.lag))
+
+    @property
+    def order(self) -> int:
+        """How many poles the loop with a wall that has damping has."""
+        f = self.estimate
+        return self.poles.size + self.lag + f.poles.size + max(f.window + f.lag, 0)
+
+    def turning(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """How fast q and F vary at most within ``reach`` of w, relative to themselves."""
+        before = circle(w).before[..., None]
+        roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
+        far = np.abs(before + roots) - reach[..., None]
+        # A factor of a root on the circle changes its size there, not its argument: no need to look closer.
+        depth = np.abs(depths(roots))
+        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, np.where(roots == 0, 1e-9, 1e-5))
+        near = (1.0 / np.maximum(far, floor)).sum(-1)
+        return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0
+
+
+def step_apart(roots: Array, rate: Array) -> Array:
+    """Aberth's step from approximations along the last axis, Newton's by ``P'/P``, from which each keeps off others."""
+    apart = np.where(np.eye(roots.shape[-1], dtype=bool), np.inf, roots[..., :, None] - roots[..., None, :])
+    return 1.0 / (rate - (1.0 / apart).sum(-1))
+
+
+def _product(*offsets: np.ndarray) -> np.ndarray:
+    """The monic polynomial of roots given by their offsets from 1; real, for they come in pairs."""
+    return np.atleast_1d(np.poly(1.0 - np.concatenate(offsets))).real
+
+
+def estimate_polynomials(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
+    """Numerator and denominator of the velocity estimate."""
+    f = loop.estimate
+    top, bottom = f.gain * _product(f.zeros), _product(f.poles)
+    if f.window:
+        difference = np.zeros(f.window + 1)
+        difference[[0, -1]] = 1.0 / f.window, -1.0 / f.window
+        top = np.convolve(top, difference)
+    turns = f.window + f.lag
+    return np.pad(top, (0, max(-turns, 0))), np.pad(bottom, (0, max(turns, 0)))
+
+
+def affine_polynomial(loop: LoopRoots) -> Affine:
+    """D, N1 and N2 of the closed loop."""
+    top, bottom = estimate_polynomials(loop)
+    device = np.pad(_product(loop.poles), (0, max(loop.lag, 0)))
+    answer = np.pad(loop.gain * _product(loop.zeros), (0, max(-loop.lag, 0)))
+    parts = [np.convolve(device, bottom), np.convolve(answer, bottom), np.convolve(answer, top)]
+    length = max(part.size for part in parts)
+    return Affine(*(np.pad(part, (length - part.size, 0)) for part in parts))
+
+
+def closed_loop_roots(loop: LoopRoots, alpha: float, beta: float) -> tuple[np.ndarray, np.ndarray, float, int]:
+    """Zeros, poles, gain and lag of ``P = z^lag prod(z - poles) + gain prod(z - zeros)`` for one wall."""
+    f, (top, bottom) = loop.estimate, estimate_polynomials(loop)
+    wall = np.trim_zeros(np.polyadd(alpha * bottom, beta * top), "f")
+    lag = loop.lag + max(f.window + f.lag, 0)
+    zeros = np.concatenate([1.0 - loop.zeros, np.roots(wall), np.zeros(max(-lag, 0))])
+    poles = 1.0 - np.concatenate([loop.poles, f.poles])
+    return zeros, poles, loop.gain * float(wall[0] if wall.size else 0.0), max(lag, 0)

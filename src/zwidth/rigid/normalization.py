@@ -1,0 +1,234 @@
+"""From SI quantities to the numbers that the stability of a rigid loop depends on, and back.
+
+The normalization is the paper's eqs. (14) and (16): ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``,
+``d = t_d/T``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.evaluate import as_float64, evaluate, join_shapes
+from zwidth.arrays.held_mass import valid_device
+from zwidth.parts.checks import accept_units, in_periods
+from zwidth.words.errors import InputError
+from zwidth.words.quantities import PARAMETERS, SI_RANGE, SIZES, WALL_RANGE
+from zwidth.words.showing import shown
+from zwidth.words.status import Status
+from zwidth.words.types import Array, ArrayLike
+from zwidth.words.xp import is_jax, is_traced, namespace, nan_unless, within
+
+
+@shown()
+class Normalized(NamedTuple):
+    """The four dimensionless numbers that the stability of the wall depends on."""
+
+    alpha: Array
+    beta: Array
+    delta: Array
+    d: Array
+
+
+@shown(mass="kg", damping="N s/m", period="s", delay="s")
+class Physical(NamedTuple):
+    """The same wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
+
+    mass: Array
+    damping: Array
+    period: Array
+    delay: Array
+    stiffness: Array
+    virtual_damping: Array
+
+
+def _magnitudes(name: str) -> tuple[float, float]:
+    """The magnitudes that are allowed beside 0."""
+    return SIZES.get(name, SI_RANGE)
+
+
+def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
+    """Return ``value`` as float64; a scalar out of range raises. A traced value is left to JAX."""
+    if is_traced(value):
+        return value
+    number = as_float64(name, value)
+    if number.ndim == 0:
+        parameter, (least, most) = PARAMETERS[name], _magnitudes(name)
+        unit = f" (in {parameter.unit})" if parameter.unit != "1" else ""
+        if not _valid(name, number):
+            bound = str(parameter.sign)
+            raise InputError(f"{name}: got {value!r}; it must be finite{f' and {bound}' if bound else ''}{unit}")
+        if not within(number, (least, most)):
+            allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"at most {most:g}"
+            raise InputError(f"{name}: got {value!r}; it must be {allowed}{unit}")
+    return number
+
+
+def _valid(name: str, value: Array) -> Array:
+    return namespace(value).isfinite(value) & PARAMETERS[name].sign.holds(value)
+
+
+def quantity_status(**values: Array) -> Array:
+    """The `Status` of quantities named as in `normalize`: INVALID_INPUT before OUT_OF_RANGE, elementwise."""
+    xp = namespace(*values.values())
+    valid = inside = True
+    for name, value in values.items():
+        valid, inside = valid & _valid(name, value), inside & within(value, _magnitudes(name))
+    status = xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
+    return status.astype(np.int32)
+
+
+def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """Whether a wall on a device lies where the model is computed."""
+    return valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
+
+
+def device_status(delta: Array, d: Array) -> Array:
+    """The `Status` of a device and its delay."""
+    return quantity_status(delta=delta, d=d)
+
+
+def wall_status(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """The `Status` of a wall on a device."""
+    return quantity_status(alpha=alpha, beta=beta, delta=delta, d=d)
+
+
+def status_of_results(
+    shape: tuple[int, ...], numbers: Iterable[np.ndarray], walls: tuple[np.ndarray, ...], device: tuple[np.ndarray, ...]
+) -> np.ndarray:
+    """The `Status` of each wall on each device, of numbers that are NaN where none was found."""
+    status = np.full(shape, Status.OK, np.uint8)
+    for found in numbers:
+        status[np.isnan(found)] = Status.NOT_CONVERGED
+    # Each by itself first: seldom is one of them where the model is not computed.
+    if not (valid_device(*device).all() and all(within(part, WALL_RANGE).all() for part in walls)):
+        told = wall_status(*walls, *device)
+        np.copyto(status, told, where=told != Status.OK, casting="unsafe")
+    return status
+
+
+def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
+    """Check the arguments, put NaN where an array's entry is out of range, and apply ``formula``."""
+    checked = {name: _check_quantity(name, value) for name, value in values.items()}
+    join_shapes((name, np.shape(value)) for name, value in checked.items())
+    if any(map(is_jax, values.values())):
+        return evaluate(_formula_at, values, formula, tuple(values))
+    with np.errstate(all="ignore"):
+        result = _formula_at(*checked.values(), formula, tuple(values))
+    return tuple(part[()] for part in result)
+
+
+def _formula_at(*arguments: Any) -> tuple[Array, ...]:
+    """``formula`` with NaN for what is out of range; the last two arguments are the formula and the names."""
+    *values, formula, names = arguments
+    good = (_valid(name, value) & within(value, _magnitudes(name)) for name, value in zip(names, values, strict=True))
+    return formula(*(nan_unless(ok, value)[0] for ok, value in zip(good, values, strict=True)))
+
+
+def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:
+    """Eqs. (14), (16)."""
+    return (
+        stiffness * period * period / mass,
+        virtual_damping * period / mass,
+        damping * period / mass,
+        in_periods(delay, period),
+    )
+
+
+def _denormalize(mass, period, alpha, beta, delta, d) -> tuple[Array, ...]:
+    """Eqs. (14), (16) solved for the SI quantities, in the order of `Physical`."""
+    rate = mass / period
+    return mass, delta * rate, period, d * period, alpha * rate / period, beta * rate
+
+
+@accept_units
+def normalize(
+    *,
+    mass: ArrayLike,
+    damping: ArrayLike = 0.0,
+    period: ArrayLike,
+    delay: ArrayLike = 0.0,
+    stiffness: ArrayLike = 0.0,
+    virtual_damping: ArrayLike = 0.0,
+) -> Normalized:
+    """Turn SI quantities into the normalized ones.
+
+    ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``, ``d = t_d/T``.
+
+    Args:
+        mass: m in kg, > 0.
+        damping: b, the physical damping of the device, in N s/m, >= 0.
+        period: T, the sampling period, in s, > 0.
+        delay: t_d, from the sample to the moment its force acts, in s, >= 0.
+        stiffness: K of the virtual wall in N/m.
+        virtual_damping: B of the virtual wall in N s/m.
+            All broadcast against each other; each is 0 or 1e-30 to 1e30 in magnitude.
+
+    Returns:
+        ``alpha``, ``beta``, ``delta``, ``d``. ``d`` is taken as whole where the quotient is whole but for rounding.
+        An entry of an array that is out of range gives NaN.
+
+    Raises:
+        InputError: a scalar is out of range, or an argument is no number.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (14), (16).
+
+    Example:
+        >>> import zwidth
+        >>> wall = zwidth.normalize(mass=0.1, damping=10, period=1e-3, delay=1e-3, stiffness=14.9e3)
+        >>> print(f"{wall.alpha:.3f} {wall.delta:.1f} {wall.d:.0f}")
+        0.149 0.1 1
+    """
+    numbers = _convert_quantities(
+        _normalize,
+        mass=mass,
+        damping=damping,
+        period=period,
+        delay=delay,
+        stiffness=stiffness,
+        virtual_damping=virtual_damping,
+    )
+    return Normalized(*numbers)
+
+
+@accept_units
+def denormalize(
+    *,
+    mass: ArrayLike,
+    period: ArrayLike,
+    alpha: ArrayLike = 0.0,
+    beta: ArrayLike = 0.0,
+    delta: ArrayLike = 0.0,
+    d: ArrayLike = 0.0,
+) -> Physical:
+    """Turn normalized quantities back into SI ones, for a device of this mass and sampling period.
+
+    ``K = alpha m/T^2``, ``B = beta m/T``, ``b = delta m/T``, ``t_d = d T``.
+
+    Args:
+        mass: m in kg, > 0.
+        period: T in s, > 0.
+        alpha: normalized stiffness, 0 or 1e-60 to 1e60 in magnitude.
+        beta: normalized virtual damping, 0 or 1e-60 to 1e60 in magnitude.
+        delta: normalized physical damping, 0 to 1e12.
+        d: delay in periods, 0 to 1e5.
+
+    Returns:
+        ``mass``, ``damping``, ``period``, ``delay``, ``stiffness``, ``virtual_damping`` in SI units.
+
+    Raises:
+        InputError: a scalar is out of range, or an argument is no number.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (14), (16).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.denormalize(mass=0.1, period=1e-3, alpha=0.149).stiffness:.0f} N/m")
+        14900 N/m
+    """
+    numbers = _convert_quantities(_denormalize, mass=mass, period=period, alpha=alpha, beta=beta, delta=delta, d=d)
+    return Physical(*numbers)

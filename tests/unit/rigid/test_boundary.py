@@ -1,0 +1,353 @@
+"""The closed form of the boundary, and exact points on lines, against the real 2x2 system solved in mpmath."""
+
+import itertools
+import math
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+import tolerances as tol
+from compiling import QUICKLY
+from mpmath import mpf
+
+import oracles
+import zwidth
+from zwidth.arrays.held_mass import device
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
+
+NEAR_ZERO = [1e-300, 1e-100, 1e-20, 1e-8, 1e-3]
+NEAR_PI = [3.14, math.pi - 1e-6, math.pi - 1e-12, np.nextafter(math.pi, 0), math.pi]
+FREQUENCIES = [*NEAR_ZERO, 0.1, 1.0, 2.0, 2.5, *NEAR_PI]
+DAMPINGS = [0.0, 1e-12, 0.1, 2.31, 30.0, 1e6]
+DELAYS = [0.0, 1e-10, 0.125, 0.5, 1 - 2.0**-53, 1.0, 1.3, 4.0, 37.25, 500.0]
+GRID = np.array(list(itertools.product(FREQUENCIES, DAMPINGS, DELAYS)))
+
+
+def digits(omega, delta):
+    return oracles.digits_for(delta) + 40 + max(0, math.ceil(-3 * math.log10(omega)))
+
+
+def exact_and_condition(omega, delta, d, delay):
+    """alpha and beta, and what one rounding error of every input can do to each: |f| + sum |x df/dx|."""
+    exact = oracles.boundary(omega, delta, d, delay)
+    h = mpf(10) ** -30
+    # Inwards in omega and delta, to the right in d, where a whole delay belongs.
+    shifted = [(omega * (1 - h), delta, d), (omega, delta * (1 - h), d), (omega, delta, d * (1 + h))]
+    moved = [oracles.boundary(*map(mpf, point), delay=delay) for point in shifted]
+    return [(value, abs(value) + sum(abs(m[k] - value) for m in moved) / h) for k, value in enumerate(exact)]
+
+
+@pytest.mark.parametrize("delay", ["held", "fractional_power"])
+def test_closed_form(delay):
+    got = zwidth.boundary(*GRID.T, delay=delay)
+    for point, *walls in zip(GRID, got.alpha, got.beta, strict=True):
+        omega, delta, d = map(float, point)
+        with mp.workdps(digits(omega, delta)):
+            both = exact_and_condition(omega, delta, d, delay)
+            # alpha is formed from beta: next to a zero of alpha it carries beta's rounding.
+            floor = mpf(1e-290) + (abs(both[1][0]) if omega > 1 else 0)
+            for value, (exact, condition) in zip(walls, both, strict=True):
+                assert abs(mpf(float(value)) - exact) <= tol.BOUNDARY.float64 * (condition + floor), point
+
+
+def test_models_agree_for_whole_delays():
+    omega = np.array(FREQUENCIES)[:, None]
+    whole = np.array([0, 1, 2, 7])
+    held, power = (zwidth.boundary(omega, 0.3, whole, delay=delay) for delay in ("held", "fractional_power"))
+    np.testing.assert_allclose(held.alpha, power.alpha, rtol=1e-13)
+    np.testing.assert_allclose(held.beta, power.beta, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("delay", ["held", "fractional_power"])
+@pytest.mark.parametrize("omega", [0.0, -0.0, 5e-324])
+def test_the_curve_starts_at_eq_19(omega, delay):
+    delta = np.array([0.0, 1e-300, 0.25, 2.31, 1e6])[:, None]
+    got = zwidth.boundary(omega, delta, np.array([0.0, 0.5, 1.0, 500.0]), delay=delay)
+    np.testing.assert_array_equal(got.alpha, np.zeros((5, 4)))
+    np.testing.assert_allclose(got.beta, np.broadcast_to(-delta, (5, 4)), rtol=tol.BOUNDARY_LIMIT.float64)
+
+
+@pytest.mark.parametrize("d", [0.0, 0.125, 0.9, 1.0, 2.0, 3.3])
+def test_the_limit_at_pi(d):
+    delta = np.array([0.1, 2.31, 4.0, 100.0, 1e4])
+    got = zwidth.boundary(math.pi, delta, d)
+    for k, value in enumerate(delta):
+        with mp.workdps(100):
+            alpha, beta = oracles.boundary(mp.pi - mpf(10) ** -40, value, d)
+            size = abs(alpha) + abs(beta)
+            assert abs(mpf(float(got.alpha[k])) - alpha) <= 8 * tol.BOUNDARY_LIMIT.float64 * size
+            assert abs(mpf(float(got.beta[k])) - beta) <= 8 * tol.BOUNDARY_LIMIT.float64 * size
+
+
+def test_undelayed_explicit_formula():
+    delta = np.array([1e-8, 0.1, 1.0, 2.4, 10.0, 1e3])[:, None]
+    got = zwidth.boundary(np.linspace(0.05, 3.1, 40), delta, 0)
+    for (row, column), beta in np.ndenumerate(got.beta):
+        with mp.workdps(60):
+            value = oracles.phi(delta[row, 0])
+
+            def alpha_of(b, value=value):
+                numerator = 1 - value.c + b * (value.phi2 + value.c * value.psi) - b**2 * value.psi * value.phi1
+                return numerator / (value.psi * (1 + value.phi2 * b))
+
+            b = mpf(float(beta))
+            alpha = alpha_of(b)
+            # What the rounding of beta makes of it.
+            condition = abs(alpha) + abs(b) + abs(alpha_of(b * (1 + mpf(10) ** -25)) - alpha) * mpf(10) ** 25
+            assert abs(mpf(float(got.alpha[row, column])) - alpha) <= 4 * tol.BOUNDARY.float64 * condition
+
+
+def test_the_line_of_a_pole_at_minus_one():
+    points = np.array(list(itertools.product([0.1, 2.0, 2.31, 4.0, 1e3], [0.0, 0.125, 0.5, 0.9, 1.0, 2.0, 3.3])))
+    for limit, (delta, d) in zip(1.0 / device(*points.T).tilt, points, strict=True):
+        with mp.workdps(60):
+            # P(-1) is affine in alpha + 2 beta, which is put into alpha alone.
+            at_zero, at_one = (oracles.evaluate(oracles.polynomial(a, 0, delta, d), -1) for a in (0, 1))
+            exact = (-at_zero / (at_one - at_zero)).real
+            # N(-1) cancels towards the fraction at which it vanishes.
+            numerator = oracles.numerator(delta, d - int(d))
+            condition = sum(numerator) / abs(numerator[0] - numerator[1] + numerator[2])
+            assert oracles.relative_error(limit, exact) <= tol.BOUNDARY.float64 * float(condition)
+
+
+def test_remark_3_in_all_digits():
+    # From this damping on the line touches the stable region: the curve then ends at pi with alpha > 0.
+    threshold = 2.31057135675369424
+    ends = zwidth.boundary(math.pi, threshold + np.array([-1e-12, 1e-12]), 0).alpha
+    assert ends[0] < 0 < ends[1]
+
+
+def test_every_point_of_the_curve_has_a_pole_on_the_circle():
+    for d, delta in itertools.product([0.0, 0.37, 1.0, 2.6, 8.0], [0.0, 0.1, 4.0]):
+        omega = np.linspace(0.02, 3.0, 9)
+        curve = zwidth.boundary(omega, delta, d)
+        for w, alpha, beta in zip(omega, curve.alpha, curve.beta, strict=True):
+            with mp.workdps(60):
+                z = mp.expj(float(w))
+                terms = oracles.polynomial(alpha, beta, delta, d)
+                size = sum(abs(term) for term in terms)
+                assert abs(oracles.evaluate(terms, z)) <= 20 * tol.BOUNDARY.float64 * (d + 1) * size
+
+
+# Points at which derivatives are asked for: d whole (from the right) and not, delta = 0 too.
+SLOPE_POINTS = [(0.3, 0.0, 0.0), (0.7, 0.2, 1.0), (1.1, 3.0, 0.4), (2.6, 2.5, 0.0), (0.2, 1e3, 4.5), (0.05, 1e-9, 8.0)]
+BAD = [(-0.1, 0.1, 1.0), (3.2, 0.1, 1.0), (0.5, -0.1, 1.0), (0.5, 0.1, -1.0), (np.nan, 0.1, 1.0), (0.5, np.inf, 1.0)]
+DIRECTIONS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)], dtype=float)
+
+
+@cache
+def along(delay):
+    """Value, first and second derivative of (alpha, beta) in one direction of (omega, delta, d)."""
+
+    def derivatives(point, direction):
+        def value(step):
+            return jnp.stack(zwidth.boundary(*(point + step * direction), delay=delay))
+
+        def slope(step):
+            return jax.jvp(value, (step,), (1.0,))
+
+        (first, second), (_, third) = jax.jvp(slope, (0.0,), (1.0,))
+        return first, second, third
+
+    # Compiled of one direction, which is faster than of all of them.
+    compiled = jax.jit(jax.vmap(derivatives, (0, None)), compiler_options=QUICKLY)
+
+    def each(points, directions):
+        found = [compiled(points, direction) for direction in directions]
+        return [np.stack([np.asarray(part) for part in parts], 1) for parts in zip(*found, strict=True)]
+
+    return each
+
+
+@pytest.mark.parametrize("delay", ["held", "fractional_power"])
+def test_derivatives(delay, x64):
+    _, first, second = along(delay)(np.array(SLOPE_POINTS), DIRECTIONS)
+    h = mpf(10) ** -25
+    with mp.workdps(140):
+        for (row, point), (column, direction) in itertools.product(enumerate(SLOPE_POINTS), enumerate(DIRECTIONS)):
+
+            def at(steps, point=point, direction=direction):
+                return oracles.boundary(
+                    *(mpf(x) + steps * h * mpf(u) for x, u in zip(point, direction, strict=True)), delay=delay
+                )
+
+            for part, (f0, f1, f2, f3) in enumerate(zip(*(at(steps) for steps in range(4)), strict=True)):
+                slope, bend = (4 * f1 - f2 - 3 * f0) / (2 * h), (2 * f0 - 5 * f1 + 4 * f2 - f3) / h**2
+                for got, exact in ((first, slope), (second, bend)):
+                    size = np.abs(got[row, :, part]).max()
+                    assert oracles.relative_error(got[row, column, part], exact, size) <= tol.BOUNDARY_SLOPE.float64
+
+
+def test_derivatives_in_omega_beside_pi(x64):
+    # Both parts are even about pi: the slope is the second derivative times the distance.
+    slope = jax.jit(
+        jax.jacfwd(lambda omega, delta, d: jnp.stack(zwidth.boundary(omega, delta, d)), 0), compiler_options=QUICKLY
+    )
+    for delta, d in ((0.5, 0.0), (0.0, 0.5), (0.3, 0.5), (0.7, 1.0), (0.2, 4.0), (2.0, 37.25)):
+        with mp.workdps(80):
+            h = mpf(10) ** -12
+            ahead, level = (oracles.boundary(mp.pi - k * h, delta, d) for k in (2, mpf(10) ** -12))
+            bend = [2 * (a - b) / (2 * h) ** 2 for a, b in zip(ahead, level, strict=True)]
+        for distance in (0.0, 1e-12, 1e-9, 1e-7, 1e-6):
+            omega = math.pi - distance
+            # pi itself is no float64.
+            left = mpf(math.pi - omega) + mpf("1.2246467991473532e-16")
+            for got, second in zip(slope(omega, delta, d), bend, strict=True):
+                # Rounding of the terms that cancel; beyond, the fourth derivative.
+                allowed = 4 * tol.EPS64 + (2e-10 + (d + 1) ** 2 * float(left) ** 2) * float(left)
+                assert abs(mpf(float(got)) + second * left) <= allowed * abs(second), (delta, d)
+
+
+def test_points_out_of_range_are_nan_with_all_derivatives(x64):
+    assert np.isnan(zwidth.boundary(*np.array(BAD).T)).all()
+    for part in along("held")(np.array(BAD), DIRECTIONS):
+        assert np.isnan(part).all()
+
+
+def test_an_unknown_delay_model_is_refused():
+    with pytest.raises(InputError, match="delay: got 'power', allowed are 'held', 'fractional_power'"):
+        zwidth.boundary(0.1, 0.1, 1, delay="power")  # pyright: ignore[reportArgumentType]
+
+
+# --- points on lines ---------------------------------------------------------------------------------------------
+
+# All calls hold as many points, so that they share one compilation a delay model.
+DEVICES = np.array(list(itertools.product([0.0, 0.1, 2.4, 100.0], [0.0, 0.5, 1.0, 1.3, 4.0])))
+DELTA, D = DEVICES.T
+SHARES = [1e-9, 0.3, 0.9]
+
+
+@pytest.fixture(scope="module")
+def ridge():
+    return {delay: zwidth.alpha_max(DELTA, D, delay=delay) for delay in ("held", "fractional_power")}
+
+
+def assert_on_curve(points, rows, fixed, delay="held"):
+    """The wall is the exact point of the curve with this alpha (or beta), found anew by mpmath from the frequency."""
+    for row in rows:
+        omega, delta, d = float(points.omega[row]), DELTA[row], D[row]
+        if omega in (0.0, math.pi):
+            continue
+        wall = [mpf(float(points.alpha[row])), mpf(float(points.beta[row]))]
+        with mp.workdps(80):
+
+            def offset(w, delta=delta, d=d, wall=wall):
+                return oracles.boundary(w, delta, d, delay)[fixed] - wall[fixed]
+
+            exact_omega = mp.findroot(offset, (mpf(omega), mpf(omega) * (1 - mpf(10) ** -10)), solver="secant")
+            exact = oracles.boundary(exact_omega, delta, d, delay)
+            step = exact_omega * mpf(10) ** -20
+            near = oracles.boundary(exact_omega - step, delta, d, delay)
+            slope = (near[1 - fixed] - exact[1 - fixed]) / (near[fixed] - exact[fixed])
+            size = abs(exact[0]) + abs(exact[1])
+            condition = size + abs(slope * exact[fixed]) * tol.EPS64 / tol.BOUNDARY_POINT.float64
+            error = abs(wall[1 - fixed] - exact[1 - fixed])
+            assert error <= tol.BOUNDARY_POINT.float64 * condition, (delta, d)
+            assert abs(omega - exact_omega) <= 1e-8
+
+
+def radius(alpha, beta, delta, d):
+    """The spectral radius by NumPy's roots of the exact polynomial."""
+    with mp.workdps(oracles.digits_for(delta)):
+        coefficients = [float(term) for term in oracles.polynomial(alpha, beta, delta, d)]
+    return np.abs(np.roots(coefficients)).max()
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_columns(ridge, share):
+    alpha = share * ridge["held"].alpha
+    lower = zwidth.boundary_point(DELTA, D, alpha=alpha, side="lower")
+    upper = zwidth.boundary_point(DELTA, D, alpha=alpha, side="upper")
+    for points in (lower, upper):
+        assert (points.status == Status.OK).all()
+        np.testing.assert_allclose(points.alpha, alpha, rtol=1e-14)
+        assert_on_curve(points, range(DELTA.size), fixed=0)
+    assert (lower.beta < upper.beta).all()
+    for row in range(DELTA.size):
+        width = upper.beta[row] - lower.beta[row]
+        sides = lower.beta[row] + width * np.array([-0.01, 0.01, 0.99, 1.01])
+        stable = [radius(alpha[row], beta, DELTA[row], D[row]) < 1 for beta in sides]
+        # At 1e-9 of the height the outer poles are closer to the circle than np.roots resolves.
+        assert share < 1e-3 or stable == [False, True, True, False]
+
+
+@pytest.mark.parametrize("height", [0.05, 0.5, 0.97])
+def test_rows(ridge, height):
+    beta = -DELTA + height * (ridge["held"].beta + DELTA)
+    points = zwidth.boundary_point(DELTA, D, beta=beta)
+    assert (points.status == Status.OK).all()
+    np.testing.assert_allclose(points.beta, beta, rtol=1e-14)
+    assert_on_curve(points, range(DELTA.size), fixed=1)
+    for row in range(DELTA.size):
+        inner, outer = (radius(s * points.alpha[row], beta[row], DELTA[row], D[row]) for s in (0.99, 1.01))
+        assert inner < 1 < outer
+
+
+def test_a_strongly_damped_device_is_bounded_by_a_pole_at_minus_one():
+    delta, beta = np.full(DELTA.size, 10.0), np.full(DELTA.size, -1.0)
+    points = zwidth.boundary_point(delta, np.zeros(DELTA.size), beta=beta)
+    with mp.workdps(60):
+        c = mp.exp(-10)
+        # alpha + 2 beta = 2 delta^2 (1 + c)/(delta (1 + c) - 2 (1 - c))
+        alpha = 200 * (1 + c) / (10 * (1 + c) - 2 * (1 - c)) + 2
+    np.testing.assert_array_equal(points.omega, math.pi)
+    np.testing.assert_allclose(points.alpha, float(alpha), rtol=1e-14)
+
+
+def test_fractional_power_points(ridge):
+    top = ridge["fractional_power"]
+    alpha = 0.6 * top.alpha
+    for side in ("lower", "upper"):
+        points = zwidth.boundary_point(DELTA, D, alpha=alpha, side=side, delay="fractional_power")
+        rows = np.flatnonzero(D % 1)
+        assert (points.status[rows] == Status.OK).all()
+        assert_on_curve(points, rows, fixed=0, delay="fractional_power")
+
+
+def test_lines_without_a_stable_part(ridge):
+    nan = np.full(DELTA.size, np.nan)
+    lines: tuple[dict[str, Any], ...] = (
+        {"alpha": 1.001 * ridge["held"].alpha},
+        {"alpha": 1.001 * ridge["held"].alpha, "side": "upper"},
+        {"alpha": np.zeros(DELTA.size)},
+        {"alpha": -np.ones(DELTA.size), "side": "upper"},
+        {"beta": -1.001 * DELTA - 0.01},
+        {"beta": 10 * (DELTA + 1)},
+    )
+    for line in lines:
+        points = zwidth.boundary_point(DELTA, D, **line)
+        np.testing.assert_array_equal(points.status, Status.NO_BOUNDARY)
+        for value in (points.alpha, points.beta, points.omega):
+            np.testing.assert_array_equal(value, nan)
+
+
+def test_bad_points_are_marked_and_leave_the_others_alone(ridge):
+    alpha = 0.3 * ridge["held"].alpha
+    clean = zwidth.boundary_point(DELTA, D, alpha=alpha)
+    for name, value in (("delta", -1.0), ("delta", np.inf), ("d", np.nan), ("alpha", np.nan), ("alpha", np.inf)):
+        arguments = {"delta": DELTA, "d": D, "alpha": alpha}
+        arguments[name] = np.where(np.arange(DELTA.size) == 7, value, arguments[name])
+        got = zwidth.boundary_point(**arguments)
+        assert got.status[7] == Status.INVALID_INPUT
+        assert np.isnan([got.alpha[7], got.beta[7], got.omega[7]]).all()
+        for mine, other in zip(got, clean, strict=True):
+            np.testing.assert_array_equal(np.delete(mine, 7), np.delete(other, 7))
+
+
+@pytest.mark.parametrize(
+    "line, message",
+    [
+        ({}, "beta, alpha: got none; give exactly one of the two"),
+        ({"alpha": 0.1, "beta": 0.1}, "beta, alpha: got both; give exactly one"),
+        ({"alpha": 0.1, "side": "top"}, "side: got 'top', allowed are 'lower', 'upper'"),
+        ({"alpha": "0.1"}, "alpha.*: got '0.1', a real number"),
+    ],
+)
+def test_what_is_refused(line, message):
+    with pytest.raises(InputError, match=message):
+        zwidth.boundary_point(0.1, 1, **line)
