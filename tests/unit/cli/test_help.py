@@ -54,6 +54,6 @@ def test_a_file_that_cannot_be_written_is_named_as_it_was_given(tmp_path):
     )
     run = str(tmp_path / "run")
     assert CliRunner().invoke(cli, ["run", str(tmp_path / "config.yaml"), "--out", run]).exit_code == 0
-    with pytest.raises(OSError, match="page.html") as caught:
+    with pytest.raises(OSError, match="page") as caught:
         CliRunner().invoke(cli, ["report", run, "--out", "/proc/page.html"], catch_exceptions=False)
     assert caught.value.filename == "/proc/page.html"
