@@ -114,12 +114,20 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
         script=script,
         style_digest=digests[0],
         script_digest=digests[1],
+        missing="".join(_miss(entry) for entry in content["studies"] if entry not in done),
         contents="".join(f'<li><a href="#{escape(each["name"])}">{escape(each["name"])}</a></li>' for each in done),
         sections="".join(_section(where, entry) for entry in done),
         beside=f" Beside it goes the folder <code>{INPUTS}</code> of the run." if content.get("inputs") else "",
         versions=_scrolling("Versions", rows),
         config=f'<h3>Configuration</h3><pre tabindex="0">{escape(config)}</pre>' if config else "",
     )
+
+
+def _miss(entry: dict[str, Any]) -> str:
+    """What is said of a study that has no section."""
+    why = f"it failed: {entry['error']}" if entry.get("error") else "it is not finished"
+    remedy = "'zwidth run CONFIG --resume' computes it"
+    return f"<p><strong>{escape(entry['name'])} is not here</strong>, for {escape(why)}; {remedy}.</p>"
 
 
 def _section(where: Path, entry: dict[str, Any]) -> str:

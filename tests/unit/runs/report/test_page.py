@@ -181,3 +181,16 @@ def test_a_sweep_over_one_parameter_has_its_curve_and_a_map_without_edges_names_
 
 def test_the_day_of_a_run_is_told_as_people_write_it(page):
     assert re.search(r"Computed on \d{4}-\d\d-\d\d at \d\d:\d\d UTC, in float64", page)
+
+
+def test_a_study_that_failed_is_told_and_has_no_section(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise ValueError("<no luck>")
+
+    monkeypatch.setattr("zwidth.studies.ridge.RidgeStudy.compute", fail)
+    walls = {"kind": "boundary", "name": "walls", "delta": 0.1, "d": 1}
+    assert not zwidth.run({"version": 1, "name": "example", "studies": [TOP, walls]}, out=tmp_path).ok
+    page = zwidth.write_report(tmp_path).read_text(encoding="utf-8")
+    assert "<strong>top is not here</strong>, for it failed: ValueError: &lt;no luck&gt;; " in page
+    assert 'id="top"' not in page
+    assert 'id="walls"' in page
