@@ -192,7 +192,7 @@ def test_a_contact_is_simulated_on_demand(page):
     settle(page)
     scene, shown = shown_scene(page), data_of(page, "contact")
     page.uncheck("#contact-wanted")
-    start = -0.5 * scene.timing.period
+    start = -0.5 * scene.timing.period / max(1.0, 10.0 * scene.delta)
     hit = scene.simulate(start_position=start, start_velocity=0.1, contact="unilateral", periods=shown["x"].size)
     np.testing.assert_array_equal(shown["force"], hit.wall_force)
 
@@ -208,12 +208,31 @@ def test_a_refused_value_is_said_and_the_page_goes_on(page):
     assert_edge_is_of(page, shown_scene(page))
 
 
+def test_a_rate_is_a_period_and_one_that_is_none_is_refused(page):
+    before = value_of(page, "period")
+    for text in ("0", "-3", ""):
+        page.fill("#rate", text)
+        page.press("#rate", "Enter")
+        wait(page, "document.getElementById('error').textContent.startsWith('rate 1/T in Hz: no number above 0')")
+        page.press("#rate", "Escape")
+        settle(page)
+        assert page.inner_text("#error") == ""
+        assert value_of(page, "rate") == pytest.approx(1e3 / before, rel=1e-5)
+    page.fill("#rate", "800")
+    assert "before this entry" in page.inner_text("#verdict-line")
+    page.press("#rate", "Enter")
+    settle(page)
+    assert value_of(page, "period") == 1.25
+
+
 def test_it_fits_and_can_be_read(page):
-    for width, scheme in ((390, "dark"), (390, "light"), (1280, "light"), (1280, "dark")):
+    for width, scheme in ((390, "dark"), (390, "light"), (900, "light"), (1280, "light"), (1280, "dark")):
         page.set_viewport_size({"width": width, "height": 900})
         page.emulate_media(color_scheme=scheme)
         settle(page)
         assert page.evaluate("document.documentElement.scrollWidth") <= width
+        # No control reaches over the edge of its card.
+        assert page.evaluate(OVER_THE_EDGE) == []
         # WCAG's contrast of the text on what it stands on: 4.5 for AA.
         assert page.evaluate(CONTRAST) >= 4.5
 
@@ -224,6 +243,11 @@ def test_when_the_server_ends_the_page_says_so(shared, server):
     wait(shared, "document.getElementById('error').textContent.includes('has ended')")
 
 
+OVER_THE_EDGE = """(() => {
+  const edge = document.getElementById("controls").getBoundingClientRect().right;
+  const parts = [...document.querySelectorAll("#controls .row > *")];
+  return parts.filter(e => e.getBoundingClientRect().right > edge).map(e => e.id);
+})()"""
 CONTRAST = """(() => {
   const light = color => color.match(/[\\d.]+/g).slice(0, 3).map(Number).map(v => v / 255)
     .map(v => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)

@@ -214,9 +214,11 @@ def test_a_damaged_description_of_a_store_is_told(config, copy, capsys):
 
 
 def test_a_folder_without_a_store_is_told(tmp_path, capsys):
-    for words in (["verify", tmp_path], ["export", tmp_path, "--csv", tmp_path / "x.csv"], ["verify", tmp_path / "no"]):
+    for words in (["verify", tmp_path], ["export", tmp_path, "--csv", tmp_path / "x.csv"]):
         assert main_of(*words) == 2
         assert "holds no store of a sweep" in capsys.readouterr().err
+    assert main_of("verify", tmp_path / "no") == 2
+    assert "no such folder" in capsys.readouterr().err
 
 
 def test_the_plan_of_a_configuration_without_sweeps(tmp_path, capsys):

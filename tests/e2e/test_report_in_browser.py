@@ -31,9 +31,35 @@ def test_the_page_opens_from_the_disk(browser, tmp_path, width, scheme):
         expected = zwidth.spectral_radius(0.01, -0.2, 0.5, 1.0)
         assert float(readout.inner_text().split(":")[1]) == pytest.approx(float(expected), rel=1e-4)
         # The map's corner lies within its axes: the highest row of the first column.
-        page.locator("canvas").hover(position={"x": 64, "y": 14})
+        page.locator("canvas").hover(position={"x": 72, "y": 14})
         assert readout.inner_text().startswith("normalized stiffness = 0.01, normalized virtual damping = 1: ")
         page.locator("canvas").hover(position={"x": 4, "y": 4})
         assert page.evaluate("document.querySelector('canvas').width") > 250
         assert page.asked == []
         assert page.complaints == []
+
+
+WRITTEN = """window.written = [];
+const fillText = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (text, ...more) {
+  written.push(text);
+  return fillText.call(this, text, ...more);
+};"""
+
+
+def test_round_values_stand_beside_a_map_of_chosen_rows_and_columns(browser, tmp_path):
+    axes = {
+        "alpha": {"log": {"start": 0.002, "stop": 8, "num": 301}},
+        "beta": {"linear": {"start": -2, "stop": 2, "num": 170}},
+        "delta": 0.1,
+        "d": 1,
+    }
+    fine = study("fine", axes, ("stable",))
+    zwidth.run({"version": 1, "name": "example", "studies": [fine]}, out=tmp_path / "run")
+    file = zwidth.write_report(tmp_path / "run")
+    with open_page(browser, viewport={"width": 1280, "height": 900}) as page:
+        page.add_init_script(WRITTEN)
+        page.goto(file.as_uri())
+        written = set(page.evaluate("written"))
+    assert {"0.01", "0.1", "1", "-1.5", "0", "0.5", "2", "yes", "no"} <= written
+    assert max(len(text) for text in written if not text.startswith("normalized")) <= 4

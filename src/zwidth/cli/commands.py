@@ -12,6 +12,7 @@ import click
 
 from zwidth import __version__
 from zwidth.cli.options import (
+    OF_SCENE,
     SHARE,
     Parsed,
     figure_option,
@@ -20,6 +21,7 @@ from zwidth.cli.options import (
     read_factor,
     save_figure,
     scene_options,
+    show_example,
 )
 from zwidth.pages import words
 from zwidth.pages.words import row
@@ -50,11 +52,14 @@ def cli() -> None:
     """
 
 
-@cli.command()
-@scene_options(wall=True, required=True)
+@cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
+@scene_options(wall=True)
 @json_option
 def check(scene: Any, as_json: bool) -> None:
-    """Judge one wall: stable, passive, how far from the boundary."""
+    """Judge one wall: stable, passive, how far from the boundary.
+
+    It needs --stiffness, --mass (or --device) and --rate (or --period); damping and delay are 0 where left out.
+    """
     from zwidth.scenes.assessment import assess, limits_of
 
     verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
@@ -65,10 +70,10 @@ def check(scene: Any, as_json: bool) -> None:
     words.tell(result, lines + words.note_lines(notes), as_json)
 
 
-@cli.command()
+@cli.command(**show_example("ridge", OF_SCENE))
 @click.option("--delta", type=quantity_type("1", Range(*SIZES["delta"])), help="Normalized physical damping b T/m.")
 @click.option("--d", type=quantity_type("1", Range(*SIZES["d"])), help="Delay in periods.")
-@scene_options(wall=False, required=False)
+@scene_options(wall=False, instead="--delta and --d")
 @click.option(
     "--delay-model",
     type=click.Choice(["held", "fractional_power"]),
@@ -87,7 +92,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     from zwidth.scenes.scene import Scene
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
-        raise click.UsageError("give either --delta and --d, or --mass and --period (with --damping and --delay)")
+        raise click.UsageError("give either --delta and --d, or --mass and --rate (with --damping and --delay)")
     given = scene
     scene = Scene(Device(1.0, delta), Timing(1.0, d)) if scene is None else scene
     scene = replace(scene, timing=replace(scene.timing, delay_model=delay_model))
@@ -285,8 +290,8 @@ _FACTOR = Parsed("FACTOR", read_factor, "write a factor, as 2, or 6 dB")
 _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")), "write degrees, as 30")
 
 
-@cli.command()
-@scene_options(wall=False, required=True)
+@cli.command(**show_example("recommend --phase-margin 30", OF_SCENE))
+@scene_options(wall=False)
 @click.option("--stiffness-fraction", type=SHARE, help="At most this share of K_max; 75% if nothing is asked for.")
 @click.option("--gain-margin", type=_FACTOR, help="At least this factor on K and B together.")
 @click.option("--phase-margin", type=_DEGREES, help="At least so many degrees.")
@@ -297,7 +302,8 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wanted: Any) -> None:
     """Say which wall to set: the stiffest one with wanted margins.
 
-    Then what else is known of that wall, and what would allow a stiffer one.
+    Then what else is known of that wall, and what would allow a stiffer one. It needs --mass (or --device) and --rate
+    (or --period); damping and delay are 0 where left out.
     """
     if code and as_json:
         raise click.UsageError("give --code or --json: each has all of the output")

@@ -8,7 +8,16 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
-from zwidth.cli.options import Parsed, flag_of, json_option, read_pairs, read_share, scene_options
+from zwidth.cli.options import (
+    OF_SCENE,
+    Parsed,
+    flag_of,
+    json_option,
+    read_pairs,
+    read_share,
+    scene_options,
+    show_example,
+)
 from zwidth.pages.words import row, tell
 from zwidth.words.formatting import count_digits, name_wall, plain, round_safely, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS
@@ -31,26 +40,26 @@ _TOLERANCE = Parsed(
 )
 
 
-@cli.command()
-@scene_options(wall=True, required=True)
-@click.option("--find", type=click.Choice(tuple(_FINDS)), help="What to choose for the stiffness.")
+@cli.command(**show_example("design --stiffness '30 kN/m' --find rate", OF_SCENE))
+@scene_options(wall=True)
+@click.option("--find", type=click.Choice(tuple(_FINDS)), help="What is to be chosen for --stiffness.")
 @click.option(
     "--tolerance",
     "tolerances",
     type=_TOLERANCE,
     multiple=True,
     callback=read_pairs,
-    help="As mass=10%; may be repeated.",
+    help="By how much a property may differ, as mass=10%; may be repeated.",
 )
 @click.option(
     "--distribution",
     type=click.Choice(("uniform", "normal")),
     default="uniform",
     show_default=True,
-    help="Of the tolerances: a share either way, or a standard deviation.",
+    help="What a tolerance is: a share either way, or a standard deviation.",
 )
-@click.option("--samples", type=int, help="Devices drawn; 10,000, or 200 of a scene with parts.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the draws.")
+@click.option("--samples", type=int, help="How many devices are drawn; 10,000, or 200 of a scene with parts.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the draws.")
 @json_option
 def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: bool, **drawn: Any) -> None:
     """Say what a wanted stiffness needs, or what tolerances cost.

@@ -19,6 +19,7 @@ from zwidth.cli.options import (
     quantity_type,
     read_logs,
     save_figure,
+    show_example,
     velocity_options,
 )
 from zwidth.pages.words import row, tell
@@ -59,7 +60,10 @@ _WALL = Parsed("WALL", _read_wall)
 _SOFTER = 50
 
 
-@cli.command()
+_BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
+
+
+@cli.command(**show_example("fit --rate '1 kHz'", *_BUZZING))
 @click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--buzz", "walls", type=_WALL, multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
 @period_options
@@ -136,11 +140,11 @@ def fit(
 _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
 
 
-@cli.command()
+@cli.command(**show_example("excite --rate '1 kHz' --force '2 N' --resolution '10 um'"))
 @period_options
-@click.option("--force", type=quantity_type("N", POSITIVE), required=True, help="The largest to command, in N.")
+@click.option("--force", type=quantity_type("N", POSITIVE), required=True, help="The largest force to command, in N.")
 @click.option("--resolution", type=quantity_type("m", POSITIVE), required=True, help="One count of the encoder, in m.")
-@click.option("--duration", type=_TIME, default="60 s", show_default=True, help="In s.")
+@click.option("--duration", type=_TIME, default="60 s", show_default=True, help="How long it plays, in s.")
 @click.option("--response", type=_FILE, help="The response of a first record, to design the second.")
 @click.option("--out", type=_FILE, default=Path("play.csv"), show_default=True, help="The file to play.")
 @velocity_options
@@ -167,7 +171,7 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
     tell(found, [*lines, row("wrote", str(out))], as_json)
 
 
-@cli.command()
+@cli.command(**show_example("respond log.csv --save response.csv --figure response.png"))
 @click.argument("logs", metavar="LOG.csv...", nargs=-1, required=True, type=_FILE)
 @period_options
 @click.option("--cycle", type=_TIME, help="Period of the force, in s; found from a force that repeats exactly.")

@@ -93,6 +93,14 @@ def _is_plausible(kind: str, value: float) -> bool:
     return value == 0 or low <= abs(value) <= high
 
 
+OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
+
+
+def show_example(command: str, *more: str) -> dict[str, str]:
+    """What a command is declared with so that its help ends with an example, on lines of their own."""
+    return {"epilog": "\b\nExample:\n" + " \\\n    ".join((f"  zwidth {command}", *more))}
+
+
 class Parsed(click.ParamType):
     """What a function reads of an option's text, or raises a `ValueError` for: then ``remedy`` says what to write."""
 
@@ -170,16 +178,16 @@ def _add_option(command: Command, path: str, required: bool = False) -> Command:
         # The parts themselves check the ranges of theirs.
         allowed = ANY if path in OF_PARTS else known.allowed
         kind = click.INT if known.whole else quantity_type(known.unit, allowed, periods=path == "delay")
-        unit, note = "" if known.whole else f", in {known.unit}", f"; {known.note}" if known.note else ""
+        unit, note = "" if known.unit == "1" else f", in {known.unit}", f"; {known.note}" if known.note else ""
         text = f"{known.sentence}{unit}{note}"
     return click.option(flag_of(path), path.replace(".", "__"), type=kind, required=required, help=f"{text}.")(command)
 
 
-def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]:
+def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
     """The options that describe a scene, and perhaps its wall; the command gets a `zwidth.Scene` as ``scene``."""
-    # Where none is required it is None without any of them.
+    # Where other options may stand instead it is None without any of them.
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
-    return _take_options("scene", (*bare, *_PARTS), ("stiffness",), lambda given: build_scene(given, required))
+    return _take_options("scene", (*bare, *_PARTS), ("stiffness",), lambda given: build_scene(given, instead))
 
 
 def _take_options(
@@ -226,18 +234,19 @@ def _read_period(given: dict[str, Any]) -> float | None:
 period_options = _take_options("period", ("period", "rate"), (), _read_period)
 
 
-def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
-    """The scene of some options by path; None where nothing describes one and none is required."""
+def build_scene(given: dict[str, Any], instead: str = "") -> Scene | None:
+    """The scene of some options by path; None where nothing describes one and other options may stand instead."""
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
 
-    if not given and not required:
+    if not given and instead:
         return None
     if {"period", "rate"} <= given.keys():
         raise click.UsageError(_BOTH)
     device = given.pop("device", None)
-    if not (device or "mass" in given) or not {"period", "rate"} & given.keys():
-        raise click.UsageError("give --mass or --device, and one of --period and --rate")
+    known = {"--mass or --device": device or "mass" in given, "--rate or --period": {"period", "rate"} & given.keys()}
+    if missing := [flags for flags, there in known.items() if not there]:
+        raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
     for line in doubts_of(given):
         click.echo(f"zwidth: {line}", err=True)
 

@@ -182,6 +182,9 @@ class Strict(BaseModel):
         """Hook: what is wrong with a key that does not belong here, what is allowed and the remedy."""
         if name == "<<":
             return "unknown key", "YAML 1.2 has no merge keys", "write the keys out"
+        key, colon, value = name.partition(":")
+        if colon and key in cls.model_fields:
+            return "unknown key", "a blank follows the colon behind a key", f"write '{key}: {value}'"
         allowed = f"{cls.what} has the keys {listing(cls.model_fields)}"
         return "unknown key", allowed, suggestion(name, cls.model_fields, "remove it")
 

@@ -181,6 +181,10 @@ for _tag, _pattern, _first in (
     _Resolver.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
 
 
+# Keys of a mapping that stand on one line.
+_ON_A_LINE = 4
+
+
 class _Dumper(yaml.SafeDumper):
     """PyYAML's, with quotes around what the core schema would take for a number."""
 
@@ -189,6 +193,12 @@ class _Dumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
         """Write everything out."""
         return True
+
+    def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.MappingNode:
+        """A scene, say, has a line for each key; of few numbers one line holds all."""
+        node = super().represent_mapping(tag, mapping, flow_style)
+        node.flow_style = node.flow_style and len(node.value) <= _ON_A_LINE
+        return node
 
 
 class _Alias(yaml.Node):

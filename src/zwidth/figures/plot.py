@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Concatenate
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -37,6 +37,7 @@ from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
 from zwidth.rigid.response import settling_time
 from zwidth.scenes.assessment import passive_edge, round_margin
+from zwidth.scenes.base import of_scene
 from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
@@ -62,6 +63,13 @@ def __dir__() -> list[str]:
 def _draws(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Let a function draw in the house's look, in the units of its first argument."""
     return in_own_units(style.house_style()(function))
+
+
+def _draws_scene(
+    function: Callable[Concatenate[Scene, Parameters], Result],
+) -> Callable[Concatenate[Scene, Parameters], Result]:
+    """The same of a function whose first argument is a scene; anything else is refused."""
+    return of_scene(style.house_style()(function))
 
 
 def _axes(ax: Axes | None) -> Axes:
@@ -176,7 +184,7 @@ def _draw_response(ax: Axes, response: Table) -> None:
         ax.legend([dot], [text], loc="upper right", handletextpad=0.2)
 
 
-@_draws
+@_draws_scene
 def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = None) -> Axes:
     """Draw the stiffest stable wall over one parameter of a scene, all others as they are.
 
@@ -210,7 +218,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     return ax
 
 
-@_draws
+@_draws_scene
 def step(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -251,7 +259,7 @@ def _frequencies(scene: Scene) -> np.ndarray:
     return np.concatenate([slow, fast[1:]])
 
 
-@_draws
+@_draws_scene
 def bode(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -300,7 +308,7 @@ def bode(
     return np.array([upper, lower])
 
 
-@_draws
+@_draws_scene
 def nyquist(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -331,7 +339,7 @@ def nyquist(
     return ax
 
 
-@_draws
+@_draws_scene
 def poles(
     scene: Scene,
     stiffness: float | str | None = None,

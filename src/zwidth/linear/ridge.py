@@ -149,9 +149,9 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
         (w, other), heights, slopes = _nearest_two(border.boundary, alpha, beta)
     w, other = sorted((w, other))
     # Of the place in beta the flatter one makes the less of alpha.
-    apart = abs(slopes[0] - slopes[1])
+    apart, missed = abs(slopes[0] - slopes[1]), abs(heights[1] - heights[0]) / abs(alpha)
     flat = min(1.0, min(map(abs, slopes)) / apart) if apart > 0 else 1.0
-    if flat * abs(heights[1] - heights[0]) <= _MEETS * abs(alpha) and other - w > 1e-6:
+    if missed <= _NEAR and flat * missed <= _MEETS and other - w > 1e-6:
         return BoundRidge(alpha, beta, w, other, _condition(w), _condition(other))
     # A double pole at z = -1, or at z = 1 of a device that moves against its force: the curve ends on the line there.
     for w in (np.pi, 0.0):

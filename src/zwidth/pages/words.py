@@ -94,6 +94,11 @@ def word_of(verdict: Assessment) -> str:
     return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
 
 
+def spell_radius(radius: float) -> str:
+    """A spectral radius with its name, six decimals where it is near the circle."""
+    return f"spectral radius {f'{radius:.6f}' if radius < 1e4 else plain(radius)}"
+
+
 @in_own_units
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
     wall, word = scene.wall, word_of(verdict)
@@ -118,7 +123,7 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
         words = f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}"
         normalized = [row("normalized", words)]
     if by_poles:
-        told = f"{told}, spectral radius {verdict.spectral_radius:.6f}"
+        told = f"{told}, {spell_radius(verdict.spectral_radius)}"
     return [
         *scene_lines(scene),
         row("wall", f"K = {spell_stiffness(wall.stiffness)}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),

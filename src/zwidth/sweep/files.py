@@ -97,6 +97,10 @@ def hidden_beside(path: Path) -> Iterator[Path]:
     partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     try:
         yield partial
+    except OSError as error:
+        # What the system says of it is meant of the path.
+        error.filename = str(path) if error.filename == str(partial) else error.filename
+        raise
     finally:
         remove_quietly(partial)
 

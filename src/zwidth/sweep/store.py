@@ -299,7 +299,8 @@ def list_stores(path: str | os.PathLike[str]) -> list[Path]:
         return [folder]
     found = sorted(found for found in folder.glob(f"*{SUFFIX}") if not found.name.startswith("."))
     if not found:
-        raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
+        what = "holds no store of a sweep" if folder.is_dir() else "no such folder"
+        raise StoreError(f"{folder}: {what}; name the folder of a run with a study of kind 'sweep', or a store in it")
     return found
 
 

@@ -124,7 +124,7 @@ _PARAMETERS = (
     Parameter("rate", "sampling rate 1/T", "1/T", RATES, "Hz", None, "in place of the period", "sampling rate"),
     Parameter(
         "delay", "delay t_d from a sample to the moment its force acts", "t_d", NOT_NEGATIVE, "s", (0.0, 0.02),
-        "or in periods", "delay",
+        "or in sampling periods, as '1.5 periods'", "delay",
     ),
     Parameter("mass", "mass m of the device", "m", POSITIVE, "kg", (1e-3, 10.0), short_name="mass"),
     Parameter(

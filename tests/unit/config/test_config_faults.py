@@ -159,6 +159,10 @@ FAULTS = {
     "two_documents": [("8:1: a second document begins here", "remove the '---' or split the file")],
     "unclosed_bracket": [("7:6: not valid YAML", "close the bracket opened at line 6, column 12")],
     "unclosed_quote": [("5:1: not valid YAML", "check the quoted text that begins at line 3")],
+    "blank_missing": [
+        ("3:8: scene.mass: missing", "add 'mass: 0.1 kg'"),
+        ("3:9: scene.mass:100 g: unknown key", "write 'mass: 100 g'"),
+    ],
     "unknown_key": [("6:5: studies[0].detla: unknown key", "did you mean 'delta'?")],
     "unknown_top_key": [("8:1: studys: unknown key", "did you mean 'studies'?")],
     "utf16": [("1:1: got the byte 0xff, which is not UTF-8", "save it as UTF-8")],

@@ -97,6 +97,13 @@ def test_whole_numbers_are_points():
     assert "in 1" not in ax.get_xlabel()
 
 
+@pytest.mark.parametrize(("name", "more"), [("ridge", ("damping", [1.0])), ("step", (1.0,)),
+                                            ("bode", ()), ("nyquist", ()), ("poles", ())])  # fmt: skip
+def test_what_is_no_scene_is_refused_by_name(name, more, unpainted):
+    with pytest.raises(zwidth.InputError, match=r"scene: got 3\.0; a zwidth\.Scene is needed"):
+        getattr(plot, name)(3.0, *more)
+
+
 def test_it_shows_its_own_names():
     assert dir(plot) == sorted(plot.__all__)
     assert "bode" in dir(plot)

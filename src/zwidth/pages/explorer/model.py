@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.linear.passivity import find_obstacle
-from zwidth.pages.words import check_lines, list_slopes, pole_words, row, word_of
+from zwidth.pages.words import check_lines, list_slopes, pole_words, row, spell_radius, word_of
 from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin
 from zwidth.scenes.scene import Scene
@@ -134,8 +134,9 @@ def ridge_path(scene: Scene) -> Curve:
 
 def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     """Time, position and wall force of the device that hits the wall, and what comes of it in words."""
-    # From five periods before the wall at a tenth of a meter a second; the normalized device at as many units.
-    start = -_APPROACH * _IMPACT * scene.timing.period
+    # From five periods before the wall at a tenth of a meter a second, or half the way on which damping stops the
+    # device; the normalized one at as many units.
+    start = -_APPROACH * _IMPACT * scene.timing.period / max(1.0, 2.0 * _APPROACH * float(scene.delta))
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
     kind = MotionKind(int(hit.outcome))
     end = "" if kind in (MotionKind.UNCLEAR, MotionKind.INVALID) else f", {kind.name.lower()} at the end"
@@ -156,10 +157,13 @@ def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
     for k, level in enumerate(LEVELS):
         lines: Any = generator.lines(level)
         for line in sorted(lines, key=len, reverse=True):
-            # Below the ridge, where no other line runs, each further down than the last one, so that names part; of
-            # several pieces the longest one has the name.
-            named = line[np.argmax(line[:, 0] / np.ptp(across) - (0.4 + 0.3 * k) * line[:, 1] / np.ptp(up))]
+            # Below the ridge, where no other line runs, each nearer to the tip than the last one, so that names part;
+            # of several pieces the longest one has the name.
+            named = line[np.argmax(line[:, 0] / np.ptp(across) - (2.0 - 0.35 * k) * line[:, 1] / np.ptp(up))]
             text = f"{level:g}" if line is max(lines, key=len) else ""
+            # A piece without a name and smaller than two cells of the grid is a speck.
+            if not text and all(np.ptp(line, axis=0) < (2.0 * (x[1] - x[0]), 2.0 * (y[1] - y[0]))):
+                continue
             for name, value in zip(found, (line[:, 0], line[:, 1], *named, text), strict=True):
                 found[name].append(value)
     return found
@@ -208,7 +212,7 @@ def normalized_lines(verdict: Assessment) -> list[str]:
         for end in (verdict.stiffness_limit, verdict.passivity_margin, verdict.alpha_max)
     )
     rows = {
-        "verdict": f"{word_of(verdict)}, spectral radius {verdict.spectral_radius:.6f}",
+        "verdict": f"{word_of(verdict)}, {spell_radius(verdict.spectral_radius)}",
         "stable alpha": f"up to {limit} at this beta",
         "stable beta": f"{span} at this alpha",
         "passive": f"{'yes' if verdict.passive else 'no'}, margin {spare} of delta",

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from bokeh.document import Document
 from bokeh.events import DoubleTap, PressUp, Tap
-from bokeh.models import ColumnDataSource, DataRange1d, Span
+from bokeh.models import BasicTickFormatter, ColumnDataSource, DataRange1d, Span
 from bokeh.plotting import figure
 
 from zwidth.figures import style
 from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls, read_link, to_link, to_python, to_yaml
 from zwidth.pages.explorer.model import IMPORTING, Update, compute_details, show_outlines
+from zwidth.pages.words import spell_radius
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import ZwidthError
@@ -87,6 +88,10 @@ class Page:
         plot = figure(height=height, sizing_mode="stretch_width", tools=tools, output_backend="canvas", **keywords)
         plot.toolbar.logo, plot.toolbar.autohide, plot.toolbar.active_drag = None, True, None  # pyright: ignore
         plot.outline_line_color = None  # pyright: ignore
+        for axis in plot.axis:
+            # A thousandth is written out.
+            if isinstance(axis.formatter, BasicTickFormatter):
+                axis.formatter.power_limit_low = -6
         self.inks += [(plot, "background_fill_color", "paper"), (plot, "border_fill_color", "paper")]
         return plot
 
@@ -273,7 +278,7 @@ class Page:
                 axis.update(start=low, end=high, reset_start=low, reset_end=high)
         self._point_at_wall()
         word = "stable" if stable else "UNSTABLE"
-        said = {"error": "", "word": word, "radius": f"spectral radius {np.abs(poles).max():.6f}", "busy": True}
+        said = {"error": "", "word": word, "radius": spell_radius(np.abs(poles).max()), "busy": True}
         said |= {"poles_words": model.caption_poles(poles, word.lower()), "state": controls.shown(), "frame": frame}
         recipes = {"yaml": to_yaml, "python": to_python, "link": to_link} if rest else {}
         self.tell({**said, **{name: spell(controls) for name, spell in recipes.items()}})
@@ -340,4 +345,6 @@ class Page:
 
 def _explain(error: Exception) -> str:
     """What the page says of an error; whatever it is, the page stays."""
-    return str(error) if isinstance(error, ZwidthError) else f"{type(error).__name__}: {error}"
+    if isinstance(error, ZwidthError):
+        return str(error)
+    return f"this cannot be computed ({type(error).__name__}: {error}); change a number, or reload the page"

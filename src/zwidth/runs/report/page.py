@@ -11,6 +11,7 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +19,8 @@ import numpy as np
 from zwidth.config.study import KINDS
 from zwidth.figures.grid import choose_axes, in_order
 from zwidth.figures.plane import Edges
-from zwidth.figures.style import pick_evenly
-from zwidth.runs.draw import make_edges
+from zwidth.figures.style import pick_evenly, save, style_sheet
+from zwidth.runs.draw import figures_of, make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.files import write_whole
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 FILE = "report.html"
 _GRAY = "not finite, or not known"
+_LINES = " Lines: exact edges of the stable walls, dashed of the passive ones."
 # Of each axis of a slice, of each other axis, and numbers a map in all: half a megabyte.
 _ALONG, _OTHERS, _MOST = 120, 9, 120_000
 
@@ -102,14 +104,17 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
     config = path.read_text(encoding="utf-8") if path.is_file() and not path.is_symlink() else ""
     versions = content["versions"]
     rows = [f'<th scope="row">{escape(name)}</th><td>{escape(str(each))}</td>' for name, each in versions.items()]
-    told = ("name", "description", "started", "precision", "config_sha256")
+    told = {name: content[name] for name in ("name", "description", "precision", "config_sha256")}
+    # Days and minutes say enough to people; in the record they are in UTC.
+    told["started"] = content["started"][:16].replace("T", " at ")
     return Template(html).substitute(
-        {name: escape(str(content[name])) for name in told},
+        {name: escape(str(each)) for name, each in told.items()},
         release=escape(str(versions["zwidth"])),
         style=style,
         script=script,
         style_digest=digests[0],
         script_digest=digests[1],
+        missing="".join(_miss(entry) for entry in content["studies"] if entry not in done),
         contents="".join(f'<li><a href="#{escape(each["name"])}">{escape(each["name"])}</a></li>' for each in done),
         sections="".join(_section(where, entry) for entry in done),
         beside=f" Beside it goes the folder <code>{INPUTS}</code> of the run." if content.get("inputs") else "",
@@ -118,10 +123,17 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
     )
 
 
+def _miss(entry: dict[str, Any]) -> str:
+    """What is said of a study that has no section."""
+    why = f"it failed: {entry['error']}" if entry.get("error") else "it is not finished"
+    remedy = "'zwidth run CONFIG --resume' computes it"
+    return f"<p><strong>{escape(entry['name'])} is not here</strong>, for {escape(why)}; {remedy}.</p>"
+
+
 def _section(where: Path, entry: dict[str, Any]) -> str:
     kind, name = str(entry["kind"]), escape(str(entry["name"]))
     said = [*entry.get("answer", ()), *entry.get("notes", ())]
-    notes = "".join(f"<p>{escape(str(each))}</p>" for each in said)
+    notes = f'<div class="told">{"".join(f"<p>{escape(str(each))}</p>" for each in said)}</div>' if said else ""
     method = f'<p class="soft">{escape(KINDS[kind].method)}</p>' if kind in KINDS and KINDS[kind].method else ""
     body = "".join(_contents(where, entry))
     listed = ", ".join(escape(file) for file in sorted(entry.get("files", {})))
@@ -135,12 +147,7 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
     for file in sorted(entry.get("files", {})):
         path = where / file
         if file.endswith(".svg"):
-            data = base64.b64encode(path.read_bytes()).decode()
-            text = f"Figure {path.stem} of the study {entry['name']}"
-            yield (
-                f'<figure><img alt="{escape(text)}" src="data:image/svg+xml;base64,{data}">'
-                f"<figcaption>{escape(path.stem)}</figcaption></figure>"
-            )
+            yield _show_figure(path, entry["name"])
         elif entry.get("kind") == "published" and file.endswith(".json"):
             yield _published(json.loads(path.read_text(encoding="utf-8")))
         elif file.endswith(SUFFIX) and path.is_symlink():
@@ -150,7 +157,26 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
             with open_dataset(path) as data:
                 if not data.attrs["complete"]:
                     raise StoreError(f"{path}: chunks are missing; 'zwidth run CONFIG --resume' computes them")
-                yield from find_slices(data, make_edges(Store(path)))
+                edges = make_edges(Store(path))
+                yield "".join([*find_slices(data, edges), *_draw_curves(data, entry["name"])]) or (
+                    '<p class="soft">It holds no plane of numbers and no curve; zwidth export writes its table.</p>'
+                )
+
+
+def _show_figure(path: Path, study: str) -> str:
+    data, text = base64.b64encode(path.read_bytes()).decode(), f"Figure {path.stem} of the study {study}"
+    image = f'<img alt="{escape(text)}" src="data:image/svg+xml;base64,{data}">'
+    return f"<figure>{image}<figcaption>{escape(path.stem)}</figcaption></figure>"
+
+
+def _draw_curves(data: xarray.Dataset, study: str) -> Iterator[str]:
+    """What a sweep has over one parameter, as `zwidth figures` draws it."""
+    data = data.reset_coords(drop=True)
+    with TemporaryDirectory() as place, style_sheet():
+        for name, draw in figures_of(data):
+            if name in OUTPUTS and len(choose_axes(data, name)) == 1:
+                (file,) = save(draw(), Path(place) / f"{study}_{name}", ("svg",))
+                yield _show_figure(file, study)
 
 
 def _published(content: dict[str, Any]) -> str:
@@ -228,8 +254,7 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
     embedded = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
     return (
         f'<div class="slices"><h3>{escape(name)}</h3><p class="soft">{escape(words)}. '
-        f"Dark to bright: {ends}; gray: {_GRAY}. Lines, if any: exact edges of the stable walls, dashed of the passive "
-        f"ones.{thinned} "
+        f"Dark to bright: {ends}; gray: {_GRAY}.{_LINES if any(content['edges']) else ''}{thinned} "
         "Point, or focus the map and use the arrow keys, to read a value.</p>"
         f'{sliders}<canvas tabindex="0" role="img" aria-label="{escape(words)}"></canvas><output aria-live="polite">'
         f'</output><script type="application/json">{embedded}</script></div>'

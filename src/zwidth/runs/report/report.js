@@ -21,7 +21,7 @@
     small.width = columns; small.height = rows;
     const painter = small.getContext("2d"), pen = canvas.getContext("2d");
     const at = { column: columns >> 1, row: rows >> 1 };
-    const box = { left: 62, top: 12, right: 78, bottom: 44 };
+    const box = { left: 70, top: 12, right: 78, bottom: 44 };
     const logarithmic = data.scale === "log";
     const share = (value) => logarithmic ? Math.log(value / data.low) / Math.log(data.high / data.low)
       : (value - data.low) / (data.high - data.low || 1);
@@ -51,18 +51,23 @@
       k = Math.min(Math.max(k < 0 ? steps.length - 1 : k, 1), steps.length - 1);
       return k - 0.5 + (value - steps[k - 1]) / (steps[k] - steps[k - 1]);
     }
-    // Round values where the steps are even, or their ratios over a decade or more, else some of the steps themselves.
+    // Round values where the steps are even, or their ratios over a decade or more, else some of the steps themselves. Many
+    // steps may be chosen ones of a finer map, each off by half of its steps.
     function ticks(steps, most) {
-      const last = steps.length - 1, span = Math.abs(steps[last] - steps[0]), step = span / last, ratio = (steps[last] / steps[0]) ** (1 / last);
-      const low = Math.min(steps[0], steps[last]), alike = (rule) => typeof steps[0] === "number" && steps.every((value, k) => !k || rule(value, steps[k - 1]));
-      if (low > 0 && span >= 9 * low && alike((value, before) => Math.abs(value / before / ratio - 1) < 1e-3)) {
+      const last = steps.length - 1, span = Math.abs(steps[last] - steps[0]), slack = last > 20 ? 0.6 : 0.01;
+      const low = Math.min(steps[0], steps[last]), number = typeof steps[0] === "number";
+      const even = (scale) => {
+        const first = scale(steps[0]), step = (scale(steps[last]) - first) / last;
+        return steps.every((value, k) => Math.abs(scale(value) - first - k * step) <= slack * Math.abs(step));
+      };
+      if (number && low > 0 && span >= 9 * low && even(Math.log)) {
         const decades = Array.from({ length: 700 }, (_, k) => [1, 2, 5].map((n) => Number(`${n}e${k - 350}`))).flat();
         const round = decades.filter((value) => value >= low * 0.999 && value <= (low + span) * 1.001), tens = round.filter((_, k) => decades.indexOf(round[k]) % 3 === 0);
         const chosen = round.length <= most ? round : tens.filter((_, k) => k % Math.ceil(tens.length / most) === 0);
         return chosen.map((value) => [place(steps, value), spell(value)]);
       }
-      if (!alike((value, before) => Math.abs(Math.abs(value - before) - step) <= 0.01 * step))
-        return [...new Set(Array.from({ length: most }, (_, k) => Math.round(k * last / (most - 1))))].map((k) => [k + 0.5, spell(steps[k]).slice(0, 12)]);
+      if (!number || !even(Number))
+        return [...new Set(Array.from({ length: most }, (_, k) => Math.round(k * last / (most - 1))))].map((k) => [k + 0.5, spell(steps[k], 4).slice(0, 12)]);
       const size = 10 ** Math.floor(Math.log10(span / most)), unit = [1, 2, 5, 10].find((n) => n * size >= span / most) * size;
       const first = Math.ceil(low / unit - 1e-9), count = Math.floor((low + span) / unit + 1e-9) - first;
       return Array.from({ length: count + 1 }, (_, k) => unit * (first + k)).map((value) => [place(steps, value), spell(value, 12)]);
@@ -86,7 +91,7 @@
       }
       for (const [share, text] of ticks(data.y.values, Math.max(3, Math.floor(up / 50)))) {
         const y = top + up - share / rows * up;
-        line(left - 5, y, left, y); write(text, left - 8, y, "right", left - 22);
+        line(left - 5, y, left, y); write(text, left - 8, y, "right", left - 28);
       }
       const named = (axis) => axis.unit ? `${axis.name} in ${axis.unit}` : axis.name;
       write(named(data.x), left + across / 2, high - 8, "center", across);

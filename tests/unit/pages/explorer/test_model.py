@@ -11,7 +11,7 @@ from tolerances import CONTOUR, EDGE_RADIUS, RESPONSE, RIDGE
 import zwidth
 from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls, normalized_controls
-from zwidth.pages.words import word_of
+from zwidth.pages.words import spell_radius, word_of
 
 CHOICES = {
     "rigid": {},
@@ -111,6 +111,14 @@ def test_contours_are_where_they_say(scene):
         levels[level] = float(np.median(np.abs(radius - level)))
     assert levels
     assert max(levels.values()) < CONTOUR.float64
+    # As a chart of 700 by 330 dots has them, no two names overlap; nor is there a speck without a name.
+    width, height = np.ptp(across), np.ptp(up)
+    named = [place for place in zip(found["x"], found["y"], found["text"], strict=True) if place[2]]
+    for k, (x, y, _) in enumerate(named):
+        for other_x, other_y, _ in named[:k]:
+            assert abs(x - other_x) / width > 26 / 700 or abs(y - other_y) / height > 10 / 330
+    for x, y, text in zip(found["xs"], found["ys"], found["text"], strict=True):
+        assert text or np.ptp(x) / width > 0.02 or np.ptp(y) / height > 0.02
 
 
 def test_the_frame_holds_the_edge_and_the_wall():
@@ -134,6 +142,18 @@ def test_a_contact_is_the_simulation():
     assert int(hit.bounces) == 1
     assert "(leaves it 1 time, " in words
     assert position[0] < 0 < position.max()
+
+
+def test_a_strongly_damped_device_reaches_the_wall_that_it_is_to_hit():
+    scene = normalized_controls(0.5, 0.4, 1.0, 1.0).scene
+    _, position, force, _ = model.contact_motion(scene, 50)
+    assert position[0] < 0 < position.max()
+    assert np.any(force)
+
+
+def test_a_huge_radius_is_told_in_few_digits():
+    assert spell_radius(1.25) == "spectral radius 1.250000"
+    assert spell_radius(2.2e41) == "spectral radius 2.200e+41"
 
 
 def test_normalized_words_have_the_numbers_of_the_verdict():

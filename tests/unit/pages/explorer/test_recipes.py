@@ -50,6 +50,10 @@ def test_the_configuration_runs_and_is_the_view(tmp_path, view):
     assert result.ok, [study.error for study in result.studies]
 
 
+def test_a_number_of_a_copied_scene_stands_on_a_line_with_its_unit():
+    assert "\n  virtual_damping: 40 mN m s/rad\n" in to_yaml(Controls().change({"motion": "rotary"}))
+
+
 @pytest.mark.parametrize("view", VIEWS)
 def test_the_script_runs_and_has_the_view_s_scene(capsys, view):
     scene, names = VIEWS[view].scene, {}

@@ -163,3 +163,34 @@ def test_of_walls_without_an_answer_a_slice_says_none(tmp_path):
         expected = [1.0, 0.0] if content["name"] == "stable" else [values[0, 0], np.inf]
         np.testing.assert_array_equal(values[0, :2], expected)
     assert len(re.findall(r'<script type="application/json">', text)) == 2
+
+
+def test_a_sweep_over_one_parameter_has_its_curve_and_a_map_without_edges_names_none(tmp_path):
+    top = study("top", {"delta": [0.0, 0.5, 1.0], "d": 1.0}, ("alpha_max",))
+    plane = study(
+        "tops", {"delta": {"linear": {"start": 0, "stop": 1, "num": 8}}, "d": [0, 1, 2, 3, 4, 5, 6]}, ("alpha_max",)
+    )
+    config = {"version": 1, "name": "example", "studies": [top, plane]}
+    zwidth.run(Config.model_validate(config), out=tmp_path)
+    page = zwidth.write_report(tmp_path).read_text(encoding="utf-8")
+    assert "<figcaption>top_alpha_max</figcaption>" in page
+    assert "<figcaption>tops_alpha_max</figcaption>" not in page
+    assert page.count('<div class="slices">') == 1
+    assert "exact edges" not in page
+
+
+def test_the_day_of_a_run_is_told_as_people_write_it(page):
+    assert re.search(r"Computed on \d{4}-\d\d-\d\d at \d\d:\d\d UTC, in float64", page)
+
+
+def test_a_study_that_failed_is_told_and_has_no_section(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise ValueError("<no luck>")
+
+    monkeypatch.setattr("zwidth.studies.ridge.RidgeStudy.compute", fail)
+    walls = {"kind": "boundary", "name": "walls", "delta": 0.1, "d": 1}
+    assert not zwidth.run({"version": 1, "name": "example", "studies": [TOP, walls]}, out=tmp_path).ok
+    page = zwidth.write_report(tmp_path).read_text(encoding="utf-8")
+    assert "<strong>top is not here</strong>, for it failed: ValueError: &lt;no luck&gt;; " in page
+    assert 'id="top"' not in page
+    assert 'id="walls"' in page

@@ -31,11 +31,23 @@ function addRow(form, name, label, ...controls) {
   form.append(row);
   return row;
 }
+// A number that is typed, and what it changes.
+function addNumber(field, name, change = value => ({ [name]: value }), kind = "no number") {
+  const number = field.number = element("input", { type: "number", step: "any", id: name });
+  number.addEventListener("input", () => doubt(number.value !== String(field.shown)));
+  number.addEventListener("keydown", event => { if (event.key === "Escape") send({}, true); });
+  number.addEventListener("change", () => {
+    moved = "";
+    const wanted = change(number.valueAsNumber);
+    if (Object.values(wanted).every(Number.isFinite)) send(wanted, true);
+    else refuse([name], `${field.text}: ${kind}; write one, or press Escape`);
+  });
+  return number;
+}
 function addSlider(form, name) {
   const field = { slides: true };
   field.range = element("input", { type: "range", min: 0, max: STEPS, step: 1, id: `${name}-slider` });
-  field.number = element("input", { type: "number", step: "any", id: name });
-  field.row = addRow(form, name, "", field.range, field.number);
+  field.row = addRow(form, name, "", field.range, addNumber(field, name));
   const slide = rest => {
     field.number.value = valueAt(field, Number(field.range.value));
     field.range.setAttribute("aria-valuetext", `${field.number.value} ${field.unit}`);
@@ -44,13 +56,6 @@ function addSlider(form, name) {
   };
   field.range.addEventListener("input", () => slide(false));
   field.range.addEventListener("change", () => slide(true));
-  field.number.addEventListener("input", () => doubt(field.number.value !== String(field.shown)));
-  field.number.addEventListener("keydown", event => { if (event.key === "Escape") send({}, true); });
-  field.number.addEventListener("change", () => {
-    moved = "";
-    if (Number.isFinite(field.number.valueAsNumber)) send({ [name]: field.number.valueAsNumber }, true);
-    else refuse([name], `${field.text}: no number; write one, or press Escape`);
-  });
   fields[name] = field;
 }
 // Labels, units and ranges of linear devices or of rotary ones.
@@ -77,10 +82,9 @@ function build() {
   for (const name of names.filter(name => !name.includes("."))) {
     addSlider(form, name);
     if (name === "period") {
-      const rate = element("input", { type: "number", step: "any", id: "rate", min: 0 });
-      const row = addRow(form, "rate", "or rate 1/T in Hz", element("span"), rate);
-      rate.addEventListener("change", () => rate.valueAsNumber > 0 && send({ period: 1e3 / rate.valueAsNumber }, true));
-      fields.rate = { rate, row };
+      const field = fields.rate = { text: "rate 1/T in Hz" };
+      const number = addNumber(field, "rate", value => ({ period: value > 0 ? 1e3 / value : NaN }), "no number above 0");
+      field.row = addRow(form, "rate", `or ${field.text}`, element("span"), number);
     }
   }
   for (const part of Object.keys(start.choices).filter(name => name !== "mode" && name !== "motion")) {
@@ -164,12 +168,11 @@ function showState(state) {
     field.row.hidden = !((name === "rate" ? "period" : name) in state);
     if (field.row.hidden || name in waiting || field.number?.getAttribute("aria-invalid")) continue;
     if (field.select) field.select.value = state[name];
-    else if (field.rate) { if (document.activeElement !== field.rate) field.rate.value = Number((1e3 / state.period).toPrecision(6)); }
     else {
-      if (document.activeElement !== field.range) field.range.value = placeOf(field, state[name]);
-      field.shown = Number(state[name].toPrecision(10));
+      field.shown = Number(field.range ? state[name].toPrecision(10) : (1e3 / state.period).toPrecision(6));
       if (document.activeElement !== field.number || !document.body.classList.contains("stale")) field.number.value = field.shown;
-      field.range.setAttribute("aria-valuetext", `${field.number.value} ${field.unit}`);
+      if (field.range && document.activeElement !== field.range) field.range.value = placeOf(field, state[name]);
+      field.range?.setAttribute("aria-valuetext", `${field.number.value} ${field.unit}`);
     }
   }
 }
