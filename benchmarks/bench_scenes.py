@@ -23,7 +23,7 @@ import zwidth
 from methods.clock import time_calls
 from methods.page import hand_out, page_parser
 from zwidth.arrays.polynomials import companion
-from zwidth.linear.roots import affine_polynomial
+from zwidth.loops.linear.roots import affine_polynomial
 
 MAP, SAMPLE, SCATTERED = 2000, 20_000, 100_000
 # Nearer to the circle than this eigenvalues cannot tell the side.

@@ -21,7 +21,7 @@ import numpy as np
 from methods.clock import time_calls
 from zwidth.arrays import evaluate
 from zwidth.arrays.held_mass import ANY
-from zwidth.rigid import (
+from zwidth.loops.rigid import (
     certified_filter,
     circle,
     crossover,
@@ -30,7 +30,7 @@ from zwidth.rigid import (
     ridge,
     ridge_newton,
 )
-from zwidth.rigid import (
+from zwidth.loops.rigid import (
     pole_search as radius,
 )
 from zwidth.words import xp

@@ -100,7 +100,7 @@ def fitted_once():
 def early_compiler(monkeypatch):
     """Of some thousand points a compiler is asked, as a user's are who has many more."""
     from zwidth.arrays import evaluate
-    from zwidth.rigid import folding, outermost_poles, passivity, row_limit
+    from zwidth.loops.rigid import folding, outermost_poles, passivity, row_limit
 
     for module in (evaluate, folding, outermost_poles, passivity, row_limit):
         monkeypatch.setattr(module, "FEW", 1 << 11)

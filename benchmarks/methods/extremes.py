@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from methods.problems import Walls
-from zwidth.rigid.boundary import boundary, sample_lobe
-from zwidth.rigid.ridge import alpha_max
-from zwidth.rigid.verdict import StabilityMethod, decide_stability, is_stable
+from zwidth.loops.rigid.boundary import boundary, sample_lobe
+from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.loops.rigid.verdict import StabilityMethod, decide_stability, is_stable
 from zwidth.words.status import Status
 
 DELTAS = (0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-4, 1.0, 50.0, 700.0, 750.0, 1e4, 1e6, 1e12)

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.rigid import certified
-from zwidth.rigid.boundary import boundary, sample_lobe
-from zwidth.rigid.outermost_poles import outermost_poles
-from zwidth.rigid.ridge import alpha_max
-from zwidth.rigid.verdict import decide_stability
+from zwidth.loops.rigid import certified
+from zwidth.loops.rigid.boundary import boundary, sample_lobe
+from zwidth.loops.rigid.outermost_poles import outermost_poles
+from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.loops.rigid.verdict import decide_stability
 from zwidth.words.status import Status
 
 # The device of the speed problems; the cost of no method depends on it.

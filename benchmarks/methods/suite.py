@@ -14,12 +14,12 @@ from methods import problems
 from methods.baselines import available
 from methods.clock import time_calls
 from methods.problems import Walls
-from zwidth.rigid import certified
-from zwidth.rigid.passivity import is_passive, passivity_margin
-from zwidth.rigid.poles import poles
-from zwidth.rigid.ridge import RidgeMethod, alpha_max
-from zwidth.rigid.spectral_radius import spectral_radius
-from zwidth.rigid.verdict import StabilityMethod, decide_stability, is_stable
+from zwidth.loops.rigid import certified
+from zwidth.loops.rigid.passivity import is_passive, passivity_margin
+from zwidth.loops.rigid.poles import poles
+from zwidth.loops.rigid.ridge import RidgeMethod, alpha_max
+from zwidth.loops.rigid.spectral_radius import spectral_radius
+from zwidth.loops.rigid.verdict import StabilityMethod, decide_stability, is_stable
 
 # A measurement is repeated until it has taken this long, and at least this often.
 _SECONDS = 0.4

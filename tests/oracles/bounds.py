@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import broadcast
-from zwidth.rigid.folding import NAMES
-from zwidth.rigid.normalization import wall_status
-from zwidth.rigid.outermost_poles import find_poles, outermost_poles
+from zwidth.loops.rigid.folding import NAMES
+from zwidth.loops.rigid.normalization import wall_status
+from zwidth.loops.rigid.outermost_poles import find_poles, outermost_poles
 from zwidth.words.status import Status
 
 

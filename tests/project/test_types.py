@@ -13,12 +13,12 @@ from jaxtyping import AbstractArray, jaxtyped
 
 import zwidth
 from zwidth.arrays.polynomials import companion
-from zwidth.rigid.aberth import aberth_kernel, discs, product_form
-from zwidth.rigid.boundary import sample_lobe
-from zwidth.rigid.folding import find_degree
-from zwidth.rigid.poles import pole_kernel, radius_by_companion
-from zwidth.rigid.polynomial import affine, coefficients, frequency_boundary, frequency_loop
-from zwidth.rigid.response import step_response
+from zwidth.loops.rigid.aberth import aberth_kernel, discs, product_form
+from zwidth.loops.rigid.boundary import sample_lobe
+from zwidth.loops.rigid.folding import find_degree
+from zwidth.loops.rigid.poles import pole_kernel, radius_by_companion
+from zwidth.loops.rigid.polynomial import affine, coefficients, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.response import step_response
 from zwidth.words import types as _types
 from zwidth.words.types import Reals, Roots
 

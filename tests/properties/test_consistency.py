@@ -17,8 +17,8 @@ import pytest
 from bounds import bound_radius
 
 import zwidth
-from zwidth.rigid.normalization import wall_status
-from zwidth.rigid.response import settling_time
+from zwidth.loops.rigid.normalization import wall_status
+from zwidth.loops.rigid.response import settling_time
 from zwidth.words.status import Status
 
 # Walls that are judged at one time: few enough for NumPy, so that nothing is compiled.

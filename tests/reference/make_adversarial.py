@@ -236,9 +236,9 @@ def labelled(count: int, seed: int) -> dict[str, np.ndarray]:
 def check(points: dict[str, np.ndarray]) -> int:
     """Hold the certified method to the labels; how many it gets wrong or leaves undecided."""
     import zwidth
-    from zwidth.rigid.certified_filter import OPEN, each_code
-    from zwidth.rigid.folding import Points
-    from zwidth.rigid.normalization import wall_status
+    from zwidth.loops.rigid.certified_filter import OPEN, each_code
+    from zwidth.loops.rigid.folding import Points
+    from zwidth.loops.rigid.normalization import wall_status
     from zwidth.words.status import Status
 
     start = time.perf_counter()

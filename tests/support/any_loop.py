@@ -1,7 +1,7 @@
 """Any linear scene by another way than the library's: absolute coordinates, a dense exponential, every delay a state.
 
-Nothing here shares a formula with `zwidth.linear`: bodies are described by masses, dampers and springs, filters by
-their difference equations, the loop by one matrix whose eigenvalues are the poles. `ball_parts` does the same in
+Nothing here shares a formula with `zwidth.loops.linear`: bodies are described by masses, dampers and springs, filters
+by their difference equations, the loop by one matrix whose eigenvalues are the poles. `ball_parts` does the same in
 arithmetic that bounds its own error, for labels where float64 cannot tell.
 """
 

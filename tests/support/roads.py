@@ -17,7 +17,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli import cli
-from zwidth.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.simulation.result import MotionKind
 from zwidth.words.status import Status
 

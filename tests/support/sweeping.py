@@ -169,6 +169,6 @@ def flip(file, position=-1):
 
 def poles_say_stable(alpha, beta, delta, d):
     """Stability by poles, the slow way."""
-    from zwidth.rigid.poles import radius_by_companion
+    from zwidth.loops.rigid.poles import radius_by_companion
 
     return np.asarray(radius_by_companion(alpha, beta, delta, d)) < 1.0

@@ -24,7 +24,7 @@ from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_pa
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import HeldStudy, register
 from zwidth.config.values import Axis, Quantity, axis_of
-from zwidth.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.device import Device
 from zwidth.parts.paths import PARTS
 from zwidth.parts.timing import Timing

@@ -31,11 +31,11 @@ from zwidth.figures.grid import scale_axis
 from zwidth.figures.motion import draw_motion, draw_positions, draw_step
 from zwidth.figures.stable_set import draw_stable_set, scale_walls, tabulate_sets, tabulate_walls
 from zwidth.figures.table import Parameters, Result, Table, name_as_linear, stack
-from zwidth.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.rigid.response import settling_time
 from zwidth.parts.checks import read_texts
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
-from zwidth.rigid.response import settling_time
 from zwidth.scenes.assessment import passive_edge, round_margin
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.recommendation import Recommendation

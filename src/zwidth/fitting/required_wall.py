@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.held_mass import Plant, held_plant, split_delay
+from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.circle import CirclePoints, Jet
-from zwidth.rigid.ridge import plant_slopes
 from zwidth.words.types import Array
 
 # A double pole has no partial fractions.

@@ -19,12 +19,12 @@ import numpy as np
 
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
-from zwidth.linear.held import Sampled, delay_force
+from zwidth.loops.linear.held import Sampled, delay_force
+from zwidth.loops.rigid.normalization import device_status
 from zwidth.parts.chain import Body, Chain, Resonance
 from zwidth.parts.circle import circle
 from zwidth.parts.state_space import StateSpace, estimate_matrices, in_series
 from zwidth.parts.velocity import BackwardDifference, Estimate
-from zwidth.rigid.normalization import device_status
 from zwidth.scenes.tolerances import borne_by
 from zwidth.scenes.variants import RigidVariants
 from zwidth.simulation.flow import flow

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
-from zwidth.linear.held import closed_loop, delayed_device, open_loop
-from zwidth.linear.passivity import find_obstacle
-from zwidth.linear.rows import Island
+from zwidth.loops.linear.held import closed_loop, delayed_device, open_loop
+from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.rows import Island
+from zwidth.loops.rigid.verdict import STABILITY_METHODS, StabilityMethod
 from zwidth.parts.checks import read_texts
 from zwidth.parts.state_space import StateSpace
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
-from zwidth.rigid.verdict import STABILITY_METHODS, StabilityMethod
 from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.results import Margins, Stability
@@ -143,7 +143,7 @@ class SceneAnswers(SceneParts):
 
         Numerics:
             Closed form for a rigid device with the backward difference. Otherwise by the signed crossings of each
-            row (`linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
+            row (`loops.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
             costs some microseconds and a stiffness next to nothing.
         """
         if method != "auto":
@@ -204,7 +204,7 @@ class SceneAnswers(SceneParts):
         """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is out of range.
 
         Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
-        (`linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
+        (`loops.linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
         motor the motor's own damping counts, which is sufficient and not necessary; with the sensor at the tip, with an
         actuator and with modes there is no such condition, and InputError says so. A wall that pushes has at most its
         K T.

@@ -9,6 +9,7 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 
+from zwidth.loops.rigid.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.checks import Part, check_kind
 from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
@@ -18,7 +19,6 @@ from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import NoWall, VirtualWall
-from zwidth.rigid.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.scenes.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.words.errors import InputError

@@ -17,28 +17,28 @@ import numpy as np
 
 from zwidth.arrays.evaluate import check_scalars, evaluate
 from zwidth.arrays.held_mass import classify_delays
-from zwidth.linear.border import Border
-from zwidth.linear.boundary import Boundary
-from zwidth.linear.held import find_roots
-from zwidth.linear.margins import linear_margins, open_loop_response
-from zwidth.linear.passivity import PassivityCondition, passivity_margins
-from zwidth.linear.poles import is_marginal, log_size, poles_less_one
-from zwidth.linear.poles import spectral_radius as linear_radius
-from zwidth.linear.ridge import BoundRidge, SceneSensitivities, differentiate, find_ridge, find_slope
-from zwidth.linear.roots import LoopRoots
-from zwidth.linear.rows import Island, bound_intervals, label_walls, stable_dampings
+from zwidth.loops.linear.border import Border
+from zwidth.loops.linear.boundary import Boundary
+from zwidth.loops.linear.held import find_roots
+from zwidth.loops.linear.margins import linear_margins, open_loop_response
+from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
+from zwidth.loops.linear.poles import is_marginal, log_size, poles_less_one
+from zwidth.loops.linear.poles import spectral_radius as linear_radius
+from zwidth.loops.linear.ridge import BoundRidge, SceneSensitivities, differentiate, find_ridge, find_slope
+from zwidth.loops.linear.roots import LoopRoots
+from zwidth.loops.linear.rows import Island, bound_intervals, label_walls, stable_dampings
+from zwidth.loops.rigid.boundary import boundary_point, stable_region
+from zwidth.loops.rigid.margins import margins, margins_kernel
+from zwidth.loops.rigid.normalization import wall_status
+from zwidth.loops.rigid.outermost_poles import slowest_pole
+from zwidth.loops.rigid.passivity import passivity_margin
+from zwidth.loops.rigid.poles import poles
+from zwidth.loops.rigid.ridge import alpha_max, slopes_kernel, stiffness_slopes
+from zwidth.loops.rigid.spectral_radius import spectral_radius
+from zwidth.loops.rigid.verdict import StabilityMethod, decide_stability, is_stable
 from zwidth.parts.chain import AnyChain, chain_of
 from zwidth.parts.circle import circle
 from zwidth.parts.paths import AnyScene, list_parameters, replace_parameters
-from zwidth.rigid.boundary import boundary_point, stable_region
-from zwidth.rigid.margins import margins, margins_kernel
-from zwidth.rigid.normalization import wall_status
-from zwidth.rigid.outermost_poles import slowest_pole
-from zwidth.rigid.passivity import passivity_margin
-from zwidth.rigid.poles import poles
-from zwidth.rigid.ridge import alpha_max, slopes_kernel, stiffness_slopes
-from zwidth.rigid.spectral_radius import spectral_radius
-from zwidth.rigid.verdict import StabilityMethod, decide_stability, is_stable
 from zwidth.scenes.variants import RIGID_PARAMETERS, RigidVariants, Variants
 from zwidth.words.errors import InputError, ZwidthError
 from zwidth.words.quantities import WALL_RANGE
@@ -110,7 +110,7 @@ class LinearLoop:
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         if method == "certified":
-            from zwidth.linear.certified import decide_walls
+            from zwidth.loops.linear.certified import decide_walls
 
             stable, proved = decide_walls(self.scene, *exact)
             inside = status == Status.OK
@@ -178,7 +178,7 @@ class LinearLoop:
         """The stiffest stable wall, with beta >= 0 unless negative dampings count."""
         self._check_delay_model()
         if is_traced(*list_parameters(self.scene).values()):
-            from zwidth.linear.traced_ridge import trace_stiffest
+            from zwidth.loops.linear.traced_ridge import trace_stiffest
 
             return trace_stiffest(self.scene, negative)
         found, status = self.ridge(negative)

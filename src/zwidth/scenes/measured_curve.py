@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.linear.rows import lay_lines, side_by_side
+from zwidth.loops.linear.rows import lay_lines, side_by_side
 from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.roots import narrow_dips
-from zwidth.linear.margins import nearest_gain_crossover, nearest_phase_crossover
-from zwidth.linear.rows import Island, side_by_side
+from zwidth.loops.linear.margins import nearest_gain_crossover, nearest_phase_crossover
+from zwidth.loops.linear.rows import Island, side_by_side
+from zwidth.loops.rigid.verdict import StabilityMethod
 from zwidth.parts.chain import AnyChain
-from zwidth.rigid.verdict import StabilityMethod
 from zwidth.scenes.loop import LinearLoop, SlowestMotion
 from zwidth.scenes.measured_curve import Decided, DecidedWalls, ResponseCurve
 from zwidth.words.errors import InputError

@@ -11,10 +11,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import false_position, find_lowest
-from zwidth.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
 from zwidth.parts.wall import NoWall, VirtualWall
-from zwidth.rigid.response import decay_time
 from zwidth.scenes.assessment import (
     Assessment,
     Limit,

@@ -1,7 +1,7 @@
 """The stiffest wall that every device of a family can render, proved (rigid loop): all its four numbers uncertain.
 
 A device found by search bounds the answer from above. From below it is proved: the box of devices is cut until the
-verdict of `rigid.certified_filter` holds for every device of every part at once.
+verdict of `loops.rigid.certified_filter` holds for every device of every part at once.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 from zwidth.arrays.balls import quantities
 from zwidth.arrays.evaluate import as_float64, join_shapes
 from zwidth.arrays.roots import bisect
+from zwidth.loops.rigid.boundary import boundary_point
+from zwidth.loops.rigid.certified_filter import stable_everywhere
+from zwidth.loops.rigid.normalization import normalize, quantity_status
+from zwidth.loops.rigid.verdict import is_stable
 from zwidth.parts.checks import accept_units
-from zwidth.rigid.boundary import boundary_point
-from zwidth.rigid.certified_filter import stable_everywhere
-from zwidth.rigid.normalization import normalize, quantity_status
-from zwidth.rigid.verdict import is_stable
 from zwidth.scenes.stiffness import max_stiffness
 from zwidth.words.errors import InputError
 from zwidth.words.showing import shown

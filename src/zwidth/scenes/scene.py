@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64
-from zwidth.linear.border import Outline, outlines
-from zwidth.linear.curve import curve_at
+from zwidth.loops.linear.border import Outline, outlines
+from zwidth.loops.linear.curve import curve_at
 from zwidth.scenes.base import WallSI
 from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.scenes.recommendation import SceneAdvice

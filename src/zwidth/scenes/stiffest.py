@@ -10,8 +10,8 @@ from typing import Any, Literal, NamedTuple, cast, get_args
 import numpy as np
 
 from zwidth.arrays.roots import find_lowest
-from zwidth.linear.margins import OpenLoop
-from zwidth.linear.ridge import SceneSensitivities
+from zwidth.loops.linear.margins import OpenLoop
+from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.parts.checks import read_texts
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import SceneAnswers, allows_negative

@@ -11,9 +11,9 @@ import numpy as np
 
 from zwidth.arrays.evaluate import check_scalars, compile_traced, evaluate
 from zwidth.arrays.held_mass import DelayClasses, classify_delays
+from zwidth.loops.rigid.normalization import Normalized, normalize, quantity_status
+from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
 from zwidth.parts.checks import accept_units
-from zwidth.rigid.normalization import Normalized, normalize, quantity_status
-from zwidth.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.evaluate import FEW
-from zwidth.linear.rows import reaches_down
-from zwidth.rigid.boundary import boundary_point
-from zwidth.rigid.ridge import alpha_max
-from zwidth.rigid.verdict import is_stable
+from zwidth.loops.linear.rows import reaches_down
+from zwidth.loops.rigid.boundary import boundary_point
+from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.loops.rigid.verdict import is_stable
 
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
 # More pieces than these are compiled.

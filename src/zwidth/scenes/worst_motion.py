@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.linear.passivity import PassivityCondition, find_need
+from zwidth.loops.linear.passivity import PassivityCondition, find_need
 from zwidth.parts.velocity import Estimate
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import SceneAnswers, one_wall

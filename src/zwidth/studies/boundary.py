@@ -18,11 +18,11 @@ from zwidth.config.study import DelayModels, HeldStudy, name_parts, register
 from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.figures.stable_set import Outlines, tabulate_sets
 from zwidth.figures.table import stack
-from zwidth.rigid.boundary import Piece, boundary_point, stable_region
-from zwidth.rigid.normalization import status_of_results
-from zwidth.rigid.passivity import is_passive
-from zwidth.rigid.spectral_radius import spectral_radius
-from zwidth.rigid.verdict import is_stable
+from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
+from zwidth.loops.rigid.normalization import status_of_results
+from zwidth.loops.rigid.passivity import is_passive
+from zwidth.loops.rigid.spectral_radius import spectral_radius
+from zwidth.loops.rigid.verdict import is_stable
 from zwidth.studies.outcome import (
     ComputedStudy,
     CurvesStudy,

@@ -15,9 +15,9 @@ import numpy as np
 from zwidth.arrays.roots import bisect
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
-from zwidth.rigid.boundary import boundary
-from zwidth.rigid.normalization import normalize
-from zwidth.rigid.ridge import alpha_max, stiffness_slope
+from zwidth.loops.rigid.boundary import boundary
+from zwidth.loops.rigid.normalization import normalize
+from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.studies.outcome import ComputedStudy, Outcome
 
 SOURCE = "Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006"

@@ -30,10 +30,10 @@ from zwidth.config.values import Duration, Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.style import WIDTH, house_style, new_figure
 from zwidth.figures.table import Table, stack
+from zwidth.loops.rigid.response import step_response
+from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
-from zwidth.rigid.response import step_response
-from zwidth.rigid.ridge import alpha_max
 from zwidth.scenes.recommendation import RANGES, Recommendation
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit

@@ -19,12 +19,12 @@ from zwidth.config.study import DelayModels, HeldStudy, register
 from zwidth.config.values import Delay, quantity_of
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.table import SI_COLUMNS, stack
+from zwidth.loops.rigid.boundary import stable_region
+from zwidth.loops.rigid.passivity import passive_stiffness_slope
+from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
+from zwidth.loops.rigid.verdict import is_stable
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
-from zwidth.rigid.boundary import stable_region
-from zwidth.rigid.passivity import passive_stiffness_slope
-from zwidth.rigid.ridge import alpha_max, stiffness_slope
-from zwidth.rigid.verdict import is_stable
 from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, share_of_device

@@ -16,14 +16,14 @@ from typing import TypeAlias
 import numpy as np
 
 from zwidth.arrays.evaluate import Route, map_blocks
-from zwidth.rigid.margins import margins_kernel
-from zwidth.rigid.normalization import status_of_results
-from zwidth.rigid.outermost_poles import area_poles, list_poles
-from zwidth.rigid.passivity import margin_at_one_delay
-from zwidth.rigid.pole_map import Area
-from zwidth.rigid.response import decay_time
-from zwidth.rigid.ridge import alpha_max
-from zwidth.rigid.row_limit import row_limits
+from zwidth.loops.rigid.margins import margins_kernel
+from zwidth.loops.rigid.normalization import status_of_results
+from zwidth.loops.rigid.outermost_poles import area_poles, list_poles
+from zwidth.loops.rigid.passivity import margin_at_one_delay
+from zwidth.loops.rigid.pole_map import Area
+from zwidth.loops.rigid.response import decay_time
+from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.loops.rigid.row_limit import row_limits
 from zwidth.sweep.grid import Block
 from zwidth.words.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.words.status import Status

@@ -10,7 +10,7 @@ import numpy as np
 
 from zwidth.config.device_table import LABEL
 from zwidth.config.sweep import SweepStudy
-from zwidth.rigid.normalization import normalize
+from zwidth.loops.rigid.normalization import normalize
 from zwidth.words.quantities import PARAMETERS, WALL, Family
 from zwidth.words.rotation import own_unit
 

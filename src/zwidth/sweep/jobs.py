@@ -19,7 +19,7 @@ import numpy as np
 
 from zwidth.arrays.kernel_cache import mend_compilation_cache
 from zwidth.config.sweep import SweepStudy
-from zwidth.rigid.normalization import wall_status
+from zwidth.loops.rigid.normalization import wall_status
 from zwidth.scenes.scene import Scene
 from zwidth.sweep.files import content, hopeless
 from zwidth.sweep.grid import SceneBlock

@@ -11,7 +11,7 @@ import pytest
 import scipy.signal
 
 import zwidth
-from zwidth.linear.curve import curve_at
+from zwidth.loops.linear.curve import curve_at
 
 # A mass of 0.1 kg with 10 N s/m.
 TIMING = zwidth.Timing(1e-3, 1.5e-3)

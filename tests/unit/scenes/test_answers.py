@@ -8,7 +8,7 @@ import scipy.linalg
 from independent_scenes import KINDS, closed_loop_matrix, continuous, flow, random_scene, random_walls
 
 import zwidth
-from zwidth.linear.poles import log_size, poles_less_one, spectral_radius
+from zwidth.loops.linear.poles import log_size, poles_less_one, spectral_radius
 from zwidth.words.errors import InputError
 from zwidth.words.status import Method, Status
 

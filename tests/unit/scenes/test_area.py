@@ -10,8 +10,8 @@ from mpmath import mpf
 import oracles
 import zwidth
 from zwidth import passive_area, stable_area
-from zwidth.rigid.boundary import Piece
-from zwidth.rigid.poles import radius_by_companion
+from zwidth.loops.rigid.boundary import Piece
+from zwidth.loops.rigid.poles import radius_by_companion
 
 # Undamped; cut by the line of z = -1 before and after the corner becomes the ridge; delayed; held.
 POINTS = [(0.0, 0.0), (0.5, 0.0), (3.0, 0.0), (10.0, 0.0), (0.1, 1.0), (1.0, 4.0), (40.0, 0.125), (2.0, 0.6)]

@@ -9,9 +9,9 @@ import pytest
 import zwidth
 from zwidth.config.scenes import PhysicalScene
 from zwidth.figures.table import stack
+from zwidth.loops.rigid.passivity import passive_stiffness_slope
+from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.parts.checks import read_texts
-from zwidth.rigid.passivity import passive_stiffness_slope
-from zwidth.rigid.poles import radius_by_companion
 from zwidth.studies.boundary import BoundaryStudy, MapStudy, outline, stable_intervals
 from zwidth.studies.outcome import csv_text
 from zwidth.studies.responses import RecommendStudy, StepStudy

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.pages.words import check_lines, list_slopes, pole_words, row, spell_radius, word_of
 from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin

@@ -1,0 +1,353 @@
+"""Rows of the boundary of any linear loop, and how many poles of each wall lie outside (docs/theory/scenes.md).
+
+A row meets each arc of `loops.linear.curve` once at most (V12). Along it a pole leaves the circle where
+``Im(q' - beta F') > 0``, which at z = 1 and z = -1 holds for the real poles as well. Hence
+
+    poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
+
+with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide (V13, V14).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.loops.linear.curve import (
+    Arc,
+    CrossingLine,
+    bands,
+    circle_zeros,
+    curve_at,
+    cut_arcs,
+    lines_at,
+    nodes_of,
+    zeros_of,
+)
+from zwidth.loops.linear.roots import LoopRoots
+from zwidth.parts.circle import ON_CIRCLE, circle, depths
+
+# Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
+_MOST_STEPS, _ARRIVED = 120, 1e-10
+# By what share a row is moved, at most, that rounding keeps from being counted.
+_SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
+# How near to an angle where the curve has no point of its own it is looked at, as a share of the way to a node.
+_PROBE = 1e-6
+# Pairs of rows and arcs that are looked at in one go: what they need stays in caches.
+_BLOCK = 1 << 17
+
+
+class Crossings(NamedTuple):
+    """Where rows cross the boundary: shape (rows, arcs and lines), NaN where one does not."""
+
+    alpha: np.ndarray
+    w: np.ndarray
+    leaving: np.ndarray  # poles that leave the circle as alpha rises past the crossing; negative for entering ones
+    sound: np.ndarray  # of each row: whether its crossings lead from the count far below to that far above
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """The boundary of one loop, laid out for rows."""
+
+    loop: LoopRoots
+    w: np.ndarray
+    arcs: tuple[Arc, ...]
+    lines: tuple[CrossingLine, ...]
+    infinite: np.ndarray  # angles at which the curve runs to infinity
+    limits: dict[float, tuple[float, float]]  # alpha and beta where it has no point of its own, NaN where it has no end
+
+    @classmethod
+    def trace(cls, loop: LoopRoots) -> Boundary:
+        """Lay out the curve."""
+        w = nodes_of(loop)
+        here = curve_at(loop, w)
+        vertical = zeros_of(loop, w, here.fall, "fall")
+        touched = [p for p in circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
+        vertical = np.union1d(vertical, touched)
+        lines = lines_at(loop, vertical)
+        poles = np.array([p for p in vertical if all(p != line.w for line in lines)])
+        turns = zeros_of(loop, w, here.turn, "turn")
+        turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
+        lines += lines_at(loop, (0.0, np.pi))
+        limits = dict.fromkeys([0.0, np.pi, *poles.tolist()], (np.nan, np.nan))
+        limits |= {line.w: (line.q - line.meeting * line.f, line.meeting) for line in lines}
+        return cls(loop, w, tuple(cut_arcs(loop, w, here, turns, limits)), tuple(lines), poles, limits)
+
+    def crossings(self, beta: np.ndarray) -> Crossings:
+        """Where the rows of these dampings, shape (rows,), cross the boundary."""
+        beta, sound = self.settle(beta)
+        steps = self._steps
+        place, row, k = steps.meet(beta)
+        w, alpha = self._solve(beta[row], place, k)
+        shape = beta.size, len(self.arcs) + len(self.lines)
+        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape), sound)
+        out.alpha[row, place], out.w[row, place] = alpha, w
+        out.leaving[row, place] = steps.leaving[place]
+        for place, line in enumerate(self.lines, len(self.arcs)):
+            out.alpha[:, place] = line.q - beta * line.f
+            out.w[:, place] = line.w
+            out.leaving[:, place] = line.leaving(beta)
+        return out
+
+    def _solve(self, beta: np.ndarray, place: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The angle before node ``k`` of all arcs' at which each row crosses, and its alpha."""
+        # Newton's method, inside a bracket, on ``Im(q - beta F)``, which rises with w where a pair leaves, over what
+        # vanishes on every row; who has arrived takes no part any more.
+        steps, nodes = self._steps, self._at_nodes
+        lower = np.where(steps.w[k - 1] < steps.w[k], k - 1, k)
+        upper = 2 * k - 1 - lower
+        below, above = steps.w[lower], steps.w[upper]
+        middle = np.cos(0.5 * (below + above))
+        signs = [np.sign(middle - np.cos(w)) for w in self._fixed]
+        rising = steps.leaving[place] * np.prod(signs, axis=0) > 0
+        first, last = nodes.pick(lower).of_rows(beta), nodes.pick(upper).of_rows(beta)
+        # A row through an end of its arc meets the line there in one point, with nothing between them.
+        found = np.where(last.ratio == 0, above, np.where(first.ratio == 0, below, _between(below, above, first, last)))
+        alpha = np.where(last.ratio == 0, last.alpha, first.alpha)
+        here = np.flatnonzero((first.ratio != 0) & (last.ratio != 0))
+        x = found[here]
+        for step in range(_MOST_STEPS if here.size else 0):
+            row = self._look(x).of_rows(beta[here])
+            ahead = (row.ratio < 0) == rising[here]
+            below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
+            with np.errstate(all="ignore"):
+                move = -row.ratio / row.ratio_slope
+            new = x + move
+            good = (new >= below[here]) & (new <= above[here]) & (step % 6 != 5)
+            # Who has arrived at an end of the bracket may leave it by rounding.
+            good |= np.abs(new - x) <= _ARRIVED * x
+            new = np.where(good, np.clip(new, below[here], above[here]), 0.5 * (below[here] + above[here]))
+            # A step so short leaves rounding: each next one would be its square. Beside an undamped mode that of the
+            # angle is too much for alpha.
+            move = np.where(new == x + move, move, new - x)
+            found[here], alpha[here] = new, row.alpha + move * row.alpha_slope
+            on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
+            if not on.any():
+                break
+            here, x = here[on], new[on]
+        return found, alpha
+
+    def _look(self, w: np.ndarray) -> _LoopAngles:
+        """The loop at angles, for any rows."""
+        at, whole, turn = circle(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
+        for angle in self._fixed:
+            factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
+            whole, turn = whole * factor, turn * factor - whole * np.sin(w)
+        with np.errstate(all="ignore"):
+            return _LoopAngles(*self.loop.required_wall(at), *self.loop.estimate.jet(at), whole, turn)
+
+    @cached_property
+    def _at_nodes(self) -> _LoopAngles:
+        return self._look(self._steps.w)
+
+    @cached_property
+    def _steps(self) -> _Steps:
+        return _Steps.join(self.arcs)
+
+    def arc_at(self, w: np.ndarray) -> np.ndarray:
+        """The arc that an angle lies on."""
+        return np.searchsorted(self._steps.slowest, w, side="right") - 1
+
+    @cached_property
+    def heights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Angles between which alpha is monotone along the curve, and alpha there; NaN where it runs to infinity."""
+        slope = curve_at(self.loop, self.w).alpha_slope
+        tops = zeros_of(self.loop, self.w, slope, "alpha_slope")
+        nodes = np.unique(np.concatenate([self.w, tops]))
+        pieces, heights = [], []
+        for a, b in pairwise(sorted(self.limits)):
+            inner = nodes[(nodes > a) & (nodes < b)]
+            inner = inner if inner.size else np.array([0.5 * (a + b)])
+            # Towards an end at infinity the curve is looked at no further than this.
+            probes = a + _PROBE * (inner[0] - a), b - _PROBE * (b - inner[-1])
+            inner = np.concatenate([probes[:1], inner, probes[1:]])
+            pieces.append(np.concatenate([[a], inner, [b]]))
+            heights.append(np.concatenate([self.limits[a][:1], curve_at(self.loop, inner).alpha, self.limits[b][:1]]))
+        return np.concatenate(pieces), np.concatenate(heights)
+
+    @property
+    def _fixed(self) -> list[float]:
+        """The angles besides 0 and pi at which ``Im(q - beta F)`` vanishes on every row."""
+        return [line.w for line in self.lines if line.poles == 2]
+
+    def settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows whose crossings lead from the count far below to that far above, and which ones do (V15)."""
+        # A row within rounding of a turn of the curve may miss one of two arcs: a neighbor that does not stands for it.
+        missed = self._missed(beta)
+        for shift in _SHIFTS:
+            row = np.flatnonzero(missed)
+            if not row.size:
+                break
+            beta = beta.copy()
+            beta[row] = beta[row] * (1.0 + shift)
+            missed[row] = self._missed(beta[row])
+        return beta, missed == 0
+
+    def _missed(self, beta: np.ndarray) -> np.ndarray:
+        """By how many poles the crossings of each row fail to lead to the count far above."""
+        return self.base - self.top + self._sum_leaving(beta)
+
+    def _sum_leaving(self, beta: np.ndarray, most: float = np.inf) -> np.ndarray:
+        """Poles that leave at all crossings of each row, where each counts for no more than ``most``."""
+        steps = self._steps
+        total = steps.sum_met(np.minimum(steps.leaving, most), beta)
+        return total + sum(np.minimum(line.leaving(beta), most) for line in self.lines)
+
+    def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """How many poles of each wall lie outside the circle; -1 where the row's crossings contradict each other."""
+        passed, sound = self._passed(alpha, beta)
+        return np.where(sound, self.base + passed, -1)
+
+    def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> tuple[np.ndarray, np.ndarray]:
+        """Poles that have left below each wall, without those of one column of the crossings; and if that is sound."""
+        # Most walls are far above or below where an arc crosses their row, which the nodes beside tell.
+        but = np.broadcast_to(but, beta.shape)
+        beta, sound = self.settle(beta)
+        steps = self._steps
+        place, row, k = steps.meet(beta)
+        counted = but[row] != place
+        place, row, k = place[counted], row[counted], k[counted]
+        with np.errstate(all="ignore"):
+            share = (beta[row] - steps.beta[k - 1]) / (steps.beta[k] - steps.beta[k - 1])
+            share = np.where(steps.straight[k], share, 0.5)
+            away = alpha[row] - (steps.alpha[k - 1] + share * (steps.alpha[k] - steps.alpha[k - 1]))
+            passed, near = away > steps.room[k], ~(np.abs(away) > steps.room[k])
+        if near.any():
+            passed[near] = self._solve(beta[row[near]], place[near], k[near])[1] < alpha[row[near]]
+        total = np.zeros(beta.shape)
+        np.add.at(total, row[passed], steps.leaving[place[passed]])
+        for place, line in enumerate(self.lines, len(self.arcs)):
+            passed = (line.q - beta * line.f < alpha) & (but != place)
+            total += np.where(passed, line.leaving(beta), 0.0)
+        return total.astype(int), sound
+
+    def borders(self, w: np.ndarray) -> np.ndarray:
+        """Whether the stable set lies on one side of the curve at each angle (V18)."""
+        here = curve_at(self.loop, w)
+        held = np.isfinite(here.alpha) & np.isfinite(here.beta)
+        # Of a long delay's rows most hold no stable wall wherever: not enough poles enter on them.
+        held[held] = self.base + self._sum_leaving(self.settle(here.beta[held])[0], 0.0) <= 0
+        own, block = self.arc_at(w), max(1, _BLOCK // max(1, len(self.arcs)))
+        for part in np.array_split(np.flatnonzero(held), 1 + held.sum() // block):
+            passed, sound = self._passed(here.alpha[part], here.beta[part], own[part])
+            # By the arc: next to z = -1 the slope at one angle may be rounding.
+            held[part] = sound & (self.base + passed == np.where(self._steps.leaving[own[part]] > 0, 0, 2))
+        return held
+
+    def line_borders(self, line: int, beta: np.ndarray) -> np.ndarray:
+        """Whether the stable set lies on one side of a line at each damping."""
+        at = self.lines[line]
+        passed, sound = self._passed(at.q - beta * at.f, beta, len(self.arcs) + line)
+        return sound & (self.base + passed == np.where(at.leaving(beta) > 0, 0, at.poles))
+
+    @cached_property
+    def base(self) -> int:
+        """Poles outside far below every crossing (docs/theory/scenes.md, V14)."""
+        return self._far_outside(-1.0)
+
+    @cached_property
+    def top(self) -> int:
+        """Poles outside far above every crossing: every row's crossings must lead from ``base`` to it."""
+        return self._far_outside(1.0)
+
+    def _far_outside(self, side: float) -> int:
+        """Where the wall's spring is all there is, the poles are at the device's zeros, the others at infinity."""
+        loop = self.loop
+        depth = depths(loop.zeros)
+        on = np.abs(depth) <= ON_CIRCLE
+        answer = loop.response(circle(np.abs(np.angle(1.0 - loop.zeros[on]))))
+        # Towards a zero on the circle: G(w) = -1/alpha, and |z| > 1 where Im w < 0.
+        leaving = int(np.sum(side * answer.slope.imag < 0))
+        return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
+
+
+class _Steps(NamedTuple):
+    """All arcs one after another: of each node, and of the step that leads to it from the one before."""
+
+    w: np.ndarray
+    beta: np.ndarray
+    alpha: np.ndarray
+    straight: np.ndarray  # of the step to each: whether alpha may be interpolated in beta, else both ends' mean counts
+    room: np.ndarray  # of the step to each: how far alpha may be from that
+    keys: np.ndarray  # of each node: its arc, then its place among the dampings of all
+    dampings: np.ndarray
+    first: np.ndarray  # of each arc: its first node in these
+    ends: np.ndarray  # (2, arcs): between which dampings it is
+    order: np.ndarray  # of the first ends, then of the last ones
+    sorted_ends: np.ndarray
+    leaving: np.ndarray
+    slowest: np.ndarray  # its lowest angle
+
+    @classmethod
+    def join(cls, arcs: tuple[Arc, ...]) -> _Steps:
+        """Lay the arcs of a boundary one after another."""
+        w, beta, *rest = map(np.concatenate, zip(*(arc[:6] for arc in arcs), strict=True))
+        sizes = [arc.w.size for arc in arcs]
+        dampings, keys = np.unique(beta, return_inverse=True)
+        keys = keys + np.repeat(np.arange(len(arcs)), sizes) * dampings.size
+        ends = np.array([arc.beta[[0, -1]] for arc in arcs]).T
+        order = np.argsort(ends, axis=None)
+        ends, first = (ends, order, ends.ravel()[order]), np.cumsum([0, *sizes[:-1]])
+        own = np.array([(arc.leaving, arc.first) for arc in arcs]).T
+        return cls(w, beta, rest[0], *bands(w, *rest), keys, dampings, first, *ends, *own)
+
+    def sum_met(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """The sum of weights of the arcs that rows meet; a row through an end of arcs as the row just above it."""
+        sums = np.cumsum(np.concatenate([[0.0], np.concatenate([weights, -weights])[self.order]]))
+        return sums[np.searchsorted(self.sorted_ends, beta, side="right")]
+
+    def meet(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The arcs that rows meet, the rows, and before which of the nodes."""
+        place, row = np.nonzero((beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None]))
+        k = np.searchsorted(self.keys, place * self.dampings.size + np.searchsorted(self.dampings, beta)[row])
+        return place, row, np.maximum(k, self.first[place] + 1)
+
+
+class _Row(NamedTuple):
+    """Of rows at angles: what vanishes at a crossing, ``Re(q - beta F)``, and their slopes in w."""
+
+    ratio: np.ndarray
+    ratio_slope: np.ndarray
+    alpha: np.ndarray
+    alpha_slope: np.ndarray
+
+
+class _LoopAngles(NamedTuple):
+    """q and F at angles with their slopes, and ``sin w prod(cos w - cos fixed)`` with its own."""
+
+    q: np.ndarray
+    q_slope: np.ndarray
+    f: np.ndarray
+    f_slope: np.ndarray
+    whole: np.ndarray
+    turn: np.ndarray
+
+    def pick(self, index: np.ndarray) -> _LoopAngles:
+        """Some of them."""
+        return _LoopAngles(*(part[index] for part in self))
+
+    def of_rows(self, beta: np.ndarray) -> _Row:
+        """``Im(q - beta F)`` over what vanishes on every row, and the alpha of rows that cross there."""
+        with np.errstate(all="ignore"):
+            value, slope = self.q - beta * self.f, self.q_slope - beta * self.f_slope
+            end = self.whole == 0
+            safe = np.where(end, 1.0, self.whole)
+            ratio = np.where(end, np.imag(slope) / self.turn, np.imag(value) / safe)
+            return _Row(ratio, (np.imag(slope) - ratio * self.turn) / safe, np.real(value), np.real(slope))
+
+
+@np.errstate(all="ignore")
+def _between(below: np.ndarray, above: np.ndarray, first: _Row, last: _Row) -> np.ndarray:
+    """Where a crossing between two angles is sought first: by the cubic of the inverse, or by the secant."""
+    rise, far = last.ratio - first.ratio, above - below
+    share = -first.ratio / rise
+    known = np.isfinite(first.ratio) & np.isfinite(last.ratio)
+    secant = np.where(known, np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9)), 0.5)
+    bends = rise * (1.0 - share) / first.ratio_slope, rise * share / last.ratio_slope
+    cubic = below + share * (share * (3.0 - 2.0 * share) * far + (1.0 - share) * (bends[0] - bends[1]))
+    return np.where((share > 0) & (share < 1) & (cubic > below) & (cubic < above), cubic, below + secant * far)

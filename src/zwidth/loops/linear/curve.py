@@ -1,0 +1,204 @@
+"""The boundary of any linear loop: the curve of pole pairs, its nodes, zeros and arcs, and the lines (V8 to V12).
+
+On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``. On an arc
+beta is monotone, so that a row meets it once. Where F is real, ``alpha + beta F = q`` is a line as soon as q is real as
+well: real poles, and pairs of undamped devices at one frequency.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from zwidth.arrays.roots import zeros_between
+from zwidth.loops.linear.roots import LoopRoots
+from zwidth.parts.circle import ON_CIRCLE, circle, depths
+
+# How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
+_STEP = 0.08
+_ROUNDS = 60
+# How near to z = -1 the last node is, for a loop without roots there.
+_LAST = 1e-4
+
+
+class CurvePoints(NamedTuple):
+    """Points of the boundary curve, and what decides their order."""
+
+    alpha: np.ndarray
+    beta: np.ndarray
+    alpha_slope: np.ndarray  # d alpha/dw
+    turn: np.ndarray  # Im q' Im F - Im q Im F', of the sign of d beta/dw
+    fall: np.ndarray  # Im F
+    size: np.ndarray  # |q| + |beta F|, of which alpha is a difference
+
+
+def curve_at(loop: LoopRoots, w: np.ndarray) -> CurvePoints:
+    """The boundary curve at angles in (0, pi)."""
+    at = circle(w)
+    with np.errstate(all="ignore"):
+        q, f = loop.required_wall(at), loop.estimate.jet(at)
+        beta = q.value.imag / f.value.imag
+        alpha = q.value.real - beta * f.value.real
+        turn = q.slope.imag * f.value.imag - q.value.imag * f.slope.imag
+        beta_slope = turn / f.value.imag**2
+        alpha_slope = q.slope.real - beta_slope * f.value.real - beta * f.slope.real
+        size = np.abs(q.value) + np.abs(beta * f.value)
+        return CurvePoints(alpha, beta, alpha_slope, turn, f.value.imag, size)
+
+
+def nodes_of(loop: LoopRoots) -> np.ndarray:
+    """Angles from nearly 0 to nearly pi, so close that the loop hardly changes from one to the next."""
+    roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
+    sizes, far = np.abs(roots), np.abs(roots - 2.0)
+    turn = 1.0 / (abs(loop.lag) + loop.estimate.window + 1.0)
+    first = 1e-3 * min([turn, *sizes[sizes > 1e-13]])
+    # Next to z = -1 imaginary parts x = pi - w have lost eps/x of themselves, and beta varies by (x/far)^2: closer than
+    # this its slope is rounding.
+    last = _LAST * min([turn, *far[far > 1e-13]]) ** (2.0 / 3.0)
+    w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - last, 32)[1:]])
+    nodes, low, high = [w], w[:-1], w[1:]
+    for _ in range(_ROUNDS):
+        half = 0.5 * (high - low)
+        steps = 2.0 * half * loop.turning(low + half, half * np.array([[1.0], [0.0]]))
+        wide = (steps > _STEP * np.array([[16.0], [1.0]])).any(0)
+        if not wide.any():
+            break
+        middle = (low + half)[wide]
+        nodes.append(middle)
+        low, high = np.concatenate([low[wide], middle]), np.concatenate([middle, high[wide]])
+    return np.sort(np.concatenate(nodes))
+
+
+def zeros_of(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
+    """Zeros of a field of the curve between nodes where its sign changes."""
+    k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
+    return zeros_between(lambda at: getattr(curve_at(loop, at), field), w, values, k)
+
+
+# Of |q|: less of an imaginary part than that where Im F vanishes is none.
+_NONE = 1e-11
+# A velocity estimate that turns less than this at z = 1, -1 or a line does not answer there.
+_FLAT = 1e-12
+
+
+class CrossingLine(NamedTuple):
+    """A frequency at which a whole line ``alpha + beta real(F) = q`` puts poles on the circle."""
+
+    w: float
+    q: float
+    f: float
+    q_turn: float  # Im dq/dw
+    f_turn: float
+    poles: int  # 1 at z = 1 and z = -1, else 2
+
+    @property
+    def meeting(self) -> float:
+        """The damping at which the curve meets the line, ``Im q'/Im F'``; NaN where it does not."""
+        return self.q_turn / self.f_turn if abs(self.f_turn) > _FLAT else np.nan
+
+    def leaving(self, beta: np.ndarray) -> np.ndarray:
+        """Poles that leave the circle there as alpha rises; on the row through the meeting, as just above it."""
+        if np.isnan(self.meeting):
+            return np.full(beta.shape, self.poles * np.sign(self.q_turn))
+        return self.poles * np.sign(self.f_turn) * np.where(beta < self.meeting, 1.0, -1.0)
+
+
+def lines_at(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
+    """The lines of zeros of Im F where q is real as well: at z = 1 and -1, inside of undamped devices and windows."""
+    # There is none where q or F is infinite: where the device does not move, say.
+    w = np.array(angles, float)
+    at, end = circle(w), (w == 0.0) | (w == np.pi)
+    with np.errstate(all="ignore"):
+        q, f = loop.required_wall(at), loop.estimate.jet(at)
+        real = end | (np.abs(q.value.imag) <= _NONE * np.abs(q.value))
+    numbers = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
+    near = np.abs(at.before[:, None] + loop.zeros) <= np.where(end, ON_CIRCLE, 1e-9)[:, None]
+    found = np.flatnonzero(real & ~near.any(1) & np.isfinite(numbers).all(1))
+    return [CrossingLine(*numbers[k].tolist(), poles=1 if end[k] else 2) for k in found]
+
+
+def circle_zeros(loop: LoopRoots) -> np.ndarray:
+    """Angles of zeros on the circle: of an undamped device, where q is infinite, or of F, where Im F may touch 0."""
+    zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
+    angles = np.angle(1.0 - zeros[np.abs(depths(zeros)) <= ON_CIRCLE])
+    return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
+
+
+# How far beyond two neighboring nodes the curve may be between them, of what alpha is a difference of.
+_ROOM, _ROUNDING = 0.02, 1e-6
+
+
+class Arc(NamedTuple):
+    """A part of the curve on which beta is monotone, by its nodes in ascending beta."""
+
+    w: np.ndarray
+    beta: np.ndarray
+    alpha: np.ndarray
+    alpha_slope: np.ndarray  # in w, as beta's
+    beta_slope: np.ndarray
+    size: np.ndarray  # that of `CurvePoints`
+    leaving: float  # poles that leave the circle as alpha rises past it: 2, or -2
+
+    @property
+    def first(self) -> float:
+        """Its lowest angle."""
+        return float(min(self.w[0], self.w[-1]))
+
+
+def cut_arcs(
+    loop: LoopRoots, w: np.ndarray, here: CurvePoints, turns: np.ndarray, limits: dict[float, tuple[float, float]]
+) -> list[Arc]:
+    """Cut the curve where beta turns or runs to infinity, and where Im F changes its sign."""
+    ends = np.unique(np.concatenate([list(limits), turns]))
+    betas = dict(zip(turns.tolist(), curve_at(loop, turns).beta.tolist(), strict=True))
+    betas |= {end: beta for end, (_, beta) in limits.items()}
+    arcs, starts, stops = [], np.searchsorted(w, ends, "right").tolist(), np.searchsorted(w, ends, "left").tolist()
+    for (a, b), start, stop in zip(pairwise(ends.tolist()), starts[:-1], stops[1:], strict=True):
+        nodes, curve = w[start:stop], CurvePoints(*(values[start:stop] for values in here))
+        if not nodes.size:
+            nodes = np.array([0.5 * (a + b)])
+            curve = curve_at(loop, nodes)
+        rising = np.sum(np.sign(curve.turn)) > 0
+        # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w: told once, by the nodes.
+        leaving = 2.0 if rising == (np.sum(np.sign(curve.fall)) > 0) else -2.0
+        first, last = (
+            betas[end] if np.isfinite(betas[end]) else side * np.inf
+            for end, side in ((a, -1.0 if rising else 1.0), (b, 1.0 if rising else -1.0))
+        )
+        # The ends have no alpha: next to them every wall is compared with the crossing itself.
+        with np.errstate(all="ignore"):
+            slope = curve.turn / curve.fall**2
+        parts = [nodes, curve.beta, curve.alpha, curve.alpha_slope, slope, curve.size]
+        edges = [(a, b), (first, last), *[(np.nan, np.nan)] * 4]
+        parts = [np.concatenate([[end[0]], part, [end[1]]]) for part, end in zip(parts, edges, strict=True)]
+        if not rising:
+            parts = [part[::-1] for part in parts]
+        # Next to a limit or an extreme rounding may leave a node out of order; without it nothing is lost.
+        beta = parts[1]
+        good = np.maximum.accumulate(beta) == beta
+        good &= np.minimum.accumulate(beta[::-1])[::-1] == beta
+        good[[0, -1]] = True
+        if beta[0] <= beta[-1]:
+            parts = [part[good] for part in parts]
+            arcs.append(Arc(*parts, leaving))
+    return arcs
+
+
+def bands(
+    w: np.ndarray, alpha: np.ndarray, alpha_slope: np.ndarray, beta_slope: np.ndarray, size: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of the steps to nodes whether alpha may be interpolated in beta, else both ends' mean counts; and within what."""
+    # Of arcs one after another: their ends have no alpha.
+    # Where the slope of beta hardly changes over a step, a straight line misses alpha by an eighth of the step times
+    # what alpha's slope changes, and by what beta bends; four times that is allowed. Elsewhere, more than both ends
+    # differ.
+    with np.errstate(all="ignore"):
+        bend = beta_slope / np.roll(beta_slope, 1)
+        straight = (bend > 0.5) & (bend < 2.0)
+        step, rise, turn = (np.abs(np.diff(part, prepend=part[0])) for part in (w, alpha, alpha_slope))
+        largest = np.maximum(size, np.roll(size, 1))
+        close = 0.5 * step * turn + np.abs(bend - 1.0) * rise + _ROUNDING * largest
+        return straight, np.where(straight, close, 1.5 * rise + _ROOM * largest)

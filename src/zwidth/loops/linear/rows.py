@@ -1,0 +1,272 @@
+"""Stable intervals of any linear loop, of the stiffness in a row and of the damping in a column; many walls' labels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.roots import bisect, zeros_between
+from zwidth.loops.linear.boundary import Boundary
+from zwidth.loops.linear.curve import curve_at
+from zwidth.loops.linear.poles import log_size, poles_less_one
+from zwidth.words.quantities import WALL_RANGE
+from zwidth.words.showing import shown
+
+# Rows whose crossings are laid out at one time, or more of few arcs: so many pairs of both.
+_ROWS, _PAIRS = 1 << 12, 1 << 16
+# With fewer walls a row than this, each wall is compared with its own crossings.
+_FEW_WALLS = 4
+
+
+class BoundIntervals(NamedTuple):
+    """Stable intervals of alpha: shape (rows, most intervals of a row), NaN where a row has fewer."""
+
+    # With each stands the column of the crossings that ends it, -1 where there is none, and the angle there.
+
+    low: np.ndarray
+    high: np.ndarray
+    w_below: np.ndarray
+    w_above: np.ndarray
+    below: np.ndarray
+    above: np.ndarray
+
+
+def bound_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
+    """Where the rows of these dampings, shape (rows,), are stable, and what of the boundary ends each interval."""
+    columns = lay_lines(partial(_some_intervals, boundary), _ROWS, beta)
+    return BoundIntervals(*columns[:4], *np.where(np.isnan(columns[4:]), -1.0, columns[4:]).astype(int))
+
+
+def lay_lines(find: Callable[..., tuple[np.ndarray, ...]], together: int, *lines: np.ndarray) -> np.ndarray:
+    """What is found of lines, so many at a time: columns (lines, most of one), NaN where one has fewer."""
+    starts = range(0, max(lines[0].size, 1), together)
+    parts = [find(*(values[start : start + together] for values in lines)) for start in starts]
+    line, *found = (np.concatenate(column) for column in zip(*parts, strict=True))
+    line += np.repeat(starts, [part[0].size for part in parts])
+    return np.moveaxis(side_by_side(lines[0].size, line, np.stack(found, -1)), -1, 0)
+
+
+def _some_intervals(boundary: Boundary, beta: np.ndarray) -> tuple[np.ndarray, ...]:
+    """One after another: the row that each is of, its ends, the angles there, and what of the boundary ends it."""
+    known = np.where(np.isfinite(beta), beta, 0.0)
+    found = boundary.crossings(known)
+    order = np.argsort(found.alpha, axis=1)
+    alpha = np.take_along_axis(found.alpha, order, 1)
+    leaving = np.take_along_axis(found.leaving, order, 1)
+    sides = (0, 0), (1, 1)
+    ends = np.pad(np.where(np.isnan(alpha), np.inf, alpha), sides, constant_values=(-np.inf, np.inf))
+    met = np.pad(order, sides, constant_values=-1)
+    w = np.pad(np.take_along_axis(found.w, order, 1), sides, constant_values=np.nan)
+    outside = boundary.base + np.concatenate([np.zeros((beta.size, 1)), np.cumsum(leaving, 1)], 1)
+    # Closer than any alpha in range two crossings are one: the rounding of 0 on an undamped device's own row.
+    wide = ends[:, 1:] > ends[:, :-1] + WALL_RANGE[0]
+    stable = (np.round(outside) == 0) & wide & (np.isfinite(beta) & found.sound)[:, None]
+    # Neighbors that touch, where one pole leaves as another enters, stay apart: their common end is on the boundary.
+    row, gap = np.nonzero(stable)
+    return row, *(part[row, gap] for both in (ends, w, met) for part in (both[:, :-1], both[:, 1:]))
+
+
+def side_by_side(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values that belong to ascending lines by line: (lines, most of one, ...), NaN where one has fewer."""
+    place = np.arange(line.size) - np.searchsorted(line, line)
+    out = np.full((lines, int(place.max(initial=-1)) + 1, *values.shape[1:]), np.nan)
+    out[line, place] = values
+    return out
+
+
+def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """Whether each wall is stable; arrays that broadcast. Dampings that repeat are solved once."""
+    shape = np.broadcast_shapes(alpha.shape, beta.shape)
+    rows, place = np.unique(beta, return_inverse=True)
+    many = rows.size * _FEW_WALLS > np.prod(shape)
+    if many or not boundary.settle(np.where(np.isfinite(rows), rows, 0.0))[1].all():
+        return _count_walls(boundary, *np.broadcast_arrays(alpha, beta))
+    ends = bound_intervals(boundary, rows)
+    place = place.reshape(beta.shape)
+    stable = np.zeros(shape, bool)
+    for low, high in zip(ends.low.T, ends.high.T, strict=True):
+        inside = alpha > low[place]
+        inside &= alpha < high[place]
+        stable |= inside
+    return stable
+
+
+def _count_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """The same for walls of their own dampings each: poles are counted, and most crossings need not be solved."""
+    shape = alpha.shape
+    columns, good = (alpha.reshape(-1), beta.reshape(-1)), np.isfinite(alpha + beta).reshape(-1)
+    stable = np.zeros(good.shape, bool)
+    size = max(_ROWS, _PAIRS // max(len(boundary.arcs), 1))
+    for start in range(0, good.size, size):
+        part = slice(start, start + size)
+        alpha, beta = (np.where(good[part], column[part], 0.0) for column in columns)
+        outside = boundary.outside(alpha, beta)
+        # A row whose crossings contradict each other says nothing: all poles of its walls do.
+        left = np.flatnonzero(outside < 0)
+        if left.size:
+            outside[left] = (log_size(poles_less_one(boundary.loop, alpha[left], beta[left])) >= 0).sum(1)
+        stable[part] = good[part] & (outside == 0)
+    return stable.reshape(shape)
+
+
+# How far beside an end, as a share of it, walls must have the labels of the intervals that it parts: their rounding is
+# that of a row, which may cross where a column hardly moves.
+_BESIDE = 1e-7
+
+
+def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
+    """Where a column is stable: array (intervals, 2) of beta, ascending."""
+    # Every damping at which the column meets the boundary is found, for alpha is monotone along the curve between two
+    # nodes once its extremes are among them; the walls between two such dampings share the label of one of them. An end
+    # whose own neighbors contradict that is sought by labels alone.
+    on_lines = np.array([(line.q - alpha) / line.f for line in boundary.lines if line.f != 0.0])
+    w, height = boundary.heights
+    above = height - alpha
+    k = np.flatnonzero(np.isfinite(above[1:] + above[:-1]) & ((above[1:] > 0) != (above[:-1] > 0)))
+    on_curve = zeros_between(lambda at: curve_at(boundary.loop, at).alpha - alpha, w, above, k)
+    met = np.unique(np.concatenate([curve_at(boundary.loop, on_curve).beta, on_lines]))
+    met = met[np.isfinite(met)]
+    if not np.isfinite(alpha) or not met.size:
+        return np.zeros((0, 2))
+
+    def label(beta: np.ndarray) -> np.ndarray:
+        return label_walls(boundary, np.full(beta.size, alpha), beta)
+
+    reach = np.ptp(met) + np.abs(met).max() + 1.0
+    between = 0.5 * (np.concatenate([[met[0] - reach], met]) + np.concatenate([met, [met[-1] + reach]]))
+    stable = label(between)
+    k = np.flatnonzero(stable[1:] != stable[:-1])
+    room = np.minimum(met[k] - between[k], between[k + 1] - met[k])
+    beside = np.minimum(_BESIDE * np.abs(met[k]), 0.5 * room)
+    wrong = (label(met[k] - beside) != stable[k]) | (label(met[k] + beside) != stable[k + 1])
+    k, low, high = k[wrong], between[:-1][k[wrong]], between[1:][k[wrong]]
+    # Twice: the last digit of a long way is not that of an end near 0.
+    for _ in range(2 if k.size else 0):
+        met[k] = bisect(lambda beta: label(beta) == stable[k], low, high)
+        low, high = met[k] - 1e-12 * (high - low), met[k] + 1e-12 * (high - low)
+    ends = np.concatenate([[-np.inf], met, [np.inf]])
+    return np.stack([ends[:-1][stable], ends[1:][stable]], -1)
+
+
+# A row that begins within such a share of its end begins at 0: the rounding of a sampled device's coefficients may put
+# its pole at z = 1 beyond it, and the softest walls of all then do not hold it. Of 12th order up to 3e-8 was seen.
+_SOFT = 1e-6
+
+
+def reaches_down(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Whether stable intervals of alpha, or of K, hold soft walls, but for rounding."""
+    return (low <= _SOFT * high) & (high > 0)
+
+
+# Rows between two neighboring corners, as shares of the way; and rows across the whole of the plane.
+_SHARES, _ACROSS = np.array([1e-3, 0.5, 1.0 - 1e-3]), 65
+# Two rows between corners with different ends are halved so often, until a corner that was not seen is between them.
+_HALVINGS = 48
+# A corner is known to such a share, and so many rows may lie within it.
+_NEAR, _MOST_BESIDE = 1e-9, 4
+
+
+@shown()
+class Island(NamedTuple):
+    """A piece of the stable set without soft walls: its extent in stiffness and in damping."""
+
+    stiffness: tuple[float, float]
+    virtual_damping: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class StablePieces:
+    """The stable set of one loop, piece by piece."""
+
+    boundary: Boundary
+    corners: np.ndarray  # dampings at which the set's edge has ends or turns, or passes from K > 0 to K < 0
+
+    @cached_property
+    def _rows(self) -> tuple[np.ndarray, BoundIntervals]:
+        """Rows with their intervals, so many that between corners neighbors have the same ends."""
+        corners = self.corners
+        rows = (corners[:-1, None] + np.diff(corners)[:, None] * _SHARES).ravel()
+        across = np.linspace(corners[0], corners[-1], _ACROSS + 2)[1:-1] if corners.size else corners
+        rows = np.unique(np.concatenate([rows, across]))
+        rows = rows[self.boundary.settle(rows)[1]]
+        found = bound_intervals(self.boundary, rows)
+        for _ in range(_HALVINGS):
+            same = (found.below[1:] == found.below[:-1]).all(1) & (found.above[1:] == found.above[:-1]).all(1)
+            parted = np.searchsorted(corners, rows[1:], side="left") != np.searchsorted(corners, rows[:-1], side="left")
+            middle = 0.5 * (rows[1:] + rows[:-1])
+            new = middle[~same & ~parted & (middle > rows[:-1]) & (middle < rows[1:])]
+            new = new[self.boundary.settle(new)[1]]
+            if not new.size:
+                break
+            rows = np.sort(np.append(rows, new))
+            found = bound_intervals(self.boundary, rows)
+        return rows, found
+
+    @cached_property
+    def _labels(self) -> tuple[np.ndarray, np.ndarray]:
+        """The number of the piece of each interval of `_rows`, -1 for none; and the pieces with soft walls."""
+        _, found = self._rows
+        there = found.above >= 0
+        number = np.where(there, np.cumsum(there).reshape(there.shape) - 1, -1)
+        joined = [np.zeros((2, 0), int)]
+        for ends in (found.below, found.above):
+            row, one, other = np.nonzero((ends[:-1, :, None] == ends[1:, None, :]) & (ends[:-1, :, None] >= 0))
+            joined.append(np.stack([number[row, one], number[row + 1, other]]))
+        pairs, count = np.concatenate(joined, 1), int(there.sum())
+        # The least number that each is joined to; a graph of SciPy's would take a third of a second to load.
+        piece, before = np.arange(count), np.full(count, -1)
+        while not np.array_equal(piece, before):
+            before = piece.copy()
+            for one, other in (pairs, pairs[::-1]):
+                np.minimum.at(piece, one, before[other])
+            piece = piece[piece]
+        labels = np.full(there.shape, -1)
+        labels[there] = piece
+        # One that narrows towards K = 0 holds soft walls in no row but the last.
+        low, high = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(low, piece, found.low[there])
+        np.maximum.at(high, piece, found.high[there])
+        return labels, np.flatnonzero(reaches_down(low, high))
+
+    def find_highest(self, least: float) -> float:
+        """Up to which alpha rows with that much damping or more are stable in pieces with soft walls; else -inf."""
+        rows, found = self._rows
+        inside = np.isin(*self._labels) & np.isfinite(found.high) & (rows >= least)[:, None]
+        return float(np.max(found.high, where=inside, initial=-np.inf))
+
+    def piece_at(self, beta: float, place: int) -> int:
+        """The piece at the point of a row on one column of its crossings, -1 where none is beside it."""
+        rows, found = self._rows
+        after = int(np.searchsorted(rows, beta))
+        # Of a corner two edges tell nearly the same damping, with rows between them.
+        near = range(max(after - _MOST_BESIDE, 0), min(after + _MOST_BESIDE, rows.size))
+        for row in sorted(near, key=lambda row: abs(rows[row] - beta)):
+            met = (found.below[row] == place) | (found.above[row] == place)
+            if met.any() and (row in (after - 1, after) or abs(rows[row] - beta) <= _NEAR * abs(beta)):
+                return int(self._labels[0][row, int(np.argmax(met))])
+        return -1
+
+    def extents(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """The least and the largest alpha and beta that rows meet in each piece without soft walls."""
+        rows, found = self._rows
+        labels, main = self._labels
+        extents = {}
+        for piece in np.setdiff1d(labels[labels >= 0], main).tolist():
+            row, column = np.nonzero(labels == piece)
+            low, high, beta = found.low[row, column], found.high[row, column], rows[row]
+            extents[piece] = np.array([low.min(), beta.min()]), np.array([high.max(), beta.max()])
+        return extents
+
+    def holds_softly(self, alpha: float, beta: float) -> bool:
+        """Whether a wall is stable in a piece with soft walls."""
+        found = bound_intervals(self.boundary, np.array([beta]))
+        above = found.above[0, (found.low[0] < alpha) & (alpha < found.high[0])]
+        return any(self.is_main(self.piece_at(beta, place)) for place in above.tolist())
+
+    def is_main(self, piece: int) -> bool:
+        """Whether a piece contains soft walls."""
+        return bool(np.isin(piece, self._labels[1]))

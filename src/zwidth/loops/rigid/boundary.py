@@ -1,0 +1,322 @@
+"""The stability boundary of the rigid loop: closed form, exact points on a row or column, outline of the stable set."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+
+from zwidth.arrays.evaluate import as_number, check_scalars, evaluate
+from zwidth.arrays.held_mass import DelayClasses, classify_delays, valid_device
+from zwidth.arrays.roots import follow_root, integrate
+from zwidth.loops.rigid.curve import column_end, creeps, frequency, lobe, on_line, peak, row_end, wall
+from zwidth.loops.rigid.normalization import wall_status
+from zwidth.loops.rigid.polynomial import Wall, check_delay_model, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.ridge import ridge_kernel
+from zwidth.parts.checks import check_whole
+from zwidth.words.errors import InputError, check_choice
+from zwidth.words.showing import shown
+from zwidth.words.status import Status
+from zwidth.words.types import Array, ArrayLike, DelayModel, Vertices
+from zwidth.words.xp import frozen, namespace, nan_with_nan_slopes, store_once, tree_map
+
+PointMethod: TypeAlias = Literal["auto", "optimistix"]
+
+# Closer to pi the frequency of a fractional power of less than one has too few digits.
+_NEAREST_PI = 1e-3
+
+
+def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> Wall:
+    """Return the wall that puts a pole pair of the loop at ``e^(+-j omega)``, in closed form.
+
+    With ``q = -z^n (z - 1)(z - c)/(n0(z) + n1(z)/z)`` on ``z = e^(j omega)``: ``beta = Im q / sin omega``,
+    ``alpha = Re q - tan(omega/2) Im q``. The curve starts at (0, -delta), eq. (19). Its first lobe bounds the stable
+    set, see `zwidth.stable_region`; behind it the curve only lists walls with a pole on the circle.
+
+    Args:
+        omega: frequency in radians a period, 0 <= omega <= pi.
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, whole or not. All three broadcast.
+        delay: "held" (exact) or "fractional_power" (the paper's z^(1+d), principal branch).
+
+    Returns:
+        Wall with ``alpha`` and ``beta`` of the broadcast shape; NaN out of range. At omega = 0 and pi the
+        values are the limits. They are finite unless the curve runs to infinity at pi: where N(-1) = 0, as for
+        delta = 0 and whole d (for held delays between whole numbers it vanishes at one damping, if at all), and for a
+        fractional power.
+
+    Numerics:
+        A few units in the last place, at a cost that does not grow with d. Traceable, also in d (derivatives at whole
+        d are those from the right). Float64 when called directly; the ambient precision inside `jit`.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section V; D-decomposition.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.boundary(0.0, 0.25, 2).beta:.2f}")
+        -0.25
+    """
+    check_delay_model(delay)
+    return evaluate(_boundary_kernel, {"omega": omega, "delta": delta, "d": d}, delay)
+
+
+def _boundary_kernel(omega: Array, delta: Array, d: Array, delay_model: str) -> Wall:
+    xp = namespace(omega, delta, d)
+    ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
+    spoiled = nan_with_nan_slopes(ok, omega, delta, d)
+    omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
+    curve = frequency_boundary(omega, frequency_loop(delta, d, delay_model))
+    return Wall(curve.alpha + spoiled, curve.beta + spoiled)
+
+
+@shown()
+class BoundaryPoint(NamedTuple):
+    """A wall on the edge of stability, or an array of them."""
+
+    alpha: Array
+    beta: Array
+    omega: Array
+    status: Array
+
+
+def boundary_point(
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    beta: ArrayLike | None = None,
+    alpha: ArrayLike | None = None,
+    side: str = "lower",
+    delay: DelayModel = "held",
+    method: PointMethod = "auto",
+) -> BoundaryPoint:
+    """Find the exact boundary point of a row or column: ``P(e^(j omega)) = 0`` on the edge of the stable set.
+
+    Exactly one of ``beta`` and ``alpha`` is given: the stiffest stable wall of that damping; or the smallest
+    (``side="lower"``) or largest (``"upper"``) stable damping of that stiffness.
+
+    Args:
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, whole or not.
+        beta: normalized virtual damping of a row.
+        alpha: normalized stiffness of a column, > 0.
+        side: which end of the column. Everything broadcasts.
+        delay: "held" or "fractional_power".
+        method: "auto" solves the proved monotone functions of the lobe; "optimistix" the frequency response in real
+            unknowns, from a bracket by jaxopt, for any loop that has one: an independent judge, which compiles.
+
+    Returns:
+        BoundaryPoint: ``alpha``, ``beta``; ``omega`` of the pole on the circle (pi: a real one); ``status``, see
+        `zwidth.Status`, with NaN where it is not OK: NO_BOUNDARY where a row or column holds no stable wall, UNDECIDED
+        where the point lies closer to omega = pi than its digits allow (a fractional power of almost 0).
+
+    Raises:
+        InputError: not exactly one line is given, or as `zwidth.InputError` says.
+
+    Numerics:
+        alpha and ``beta + delta`` to about 1e-15 relative, times the condition of the line: close to the ridge a column
+        determines beta to half the digits only. The same in NumPy, compiled and traced; a scalar takes a fraction of a
+        millisecond and compiles nothing. Traceable with first and second derivatives, also in d (at whole d from the
+        right). Rows and columns are intervals by proof (docs/theory/one-lobe.md).
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section V.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.boundary_point(0.0, 0, beta=0.5).alpha:.4f}")
+        0.6000
+    """
+    check_delay_model(delay)
+    check_choice("side", side, ("lower", "upper"))
+    check_choice("method", method, get_args(PointMethod))
+    given = [(name, value) for name, value in (("beta", beta), ("alpha", alpha)) if value is not None]
+    if len(given) != 1:
+        raise InputError(f"beta, alpha: got {'both' if given else 'none'}; give exactly one of the two")
+    ((name, value),) = given
+    line = side if beta is None else "row"
+    arguments = {"delta": delta, "d": d, name: value}
+    if method == "optimistix":
+        # Its solvers take a second to import.
+        from zwidth.loops.rigid.exact_points import point_kernel
+
+        return BoundaryPoint(*evaluate(point_kernel, arguments, line, delay, ridge_kernel, route="jax"))
+    return evaluate(_point_kernel, arguments, line, delay, classify_delays(d))
+
+
+def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model: str, kind: Any) -> BoundaryPoint:
+    """The end of the row of damping ``number``, or one of the column of that stiffness."""
+    xp, is_row, zero = namespace(delta, d, number), line == "row", 0.0 * number
+    given = wall_status(*((zero, number) if is_row else (number, zero)), delta, d)
+    curve = lobe(delta, d, delay_model, kind)
+    creeping = creeps(delay_model, kind)
+    fixed, still = frozen((curve, number), xp)
+    if is_row:
+        row = store_once(row_end(still, fixed, delay_model, kind), delta)
+        x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
+        x = follow_root(lambda x, curve, b: wall(x, curve).b - b, x, lambda *_: True, curve, number + delta)
+        at = wall(x, curve)
+        # The number that `zwidth.is_stable` compares with, with the derivatives of the curve.
+        alpha = row.alpha if xp is np else frozen(row.alpha, xp) + (at.alpha - frozen(at.alpha, xp))
+        beta = number
+    else:
+        top = peak(fixed, delay_model, kind)
+        exists = (still > 0) & (still < top.alpha)
+        goal = xp.where(exists, still, 0.5 * top.alpha)
+        x, cut = store_once(column_end(goal, top, fixed, line == "upper", creeping), delta)
+        on_lobe = ~cut
+        x = follow_root(lambda x, curve, alpha: wall(x, curve).alpha - alpha, x, lambda *_: True, curve, number)
+        at = wall(x, curve)
+        # Beside the ridge a step more would be rounding over rounding.
+        alpha, beta = number, at.b - delta
+    omega = frequency(x, curve)
+    if curve.short is not None and line != "lower":
+        # On the line of z = -1, alpha + 2 beta is known.
+        rest = on_line(curve) - (2.0 * number if is_row else number)
+        alpha = xp.where(on_lobe, alpha, rest) if is_row else alpha
+        beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * rest)
+        omega = xp.where(on_lobe, omega, np.pi)
+    status = xp.where(exists, int(Status.OK), int(Status.NO_BOUNDARY))
+    if creeping:
+        # The frequency of a fractional power of less than one is too close to pi.
+        undecided = on_lobe & (np.pi - x < _NEAREST_PI) & (d > 0) & (d < 1)
+        status = xp.where(exists & undecided, int(Status.UNDECIDED), status)
+    status = xp.where(given == int(Status.OK), status, given)
+    # NaN, derivatives included, where there is no point.
+    spoiled = nan_with_nan_slopes(status == int(Status.OK), delta, d, number)
+    return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
+
+
+class Piece(IntEnum):
+    """Which pole crosses the unit circle on a part of the outline."""
+
+    COMPLEX_PAIR = 0
+    MINUS_ONE = 1
+    PLUS_ONE = 2
+
+
+@shown()
+class StableRegion(NamedTuple):
+    """A closed outline: vertex k belongs to ``piece[k]``, and the last vertex joins the first along alpha = 0."""
+
+    alpha: Vertices
+    beta: Vertices
+    omega: Vertices
+    piece: np.ndarray
+
+    @property
+    def area(self) -> float:
+        """The area of the polygon, by the shoelace formula."""
+        x, y = self.alpha, self.beta
+        return float(0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
+
+
+def sample_lobe(
+    delta: float, d: float, *, delay: DelayModel = "held", points: int = 400
+) -> tuple[Vertices, Vertices, Vertices]:
+    """Frequencies along the first lobe of the boundary curve, and its alpha and beta there."""
+    check_delay_model(delay)
+    known = {"delta": as_number("delta", delta, 0.0), "d": as_number("d", d, 0.0)}
+    check_scalars(known)
+    points = check_whole("points", points, 8, 10**7)
+    kind = classify_delays(d)
+    with np.errstate(all="ignore"):
+        whole = lobe(np.float64(known["delta"]), np.float64(known["d"]), delay, kind)
+        top = peak(whole, delay, kind).x
+        first, last = (float(frequency(x, whole)) for x in (top, whole.end))
+    # Closer together at both ends and round the ridge, where the outline bends most.
+    half = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))
+    omega = np.concatenate([first * half, first + (last - first) * half[1:]]) if first < last else last * half
+    # The last product may round past its end.
+    omega = np.minimum(omega, last)
+    wall = boundary(omega, delta, d, delay=delay)
+    return omega, np.asarray(wall.alpha), np.asarray(wall.beta)
+
+
+def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points: int = 400) -> StableRegion:
+    """Return the outline of the stable set in the (alpha, beta) plane.
+
+    The lobe of the boundary curve from (0, -delta) to its return to alpha = 0, cut by the line on which a real pole
+    crosses at z = -1, and closed along alpha = 0, where one crosses at z = 1.
+
+    Args:
+        delta: normalized physical damping b T/m, >= 0, a single number.
+        d: delay in periods, >= 0, a single number.
+        delay: "held" or "fractional_power".
+        points: how many points of the curve to take, 8 to 10,000,000.
+
+    Returns:
+        StableRegion: ``alpha``, ``beta``, ``omega`` (0 and pi on the straight parts), ``piece`` (see `Piece`); ``area``
+        in units of alpha times beta, of the polygon.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section V, Figs. 5 and 7.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.stable_region(0.0, 0).alpha.max():.4f}")
+        0.6863
+    """
+    omega, alpha, beta = sample_lobe(delta, d, delay=delay, points=points)
+    piece = np.full(omega.shape, Piece.COMPLEX_PAIR)
+    if omega[-1] == np.pi and alpha[-1] > 0:
+        # From the corner along the line alpha + 2 beta = const to alpha = 0.
+        omega, piece = np.append(omega, np.pi), np.append(piece, Piece.MINUS_ONE)
+        beta = np.append(beta, beta[-1] + 0.5 * alpha[-1])
+        alpha = np.append(alpha, 0.0)
+    alpha[-1] = 0.0
+    return StableRegion(alpha, beta, omega, piece)
+
+
+# Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic, and what a point weighs for them.
+_LOBE_NODES, _LOBE_WEIGHT = 48, 16
+
+
+def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
+    """Return the area of the stable set in the (alpha, beta) plane.
+
+    ``A = integral of alpha d(beta)`` along the lobe of `zwidth.boundary`, closed by the line on which a real pole
+    crosses at z = -1, where that line cuts it, and by alpha = 0. In SI units the area over K and B is ``A m^2/T^3``.
+
+    Args:
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, whole or not (held). Both broadcast.
+
+    Returns:
+        Array of the broadcast shape; NaN out of range.
+
+    Numerics:
+        Gauss-Legendre quadrature of the closed form, about 1e-13. Traceable, with first and second derivatives; at
+        whole d those in d are from the right.
+
+    References:
+        Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, section V.
+
+    Example:
+        >>> from zwidth import stable_area
+        >>> print(f"{stable_area(0.0, 0):.4f}")
+        0.9096
+    """
+    return evaluate(_area_kernel, {"delta": delta, "d": d}, classify_delays(d), weight=_LOBE_WEIGHT)
+
+
+def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
+    xp = namespace(delta, d)
+    curve = lobe(delta, d, "held", kind)
+    end = frozen(curve.end, xp)
+    if xp is not np:
+        # It moves as the zero of alpha does, which the second derivatives of the area ask for; a corner stays.
+        at = wall(end, curve)
+        end = end - xp.where(curve.to_corner, 0.0, at.alpha / frozen(xp.where(curve.to_corner, 1.0, at.d_alpha), xp))
+    # For many places of each lobe.
+    at_places = tree_map(lambda value: None if value is None else value[..., None], curve)
+
+    def rise(x: Array) -> Array:
+        at = wall(x, at_places)
+        return at.alpha * at.d_b
+
+    # From a corner back to alpha = 0 along alpha + 2 beta = const.
+    last = xp.where(curve.to_corner, wall(end, curve).alpha, 0.0)
+    under_lobe = integrate(rise, (0.0 * end, end), (_LOBE_NODES,))
+    return under_lobe + 0.25 * last * last + nan_with_nan_slopes(valid_device(delta, d), delta, d)

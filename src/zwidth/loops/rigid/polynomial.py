@@ -1,0 +1,136 @@
+"""The closed loop of device and virtual wall, affine in (alpha, beta).
+
+Held delay d = n + f, with N(z) = a2 z^2 + a1 z + a0 of `arrays.held_mass`:
+
+    P(z) = z^(2+n) (z - 1)(z - c) + N(z) (alpha z + beta (z - 1))
+
+For whole d, a0 = 0 and one factor z cancels; that is the paper's polynomial (17) over -delta^2, monic and
+factored. Pole methods use the coefficients `coefficients`, frequency methods `frequency_boundary`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from zwidth.arrays.held_mass import Plant, held_plant, split_delay
+from zwidth.arrays.polynomials import Affine
+from zwidth.loops.rigid.folding import Degree, map_by_degree
+from zwidth.loops.rigid.normalization import valid_wall
+from zwidth.loops.rigid.ridge_newton import expand_curve, wall, wave_at
+from zwidth.words.errors import InputError, check_choice
+from zwidth.words.types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
+from zwidth.words.xp import namespace, nan_with_nan_slopes
+
+
+def affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
+    """The three coefficient vectors of devices of one degree, along a new last axis of degree.poles + 1."""
+    plant = held_plant(delta, d - degree.whole if degree.fractional else None)
+    xp = namespace(plant.a2)
+    zero, one = 0.0 * plant.a2, 0.0 * plant.a2 + 1.0
+    head = [one, -(1.0 + plant.c), plant.c]
+    # N(z) and (z - 1) N(z), without the common factor z that a whole delay leaves in them; a2 - a1 is then the gap.
+    if degree.fractional:
+        n = [plant.a2, plant.a1, plant.a0]
+        differences = [plant.a1 - plant.a2, plant.a0 - plant.a1]
+    else:
+        n = [plant.a2, plant.a1]
+        differences = [-plant.gap]
+    pad = [zero] * (degree.poles - len(n))
+    rows = (head + [zero] * (degree.poles - 2), [*pad, *n, zero], [*pad, n[0], *differences, -n[-1]])
+    return Affine(*(xp.stack(row, axis=-1) for row in rows))
+
+
+def coefficients(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
+    """Coefficients of P, highest power first, along a new last axis of degree.poles + 1; P is monic."""
+    # Of what is out of range any numbers.
+    xp, ok = namespace(alpha, beta, delta, d), valid_wall(alpha, beta, delta, d)
+    alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
+    parts = affine(delta, xp.where(ok, d, float(degree.whole)), degree)
+    return parts.D + alpha[..., None] * parts.N1 + beta[..., None] * parts.N2
+
+
+class Wall(NamedTuple):
+    """A wall by its normalized stiffness and damping, or an array of them."""
+
+    alpha: Reals
+    beta: Reals
+
+
+class FrequencyLoop(NamedTuple):
+    """What the frequency methods need of a point: computed once, then evaluated at many frequencies."""
+
+    plant: Plant
+    lag: Array  # whole periods of delay; the whole exponent d in the fractional-power model
+
+
+def frequency_loop(delta: Array, d: Array, delay_model: str) -> FrequencyLoop:
+    """The loop of one (delta, d) for evaluation on the unit circle."""
+    if delay_model == "fractional_power":
+        return FrequencyLoop(held_plant(delta), d)
+    whole, fraction = split_delay(d)
+    return FrequencyLoop(held_plant(delta, fraction), whole)
+
+
+def frequency_boundary(omega: Reals, loop: FrequencyLoop) -> Wall:
+    """The wall (alpha, beta) that puts a pole at z = e^(j omega), 0 <= omega <= pi, in closed form, for one point."""
+    return Wall(*wall(wave_at(omega, loop.lag), expand_curve(loop.plant)))
+
+
+def check_delay_model(delay_model: str) -> None:
+    """Raise `InputError` unless the name of a delay model is known."""
+    check_choice("delay", delay_model, DELAY_MODELS)
+
+
+def check_has_poles(delay_model: str) -> None:
+    """Refuse the fractional power where poles are asked for."""
+    check_delay_model(delay_model)
+    if delay_model == "fractional_power":
+        raise InputError(
+            "delay: 'fractional_power' has no poles (z^d has other sheets, always with roots outside the unit "
+            "circle); use delay='held' for poles, radius and stability, or ask for the boundary or the ridge"
+        )
+
+
+def char_poly(
+    alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: str = "held"
+) -> Coefficients:
+    """Return the coefficients of the monic characteristic polynomial, highest power first.
+
+    ``P(z) = z^(2+n) (z - 1)(z - c) + (z n0(z) + n1(z)) (alpha z + beta (z - 1))``, d = n + f, ``c = e^-delta``; for
+    whole d the paper's (17) over ``-delta^2``, delta = 0 included. Stable means: all zeros inside the unit circle.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not; concrete also inside `jit`, because it decides the degree.
+            All four broadcast.
+        delay: only "held" has a polynomial.
+
+    Returns:
+        Array of the broadcast shape with one more axis at the end: 4 + d coefficients for whole d, 5 + n
+        otherwise. Where degrees are mixed, shorter polynomials have zeros in front. A point out of range is NaN.
+
+    Raises:
+        InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, or
+            ``delay="fractional_power"``.
+        TracedDelayError: d is traced.
+
+    Numerics:
+        Every coefficient is accurate to a few rounding errors of the terms it is the sum of, for every delta.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (15), (17).
+
+    Example:
+        >>> import numpy as np, zwidth
+        >>> print(np.array2string(zwidth.char_poly(0.5, 0.5, 0.0, 0), precision=2))
+        [ 1.   -1.5   1.25 -0.25]
+    """
+    check_has_poles(delay)
+    return map_by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True)
+
+
+def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
+    spoiled = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    return coefficients(alpha, beta, delta, d, degree) + spoiled[..., None]

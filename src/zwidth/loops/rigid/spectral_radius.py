@@ -1,0 +1,145 @@
+"""The outermost pole of arrays of walls: the spectral radius, and how fast a loop settles."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
+
+from zwidth.arrays.evaluate import broadcast, check_scalars, evaluate, to_caller
+from zwidth.arrays.held_mass import classify_delays
+from zwidth.loops.rigid.folding import NAMES
+from zwidth.loops.rigid.outermost_poles import ACCURACY, find_poles
+from zwidth.loops.rigid.pole_search import traced_kernel
+from zwidth.loops.rigid.poles import radius_by_companion
+from zwidth.loops.rigid.polynomial import check_has_poles
+from zwidth.words.errors import InputError, check_choice
+from zwidth.words.types import Array, ArrayLike, DelayModel
+from zwidth.words.xp import is_traced, namespace
+
+RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
+
+# Closer in, the rounding of two counts would meet.
+_LEAST_ACCURACY = 1e-12
+
+
+def spectral_radius(
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: RadiusMethod = "auto",
+    accuracy: float | None = None,
+    delay: DelayModel = "held",
+) -> Array:
+    """Return the spectral radius of the loop: the modulus of its largest pole.
+
+    ``max |z|`` over ``P(z) = 0``, see `zwidth.char_poly`; the loop is stable where it is below 1. One period multiplies
+    a slowly decaying motion by it.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast.
+        method: "newton" (and "auto") finds the outermost pole and proves each value by counts of the poles inside
+            a circle, at a cost that does not grow with d; "companion" computes all poles.
+        accuracy: relative error to prove, 1e-9 by default, at least 1e-12. On a large map (alpha along one axis,
+            beta along another) or line a larger one is quicker, at long delays above all, and errors are nearly as
+            large in places; single walls keep most digits. "companion" takes any.
+        delay: only "held" has poles.
+
+    Returns:
+        Array of the broadcast shape: below 1 exactly where `zwidth.is_stable` says so. NaN for a point out of range,
+        and where no error bound could be proved (some walls with multiple poles).
+
+    Raises:
+        InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, a name is unknown,
+            or the accuracy is out of reach.
+        TracedDelayError: d is traced with method "companion".
+
+    Numerics:
+        Float64 when called directly, maps and up to 262,144 other walls without JAX; the ambient precision inside
+        `jit`, where d may be traced. On a map a Taylor series serves a cell of walls (`loops.rigid.pole_map`); its
+        terms fall faster than the bound that is proved of them. Derivatives are those of the outermost pole, of every
+        order up to the second; NaN where it is a multiple one. Next to a k-fold pole the radius is known to about
+        1e-16^(1/k). How slowly a loop decays that is stable by less than 1e-16, `decay_rate` tells.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (17).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.spectral_radius(0.5, 0.5, 0.1, 1):.6f}")
+        1.207346
+    """
+    values = (alpha, beta, delta, d)
+    wanted = _check_radius(method, accuracy, delay)
+    arguments = dict(zip(NAMES, values, strict=True))
+    check_scalars(arguments)
+    if method == "companion":
+        return radius_by_companion(*values)
+    if is_traced(*values):
+        log_radius = evaluate(traced_kernel, arguments, classify_delays(d).fractional)
+        return namespace(log_radius).exp(log_radius)
+    return to_caller(find_poles(broadcast(arguments), wanted).radius, values)
+
+
+def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
+    """Return how fast the slowest motion of the loop decays: ``-ln(rho)`` per period, rho the spectral radius.
+
+    After k periods a disturbance has decayed to about ``exp(-decay_rate k)``. The time constant is ``1/decay_rate``
+    periods, the stability margin ``1 - rho = -expm1(-decay_rate)``.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not (held). All four broadcast.
+
+    Returns:
+        Array of the broadcast shape, per period: positive exactly where `zwidth.is_stable` says so, 0 with a pole at 1,
+        negative where the motion grows. NaN for a point out of range and where less than three digits of the rate are
+        known: on the boundary but for some 1e-12 of alpha or beta, and next to multiple poles that are nearly as slow.
+
+    Raises:
+        InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
+
+    Numerics:
+        The logarithm of the outermost pole as for `zwidth.spectral_radius`, found from z - 1: the motion of a soft wall
+        keeps 11 digits or more however slow it is, that of a pair of poles near the circle has an absolute error of
+        some 1e-16. A proved bound of either is below a thousandth of the rate, or the rate is NaN. Where poles are
+        not told from each other (within 1e-12 in size), any of them is meant. Inside `jit` the same in the ambient
+        precision, without a bound.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (17).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.decay_rate(1e-15, 1e-9, 1e-9, 1):.6e}")
+        9.999993e-10
+    """
+    values = (alpha, beta, delta, d)
+    arguments = dict(zip(NAMES, values, strict=True))
+    check_scalars(arguments)
+    if is_traced(*values):
+        return -evaluate(traced_kernel, arguments, classify_delays(d).fractional)
+    return to_caller(find_poles(broadcast(arguments), ACCURACY, with_rate=True).rate, values)
+
+
+def _check_radius(method: str, accuracy: float | None, delay_model: str) -> float:
+    check_has_poles(delay_model)
+    check_choice("method", method, get_args(RadiusMethod))
+    if accuracy is None:
+        return ACCURACY
+    least = 0.0 if method == "companion" else _LEAST_ACCURACY
+    number: Any = accuracy
+    good = isinstance(number, int | float | np.floating) and np.isfinite(number) and 0 < number < 1 and number >= least
+    if not good:
+        raise InputError(
+            f"accuracy: got {accuracy!r}; a relative error of at least {least:g} and below 1 is needed for "
+            f"method={method!r}; 'companion' takes any"
+        )
+    return float(number)

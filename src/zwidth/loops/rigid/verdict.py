@@ -1,0 +1,160 @@
+"""Stable or not, for whole arrays of walls."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from zwidth.arrays.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
+from zwidth.arrays.held_mass import classify_delays
+from zwidth.loops.rigid.crossover import stable_kernel
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments
+from zwidth.loops.rigid.normalization import wall_status
+from zwidth.loops.rigid.poles import radius_by_companion
+from zwidth.loops.rigid.polynomial import check_has_poles
+from zwidth.loops.rigid.row_limit import boundary_map
+from zwidth.words.errors import InputError, check_choice
+from zwidth.words.results import Stability
+from zwidth.words.status import Method, Status
+from zwidth.words.types import Array, ArrayLike, DelayModel
+from zwidth.words.xp import is_traced
+
+StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
+STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
+
+
+# How far eigenvalues may be off where two poles are one: the root of the rounding unit.
+_ROUGH = 2e-8
+
+
+def is_stable(
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: StabilityMethod = "auto",
+    delay: DelayModel = "held",
+) -> Array:
+    """Tell which walls are stable: every pole strictly inside the unit circle.
+
+    ``P(z) = 0`` only for ``|z| < 1``, see `zwidth.char_poly`.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast; axes along which an argument
+            does not vary cost nothing: for a map pass alpha of shape (1, N) and beta of shape (M, 1).
+        method: "crossover" asks for the phase where the loop gain is one, in closed form; "companion" computes all
+            poles; "certified" never guesses (`zwidth.decide_stability` names the points it leaves open). "auto" is
+            "crossover", which on a map of one device compares alpha with the end of its row, the same closed form.
+        delay: only "held" has poles.
+
+    Returns:
+        Boolean array of the broadcast shape, maybe read-only. False for a point out of range.
+
+    Raises:
+        InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, or a name is
+            unknown.
+        TracedDelayError: d is traced with method "companion".
+
+    Numerics:
+        At a cost that does not depend on d. Float64 when called directly, the ambient precision inside `jit`. The label
+        of the closed form is right where alpha is more than some rounding errors away from the boundary; there is no
+        faster, rougher method. What a point costs: benchmarks/results/bench.md.
+
+    References:
+        docs/theory/one-crossover.md; Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
+
+    Example:
+        >>> import numpy as np, zwidth
+        >>> zwidth.is_stable(np.array([0.1, 0.6, 0.8]), 0.4, 0.1, 0)
+        array([ True,  True, False])
+    """
+    values = (alpha, beta, delta, d)
+    arguments, numbers = dict(zip(NAMES, values, strict=True)), are_numbers(*values)
+    if not (numbers and method == "auto" and delay == "held"):
+        _check(method, delay)
+    if method in ("auto", "crossover") and (numbers or is_traced(*values)):
+        return evaluate(stable_kernel, arguments, classify_delays(d))
+    check_scalars(arguments)
+    if is_traced(*values):
+        if method == "certified":
+            raise InputError(
+                "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
+                "'auto', 'crossover' or 'companion'"
+            )
+        return radius_by_companion(*values) < 1.0
+    laid = fold_arguments(values)
+    return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
+
+
+def decide_stability(
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: StabilityMethod = "auto",
+    delay: DelayModel = "held",
+) -> Stability:
+    """Tell which walls are stable, and for each point how that was decided.
+
+    Args:
+        alpha, beta, delta, d, method, delay: as for `zwidth.is_stable`.
+
+    Returns:
+        Stability: ``stable``, boolean; ``status``, see `zwidth.Status`: INVALID_INPUT or OUT_OF_RANGE for a point that
+        is not computed, with method "certified" UNDECIDED or ON_BOUNDARY where no label is given (``stable`` is
+        False there), and with "companion" UNDECIDED where the radius is 1 within what eigenvalues tell of a double
+        pole; ``method``, the `Method` that decided. Arrays may be read-only.
+
+    Raises:
+        InputError: as for `zwidth.is_stable`, and for traced values.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.decide_stability([0.1, float("nan")], 0.4, 0.1, 1).status
+        array([0, 1], dtype=int32)
+    """
+    values = (alpha, beta, delta, d)
+    _check(method, delay)
+    check_scalars(dict(zip(NAMES, values, strict=True)))
+    if is_traced(*values):
+        raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
+    laid = fold_arguments(values)
+    stable, used, status = _decide(laid.points, method)
+    ranged = wall_status(*laid.points)
+    status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
+    codes = (np.broadcast_to(status, laid.points.shape).astype(np.int32), np.asarray(used, np.int32))
+    return to_caller(Stability(*map(laid.spread, (stable, *codes))), values)
+
+
+def _check(method: str, delay_model: str) -> None:
+    if delay_model != "held":
+        check_has_poles(delay_model)
+    if method != "auto":
+        check_choice("method", method, STABILITY_METHODS)
+
+
+def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
+    """Labels, what decided them, and statuses where they are not all OK."""
+    if method == "companion":
+        radius = np.asarray(radius_by_companion(*points))
+        rough = (np.abs(radius - 1.0) < _ROUGH) & (np.asarray(points[0]) != 0)
+        return radius < 1.0, Method.COMPANION, np.where(rough, Status.UNDECIDED, Status.OK)
+    if method == "certified":
+        # Loaded here: it needs an extra for its last resort.
+        from zwidth.loops.rigid.certified import prove_labels
+
+        stable, status = prove_labels(points)
+        return stable, Method.CERTIFIED, status
+    if points.is_dense:
+        return boundary_map(points), Method.CROSSOVER, None
+    stable = evaluate_columns(stable_kernel, points.columns(), classify_delays(points.d))
+    return stable.reshape(points.shape), Method.CROSSOVER, None
