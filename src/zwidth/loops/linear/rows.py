@@ -163,7 +163,7 @@ def reaches_down(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 
 # Rows between two neighboring corners, as shares of the way; and rows across the whole of the plane.
-_SHARES, _ACROSS = np.array([1e-3, 0.5, 1.0 - 1e-3]), 65
+_SHARES, _ACROSS = np.array([1e-7, 1e-3, 0.5, 1.0 - 1e-3, 1.0 - 1e-7]), 65
 # Two rows between corners with different ends are halved so often, until a corner that was not seen is between them.
 _HALVINGS = 48
 # A corner is known to such a share, and so many rows may lie within it.

@@ -9,7 +9,7 @@ import any_loop
 import numpy as np
 import pytest
 
-ROWS = json.loads((Path(__file__).parents[2] / "reference" / "islands.json").read_text())
+ROWS = json.loads((Path(__file__).parents[3] / "reference" / "islands.json").read_text())
 # The ends in float64: alpha is a difference of numbers some thousand times larger at worst.
 END = 1e-9
 

@@ -21,7 +21,7 @@ from zwidth.loops.rigid.normalization import wall_status
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
-REFERENCE = Path(__file__).resolve().parents[2] / "reference"
+REFERENCE = Path(__file__).resolve().parents[3] / "reference"
 NAMES = ("alpha", "beta", "delta", "d")
 STABLE, ON_BOUNDARY = 1, 2
 

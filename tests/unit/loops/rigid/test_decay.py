@@ -14,7 +14,7 @@ from zwidth.loops.rigid.pole_search import first_pair, slow_pole
 from zwidth.loops.rigid.pole_step import halley_step
 from zwidth.words.errors import InputError
 
-REFERENCE = Path(__file__).resolve().parents[2] / "reference"
+REFERENCE = Path(__file__).resolve().parents[3] / "reference"
 NAMES = ("alpha", "beta", "delta", "d")
 # Once 0 or -5e-16; a double pole next to 1; beta = -delta; a slow pole and a pair of one size.
 FOUND = zip(

@@ -19,7 +19,7 @@ from zwidth.loops.rigid.pole_search import quick_kernel
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
-LABELS = Path(__file__).resolve().parents[2] / "reference" / "labels.npz"
+LABELS = Path(__file__).resolve().parents[3] / "reference" / "labels.npz"
 ACCURACIES = [1e-9, 1e-12]
 
 

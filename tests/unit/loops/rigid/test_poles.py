@@ -19,7 +19,7 @@ from zwidth.loops.rigid.poles import _eigenvalues, radius_by_companion
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
-LABELS = Path(__file__).resolve().parents[2] / "reference" / "labels.npz"
+LABELS = Path(__file__).resolve().parents[3] / "reference" / "labels.npz"
 
 
 @pytest.fixture(scope="module")

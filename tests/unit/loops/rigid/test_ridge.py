@@ -20,7 +20,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import DELAY_MODELS as MODELS
 
-REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "ridge_extended.json"
+REFERENCE = Path(__file__).resolve().parents[3] / "reference" / "ridge_extended.json"
 # The corner takes over at d = 0: this float64 is the last smooth one, 4e-18 below.
 TAKE_OVER = 3.659361627421783507
 # One size for all derivatives of a model: one compilation.
