@@ -30,7 +30,7 @@ from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
 from zwidth.words.errors import InputError, ZwidthError, check_choice
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
-from zwidth.words.quantities import SIZES, Range
+from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
 from zwidth.words.status import Status
 
 EXIT_FAILED, EXIT_INPUT = 1, 2
@@ -54,19 +54,27 @@ def cli() -> None:
 
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
+@click.option("--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N.")
+@click.option("--resolution", type=quantity_type("m", POSITIVE), help="One step Q of the position sensor, in m.")
 @json_option
-def check(scene: Any, as_json: bool) -> None:
+def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
     """Judge one wall: stable, passive, how far from the boundary.
 
     It needs --stiffness, --mass (or --device) and --rate (or --period); damping and delay are 0 where left out.
     """
-    from zwidth.scenes.assessment import assess, limits_of
+    from zwidth.scenes.assessment import assess, friction_rule, limits_of
 
     verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
     result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
     lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
     if as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
+    if friction is not None or resolution is not None:
+        # The device's own: the rule is for any hand.
+        device = {"damping": scene.device.damping, "period": scene.timing.period}
+        rule = friction_rule(**device, friction=friction, resolution=resolution)
+        result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
+        lines += words.friction_lines(rule)
     words.tell(result, lines + words.note_lines(notes), as_json)
 
 

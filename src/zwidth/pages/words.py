@@ -22,7 +22,7 @@ from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
 if TYPE_CHECKING:
-    from zwidth.scenes.assessment import Assessment, Intervals, Limit
+    from zwidth.scenes.assessment import Assessment, FrictionRule, Intervals, Limit
     from zwidth.scenes.scene import Scene
 
 # A margin is a difference of dampings; a smaller share of them is their rounding.
@@ -220,6 +220,17 @@ def check_lines(scene: Scene, verdict: Assessment, limits: list[Limit]) -> list[
 def limit_lines(limits: list[Limit]) -> list[str]:
     known = [limit for limit in limits if isfinite(limit.stiffness)]
     return [row("" if k else "what limits it", limit.spell()) for k, limit in enumerate(known)]
+
+
+def friction_lines(rule: FrictionRule) -> list[str]:
+    ends = {"2 b/T": rule.by_damping, "2 f_c/Q": rule.by_friction}
+    parts = [f"{name} = {with_unit(end, 'N/m')}" for name, end in ends.items() if end is not None]
+    if rule.stiffness is None:
+        parts.append("both are needed for the rule")
+    else:
+        known = with_unit(round_safely(rule.stiffness, "below"), "N/m")
+        parts.append(f"a spring alone is passive up to {known} (rigid, without delay; Abbott and Okamura 2005)")
+    return [row("friction, resolution", ", ".join(parts))]
 
 
 def coded_period_notes(scene: Scene) -> list[str]:

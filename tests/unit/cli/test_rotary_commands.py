@@ -12,7 +12,7 @@ from zwidth.cli.commands import cli
 DEVICE = ["--mass", "12 g cm^2", "--damping", "0.02mNms/rad", "--rate", "1 kHz", "--delay", "1 ms"]
 LINEAR_UNITS = re.compile(r"(N/m|N s/m|\bm?N\b(?! m)|\bk?g\b(?! ?[cm]+\^2))")
 COMMANDS = {
-    "check": ["--stiffness", "2 mN m/deg", "--virtual-damping", "0.4 mN m s/rad"],
+    "check": ["--stiffness", "2 mN m/deg", "--virtual-damping", "0.4 mN m s/rad", "--friction", "1 mN m"],
     "ridge": [],
     "recommend": ["--phase-margin", "20"],
     "design": ["--stiffness", "4 mN m/deg", "--find", "delay", "--tolerance", "mass=10%"],
@@ -72,6 +72,7 @@ def test_code_of_a_rotary_wall_says_what_goes_in_and_out():
         (["ridge", "--mass", "12 g", "--damping", "0.02 mN m s/rad", "--rate", "1 kHz"], "--damping: got '0.02 mN m s"),
         (["ridge", "--device", "haptic_wheel", "--damping", "2 N s/m", "--rate", "1 kHz"], "beside --damping"),
         (["check", *DEVICE, "--stiffness", "2 N/m"], "in units of a linear device"),
+        (["check", *DEVICE, "--stiffness", "2", "--friction", "1 N"], "--friction"),
         (["ridge", *DEVICE, "--coupling-mass", "1 g", "--coupling-stiffness", "1"], "--coupling-mass"),
         (["ridge", *DEVICE, "--operator-mass", "1 kg"], "--operator-mass"),
         (["ridge", *DEVICE, "--modes-0-mass", "1 g"], "--modes-0-mass"),
