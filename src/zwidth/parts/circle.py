@@ -14,8 +14,8 @@ from zwidth.words.xp import frozen, namespace
 
 # Nearer to the circle than this a root of the loop is on it: an undamped mode, or a zero of an undamped device.
 ON_CIRCLE = 1e-12
-# And nearer than this it is there but for rounding.
-_UNDAMPED = 4.0 * np.finfo(float).eps
+# And nearer than this share of its offset it is there but for rounding.
+_UNDAMPED = 8.0 * np.finfo(float).eps
 
 
 class Jet(NamedTuple):
@@ -80,7 +80,7 @@ def product_jet(at: CirclePoints, offsets: Any, factor: Any) -> Jet:
     turn = 1j * at.z
     for offset in offsets:
         number = isinstance(offset, np.number)
-        if number and offset.imag and abs(abs(1.0 - offset) - 1.0) < _UNDAMPED:
+        if number and offset.imag and abs(2.0 * offset.real - abs(offset) ** 2) < _UNDAMPED * abs(offset):
             # Next to a root on the circle a sum has lost its phase, too.
             angle, xp = np.angle(1.0 - offset), namespace(at.w)
             one = 2j * xp.sin(0.5 * (at.w - angle)) * xp.exp(0.5j * (at.w + angle))
