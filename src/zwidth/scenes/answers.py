@@ -143,7 +143,7 @@ class SceneAnswers(SceneParts):
 
         Numerics:
             Closed form for a rigid device with the backward difference. Otherwise by the signed crossings of each
-            row (`loops.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
+            row (`loops.linear.boundary`): the first call lays out the boundary (some 5 to 20 ms), then each damping
             costs some microseconds and a stiffness next to nothing.
         """
         if method != "auto":

@@ -66,7 +66,7 @@ class LinearLoop:
     _ridges: dict[bool, BoundRidge | None] = field(default_factory=dict, init=False, repr=False)
 
     # The delay models that it knows, and how many devices of its kind are drawn where a person waits for the answer:
-    # a stiffest wall takes some 50 ms.
+    # a stiffest wall takes some 10 to 50 ms.
     delay_models: ClassVar[tuple[DelayModel, ...]] = ("held",)
     draws: ClassVar[int] = 200
     # The most periods of window and delay that a search affords: its cost grows with their square.
