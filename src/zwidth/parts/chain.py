@@ -20,7 +20,7 @@ import numpy as np
 
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.paths import Parts
-from zwidth.parts.system import FASTEST, Realization, System
+from zwidth.parts.system import FASTEST, STRONGEST, Realization, System
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 from zwidth.words.xp import namespace
@@ -160,6 +160,15 @@ class Chain:
                     f"{what} that rings {max(found) / (2 * np.pi):.3g} times a period cannot be resolved; leave the "
                     f"{name} out, so {'stiff a link is rigid' if name == 'coupling' else 'fast a one is not there'}"
                 )
+        dampings = [float(body.damping / body.mass) for body in self.bodies]
+        dampings += [float(link.damping / light) for link in self.links]
+        if isinstance(lag, Resonance):
+            dampings.append(2.0 * float(lag.damping_ratio * lag.rate))
+        if max(dampings) > STRONGEST:
+            raise InputError(
+                f"damping: a damper that stops what moves in {1.0 / max(dampings):.3g} periods cannot be resolved; "
+                "check the units of what damps the device, its coupling, actuator and operator"
+            )
 
 
 AnyChain: TypeAlias = Chain | System

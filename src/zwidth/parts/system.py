@@ -11,8 +11,8 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 
-# Faster parts than this, in radians or decays a period, leave no digits of e^A.
-FASTEST = 1e4
+# Faster parts than this, in radians or decays a period, leave no digits of e^A; dampers may stop sooner what moves.
+FASTEST, STRONGEST = 1e4, 1e10
 
 
 class Realization(NamedTuple):

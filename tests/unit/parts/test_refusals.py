@@ -79,6 +79,11 @@ CASES = {
         "coupling.stiffness",
         "leave the coupling out",
     ),
+    "damper that cannot be resolved": (
+        lambda: zwidth.Scene(zwidth.Device(0.1, coupling=zwidth.Coupling(0.1, 1e4, 1e14)), TIMING).check_parts(),
+        "damping",
+        "check the units",
+    ),
 }
 
 

@@ -30,41 +30,38 @@ from zwidth.words.xp import frozen, namespace, repeat
 _SLOW, _MOST_STEPS, _ARRIVED = 0.1, 30, 1e-13
 # The inverse of how far a zero is at most that is kept.
 _FAR = 1e-17
-# Terms of a series; a rate that `Chain.check` allows is below 2^35.
+# Terms of a series; twice a rate that `Chain.check` allows is below 2^36.
 _TERMS, _DOUBLINGS = 15, 36
 
 
 def flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
-    """``e^(A t) - 1`` and the answer ``Gamma(t)`` to a unit force held for t."""
-    # e^A - 1 = A phi1(A) keeps the digits of slow motions.
-    phi1 = _phi1(rate * time)
-    return rate * time @ phi1, time * (phi1 @ push)
-
-
-def hold(chain: AnyChain, rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
-    """The `flow` of a chain's matrices; those of a sampled one are it, whatever the time."""
-    return (rate - np.eye(len(push)), push) if chain.sampled else flow(rate, push, time)
-
-
-def _phi1(rate: Any) -> Any:
-    """``1 + A/2! + A^2/3! + ...``: the series of A over a power of 2, ``phi1(2 A) = phi1(A) (1 + A phi1(A)/2)``."""
-    # In two loops, because a program that is differentiated costs by its length: with JAX's own exponential derivatives
-    # of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to compile.
+    """``y = e^(A t) - 1`` and the answer ``Gamma(t)`` to a unit force held for t."""
+    # The series of a time that is smaller by a power of 2, then y(2 t) = y(t) (2 + y(t)), Gamma(2 t) likewise: neither
+    # slow motions nor those that strong damping stops at once lose digits. In two loops, because a program that is
+    # differentiated costs by its length: with JAX's own exponential derivatives of `zwidth.Scene.max_stiffness` took
+    # 1.2 to 1.7 times as long to compile.
     xp = namespace(rate)
-    size = frozen(xp.abs(rate).sum(0).max(), xp)
+    size = frozen(xp.abs(rate * time).sum(0).max(), xp)
     doublings = xp.ceil(xp.log2(xp.maximum(2.0 * size, 1.0)))
-    small, one = rate / 2.0**doublings, xp.eye(rate.shape[0], dtype=rate.dtype)
+    small, one = rate * (time / 2.0**doublings), xp.eye(rate.shape[0], dtype=rate.dtype)
 
     def add(state: tuple[Any, Any]) -> tuple[Any, Any]:
         k, total = state
         return k - 1.0, one + small @ total / k
 
     def double(state: tuple[Any, Any]) -> tuple[Any, Any]:
-        k, phi1 = state
-        return k + 1.0, phi1 + xp.where(k < doublings, 0.5 * 2.0**k, 0.0) * (small @ phi1 @ phi1)
+        k, moved = state
+        return k + 1.0, xp.where(k < doublings, 2.0 * moved + moved[:, :-1] @ moved, moved)
 
     _, phi1 = repeat(_TERMS, add, (doublings * 0.0 + _TERMS + 1.0, one), xp)
-    return repeat(_DOUBLINGS, double, (doublings * 0.0, phi1), xp, lambda old, new: bool(new[0] >= doublings))[1]
+    moved = phi1 @ xp.concatenate([small, push[:, None] * (time / 2.0**doublings)], 1)
+    moved = repeat(_DOUBLINGS, double, (doublings * 0.0, moved), xp, lambda old, new: bool(new[0] >= doublings))[1]
+    return moved[:, :-1], moved[:, -1]
+
+
+def hold(chain: AnyChain, rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
+    """The `flow` of a chain's matrices; those of a sampled one are it, whatever the time."""
+    return (rate - np.eye(len(push)), push) if chain.sampled else flow(rate, push, time)
 
 
 class Sampled(NamedTuple):
