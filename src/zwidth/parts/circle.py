@@ -12,8 +12,9 @@ import numpy as np
 from zwidth.words.types import Array
 from zwidth.words.xp import frozen, namespace
 
-# Nearer to the circle than this a root of the loop is on it: an undamped mode, or a zero of an undamped device.
-ON_CIRCLE = 1e-12
+# Nearer to the circle than this share of its offset, or of so much, a root of the loop is on it: an undamped mode, or a
+# zero of an undamped device. Of a slow one much less tells how soon it comes to rest.
+_ON_CIRCLE, _AT_ONE = 1e-12, 1e-3
 # And nearer than this share of its offset it is there but for rounding.
 _UNDAMPED = 8.0 * np.finfo(float).eps
 
@@ -55,6 +56,11 @@ def circle(w: Array) -> CirclePoints:
 def depths(offsets: np.ndarray) -> np.ndarray:
     """``1 - |root|`` of roots given by their offsets from 1, with the digits that they have next to 1."""
     return (2.0 * np.real(offsets) - np.abs(offsets) ** 2) / (1.0 + np.abs(1.0 - offsets))
+
+
+def are_on_circle(offsets: np.ndarray) -> np.ndarray:
+    """Whether roots are on the unit circle but for rounding."""
+    return np.abs(depths(offsets)) <= _ON_CIRCLE * (_AT_ONE + np.abs(offsets))
 
 
 def _exactly_at_pi(w: Array, exact: complex, value: Array, xp: Any) -> Array:

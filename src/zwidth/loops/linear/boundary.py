@@ -29,7 +29,7 @@ from zwidth.loops.linear.curve import (
     zeros_of,
 )
 from zwidth.loops.linear.roots import LoopRoots
-from zwidth.parts.circle import ON_CIRCLE, circle, depths
+from zwidth.parts.circle import are_on_circle, circle, depths
 
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
 _MOST_STEPS, _ARRIVED = 120, 1e-10
@@ -258,8 +258,7 @@ class Boundary:
     def _far_outside(self, side: float) -> int:
         """Where the wall's spring is all there is, the poles are at the device's zeros, the others at infinity."""
         loop = self.loop
-        depth = depths(loop.zeros)
-        on = np.abs(depth) <= ON_CIRCLE
+        depth, on = depths(loop.zeros), are_on_circle(loop.zeros)
         answer = loop.response(circle(np.abs(np.angle(1.0 - loop.zeros[on]))))
         # Towards a zero on the circle: G(w) = -1/alpha, and |z| > 1 where Im w < 0.
         leaving = int(np.sum(side * answer.slope.imag < 0))

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from zwidth.arrays.roots import zeros_between
 from zwidth.loops.linear.roots import LoopRoots
-from zwidth.parts.circle import ON_CIRCLE, circle, depths
+from zwidth.parts.circle import are_on_circle, circle
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
 _STEP = 0.08
@@ -115,7 +115,9 @@ def lines_at(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
         q, f = loop.required_wall(at), loop.estimate.jet(at)
         real = end | (np.abs(q.value.imag) <= _NONE * np.abs(q.value))
     numbers = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
-    near = np.abs(at.before[:, None] + loop.zeros) <= np.where(end, ON_CIRCLE, 1e-9)[:, None]
+    # A slow zero has an offset of its own from z = 1.
+    reach = np.where(w == 0.0, 1e-15, np.where(end, 1e-12, 1e-9))
+    near = np.abs(at.before[:, None] + loop.zeros) <= reach[:, None]
     found = np.flatnonzero(real & ~near.any(1) & np.isfinite(numbers).all(1))
     return [CrossingLine(*numbers[k].tolist(), poles=1 if end[k] else 2) for k in found]
 
@@ -123,7 +125,7 @@ def lines_at(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
 def circle_zeros(loop: LoopRoots) -> np.ndarray:
     """Angles of zeros on the circle: of an undamped device, where q is infinite, or of F, where Im F may touch 0."""
     zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
-    angles = np.angle(1.0 - zeros[np.abs(depths(zeros)) <= ON_CIRCLE])
+    angles = np.angle(1.0 - zeros[are_on_circle(zeros)])
     return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
 
 

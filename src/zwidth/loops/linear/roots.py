@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from zwidth.arrays.polynomials import Affine
-from zwidth.parts.circle import ON_CIRCLE, CirclePoints, Jet, circle, depths, lag_jet, product_jet
+from zwidth.parts.circle import CirclePoints, Jet, are_on_circle, circle, depths, lag_jet, product_jet
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 
@@ -52,8 +52,7 @@ class LoopRoots:
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         far = np.abs(before + roots) - reach[..., None]
         # A factor of a root on the circle changes its size there, not its argument: no need to look closer.
-        depth = np.abs(depths(roots))
-        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, np.where(roots == 0, 1e-9, 1e-5))
+        floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(depths(roots)))
         near = (1.0 / np.maximum(far, floor)).sum(-1)
         return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0
 

@@ -47,6 +47,12 @@ SCENES = {
     "strongly damped motor of a link": scene(device(1e5, tied(0.1, 1e-3, "motor", 0.5)), 0.4),
     "strong damper in a light link": scene(device(0.01, tied(0.1, 1e4, "motor", 1e-3)), 1),
     "hand with a strong damper": scene(device(0.01), 0.4, hand=zwidth.Operator(0.1, 1.0, 100.0, 1e3, 1e9)),
+    "mode that creeps, on a strongly damped motor": scene(
+        zwidth.Device(1.0, 1e5 / T, modes=[zwidth.Mode(0.01, 3.3, 1.0)]), 1
+    ),
+    "coupling that creeps": scene(
+        device(0.01, tied(1e-8, 4e5, "motor", 0.03)), 3, hand=zwidth.Operator(1e3, 1e-5 / T, 1e-9 / T**2)
+    ),
     "heavy hand": scene(device(0.01), 1, hand=zwidth.Operator(1e3, 5.0, 100.0, coupling_stiffness=1e3)),
     "light hand": scene(device(0.01), 1, hand=zwidth.Operator(1e-3, 5.0, 100.0, coupling_stiffness=1e3)),
     "strong damping": scene(device(1e6), 0.5, zwidth.LowPass(cutoff=100.0)),
