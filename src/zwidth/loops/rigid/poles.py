@@ -25,7 +25,7 @@ from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
 from zwidth.words.status import Status
-from zwidth.words.types import Array, ArrayLike, Matrices, Radii, RadiiFirst, Reals, Roots, RootsFirst
+from zwidth.words.types import Array, ArrayLike, Radii, RadiiFirst, Reals, Roots, RootsFirst
 from zwidth.words.xp import epsilon, is_traced, namespace, nan_with_nan_slopes, repeat, store_once
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
@@ -38,8 +38,8 @@ _FIRST_STEPS = 9
 _ROUNDING = 32.0
 # Beyond, steps and the time to compile them grow, and the product of all distances between poles loses its digits.
 _MOST_AT_ONE_TIME = 24
-# Numbers of one kind that a block of walls holds, which then stay in the cache, and those of a block of matrices.
-_NUMBERS, _MATRICES = 1 << 15, 1 << 15
+# Numbers of one kind, or of matrices, that a block of walls holds at most, which then stay in the cache.
+_NUMBERS = 1 << 15
 
 
 def product_form(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Loop:
@@ -155,14 +155,10 @@ def aberth_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Deg
 
 def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
     """All poles along a new last axis, from eigenvalues."""
-    matrices = _lay_matrices(alpha, beta, delta, d, degree)
+    matrices = companion(coefficients(alpha, beta, delta, d, degree))
     xp = namespace(matrices)
     z = _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices)
     return _polish_poles(z, alpha, beta, delta, d, degree)
-
-
-def _lay_matrices(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Matrices:
-    return companion(coefficients(alpha, beta, delta, d, degree))
 
 
 def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
@@ -232,10 +228,10 @@ def _by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Deg
         if few or degree.poles > _MOST_AT_ONE_TIME:
             with np.errstate(all="ignore"):
                 return pole_kernel(*walls, degree=degree)
-        matrices = np.asarray(_compile_by_degree(_lay_matrices, degree)(*walls))
-        return np.asarray(_compile_by_degree(_polish_poles, degree)(_eigenvalues(matrices), *walls))
+        z = _eigenvalues(companion(np.asarray(_compile_by_degree(coefficients, degree)(*walls))))
+        return np.asarray(_compile_by_degree(_polish_poles, degree)(z, *walls))
 
-    return block(*columns) if few else map_blocks(block, columns, _block(_MATRICES // degree.poles**2))
+    return block(*columns) if few else map_blocks(block, columns, max(1, _NUMBERS // degree.poles**2))
 
 
 @cache
@@ -243,11 +239,6 @@ def _compile_by_degree(kernel: Callable[..., Any], degree: Degree) -> Any:
     import jax
 
     return jax.jit(lambda *arrays: kernel(*arrays, degree))
-
-
-def _block(most: int) -> int:
-    """The largest power of two that is not above."""
-    return 1 << max(1, most).bit_length() - 1
 
 
 def poles(
@@ -317,8 +308,8 @@ def _find_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degre
     if few:
         z, _, proved = aberth_kernel(*columns, degree)
     else:
-        block = _block(_NUMBERS // degree.poles)
-        z, _, proved = map_blocks(_compile_by_degree(aberth_kernel, degree), columns, block)
+        compiled = _compile_by_degree(aberth_kernel, degree)
+        z, _, proved = map_blocks(compiled, columns, max(1, _NUMBERS // degree.poles))
     left = np.flatnonzero(~proved & (wall_status(*columns) == Status.OK))
     if left.size:
         z[left] = _by_companion(*(column[left] for column in columns), degree=degree)
