@@ -112,6 +112,17 @@ def test_without_a_damper_a_pole_is_at_zero():
     np.testing.assert_array_equal(np.nanmin(np.abs(got), axis=-1), [0, 0, 0])
 
 
+@pytest.mark.parametrize("d", [0.0, 2.0, 2.5, 20.0])
+def test_walls_without_a_damper_are_proved_among_others(d):
+    rng = np.random.default_rng(6)
+    beta = np.where(np.arange(300) % 2, 0.0, rng.uniform(-0.1, 1.2, 300))
+    z, within, proved = by_aberth(rng.uniform(1e-3, 0.6, 300), beta, rng.uniform(0.0, 0.5, 300), d)
+    assert proved[beta == 0].all()
+    nearest = np.abs(z).argmin(-1)[:, None]
+    for values in (np.abs(z), within):
+        assert (np.take_along_axis(values, nearest, -1)[beta == 0] == 0).all()
+
+
 def test_mixed_degrees_end_in_nan():
     got = zwidth.poles(0.1, 0.2, 0.3, np.array([0, 4.5, 2]))
     np.testing.assert_array_equal(np.isfinite(got).sum(-1), [3, 8, 5])
