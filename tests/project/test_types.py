@@ -13,10 +13,9 @@ from jaxtyping import AbstractArray, jaxtyped
 
 import zwidth
 from zwidth.arrays.polynomials import companion
-from zwidth.loops.rigid.aberth import aberth_kernel, discs, product_form
 from zwidth.loops.rigid.boundary import sample_lobe
 from zwidth.loops.rigid.folding import find_degree
-from zwidth.loops.rigid.poles import pole_kernel, radius_by_companion
+from zwidth.loops.rigid.poles import aberth_kernel, discs, pole_kernel, product_form, radius_by_companion
 from zwidth.loops.rigid.polynomial import affine, coefficients, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.response import step_response
 from zwidth.words import types as _types
@@ -49,8 +48,8 @@ CALLS = [
     (coefficients, KERNEL),
     (companion, {"monic": coefficients(**KERNEL)}),
     (pole_kernel, KERNEL),
-    (aberth_kernel, {**KERNEL, "spring": False}),
-    (discs, {"z": ROOTS_FIRST, "loop": product_form(**KERNEL), "degree": HALF, "spring": False}),
+    (aberth_kernel, KERNEL),
+    (discs, {"z": ROOTS_FIRST, "loop": product_form(**KERNEL), "degree": HALF}),
     (frequency_boundary, {"omega": np.full((2, 3), 0.3), "loop": LOOP}),
 ]
 

@@ -27,7 +27,7 @@ from zwidth.arrays.evaluate import (
 from zwidth.words.errors import TracedDelayError
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import ArrayLike
-from zwidth.words.xp import is_traced, tree_map
+from zwidth.words.xp import is_traced
 
 NAMES: tuple[str, ...] = ("alpha", "beta", "delta", "d")
 
@@ -55,9 +55,9 @@ def find_degree(d: float) -> Degree:
 def map_by_degree(
     kernel: Callable[..., Any], values: tuple[ArrayLike, ...], *static: Any, lead: bool = False, route: Route = "auto"
 ) -> Any:
-    """Apply ``kernel(alpha, beta, delta, d, degree, *static)``, elementwise, to points whose delays may differ."""
-    # Results that are vectors, along a last axis, come back in one array; shorter ones are filled with zeros in front
-    # (``lead``, for coefficients) or NaN behind (for poles). By "numpy" the kernel gets all points of a degree.
+    """The vectors ``kernel(alpha, beta, delta, d, degree, *static)`` of points of any delays, as one array."""
+    # Shorter ones are filled with zeros in front (``lead``, for coefficients) or NaN behind (for poles). By "numpy" the
+    # kernel gets all points of a degree.
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
     traced = is_traced(*values)
@@ -87,36 +87,27 @@ def map_by_degree(
             weight = 1 << max(0, degree.poles.bit_length() - 4)
             parts.append(evaluate_columns(kernel, picked, degree, *static, weight=weight))
         places.append(np.arange(columns[0].size)[place])
-    order = np.argsort(np.concatenate(places), kind="stable")
-
-    def gather(*leaves: Any) -> Any:
-        joined = leaves[0] if len(leaves) == 1 else xp.concatenate(_same_length(leaves, lead, xp))[order]
-        return joined.reshape(shape + joined.shape[1:])
-
-    result = tree_map(gather, *parts)
+    (result, *others), longest = parts, max(part.shape[1] for part in parts)
+    if others:
+        order = np.argsort(np.concatenate(places), kind="stable")
+        result = xp.concatenate([_fill_up(part, longest, lead, xp) for part in parts])[order]
+    result = result.reshape(*shape, longest)
     return result if traced else to_caller(result, values)
+
+
+def _fill_up(part: Any, longest: int, lead: bool, xp: Any) -> Any:
+    """Vectors as long as the longest one."""
+    missing = longest - part.shape[1]
+    if not lead:
+        return xp.pad(part, ((0, 0), (0, missing)), constant_values=xp.nan)
+    # Zeros in front of a polynomial, NaN in front of one that is not defined.
+    front = xp.where(xp.isnan(part[:, :1]), xp.nan, 0.0)
+    return xp.concatenate([xp.repeat(front, missing, axis=1), part], axis=1)
 
 
 def few_poles(degree: Degree) -> int:
     """Up to how many points of a degree NumPy has done before a compiler has begun."""
     return max(1, FEW // max(8, degree.poles**2))
-
-
-def _same_length(leaves: tuple[Any, ...], lead: bool, xp: Any) -> list[Any]:
-    """Fill vectors of different length to the longest one."""
-    if leaves[0].ndim == 1:
-        return list(leaves)
-    longest = max(leaf.shape[1] for leaf in leaves)
-    filled = []
-    for leaf in leaves:
-        missing = longest - leaf.shape[1]
-        if lead:
-            # Zeros in front of a polynomial, NaN in front of one that is not defined.
-            front = xp.where(xp.isnan(leaf[:, :1]), xp.nan, 0.0)
-            filled.append(xp.concatenate([xp.repeat(front, missing, axis=1), leaf], axis=1))
-        else:
-            filled.append(xp.pad(leaf, ((0, 0), (0, missing)), constant_values=xp.nan))
-    return filled
 
 
 # Below this many values an argument is too small for looking for repetition to pay.
@@ -154,25 +145,17 @@ class Points(NamedTuple):
         return self.size >= _WORTH_OWN_SHAPE and shape[-1] >= 32 and 4 * sum(a.size for a in self) <= self.size
 
 
-class FoldedArguments(NamedTuple):
-    """Folded arguments and the shape the caller's arguments broadcast to."""
-
-    points: Points
-    shape: tuple[int, ...]
-
-    def spread(self, values: np.ndarray) -> np.ndarray:
-        """Broadcast values of the folded arguments to the caller's shape; a view where something repeats."""
-        return values if values.shape == self.shape else np.broadcast_to(values, self.shape)
-
-
-def fold_arguments(values: tuple[Any, Any, Any, Any]) -> FoldedArguments:
-    """Convert concrete arguments, check that they broadcast, and fold what repeats."""
+def fold_arguments(values: tuple[Any, Any, Any, Any]) -> tuple[Points, tuple[int, ...]]:
+    """Concrete arguments, checked and folded where they repeat, and the shape that they broadcast to."""
     arrays = [as_float64(name, value) for name, value in zip(NAMES, values, strict=True)]
     shape = join_shapes(zip(NAMES, (array.shape for array in arrays), strict=True))
     ranked = [array.reshape((1,) * (len(shape) - array.ndim) + array.shape) for array in arrays]
-    points = Points(*map(fold, ranked))
-    # An axis along which nothing varies has nothing to compute; `FoldedArguments.spread` restores it.
-    return FoldedArguments(points, shape)
+    return Points(*map(fold, ranked)), shape
+
+
+def spread(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """What was computed of folded arguments, in the shape that they broadcast to; a view where something repeats."""
+    return values if values.shape == shape else np.broadcast_to(values, shape)
 
 
 def fold(array: np.ndarray) -> np.ndarray:

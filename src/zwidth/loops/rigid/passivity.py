@@ -15,7 +15,7 @@ import numpy as np
 from zwidth.arrays.evaluate import FEW, as_number, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.held_mass import ANY, DelayClasses, classify_delays, valid_device
 from zwidth.arrays.roots import integrate
-from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by, spread
 from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.quantities import LONGEST_DELAY
@@ -101,18 +101,17 @@ def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, 
 
 def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
     """`passivity_margin` of many walls that share few delays; None where they do not."""
-    laid = fold_arguments(values)
-    d = laid.points.d
-    if laid.points.size <= FEW or np.unique(d).size * FEW > laid.points.size:
+    points, shape = fold_arguments(values)
+    if points.size <= FEW or np.unique(points.d).size * FEW > points.size:
         return None
-    out = np.full(laid.points.shape, np.nan)
-    for delay, arrays, place in group_by(laid.points, d):
+    out = np.full(points.shape, np.nan)
+    for delay, arrays, place in group_by(points, points.d):
         if not 0 <= delay <= LONGEST_DELAY:
             continue
         walls = Points(*arrays)
         columns = [*walls.columns()[:3], *map(np.atleast_1d, table(float(delay)))]
         out[place] = evaluate_columns(_map_kernel, columns, route="jax").reshape(walls.shape)
-    return to_caller(laid.spread(out), values)
+    return to_caller(spread(out, shape), values)
 
 
 def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:

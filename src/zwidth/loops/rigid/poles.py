@@ -1,4 +1,11 @@
-"""All poles: eigenvalues of the companion matrix, polished, or of many walls at one time by Aberth's iteration."""
+"""All poles: eigenvalues of the companion matrix, polished, or of many walls at one time by Aberth's iteration.
+
+That iteration, Ehrlich's too, moves all poles of a wall at once, with Smith's discs as its proof. With q_i the product
+of z_i - z_j over all j but i and q_i' its derivative by z_i, a step is P q/(P' q - P q'): products alone and one
+quotient a pole, which compilers make into one loop over the walls. The same q ends it. Every zero of a monic polynomial
+of degree N lies in one of the discs |z - z_i| <= N |P(z_i)/q_i| (Smith 1970), and where these are disjoint each holds
+exactly one.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +17,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, map_blocks, to_caller
 from zwidth.arrays.polynomials import companion, square
-from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, product_form, split, with_zero
+from zwidth.loops.rigid.circle import Loop, factor_loop
 from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall, wall_status
 from zwidth.loops.rigid.pole_step import Pair, join
@@ -18,31 +25,140 @@ from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
 from zwidth.words.status import Status
-from zwidth.words.types import Array, ArrayLike, Matrices, Reals, Roots, RootsFirst
-from zwidth.words.xp import is_traced, namespace, nan_with_nan_slopes, repeat
+from zwidth.words.types import Array, ArrayLike, Radii, RadiiFirst, Reals, Roots, RootsFirst
+from zwidth.words.xp import epsilon, is_traced, namespace, nan_with_nan_slopes, repeat, store_once
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 
 # The eigenvalues start with errors near eps^(1/k) for a k-fold pole; two steps finish a simple one.
 _POLISHING_STEPS = 3
-
+# Of Aberth's, with half as many more as there are poles: all but some 2 walls in 1,000 are settled.
+_FIRST_STEPS = 9
+# Of the coefficients of N(z), which come from series, of their sum and of the products behind it, in rounding units.
+_ROUNDING = 32.0
 # Beyond, steps and the time to compile them grow, and the product of all distances between poles loses its digits.
 _MOST_AT_ONE_TIME = 24
-# Numbers of one kind that a block of walls holds, which then stay in the cache, and those of a block of matrices.
-_NUMBERS, _MATRICES = 1 << 15, 1 << 15
+# Numbers of one kind, or of matrices, that a block of walls holds at most, which then stay in the cache.
+_NUMBERS = 1 << 15
 
 
-def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool = False) -> Roots:
-    """All poles along a new last axis; for walls without virtual damping, ``spring``, the matrix is a row smaller."""
-    matrices = _matrices(alpha, beta, delta, d, degree, spring)
+def product_form(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Loop:
+    """The factors of P of every wall, NaN where it is out of range, with a new first axis for its poles."""
+    xp = namespace(alpha, beta, delta, d)
+    loop = store_once(factor_loop(alpha, beta, delta, d, degree.fractional), delta)
+    return Loop(*(xp.asarray(part)[None] for part in loop))
+
+
+def _power(z: Pair, power: int) -> Pair:
+    """z^power by repeated squaring."""
+    if power == 0:
+        return Pair(0.0 * z.real + 1.0, 0.0 * z.imag)
+    root = _power(z, power // 2)
+    square = root * root
+    return square * z if power % 2 else square
+
+
+def _evaluate(z: Pair, loop: Loop, degree: Degree) -> tuple[Pair, Pair]:
+    """P(z) and P'(z)."""
+    power = degree.poles - 2
+    one, pole = z + -1.0, z + -loop.c
+    lag, quadratic, body = _power(z, power - 1), one * pole, z * (one + pole)
+    n, n_slope = z * loop.a2 + loop.h, loop.a2
+    if degree.fractional:
+        late = z + loop.q
+        n, n_slope = n * late, late * loop.a2 + n
+    wall = Pair(loop.alpha * z.real + loop.beta * one.real, loop.s * z.imag)
+    return lag * z * quadratic + n * wall, lag * (quadratic * power + body) + wall * n_slope + n * loop.s
+
+
+def _bound_rounding(z: Pair, loop: Loop, degree: Degree, unit: float) -> Array:
+    """What rounding errors may add up to in P(z)."""
+    xp, power = namespace(z.real), degree.poles - 2
+    # Sums of the parts' sizes are upper bounds of moduli that neither overflow nor underflow.
+    r, one, pole = (xp.abs(z.real - zero) + xp.abs(z.imag) for zero in (0.0, 1.0, loop.c))
+    lagged = r**power * one * ((3.0 * power + 8.0) * pole + 2.0 * loop.c)
+    n = (loop.a2 * r + loop.h) * (r + loop.q if degree.fractional else 1.0)
+    return unit * (lagged + _ROUNDING * n * (xp.abs(loop.alpha) * r + xp.abs(loop.beta) * one))
+
+
+def _split(z: Array) -> Pair:
+    """Real and imaginary parts."""
+    return Pair(z.real, z.imag)
+
+
+def _differences(z: RootsFirst) -> list[Pair]:
+    """From each pole the ones that follow it, nearest in number first."""
+    twice, count = namespace(z).concatenate([z, z]), z.shape[0]
+    return [_split(z - twice[k : k + count]) for k in range(1, count)]
+
+
+def _move_apart(z: RootsFirst, loop: Loop, degree: Degree) -> RootsFirst:
+    """A step of Aberth's iteration."""
+    q, *others = _differences(z)
+    at = _split(z)
+    q_slope = Pair(0.0 * at.real + 1.0, 0.0 * at.imag)
+    for difference in others:
+        q_slope = q_slope * difference + q
+        q = q * difference
+    value, slope = _evaluate(at, loop, degree)
+    step = (value * q).over(slope * q + value * q_slope * -1.0)
+    return join(at.real - step.real, at.imag - step.imag)
+
+
+def _start(loop: Loop, degree: Degree) -> RootsFirst:
+    """Two poles near those of the device, the others around 0, where the two parts of P are about equally large."""
+    xp, around, spring = namespace(loop.c), degree.poles - 2, loop.beta == 0
+    # Without virtual damping a pole is at 0, from which no step leads away.
+    last = loop.h * xp.where(spring, loop.alpha, loop.beta) * (loop.q if degree.fractional else 1.0)
+    r = xp.clip(xp.abs(last) ** (1.0 / xp.maximum(around - spring, 1)), 0.02, 3.0)
+    # No two are each other's conjugates: a symmetric set stays so, and could not change how many of it are real.
+    circle = np.exp(1j * (2.0 * np.pi * np.arange(around) / around + 0.4)).reshape(-1, *[1] * (r.ndim - 1))
+    first, others = xp.where(spring, 0.0, r * circle[:1]), r * circle[1:]
+    return xp.concatenate([first, others, 0.0 * r + (0.9 + 0.45j), 0.0 * r + (0.75 - 0.4j)])
+
+
+def discs(z: RootsFirst, loop: Loop, degree: Degree) -> tuple[RadiiFirst, Array, Array]:
+    """Radii of discs round ``z``, poles along the first axis: in each lies one pole if the second result says so."""
+    # The third says whether P is as small at each of them as rounding lets it be seen.
+    xp, poles = namespace(z), len(z)
+    at, unit = _split(z), epsilon(z.real)
+    apart = [xp.sqrt(part.real * part.real + part.imag * part.imag) for part in _differences(z)]
+    q = 0.0 * at.real + 1.0
+    for distance in apart:
+        q = q * distance
+    value, bound = _evaluate(at, loop, degree)[0], _bound_rounding(at, loop, degree, unit)
+    size = xp.abs(value.real) + xp.abs(value.imag)
+    # A thousandth more than N, for the rounding of q.
+    within = 1.001 * poles * (size + bound) / q
+    twice = xp.concatenate([within, within])
+    disjoint = xp.isfinite(within)
+    for k, distance in enumerate(apart[: poles // 2], start=1):
+        disjoint = disjoint & (distance > within + twice[k : k + poles])
+    settled = size <= bound + unit * (xp.abs(at.real) + xp.abs(at.imag)) * q
+    return within, xp.all(disjoint, axis=0), xp.all(settled, axis=0)
+
+
+def aberth_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> tuple[Roots, Radii, Array]:
+    """All poles, how far each is off at most, and whether that is proved and no digit is missing."""
+    loop = product_form(alpha, beta, delta, d, degree)
+    spoiled = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    xp, steps = namespace(loop.c), _FIRST_STEPS + degree.poles // 2
+    z = repeat(steps, lambda z: _move_apart(z, loop, degree), _start(loop, degree), xp)
+    within, proved, settled = discs(z, loop, degree)
+    # A disc on the real axis that holds one pole holds a real one, unless the pole's conjugate is in a disc close by.
+    real = xp.abs(z.imag) <= within
+    within = within + xp.where(real, xp.abs(z.imag), 0.0)
+    z = join(z.real, xp.where(real, 0.0, z.imag))
+    z, within = (xp.moveaxis(part, 0, -1) + spoiled[..., None] for part in (z, within))
+    return z, within, proved & settled
+
+
+def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
+    """All poles along a new last axis, from eigenvalues."""
+    matrices = companion(coefficients(alpha, beta, delta, d, degree))
     xp = namespace(matrices)
     z = _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices)
-    return _polish_poles(z, alpha, beta, delta, d, degree, spring)
-
-
-def _matrices(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Matrices:
-    monic = coefficients(alpha, beta, delta, d, degree)
-    return companion(monic[..., :-1] if spring else monic)
+    return _polish_poles(z, alpha, beta, delta, d, degree)
 
 
 def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
@@ -55,17 +171,17 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
         return np.concatenate([_eigenvalues(half) for half in np.array_split(matrices, 2)])
 
 
-def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Roots:
+def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
     """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
     xp = namespace(z, alpha)
     loop = product_form(alpha, beta, delta, d, degree)
     spoiled = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
 
     def at(z: RootsFirst) -> tuple[Pair, Pair]:
-        return evaluate(split(z), loop, degree, spring)
+        return _evaluate(_split(z), loop, degree)
 
     def step(z: RootsFirst) -> RootsFirst:
-        here = split(z)
+        here = _split(z)
         value, slope = at(z)
         still = (slope.real == 0) & (slope.imag == 0)
         by = value.over(Pair(xp.where(still, 1.0, slope.real), slope.imag))
@@ -75,12 +191,7 @@ def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, d
     first = xp.moveaxis(z, -1, 0)
     last = repeat(_POLISHING_STEPS, step, first, xp)
     better = square(at(last)[0]) < square(at(first)[0])
-    return with_zero(xp.moveaxis(xp.where(better, last, first), 0, -1), spring) + spoiled[..., None]
-
-
-def is_spring(beta: ArrayLike) -> bool:
-    """Whether all walls are known to be without virtual damping: one pole less to compute."""
-    return not is_traced(beta) and np.size(values := as_float64("beta", beta)) > 0 and not np.any(values)
+    return xp.moveaxis(xp.where(better, last, first), 0, -1) + spoiled[..., None]
 
 
 def check_degree(d: ArrayLike) -> None:
@@ -104,35 +215,30 @@ def _check(values: tuple[ArrayLike, ...], delay_model: str = "held", method: str
     check_degree(values[3])
 
 
-def _by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Roots:
+def _by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
     """Poles of columns of one degree, with the eigenvalues of concrete ones from LAPACK on every processor."""
     columns = alpha, beta, delta, d
     if is_traced(*columns):
         # As one program: differentiated outside `jit`, every operation would be compiled alone.
-        return _compile_by_degree(pole_kernel, degree, spring)(*columns)
+        return _compile_by_degree(pole_kernel, degree)(*columns)
     # Of large matrices the eigenvalues take so long that nothing else is worth a compilation.
     few = alpha.size <= few_poles(degree)
 
     def block(*walls: Any) -> np.ndarray:
         if few or degree.poles > _MOST_AT_ONE_TIME:
             with np.errstate(all="ignore"):
-                return pole_kernel(*walls, degree=degree, spring=spring)
-        matrices = np.asarray(_compile_by_degree(_matrices, degree, spring)(*walls))
-        return np.asarray(_compile_by_degree(_polish_poles, degree, spring)(_eigenvalues(matrices), *walls))
+                return pole_kernel(*walls, degree=degree)
+        z = _eigenvalues(companion(np.asarray(_compile_by_degree(coefficients, degree)(*walls))))
+        return np.asarray(_compile_by_degree(_polish_poles, degree)(z, *walls))
 
-    return block(*columns) if few else map_blocks(block, columns, _block(_MATRICES // degree.poles**2))
+    return block(*columns) if few else map_blocks(block, columns, max(1, _NUMBERS // degree.poles**2))
 
 
 @cache
-def _compile_by_degree(kernel: Callable[..., Any], degree: Degree, spring: bool) -> Any:
+def _compile_by_degree(kernel: Callable[..., Any], degree: Degree) -> Any:
     import jax
 
-    return jax.jit(lambda *arrays: kernel(*arrays, degree, spring))
-
-
-def _block(most: int) -> int:
-    """The largest power of two that is not above."""
-    return 1 << max(1, most).bit_length() - 1
+    return jax.jit(lambda *arrays: kernel(*arrays, degree))
 
 
 def poles(
@@ -170,9 +276,9 @@ def poles(
 
     Numerics:
         A simple pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k).
-        Eigenvalues by LAPACK, O(degree^3) a point, of one degree less where every beta is
-        0; then Newton steps on the factored polynomial. Aberth's iteration works on that polynomial too, O(degree^2) a
-        step. Few points need no JAX; many are compiled once for every degree.
+        Eigenvalues by LAPACK, O(degree^3) a point, then Newton steps on the factored polynomial. Aberth's iteration
+        works on that polynomial too, O(degree^2) a step. Few points need no JAX; many are compiled once for every
+        degree.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17); Aberth 1973; Smith 1970.
@@ -188,27 +294,25 @@ def poles(
         raise InputError(
             "method: 'aberth' falls back on the host; inside a JAX transformation use 'auto' or 'companion'"
         )
-    return map_by_degree(_find_poles, values, is_spring(values[1]), method, route="numpy")
+    return map_by_degree(_find_poles, values, method, route="numpy")
 
 
-def _find_poles(
-    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, method: PoleMethod
-) -> Roots:
+def _find_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, method: PoleMethod) -> Roots:
     """Poles of columns of one degree, by Aberth's iteration where it pays and by eigenvalues where it must."""
     columns = alpha, beta, delta, d
     few = alpha.size <= few_poles(degree)
     if method == "auto" and (few or is_traced(*columns) or degree.poles > _MOST_AT_ONE_TIME):
         method = "companion"
     if method == "companion":
-        return _by_companion(*columns, degree, spring)
+        return _by_companion(*columns, degree)
     if few:
-        z, _, proved = aberth_kernel(*columns, degree, spring)
+        z, _, proved = aberth_kernel(*columns, degree)
     else:
-        block = _block(_NUMBERS // degree.poles)
-        z, _, proved = map_blocks(_compile_by_degree(aberth_kernel, degree, spring), columns, block)
+        compiled = _compile_by_degree(aberth_kernel, degree)
+        z, _, proved = map_blocks(compiled, columns, max(1, _NUMBERS // degree.poles))
     left = np.flatnonzero(~proved & (wall_status(*columns) == Status.OK))
     if left.size:
-        z[left] = _by_companion(*(column[left] for column in columns), degree=degree, spring=spring)
+        z[left] = _by_companion(*(column[left] for column in columns), degree=degree)
     return z
 
 
@@ -216,7 +320,7 @@ def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: 
     """The spectral radius at every point, from the poles; NaN where the input is out of range."""
     values = (alpha, beta, delta, d)
     _check(values)
-    found = map_by_degree(_by_companion, values, is_spring(beta), route="numpy")
+    found = map_by_degree(_by_companion, values, route="numpy")
     xp = namespace(found) if is_traced(*values) else np
     z: Any = xp.asarray(found)
     # Of a wall that has fewer poles than others.

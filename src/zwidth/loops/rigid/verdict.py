@@ -9,7 +9,7 @@ import numpy as np
 from zwidth.arrays.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.held_mass import classify_delays
 from zwidth.loops.rigid.crossover import stable_kernel
-from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, spread
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.loops.rigid.polynomial import check_has_poles
@@ -87,8 +87,8 @@ def is_stable(
                 "'auto', 'crossover' or 'companion'"
             )
         return radius_by_companion(*values) < 1.0
-    laid = fold_arguments(values)
-    return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
+    points, shape = fold_arguments(values)
+    return to_caller(spread(_decide(points, method)[0], shape), values)
 
 
 def decide_stability(
@@ -127,12 +127,12 @@ def decide_stability(
     check_scalars(dict(zip(NAMES, values, strict=True)))
     if is_traced(*values):
         raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
-    laid = fold_arguments(values)
-    stable, used, status = _decide(laid.points, method)
-    ranged = wall_status(*laid.points)
+    points, shape = fold_arguments(values)
+    stable, used, status = _decide(points, method)
+    ranged = wall_status(*points)
     status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
-    codes = (np.broadcast_to(status, laid.points.shape).astype(np.int32), np.asarray(used, np.int32))
-    return to_caller(Stability(*map(laid.spread, (stable, *codes))), values)
+    codes = np.broadcast_to(status, points.shape).astype(np.int32), np.asarray(used, np.int32)
+    return to_caller(Stability(*(spread(leaf, shape) for leaf in (stable, *codes))), values)
 
 
 def _check(method: str, delay_model: str) -> None:

@@ -79,7 +79,7 @@ def test_compiled_and_plain_filters_agree_with_the_labels():
     points = adversarial()
     times = evaluate.FEW // points["label"].size + 1
     alpha, beta, delta, d = (np.tile(points[name], times) for name in NAMES)
-    code, label = filter_walls(fold_arguments((alpha, beta, delta, d)).points), np.tile(points["label"], times)
+    code, label = filter_walls(fold_arguments((alpha, beta, delta, d))[0]), np.tile(points["label"], times)
     decided = code < OPEN
     assert decided.mean() > 0.7
     np.testing.assert_array_equal(code[decided] == 1, label[decided] == STABLE)
@@ -191,7 +191,7 @@ def test_rows_of_a_map_are_labelled_as_point_by_point(delta, d):
     # With negative, no and huge stiffness, negative and no damping, beta = -delta, and values out of range.
     alpha = scale * np.append(np.linspace(-0.2, 3.0, 641), [1e59, 1e70, np.nan])
     beta = np.append(scale * np.linspace(-1.1, 3.0, 120), [0.0, -delta, 1e70, np.nan])
-    points = fold_arguments((alpha, beta[:, None], delta, d)).points
+    points = fold_arguments((alpha, beta[:, None], delta, d))[0]
     assert has_rows(points)
     by_row, alone = filter_walls(points), each_code(points)
     np.testing.assert_array_equal(by_row >= SPECIAL, alone >= SPECIAL)
@@ -204,14 +204,14 @@ def test_rows_of_a_map_are_labelled_as_point_by_point(delta, d):
 def test_rows_of_several_devices_are_kept_apart():
     alpha, beta = np.linspace(0.01, 2.0, 512), np.linspace(-0.5, 1.5, 40)[:, None]
     delta, d = np.array([0.0, 0.1, 3.0])[:, None, None], np.array([0.0, 0.5, 1.0, 3.0])[:, None, None, None]
-    points = fold_arguments((alpha, beta, delta, d)).points
+    points = fold_arguments((alpha, beta, delta, d))[0]
     assert has_rows(points)
     np.testing.assert_array_equal(filter_walls(points), each_code(points))
 
 
 def test_no_search_where_alpha_shares_its_axis():
     alpha, beta = np.linspace(0.01, 2.0, 512), np.linspace(-0.5, 1.5, 400)[:, None]
-    assert not has_rows(fold_arguments((alpha, beta, 0.1 + alpha, 1.0)).points)
+    assert not has_rows(fold_arguments((alpha, beta, 0.1 + alpha, 1.0))[0])
 
 
 def test_mixed_delays_keep_their_places():

@@ -14,9 +14,9 @@ DEGREES = [(2, False), (0, False), (0, True), (2, False), (0, False), (0, True),
 
 
 def numbers(alpha, beta, delta, d, degree):
-    """The degree as a scalar, and a vector as long as there are poles."""
-    xp = namespace(alpha, d)
-    return alpha + 0.0 * d, xp.full((*alpha.shape, degree.poles), float(degree.poles))
+    """As many numbers as there are poles: alpha, then how many."""
+    xp, first = namespace(alpha, d), alpha + 0.0 * d
+    return xp.concatenate([first[..., None], xp.full((*first.shape, degree.poles - 1), float(degree.poles))], -1)
 
 
 @pytest.mark.parametrize("d, expected", list(zip(DELAYS[:8], DEGREES, strict=True)))
@@ -37,45 +37,44 @@ def test_a_delay_an_ulp_from_a_whole_number_keeps_its_fraction():
 
 def test_every_point_has_the_degree_of_its_delay():
     def kernel(alpha, beta, delta, d, degree):
-        return alpha + degree.whole, alpha + degree.fractional
+        return np.stack([alpha + degree.whole, alpha + degree.fractional], -1)
 
     found = map_by_degree(kernel, (0.0, 0.0, 0.0, DELAYS))
-    np.testing.assert_array_equal(np.stack(found, -1), [find_degree(d) for d in DELAYS])
+    np.testing.assert_array_equal(found, [find_degree(d) for d in DELAYS])
 
 
 def test_points_come_back_to_their_places():
     delays = np.array([[2.0, 0.0, 0.5], [0.0, 7.25, 2.0]])
     alpha = np.arange(6.0).reshape(2, 3)
-    scalars, vectors = map_by_degree(numbers, (alpha, 0.0, 0.0, delays))
-    np.testing.assert_array_equal(scalars, alpha)
+    vectors = map_by_degree(numbers, (alpha, 0.0, 0.0, delays))
     assert vectors.shape == (2, 3, 11)
     expected = [[5, 3, 4], [3, 11, 5]]
     np.testing.assert_array_equal(np.isfinite(vectors).sum(-1), expected)
-    np.testing.assert_array_equal(vectors[..., 0], expected)
+    np.testing.assert_array_equal(vectors[..., 0], alpha)
+    np.testing.assert_array_equal(vectors[..., 1], expected)
 
 
 def test_filling_in_front_is_zeros():
-    _, vectors = map_by_degree(numbers, (0.0, 0.0, 0.0, np.array([0, 2])), lead=True)
-    np.testing.assert_array_equal(vectors, [[0, 0, 3, 3, 3], [5, 5, 5, 5, 5]])
+    vectors = map_by_degree(numbers, (7.0, 0.0, 0.0, np.array([0, 2])), lead=True)
+    np.testing.assert_array_equal(vectors, [[0, 0, 7, 3, 3], [7, 5, 5, 5, 5]])
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (2, 0), (1, 1)])
 def test_shapes(shape):
-    scalars, vectors = map_by_degree(numbers, (np.ones(shape), 0.0, 0.0, 1))
-    assert np.shape(scalars) == shape
-    assert vectors.shape == (*shape, 4 if np.size(scalars) else 3)
+    vectors = map_by_degree(numbers, (np.ones(shape), 0.0, 0.0, 1))
+    assert vectors.shape == (*shape, 4 if np.prod(shape) else 3)
 
 
 def test_traced_points_are_grouped_too():
     delays = np.array([2.0, 0.0, 0.5])
     function = jax.jit(lambda alpha: map_by_degree(numbers, (alpha, 0.0, 0.0, delays)))
-    scalars, vectors = function(jnp.arange(3.0))
-    np.testing.assert_array_equal(scalars, [0, 1, 2])
+    vectors = function(jnp.arange(3.0))
+    np.testing.assert_array_equal(vectors[:, 0], [0, 1, 2])
     np.testing.assert_array_equal(np.isfinite(vectors).sum(-1), [5, 3, 4])
 
 
 def test_no_traced_points_have_the_fewest_poles():
-    _, vectors = jax.jit(lambda alpha: map_by_degree(numbers, (alpha, 0.0, 0.0, 1.0)))(jnp.ones(0))
+    vectors = jax.jit(lambda alpha: map_by_degree(numbers, (alpha, 0.0, 0.0, 1.0)))(jnp.ones(0))
     assert vectors.shape == (0, 3)
 
 

@@ -13,9 +13,8 @@ from mpmath.libmp import NoConvergence
 import oracles
 import zwidth
 from zwidth.arrays.polynomials import companion
-from zwidth.loops.rigid.aberth import aberth_kernel
 from zwidth.loops.rigid.folding import map_by_degree
-from zwidth.loops.rigid.poles import _eigenvalues, radius_by_companion
+from zwidth.loops.rigid.poles import _eigenvalues, aberth_kernel, radius_by_companion
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -113,6 +112,17 @@ def test_without_a_damper_a_pole_is_at_zero():
     np.testing.assert_array_equal(np.nanmin(np.abs(got), axis=-1), [0, 0, 0])
 
 
+@pytest.mark.parametrize("d", [0.0, 2.0, 2.5, 20.0])
+def test_walls_without_a_damper_are_proved_among_others(d):
+    rng = np.random.default_rng(6)
+    beta = np.where(np.arange(300) % 2, 0.0, rng.uniform(-0.1, 1.2, 300))
+    z, within, proved = by_aberth(rng.uniform(1e-3, 0.6, 300), beta, rng.uniform(0.0, 0.5, 300), d)
+    assert proved[beta == 0].all()
+    nearest = np.abs(z).argmin(-1)[:, None]
+    for values in (np.abs(z), within):
+        assert (np.take_along_axis(values, nearest, -1)[beta == 0] == 0).all()
+
+
 def test_mixed_degrees_end_in_nan():
     got = zwidth.poles(0.1, 0.2, 0.3, np.array([0, 4.5, 2]))
     np.testing.assert_array_equal(np.isfinite(got).sum(-1), [3, 8, 5])
@@ -176,9 +186,10 @@ def many_walls(count=600):
     return 10.0 ** rng.uniform(-13, 1, count) * size, np.where(rng.random(count) < 0.25, near, beta), delta, d
 
 
-def by_aberth(*walls, spring=False):
+def by_aberth(*walls):
     """Poles, the discs in which they lie, and whether these are proved."""
-    return map_by_degree(aberth_kernel, walls, spring, route="numpy")
+    z, within = (map_by_degree(lambda *at, k=k: aberth_kernel(*at)[k], walls, route="numpy") for k in (0, 1))
+    return z, within, map_by_degree(lambda *at: aberth_kernel(*at)[2][:, None], walls, route="numpy")[..., 0]
 
 
 def test_the_iteration_is_right_to_the_last_digits_wherever_eigenvalues_are():
@@ -216,7 +227,7 @@ def test_compiled_and_not_compiled_walls_have_the_same_poles(d, beta):
     count = 5000
     walls = (rng.uniform(0, 0.5, count), rng.uniform(0, 0.6, count) if beta is None else beta, 0.3, d)
     found, peer = zwidth.poles(*walls), zwidth.poles(*walls, method="companion")
-    z, within, proved = by_aberth(*walls, spring=beta == 0)
+    z, within, proved = by_aberth(*walls)
     assert proved.mean() > 0.99
     for k in (0, 7, 4999):
         few = zwidth.poles(walls[0][k], walls[1] if beta is not None else walls[1][k], 0.3, d, method="aberth")
@@ -232,7 +243,7 @@ def test_compiled_and_not_compiled_walls_have_the_same_poles(d, beta):
 @pytest.mark.parametrize("method", ["aberth", "companion"])
 def test_discs_do_not_claim_two_poles_that_are_one(method):
     # At beta = 0, delta = 0, d = 0 two poles are those of z^2 - (2 - alpha/2) z + 1 + alpha/2: double at alpha = 16.
-    np.testing.assert_array_equal(by_aberth([16.0, 15.0], 0.0, 0.0, 0.0, spring=True)[2], [False, True])
+    np.testing.assert_array_equal(by_aberth([16.0, 15.0], 0.0, 0.0, 0.0)[2], [False, True])
     found = zwidth.poles([16.0, 15.0], 0.0, 0.0, 0.0, method=method)
     np.testing.assert_allclose(np.sort(found[0].real), [-3, -3, 0], rtol=tol.DOUBLE_POLE.float64)
 
