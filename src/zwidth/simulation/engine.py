@@ -8,7 +8,8 @@ new.
 from __future__ import annotations
 
 from collections import deque
-from functools import lru_cache, partial
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -38,7 +39,7 @@ class Program(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """What the program made of one sample."""
+    """What the program made of one sample, recorded in the rows of one array behind the position that was sensed."""
 
     measured: Array
     velocity: Array
@@ -46,20 +47,20 @@ class Reading(NamedTuple):
     touching: Array
 
 
-class Work(NamedTuple):
-    """Energy since the start."""
-
-    wall: Array  # given by the wall
-    push: Array  # given by the hand's push
-    damping: Array  # taken by dampers
-    friction: Array  # taken by friction
+def _read(rows: Array, place: Array) -> Array:
+    return jax.lax.dynamic_index_in_dim(rows, place, keepdims=False, allow_negative_indices=False)
 
 
+def _write(rows: Array, row: Array, place: Array) -> Array:
+    return jax.lax.dynamic_update_index_in_dim(rows, row, place, 0, allow_negative_indices=False)
+
+
+# A ring is as long as a power of 2, so that a place in it takes no division.
 def look_back(ring: Array, k: Array, back: Array) -> Array:
     """The entry of ``back`` samples ago in every lane."""
-    place = jnp.mod(k - back, ring.shape[0])
+    place = (k - back) & (len(ring) - 1)
     if back.shape[-1] == 1:
-        return ring[place[0]]
+        return _read(ring, place[0])
     return jnp.take_along_axis(ring, place[None], 0)[0]
 
 
@@ -76,7 +77,7 @@ _SLACK = 1.0 + 1e-9
 def control(lanes: Lanes, options: Options, program: Program, k: Array, sensed: Array) -> tuple[Program, Reading]:
     """Measure, estimate the velocity and command a force (T2)."""
     measured = round_to(lanes.resolution, sensed)
-    positions = program.positions.at[k % program.positions.shape[0]].set(measured)
+    positions = _write(program.positions, measured, k & (len(program.positions) - 1))
     estimator = lanes.estimator
     if options.foaw:
         velocity, filtered = _adapt_window(positions, k, measured, estimator.bound, options.foaw), program.filtered
@@ -95,16 +96,17 @@ def control(lanes: Lanes, options: Options, program: Program, k: Array, sensed: 
         wanted = options.law(measured, velocity / lanes.period, k * lanes.period) / lanes.force
     wanted = jnp.where(touching, wanted, 0.0)
     wanted = jnp.where(lanes.pulling, wanted, jnp.minimum(wanted, 0.0))
-    motor, last = lanes.motor, program.commands[(k - 1) % program.commands.shape[0]]
+    ring, motor = program.commands, lanes.motor
+    last = _read(ring, (k - 1) & (len(ring) - 1))
     wanted = jnp.clip(wanted, -motor.max_force, motor.max_force)
     command = jnp.clip(wanted, last - motor.max_rate, last + motor.max_rate)
-    commands = program.commands.at[k % program.commands.shape[0]].set(command)
+    commands = _write(ring, command, k & (len(ring) - 1))
     return Program(positions, filtered, commands, touching), Reading(measured, velocity, command, touching)
 
 
 def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, most: int) -> Array:
     """FOAW with the line through both ends of its window: the longest before the first that fails."""
-    past = ring[jnp.mod(k - np.arange(most + 1), ring.shape[0])]
+    past = ring[(k - np.arange(most + 1)) & (len(ring) - 1)]
     back = np.arange(1, most + 1)[:, None]
     slopes = (newest - past[1:]) / back
     missed = jnp.abs(past[1:] - (newest - slopes[:, None] * back))  # (window, sample, lanes)
@@ -123,12 +125,12 @@ def move(
     lanes: Lanes,
     options: Options,
     body: BodyState,
-    work: Work,
+    work: Array,
     force: Array,
     push: Array,
     place: tuple[Array, int],
     time: Array,
-) -> tuple[BodyState, Work]:
+) -> tuple[BodyState, Array]:
     """The motion over one piece of a period, ``place`` its substep and its number, and what it costs."""
     none, at_once = 0.0 * body.x[0], lanes.rate.shape[1] == lanes.rate.shape[0] + 1
     forces = jnp.stack([force + push + none] if at_once else [force + none, push + none])
@@ -137,32 +139,45 @@ def move(
         after, lost, rubbed = slide(lanes, body, forces, time, whole)
     elif whole is None:
         x, _, lost = advance(lanes.digits, np.zeros((), bool), body.x, forces, time + none)
-        after, rubbed = BodyState(x, body.slip), 0.0
+        after, rubbed = BodyState(x, body.slip), none
     else:
         z = jnp.concatenate([body.x, forces])
         x = body.x + times(whole.change[0], z)
-        after, rubbed = BodyState(x, body.slip), 0.0
+        after, rubbed = BodyState(x, body.slip), none
         lost = dot(z, times(whole.loss[0], z))
     way = dot(lanes.place[0], after.x - body.x)
     # What an actuator or modes make of the command varies within the piece: its work by the balance of the others.
     given = force * way if at_once else stored(lanes, after.x) - stored(lanes, body.x) + lost + rubbed - push * way
-    moved = Work(work.wall + given, work.push + push * way, work.damping + lost, work.friction + rubbed)
-    return after, moved
+    return after, work + jnp.stack([given, push * way, lost, rubbed])
 
 
 class Summary(NamedTuple):
     """What is kept of a motion that is not recorded."""
 
-    deepest: Array  # largest position at a sample
-    widest: Array  # largest distance of a body from 0
     exits: Array  # times the wall was left
     impact: Array  # velocity at the first sample in contact
     given: Array  # the most energy that the wall has given so far
-    low: Array  # how far every body went before the tail and in each of its halves, (3, bodies, lanes)
-    high: Array
+    far: Array  # how far every body went down and up, before the tail and in each of its halves, (3, 2, bodies, lanes)
     turns: Array  # how often the velocity turned positive then, (3, lanes)
-    first_turn: Array
-    last_turn: Array
+    turned: Array  # when it did first and last in the tail, (2, lanes)
+
+    @property
+    def low(self) -> Array:
+        return -self.far[:, 0]
+
+    @property
+    def high(self) -> Array:
+        return self.far[:, 1]
+
+    @property
+    def deepest(self) -> Array:
+        """The largest position at a sample."""
+        return np.maximum(self.high[:, 0].max(0), 0.0)
+
+    @property
+    def widest(self) -> Array:
+        """The largest distance of a body from 0."""
+        return np.maximum(self.far.max((0, 1, 2)), 0.0)
 
 
 class State(NamedTuple):
@@ -170,19 +185,20 @@ class State(NamedTuple):
 
     body: BodyState
     program: Program
-    work: Work
+    # Energy since the start, given by the wall and by the hand's push, taken by dampers and by friction, (4, lanes).
+    work: Array
     summary: Summary
 
 
 class Frame(NamedTuple):
-    """What is recorded at an instant."""
+    """What is recorded at an instant, in the rows of one array: one to write is compiled sooner than nine."""
 
-    positions: Array  # (bodies, lanes)
+    positions: Sequence[Array]  # of each body
     velocity: Array
     force: Array
     slip: Array
-    work: Work
     energy: Array
+    work: Sequence[Array]  # as in `State`
 
 
 class Inputs(NamedTuple):
@@ -205,12 +221,11 @@ def begin(lanes: Lanes, positions: np.ndarray, velocities: np.ndarray, rings: tu
     back = np.mod(-np.arange(rings[0]), rings[0])
     # What the program would have read.
     positions = round_to(lanes.resolution, x - back[:, None] * v)
-    zero, far = np.zeros(x.size), np.full((3, count, x.size), np.inf)
+    zero, far = np.zeros(x.size), np.full((3, 2, count, x.size), -np.inf)
     program = Program(positions, _settle(lanes, positions[0], v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
     turns = np.zeros((3, x.size))
-    never = zero + np.nan
-    summary = Summary(zero, zero, zero, never, zero, far, -far, turns, never, never)
-    return State(BodyState(body, np.sign(velocities[0])), program, Work(zero, zero, zero, zero), summary)
+    summary = Summary(zero, zero + np.nan, zero, far, turns, np.full((2, x.size), np.nan))
+    return State(BodyState(body, np.sign(velocities[0])), program, np.zeros((4, x.size)), summary)
 
 
 def _settle(lanes: Lanes, x: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -233,7 +248,7 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     durations = given.durations if options.jitter else lanes.durations
     motion = lanes.motion[0]
 
-    def substep(carry: tuple[BodyState, Work], j: Array) -> tuple[tuple[BodyState, Work], Frame | None]:
+    def substep(carry: tuple[BodyState, Array], j: Array) -> tuple[tuple[BodyState, Array], Array | None]:
         body, work = carry
         frame = None
         if options.record:
@@ -241,10 +256,10 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
             acting = forces[-1]
             for piece in reversed(range(options.pieces - 1)):
                 acting = jnp.where(durations[j, piece] > 0, forces[piece], acting)
-            positions = jnp.stack([dot(row, body.x) for row in lanes.place])
-            frame = Frame(positions, dot(motion, body.x), acting, body.slip, work, stored(lanes, body.x))
+            positions = [dot(row, body.x) for row in lanes.place]
+            frame = jnp.stack([*positions, dot(motion, body.x), acting, body.slip, stored(lanes, body.x), *work])
 
-        def one(carry: tuple[BodyState, Work], piece: Any) -> tuple[tuple[BodyState, Work], None]:
+        def one(carry: tuple[BodyState, Array], piece: Any) -> tuple[tuple[BodyState, Array], None]:
             number, force = piece
             return move(lanes, options, *carry, force, given.push, (j, number), durations[j, number]), None
 
@@ -252,38 +267,31 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
         pieces, short = (np.arange(options.pieces), jnp.stack(forces)), not (options.friction or options.jitter)
         return jax.lax.scan(one, carry, pieces, unroll=short)[0], frame
 
-    (body, work), frames = jax.lax.scan(substep, (state.body, state.work), np.arange(options.substeps))
+    start, steps, single = (state.body, state.work), np.arange(options.substeps), options.substeps == 1
+    (body, work), frames = jax.lax.scan(substep, start, steps, unroll=single)
     summary = _summarize(lanes, state, reading, body, work, given.k, ends, motion)
-    after = State(body, program, work, summary)
-    # A block goes on behind the last period. There is no half behind the last one, and what is written there is
-    # dropped; to choose between old and new halves would copy all of them each period.
-    going = given.k < ends[-1]
-    old = state.summary._replace(low=summary.low, high=summary.high, turns=summary.turns)
-    after = jax.tree.map(partial(jnp.where, going), after, state._replace(summary=old))
-    return after, (sensed, (reading, frames) if options.record else None)
+    rows = jnp.stack([sensed, *reading] if options.record else [sensed])
+    return State(body, program, work, summary), (rows, frames)
 
 
 def _summarize(
-    lanes: Lanes, state: State, reading: Reading, body: BodyState, work: Work, k: Array, ends: Array, motion: Array
+    lanes: Lanes, state: State, reading: Reading, body: BodyState, work: Array, k: Array, ends: Array, motion: Array
 ) -> Summary:
     known = state.summary
     places = jnp.stack([dot(row, state.body.x) for row in lanes.place])
     v, next_v = dot(motion, state.body.x), dot(motion, body.x)
-    first = reading.touching & ~state.program.touching & (k > 0) & jnp.isnan(known.impact)
+    hits = reading.touching & ~state.program.touching & (k > 0) & jnp.isnan(known.impact)
     turning = (v <= 0) & (next_v > 0)
     moment = k - v / jnp.where(next_v > v, next_v - v, 1.0)
-    half = jnp.sum(k >= ends)
+    half, (first, _) = jnp.sum(k >= ends), known.turned
+    turned = jnp.stack([jnp.where(jnp.isnan(first), moment, first), moment])
     return Summary(
-        jnp.fmax(known.deepest, places[0]),
-        jnp.fmax(known.widest, jnp.abs(places).max(0)),
         known.exits + (state.program.touching & ~reading.touching),
-        jnp.where(first, v, known.impact),
-        jnp.fmax(known.given, work.wall),
-        known.low.at[half].set(jnp.fmin(known.low[half], places)),
-        known.high.at[half].set(jnp.fmax(known.high[half], places)),
-        known.turns.at[half].add(turning),
-        jnp.where(turning & (half > 0) & jnp.isnan(known.first_turn), moment, known.first_turn),
-        jnp.where(turning & (half > 0), moment, known.last_turn),
+        jnp.where(hits, v, known.impact),
+        jnp.fmax(known.given, work[0]),
+        _write(known.far, jnp.fmax(_read(known.far, half), jnp.stack([-places, places])), half),
+        _write(known.turns, _read(known.turns, half) + turning, half),
+        jnp.where(turning & (half > 0), turned, known.turned),
     )
 
 
@@ -293,7 +301,16 @@ def compile_block(options: Options) -> Any:
     """A block of periods, compiled."""
 
     def block(lanes: Lanes, ends: Array, state: State, given: Inputs) -> tuple[State, Any]:
-        return jax.lax.scan(partial(_period, lanes, options, ends), state, given)
+        size, bodies = state.work.shape[-1], len(lanes.place)
+        rows = jnp.zeros((BLOCK, 5 if options.record else 1, size))
+        frames = jnp.zeros((BLOCK, options.substeps, bodies + 8, size)) if options.record else None
+
+        def one(j: Array, carry: Any) -> Any:
+            state, kept = carry
+            state, found = _period(lanes, options, ends, state, jax.tree.map(lambda part: _read(part, j), given))
+            return state, jax.tree.map(lambda rows, row: _write(rows, row, j), kept, found)
+
+        return jax.lax.fori_loop(0, jnp.minimum(BLOCK, ends[-1] - given.k[0]), one, (state, (rows, frames)))
 
     return jax.jit(block, donate_argnums=2, compiler_options=known_options(*_PLAIN))
 
@@ -304,8 +321,8 @@ def run_lanes(
     """The last state, the last positions, and what is recorded along a first axis of periods (and of substeps)."""
     edges = course.periods - course.tail * np.arange(2, -1, -1) // 2
     # All arrays in one go: one by one they cost as much as the motion.
-    state: Any = begin(lanes, given.positions, given.velocities, rings)
-    state, lanes, ends = jax.device_put((state, lanes, edges))
+    start: Any = begin(lanes, given.positions, given.velocities, rings)
+    state, placed, ends = jax.device_put((start, lanes, edges))
     recorded: Any = deque(maxlen=None if options.record else CYCLE // BLOCK + 1)
     for first in range(0, course.periods, BLOCK):
         inputs = Inputs(
@@ -316,11 +333,16 @@ def run_lanes(
         )
         # Lanes are last axes on purpose, whatever the caller wants of arrays of theirs.
         with jax.numpy_rank_promotion("allow"):
-            state, found = compile_block(options)(lanes, ends, state, inputs)
+            state, found = compile_block(options)(placed, ends, state, inputs)
         recorded.append(jax.tree.map(np.asarray, found))
     behind = -course.periods % BLOCK
-    joined = jax.tree.map(lambda *parts: np.concatenate(parts)[: BLOCK * len(parts) - behind], *recorded)
-    sensed, (reading, frame) = joined[0], joined[1] or (None, None)
+    rows, frames = jax.tree.map(lambda *parts: np.concatenate(parts)[: BLOCK * len(parts) - behind], *recorded)
+    sensed, *read = np.moveaxis(rows, 1, 0)
+    reading = frame = None
+    if options.record:
+        *positions, velocity, force, slip, energy, wall, push, damping, friction = np.moveaxis(frames, 2, 0)
+        reading = Reading(*read)
+        frame = Frame(positions, velocity, force, slip, energy, (wall, push, damping, friction))
     return jax.tree.map(np.asarray, state), sensed[-CYCLE:], reading, frame
 
 

@@ -87,6 +87,14 @@ class _Slide(NamedTuple):
     def pending(self) -> Array:
         return (self.left > 0) & (self.events < _MOST_EVENTS)
 
+    def pack(self) -> Array:
+        """All of it as rows, which are picked and put back at once."""
+        return jnp.concatenate([self.body.x, jnp.stack([self.body.slip, *self[1:]])])
+
+    @classmethod
+    def unpack(cls, rows: Array) -> _Slide:
+        return cls(BodyState(rows[:-5], rows[-5]), *rows[-4:])
+
 
 class _Trip(NamedTuple):
     x: Array
@@ -232,10 +240,11 @@ def slide(
         )
 
     def go_on_with_few(state: _Slide) -> _Slide:
-        which = jnp.nonzero(state.pending, size=few, fill_value=size)[0]
-        own, part = jax.tree.map(lambda part: _take(part, which), (joint, state))
+        which = jnp.sort(jnp.where(state.pending, np.arange(size), size))[:few]
+        own, rows = jax.tree.map(lambda part: _take(part, which), joint), state.pack()
+        part = _Slide.unpack(_take(rows, which))
         part = go_on(own, part._replace(left=jnp.where(which < size, part.left, 0.0)), which)
-        return jax.tree.map(lambda every, some: every.at[..., which].set(some, mode="drop"), state, part)
+        return _Slide.unpack(rows.at[:, which].set(part.pack(), mode="drop"))
 
     if whole is None or few == size:
         state = go_on(joint, state, None)

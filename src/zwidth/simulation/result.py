@@ -207,7 +207,7 @@ def to_si(
     low, high = (part[1:, 0] for part in (known.low, known.high))
     finite = np.isfinite(state.body.x).all(0)
     turns = known.turns[1:].sum(0)
-    frequency = (turns - 1) / ((known.last_turn - known.first_turn) * period)
+    frequency = (turns - 1) / (np.diff(known.turned, axis=0)[0] * period)
     # A motion that is lost before it is large was not followed.
     lost = ~finite & (known.widest < _BEYOND)
     outcome = np.where(lost, MotionKind.INVALID, classify(known, outlook, course))
@@ -229,7 +229,7 @@ def to_si(
         """(periods, substeps, lanes) as (lanes, samples)."""
         return part.reshape(-1, part.shape[-1]).T
 
-    columns |= {name: unroll(part) for name, part in zip(bodies, np.moveaxis(frame.positions, 2, 0), strict=True)}
+    columns |= {name: unroll(part) for name, part in zip(bodies, frame.positions, strict=True)}
     columns |= {
         "velocity": unroll(frame.velocity) / period[:, None],
         "wall_force": unroll(frame.force) * force[:, None],
@@ -237,7 +237,7 @@ def to_si(
         "measured": reading.measured.T,
         "estimated_velocity": reading.velocity.T / period[:, None],
         "command": reading.command.T * force[:, None],
-        "contact": reading.touching.T,
+        "contact": reading.touching.T > 0,
         "energy": unroll(frame.energy) * force[:, None],
     }
     for name, part in zip(("wall_work", "push_work", "damping_loss", "friction_loss"), frame.work, strict=True):

@@ -117,7 +117,7 @@ def simulate(
 
     Numerics:
         Float64. Matrix exponentials over the constant parts of a period; with friction the instants of stopping and
-        starting to the last bit (docs/theory/simulation.md). JAX compiles for one to three seconds for each combination
+        starting to the last bit (docs/theory/simulation.md). JAX compiles for half a second to two for each combination
         of bodies and nonlinear parts; `zwidth.use_compilation_cache` keeps that for later processes. What each then
         costs stands in docs/simulation.md.
 

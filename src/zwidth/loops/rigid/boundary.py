@@ -305,9 +305,11 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
     curve = lobe(delta, d, "held", kind)
     end = frozen(curve.end, xp)
+    # From a corner, which stays, back to alpha = 0 along alpha + 2 beta = const.
+    at = wall(end, curve)
+    last = xp.where(curve.to_corner, at.alpha, 0.0)
     if xp is not np:
-        # It moves as the zero of alpha does, which the second derivatives of the area ask for; a corner stays.
-        at = wall(end, curve)
+        # Another end moves as the zero of alpha does, which the second derivatives of the area ask for.
         end = end - xp.where(curve.to_corner, 0.0, at.alpha / frozen(xp.where(curve.to_corner, 1.0, at.d_alpha), xp))
     # For many places of each lobe.
     at_places = tree_map(lambda value: None if value is None else value[..., None], curve)
@@ -316,7 +318,5 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
         at = wall(x, at_places)
         return at.alpha * at.d_b
 
-    # From a corner back to alpha = 0 along alpha + 2 beta = const.
-    last = xp.where(curve.to_corner, wall(end, curve).alpha, 0.0)
     under_lobe = integrate(rise, (0.0 * end, end), (_LOBE_NODES,))
     return under_lobe + 0.25 * last * last + nan_with_nan_slopes(valid_device(delta, d), delta, d)
