@@ -19,10 +19,11 @@ from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
 from zwidth.studies.outcome import LISTENER, ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
-from zwidth.sweep.files import hidden_beside, holding, hopeless
+from zwidth.sweep.files import holding, hopeless
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.words.errors import InputError
+from zwidth.words.files import hidden_beside
 from zwidth.words.rotation import use_kind
 from zwidth.words.status import note_failures
 

@@ -23,9 +23,9 @@ from zwidth.figures.style import pick_evenly, save, style_sheet
 from zwidth.runs.draw import figures_of, make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
-from zwidth.sweep.files import write_whole
 from zwidth.sweep.store import SUFFIX, Store
 from zwidth.words.errors import StoreError
+from zwidth.words.files import write_whole
 from zwidth.words.formatting import tell_apart
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, VARIABLES
 from zwidth.words.status import Status
