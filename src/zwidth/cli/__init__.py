@@ -29,8 +29,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
     use_compilation_cache()
     try:
-        # Click knows nothing of NO_COLOR; without a wish colors stand on a terminal.
-        color = False if os.environ.get("NO_COLOR") else None
+        # Click knows nothing of NO_COLOR, nor of terminals without colors; without a wish colors stand on others.
+        color = False if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" else None
         cli.main(args=arguments, prog_name="zwidth", standalone_mode=False, color=color)
     except SystemExit as end:
         if arguments is None and end.code in _STOPPED:

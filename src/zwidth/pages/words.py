@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 # A margin is a difference of dampings; a smaller share of them is their rounding.
 _ROUNDED = 1e-12
+# Columns of a terminal in which a label's 22 leave too few for what it labels.
+_NARROW = 60
+_COLUMN = re.compile(r" {2,}")
 # A space within a quantity, as in "B = 3 N s/m"; after some words as well, where it does no harm.
 _BESIDE = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
@@ -41,11 +44,17 @@ def print_json(result: Any) -> None:
 
 
 def print_folded(lines: Iterable[str], indent: int = 24) -> None:
-    """Print lines for people as wide as their terminal is, the rest of one below it; whole where there is none."""
-    width, rest = shutil.get_terminal_size((10**4, 24)).columns, indent * " "
+    """Print lines for people as wide as their terminal is, the rest of one below it; whole where there is none.
+
+    Where a terminal is narrow no column is kept for labels, which would leave a word a line beside it.
+    """
+    width = shutil.get_terminal_size((10**4, 24)).columns
+    narrow = width < _NARROW
+    rest = (4 if narrow else indent) * " "
     fold = textwrap.TextWrapper(max(width, 40), subsequent_indent=rest, break_long_words=False, break_on_hyphens=False)
     for line in lines:
         # A number keeps its unit beside it.
+        line = _COLUMN.sub("  ", line) if narrow else line
         click.echo(fold.fill(_BESIDE.sub("\xa0", line)).replace("\xa0", " "))
 
 
