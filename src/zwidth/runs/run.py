@@ -283,13 +283,17 @@ class _Run:
         """Compute the sweeps, all together, so that workers are started once."""
         clock = time.perf_counter()
         number = {plan.study.name: len(self.results) + k for k, plan in enumerate(plans, start=1)}
-        begun: set[str] = set()
+        # Chunks end one by one, those of several sweeps mixed where there are workers: to each the time before its end.
+        spent = dict.fromkeys(number, 0.0)
 
         def follow(progress: Progress) -> None:
+            nonlocal clock
             event = StudyEvent(number[progress.study], self.total, progress.study, "sweep", progress=progress)
-            if progress.study not in begun:
-                begun.add(progress.study)
+            if not spent[progress.study]:
                 self.tell(replace(event, progress=None))
+            now = time.perf_counter()
+            spent[progress.study] += now - clock
+            clock = now
             self.tell(event)
 
         for plan in plans:
@@ -312,7 +316,7 @@ class _Run:
             counts = store.count_statuses() if state == "done" else {}
             notes = tuple(note for family, each in counts.items() for note in note_failures(each, f"{family}s"))
             error = next(iter(sweep.failed.values()), sweeps.lost)
-            seconds = time.perf_counter() - clock
+            seconds = spent[study.name]
             if not self.hopeless:
                 ended = {"seconds": round(seconds, 3), "notes": [*notes], "error": error}
                 self.record.note({**self._spell_sweep(study, state), **ended})
