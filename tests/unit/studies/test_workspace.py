@@ -41,6 +41,14 @@ def test_every_pose_has_the_wall_of_its_own_device(tmp_path, capsys):
     assert "stable in 4 of 4 poses" in said
 
 
+@pytest.mark.parametrize("scene", ["", "scene: {mass: 1, period: 3 ms}\n"])
+def test_a_rate_says_the_period_and_comes_before_the_scene_s(scene, tmp_path):
+    (study,) = load_config(write(tmp_path, STUDY.replace("period: 1 ms", "rate: 1 kHz"), scene=scene)).studies
+    assert study.period == 1e-3
+    with pytest.raises(ConfigError, match=r"studies\[0\].rate: period and rate are both given"):
+        load_config(write(tmp_path, STUDY.replace("delay:", "rate: 1 kHz, delay:")))
+
+
 def test_the_wall_is_tried_in_every_pose(tmp_path, capsys):
     # The damping that suits the weakest pose, which is heavy, is too much for one that is light and damped.
     poses = "a,b,mass [g],damping [N s/m]\n0,0,100,0\n1,0,10,25\n"
