@@ -234,11 +234,13 @@ def limit_lines(limits: list[Limit]) -> list[str]:
 def friction_lines(rule: FrictionRule) -> list[str]:
     ends = {"2 b/T": rule.by_damping, "2 f_c/Q": rule.by_friction}
     parts = [f"{name} = {with_unit(end, 'N/m')}" for name, end in ends.items() if end is not None]
-    if rule.stiffness is None:
+    if not rule.holds:
+        parts.append("for a rigid device without delay alone is it known which springs these make passive")
+    elif rule.stiffness is None:
         parts.append("both are needed for the rule")
     else:
         known = with_unit(round_safely(rule.stiffness, "below"), "N/m")
-        parts.append(f"a spring alone is passive up to {known} (rigid, without delay; Abbott and Okamura 2005)")
+        parts.append(f"a spring alone is passive up to {known} (Abbott and Okamura 2005)")
     return [row("friction, resolution", ", ".join(parts))]
 
 
