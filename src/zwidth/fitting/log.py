@@ -259,7 +259,8 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
     place, newton, fine = own_unit("m"), own_unit("N"), "degrees or counts" if is_rotary() else "mm"
     if not lightest <= mass <= heaviest:
         light = f"the position may be in {fine}, or the force in k{newton}"
-        slip = light if mass < lightest else f"the force may be in m{newton}, or the time in ms"
+        heavy = f"the force may be in m{newton}, the time in ms, or the position in a larger unit than is said"
+        slip = light if mass < lightest else heavy
         what = f"a mass of {with_unit(mass, 'kg')} is far from any device"
         doubts.append(f"{what}; {slip}: {place}, {newton} and s are meant")
     way, push = max(float(np.ptp(log.position)) for log in logs), best.model.largest

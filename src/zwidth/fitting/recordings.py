@@ -108,7 +108,7 @@ def _period(clock: np.ndarray, wavering: bool) -> tuple[float, float]:
             )
         raise InputError(
             f"time: samples are not even: steps from {with_unit(float(steps.min()), 's')} to "
-            f"{with_unit(float(steps.max()), 's')}, sample {worst} {plain(100 * abs(late[worst]) / period, 2)} % of a "
+            f"{with_unit(float(steps.max()), 's')}, sample {worst} is {plain(100 * abs(late[worst]) / period, 2)} % of a "
             f"period off; {remedy}"
         )
     return period, error / period
