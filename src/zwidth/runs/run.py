@@ -188,7 +188,8 @@ def run(
             record.sweep_up()
         job = _Run(config, record, inputs, progress or (lambda event: None), len(pieces) + len(plans))
         digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
-        record.start(name=config.name, description=config.description, config_sha256=digest)
+        planned = [study.name for study in config.studies]
+        record.start(name=config.name, description=config.description, config_sha256=digest, planned=planned)
         record.keep_config(text, files)
         job.do(pieces)
         about = {"name": config.name, "description": config.description, "config": _spell(config)}
