@@ -101,6 +101,8 @@ class DesignStudy(ComputedStudy):
     def missing(cls, name: str) -> tuple[str, str]:
         if name == "stiffness":
             return "a design begins with the stiffness that is wanted", "add 'stiffness: [20 kN/m, 40 kN/m]'"
+        if name == "find":
+            return "a design chooses one parameter, the others as they are", "add 'find: damping', or another"
         return super().missing(name)
 
     def limits(self) -> Iterable[LocatedProblem]:
