@@ -16,6 +16,7 @@ import click
 from zwidth.arrays.kernel_cache import use_compilation_cache
 from zwidth.cli.commands import EXIT_FAILED, EXIT_INPUT, cli
 from zwidth.words.errors import ZwidthError
+from zwidth.words.files import REMEDIES
 
 # Every file of this room adds its commands.
 for _module in iter_modules(__path__, f"{__name__}."):
@@ -28,8 +29,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
     use_compilation_cache()
     try:
-        # Click knows nothing of NO_COLOR; without a wish colors stand on a terminal.
-        color = False if os.environ.get("NO_COLOR") else None
+        # Click knows nothing of NO_COLOR, nor of terminals without colors; without a wish colors stand on others.
+        color = False if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" else None
         cli.main(args=arguments, prog_name="zwidth", standalone_mode=False, color=color)
     except SystemExit as end:
         if arguments is None and end.code in _STOPPED:
@@ -59,7 +60,6 @@ def _describe(error: Exception) -> str:
     """What went wrong; of what the system refused the file, why, and what helps."""
     if not isinstance(error, OSError):
         return f"{type(error).__name__}: {error} (set ZWIDTH_TRACEBACK=1 for the traceback)"
-    from zwidth.sweep.files import REMEDIES
-
-    what = ": ".join(str(part) for part in (error.filename, error.strerror or error) if part)
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    what = ": ".join(str(part) for part in (error.filename, reason) if part)
     return "; ".join(filter(None, (what, REMEDIES.get(error.errno or 0))))

@@ -70,10 +70,8 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     if as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
     if friction is not None or resolution is not None:
-        # The device's own: the rule is for any hand.
-        device = {"damping": scene.device.damping, "period": scene.timing.period}
-        rule = friction_rule(**device, friction=friction, resolution=resolution)
-        result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
+        rule = friction_rule(scene, friction, resolution)
+        result["friction_rule"] = rule._asdict()
         lines += words.friction_lines(rule)
     words.tell(result, lines + words.note_lines(notes), as_json)
 

@@ -24,7 +24,7 @@ from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
 
-_FINDS = {"damping": "damping", "mass": "mass", "period": "period", "rate": "period", "delay": "delay"}
+_FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
 _BOX = ("mass", "damping", "period", "delay")
 
@@ -89,7 +89,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     if path == "virtual_damping":
         return _choose_damping(scene)
     unit = PARAMETERS[path].unit
-    values = scene.parameters()
+    values = {**scene.parameters(), "rate": 1.0 / scene.timing.period}
     if path not in values:
         raise click.UsageError(f"--find {find}: this scene has none; give {flag_of(path)} to start from")
     present = values[path]
@@ -101,8 +101,8 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     result = {"parameter": path, "value": needed.value, "unit": own_unit(unit), "enough": needed.enough}
     result["status"] = Status(needed.status).name
     result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
-    if path == "period":
-        result["rate"] = 1.0 / needed.value
+    if path in ("period", "rate"):
+        result["rate"] = needed.value if path == "rate" else 1.0 / needed.value
     low, high = (with_unit(end, unit) for end in needed.range)
     if needed.status not in (Status.OK, Status.UNREACHABLE):
         text = f"not found from {low} to {high}: {Status(needed.status).message}"
@@ -113,10 +113,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         text = spell_enough(needed.value, needed.enough, values, unit)
         # One or two of them are told.
         others = len(values) - 1 - (" to " in text)
-        if path == "period":
-            side = {"above": "below", "below": "above"}[needed.enough]
-            rate = spell_enough(result["rate"], side, [1.0 / value for value in values], "Hz")
-            text += f" (a rate of {rate}; the same delay in seconds)"
+        text += " (the same delay in seconds)" if path in ("period", "rate") else ""
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
     return result, [row(f"{path} needed", text)]
 

@@ -184,7 +184,7 @@ class OneKind(Strict):
         )
 
 
-def _period(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float:
+def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float:
     """The period itself, or one over the rate."""
     if value is not None:
         return read(value)
@@ -271,7 +271,9 @@ class SampledMass(OneKind):
     """Whether the device turns, as all of a file do where one quantity has a unit of rotation."""
 
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
-    period: Annotated[float, quantity_of("period"), WrapValidator(_period)] = Field(default=None, validate_default=True)
+    period: Annotated[float, quantity_of("period"), WrapValidator(read_period)] = Field(
+        default=None, validate_default=True
+    )
     delay: Delay = Span(0.0, "s")
 
     @classmethod

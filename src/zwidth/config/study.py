@@ -98,7 +98,7 @@ class Study(Strict):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         """Add what the study leaves out and the scene knows."""
-        absent = [name for name in cls.from_scene if name not in raw]
+        absent = cls._list_absent(raw)
         supplied: dict[str, Any] = {name: getattr(scene, name) for name in ("delta", "d", "delay_model")}
         supplied["delay_models"] = [scene.delay_model]
         if isinstance(scene, PhysicalScene):
@@ -110,9 +110,15 @@ class Study(Strict):
         return {**{name: supplied[name] for name in absent if supplied.get(name) is not None}, **raw}
 
     @classmethod
+    def _list_absent(cls, raw: dict[str, Any]) -> list[str]:
+        """What the study leaves to the scene; who gives the rate has given the period."""
+        given = {*raw, "period"} if "rate" in raw else raw
+        return [name for name in cls.from_scene if name not in given]
+
+    @classmethod
     def _list_taken(cls, raw: dict[str, Any]) -> list[str]:
         """What of the device the study takes from the scene."""
-        return [name for name in cls.from_scene if name not in raw and not name.startswith("delay_model")]
+        return [name for name in cls._list_absent(raw) if not name.startswith("delay_model")]
 
     @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:

@@ -156,7 +156,7 @@ def _name_silent(ax: Axes, looks: list[dict[str, Any]], silent: np.ndarray) -> N
     names = [look["label"] for look, nowhere in zip(looks, np.all(silent, axis=-1).tolist(), strict=True) if nowhere]
     if names:
         lines = [", ".join(names[k : k + 2]) for k in range(0, len(names), 2)]
-        text = "silent everywhere:\n" + ",\n".join(lines)
+        text = "silent everywhere" + (":\n" + ",\n".join(lines) if len(looks) > 1 else "")
         ax.text(0.04, 0.5, text, transform=ax.transAxes, fontsize=7.5, color=style.GRAY, va="center")
 
 

@@ -148,9 +148,10 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     every, high, dampings = np.asarray(walls[SI_COLUMNS[0]]), np.asarray(boundary[_HIGH]), boundary[SI_COLUMNS[1]]
     to_spring, spring = style.si_unit(every, "N/m")
     to_damper, damper = style.si_unit(dampings, "N s/m")
-    handles = []
+    handles, colors = [], {}
     for fit, (color, shade, dash) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):
         own, source = vars(fit), style.literal(fit.fitted_to)
+        colors[fit.fitted_to] = color
         K, low, up = (own[name] * to_spring for name in (SI_COLUMNS[0], _LOW, _HIGH))
         B = own[SI_COLUMNS[1]] * to_damper
         ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {source}")
@@ -160,7 +161,9 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
         ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
         ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {source}", zorder=3)
         handles.append(style.line(f"boundary with its 95 % band, {source}", dash, color=color))
-    handles += _mark_walls(ax, walls, (to_spring, spring), (to_damper, damper))
+    # Of one fit they are black, of two in the colors of their boundaries.
+    colors = colors if len(colors) > 1 else dict.fromkeys(colors, style.BLACK)
+    handles += _mark_walls(ax, walls, colors, (to_spring, spring), (to_damper, damper))
     ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to_spring)
     # Room for the legend.
     highest = float(np.max(dampings)) * to_damper
@@ -169,7 +172,9 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     ax.legend(handles=handles, loc="upper right")
 
 
-def _mark_walls(ax: Axes, walls: Table, stiffness: tuple[float, str], damping: tuple[float, str]) -> list[Any]:
+def _mark_walls(
+    ax: Axes, walls: Table, colors: dict[str, str], stiffness: tuple[float, str], damping: tuple[float, str]
+) -> list[Any]:
     """The stiffest walls, those to set, and those that buzzed, in such units; returns entries of a legend."""
     handles, kinds = [], {}
     for kind in ("stiffest", "set", "buzzing"):
@@ -177,13 +182,12 @@ def _mark_walls(ax: Axes, walls: Table, stiffness: tuple[float, str], damping: t
         K, B = found[SI_COLUMNS[0]] * stiffness[0], found[SI_COLUMNS[1]] * damping[0]
         kinds[kind] = found, K, B
     for kind, mark, words in (("stiffest", "stiffest", "stiffest wall"), ("set", "recommended", "wall to set")):
-        _, K, B = kinds[kind]
-        mark_wall(ax, (K, B), kind, kind=mark)
-        if K.size:
+        found, *values = kinds[kind]
+        for fit, K, B in zip(found["fitted_to"], *values, strict=True):
+            mark_wall(ax, (K, B), kind, kind=mark, color=colors[fit])
             # With four digits and K rounded down the wall holds as it is read.
-            numbers = f": $K = {round_safely(K[0], 'below'):.4g}$ {stiffness[1]}, $B = {B[0]:.4g}$ {damping[1]}"
-            text = numbers if K.size == 1 else ""
-            handles.append(style.line(words + text, "", color=style.BLACK, **MARKS[mark]))
+            numbers = f"$K = {round_safely(K, 'below'):.4g}$ {stiffness[1]}, $B = {B:.4g}$ {damping[1]}"
+            handles.append(style.line(f"{words}: {numbers}", "", color=colors[fit], **MARKS[mark]))
     if not kinds["set"][1].size:
         handles.append(style.line("no wall to set: a doubt, or none holds", ""))
     found, K, B = kinds["buzzing"]

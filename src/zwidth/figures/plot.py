@@ -37,7 +37,7 @@ from zwidth.parts.checks import read_texts
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.assessment import passive_edge, round_margin
-from zwidth.scenes.base import of_scene
+from zwidth.scenes.base import check_scene, of_scene
 from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
@@ -114,9 +114,11 @@ def region(
         The Axes. Solid: the largest outline; dashed: islands; dotted: holes; what is stable is shaded.
 
     Raises:
-        InputError: no passivity condition holds for the scene, with ``passive``.
+        InputError: one is no scene; or no passivity condition holds for it, with ``passive``.
     """
     scenes = scene if isinstance(scene, Mapping) else {"": scene}
+    for each in scenes.values():
+        check_scene(each)
     outlines, walls = tabulate_sets(scenes)
     edges = [_trace_passive(each, label) for label, each in (scenes if passive else {}).items()]
     return draw_stable_set(stack([outlines, *edges]), walls, _axes(ax), normalized=normalized)[0]

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from io import BytesIO
 from pathlib import Path
 from textwrap import fill
 from typing import Any, TypeAlias
@@ -22,6 +23,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from zwidth.words.errors import InputError
+from zwidth.words.files import write_whole
 from zwidth.words.formatting import PREFIXES
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
@@ -259,7 +261,9 @@ def save(
     with house_style():
         for file in files:
             usual = PNG_DPI if file.suffix == ".png" else "figure"
-            figure.savefig(file, dpi=dpi or usual, metadata=_METADATA[file.suffix])
+            kind = {"format": file.suffix[1:], "metadata": _METADATA[file.suffix]}
+            figure.savefig(drawing := BytesIO(), dpi=dpi or usual, **kind)
+            write_whole(file, drawing.getvalue())
             # What is laid out once need not be again: it is half of the work.
             figure.set_layout_engine(None)
     figure.set_layout_engine(engine)

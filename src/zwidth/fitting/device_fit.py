@@ -51,7 +51,8 @@ class FurtherExperiment(NamedTuple):
 class FittedMotion(NamedTuple):
     """One log beside its fit, a number a sample: times in s, forces in N, positions in m.
 
-    ``modelled`` is NaN at the first samples, whose past forces are unknown, and behind the first 200,000.
+    ``modelled`` is NaN at the first samples and behind a gap, where past forces are unknown, and behind the first
+    200,000.
     """
 
     time: np.ndarray

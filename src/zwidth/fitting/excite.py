@@ -21,6 +21,7 @@ from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
+from zwidth.words.files import write_whole
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.status import Status
 
@@ -67,7 +68,7 @@ class Excitation:
     def save(self, file: str | Path) -> None:
         """Write a CSV file with the time in s and the force in N of every sample."""
         rows = [f"{k * self.period:.9g},{value:.7g}" for k, value in enumerate(self.force.tolist())]
-        Path(file).write_text("\n".join(["time [s],force [N]", *rows]) + "\n", encoding="utf-8")
+        write_whole(Path(file), ("\n".join(["time [s],force [N]", *rows]) + "\n").encode())
 
 
 def excite(

@@ -13,7 +13,7 @@ from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted, weigh_resonances
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
-from zwidth.fitting.recordings import find_stretches, read_logs
+from zwidth.fitting.recordings import find_even, find_stretches, read_logs
 from zwidth.fitting.structure import Recordings
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity
@@ -66,8 +66,8 @@ def fit_log(
     second order, and resonances are added where Schwarz's criterion asks for them.
 
     Args:
-        time: of the samples in s, evenly spaced, or their period alone. With lists of arrays for all three, several
-            logs of one device.
+        time: of the samples in s, evenly spaced, or their period alone. Where samples are missing, what lies before and
+            behind a gap is fitted as two logs. With lists of arrays for all three, several logs of one device.
         position: measured at the samples, in m.
         force: commanded at the samples, in N, positive towards growing positions.
         velocity: how the loop whose K_max is asked for estimates its velocity; the backward difference by default.
@@ -126,18 +126,31 @@ def fit_log(
 
 
 def _fit(
-    logs: tuple[Recording, ...], period: float, wavers: float, velocity: Velocity, max_delay: Any, resolution: Any
+    logs: tuple[Recording, ...],
+    places: tuple[np.ndarray, ...],
+    period: float,
+    wavers: float,
+    velocity: Velocity,
+    max_delay: Any,
+    resolution: Any,
 ) -> DeviceFit:
     """The same of logs that are read, whose period has the relative standard error ``wavers``."""
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
-    for k, log in enumerate(logs):
-        if log.force.size < skip + _FEWEST:
+    stretches = [find_even(place, skip + _FEWEST) for place in places]
+    for k, own in enumerate(stretches):
+        if not own:
+            most = max((each.stop - each.start for each in find_even(places[k], 1)), default=1)
             raise InputError(
-                f"time: log {k + 1} has {log.force.size} samples, and the first {skip} serve as past force; at least "
-                f"{skip + _FEWEST} are needed: record longer, or give a shorter max_delay"
+                f"time: log {k + 1} has {most} samples without a gap, and the first {skip} serve as past force; at "
+                f"least {skip + _FEWEST} are needed: record longer, or give a shorter max_delay"
             )
-    recordings = tuple(Recording(log.force, log.position[skip:], skip).begin(_MOST // len(logs)) for log in logs)
+    count = sum(map(len, stretches))
+    recordings = tuple(
+        Recording(log.force[each], log.position[each][skip:], skip).begin(_MOST // count)
+        for log, own in zip(logs, stretches, strict=True)
+        for each in own
+    )
     doubts = [doubt for log in logs for doubt in find_stretches(log)]
     step, odd = _find_step(resolution, logs)
     best, pole, banks, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
@@ -164,7 +177,8 @@ def _fit(
         doubts.append(
             f"the delay ends the range looked in, {with_unit(longest * period, 's')}; give a longer max_delay"
         )
-    motions, (offset, friction) = _place(best, logs, skip, period), (_in_newton(best, k) for k in (-2, -1))
+    motions = _place(best, logs, places, stretches, skip, period)
+    offset, friction = (_in_newton(best, k) for k in (-2, -1))
     shown: dict[str, Any] = {}
     if banks and not unexplained:
         shown = {"response": respond_as_fitted(best, scene, banks), "hidden": weigh_resonances(best, scene, banks)}
@@ -259,7 +273,8 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
     place, newton, fine = own_unit("m"), own_unit("N"), "degrees or counts" if is_rotary() else "mm"
     if not lightest <= mass <= heaviest:
         light = f"the position may be in {fine}, or the force in k{newton}"
-        slip = light if mass < lightest else f"the force may be in m{newton}, or the time in ms"
+        heavy = f"the force may be in m{newton}, the time in ms, or the position in a larger unit than is said"
+        slip = light if mass < lightest else heavy
         what = f"a mass of {with_unit(mass, 'kg')} is far from any device"
         doubts.append(f"{what}; {slip}: {place}, {newton} and s are meant")
     way, push = max(float(np.ptp(log.position)) for log in logs), best.model.largest
@@ -296,11 +311,20 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
     return doubts
 
 
-def _place(best: FittedModel, logs: tuple[Recording, ...], skip: int, period: float) -> tuple[FittedMotion, ...]:
-    """Every log beside its fit, NaN at its first samples and where it is too long."""
-    motions = []
-    for log, part in zip(logs, best.model.split(best.motion.position), strict=True):
+def _place(
+    best: FittedModel,
+    logs: tuple[Recording, ...],
+    places: tuple[np.ndarray, ...],
+    stretches: list[list[slice]],
+    skip: int,
+    period: float,
+) -> tuple[FittedMotion, ...]:
+    """Every log beside its fit, NaN at the first samples, behind a gap as well, and where it is too long."""
+    motions, parts = [], iter(best.model.split(best.motion.position))
+    for log, place, own in zip(logs, places, stretches, strict=True):
         modelled = np.full(log.force.size, np.nan)
-        modelled[skip : skip + part.size] = part
-        motions.append(FittedMotion(period * np.arange(modelled.size), log.force, log.position, modelled))
+        for each in own:
+            part = next(parts)
+            modelled[each.start + skip : each.start + skip + part.size] = part
+        motions.append(FittedMotion(period * place, log.force, log.position, modelled))
     return tuple(motions)

@@ -25,8 +25,8 @@ _MISSING = 1.5
 
 def read_logs(
     time: Any, position: Any, force: Any, resample: bool = False
-) -> tuple[tuple[Recording, ...], float, float]:
-    """The logs, their period, and its relative standard error."""
+) -> tuple[tuple[Recording, ...], tuple[np.ndarray, ...], float, float]:
+    """The logs, the place of each sample in periods, their period, and its relative standard error."""
     several = isinstance(position, list | tuple) and len(position) > 0 and np.ndim(position[0]) == 1
     positions, forces = (position, force) if several else ([position], [force])
     times = time if several and isinstance(time, list | tuple) else [time] * len(positions)
@@ -35,17 +35,17 @@ def read_logs(
             f"time, position, force: got {len(times)}, {len(positions)} and {len(forces)} logs; give each log all three"
         )
     read = [_read(*parts, resample) for parts in zip(times, positions, forces, strict=True)]
-    periods = [period for _, period, _ in read]
-    error = max(error for *_, error in read)
+    logs, places, periods, errors = zip(*read, strict=True)
+    error = max(errors)
     if np.ptp(periods) > (_SAME + _SURE * error) * periods[0]:
         raise InputError(
             f"time: the logs have periods of {with_unit(min(periods), 's')} to {with_unit(max(periods), 's')}; fit "
             "them one by one"
         )
-    return tuple(log for log, *_ in read), float(np.mean(periods)), error
+    return logs, places, float(np.mean(periods)), error
 
 
-def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Recording, float, float]:
+def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Recording, np.ndarray, float, float]:
     x, f = as_float64("position", position), as_float64("force", force)
     clock = None if isinstance(time, str) or np.ndim(time) == 0 else as_float64("time", time)
     given = {"position": x, "force": f} | ({} if clock is None else {"time": clock})
@@ -67,26 +67,30 @@ def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Recordi
                 f"and at least {least:g} apart; check the unit"
             )
     if clock is None:
-        period, error = check_number("time", time, "s", POSITIVE), 0.0
+        place, period, error = np.arange(x.size), check_number("time", time, "s", POSITIVE), 0.0
     else:
-        period, error = _period(clock, resample)
+        place, period, error = _place(clock, resample)
     if np.ptp(f) == 0:
         raise InputError(
             f"force: it is {plain(f[0])} N all the time; command a force that changes, as steps to and fro"
         )
     if np.ptp(x) == 0:
         raise InputError("position: it never changes; check the column, and that nothing holds the device")
-    return Recording(f, x, 0), period, error
+    return Recording(f, x, 0), place, period, error
 
 
-def _period(clock: np.ndarray, wavering: bool) -> tuple[float, float]:
-    """The period of even samples whose times are read by a clock that wavers, and its standard error."""
+def _place(clock: np.ndarray, wavering: bool) -> tuple[np.ndarray, float, float]:
+    """Samples in whole periods by a clock that wavers, their period and its relative standard error."""
     # The line through all times: nothing between the samples is guessed, they are taken as they are.
     steps = np.diff(clock)
     if steps.min() <= 0:
         k = int(np.argmin(steps))
         raise InputError(f"time: it does not grow from sample {k} to {k + 1}; sort the samples, drop double ones")
-    count = np.arange(clock.size) - 0.5 * (clock.size - 1)
+    usual = float(np.median(steps))
+    # By a clock that wavers it cannot be told how many samples are missing.
+    passed = np.where((steps > _MISSING * usual) & (not wavering), np.round(steps / usual), 1.0)
+    place = np.concatenate([[0.0], np.cumsum(passed)])
+    count = place - place.mean()
     square = float(count @ count)
     # Times to 12 digits have a period of as many.
     period = float(f"{count @ clock / square:.12g}")
@@ -96,10 +100,7 @@ def _period(clock: np.ndarray, wavering: bool) -> tuple[float, float]:
     late = late - 0.5 * (late.max() + late.min())
     worst = int(np.argmax(np.abs(late)))
     if abs(late[worst]) > (_WAVERING if wavering else _UNEVEN) * period:
-        k = int(np.argmax(steps))
-        if steps[k] > _MISSING * np.median(steps):
-            remedy = f"some are missing after sample {k}: give what lies before and behind a gap as two logs"
-        elif abs(late[worst]) > _WAVERING * period:
+        if abs(late[worst]) > _WAVERING * period:
             remedy = "which sample is whose cannot be told; record at even times"
         else:
             remedy = (
@@ -108,10 +109,16 @@ def _period(clock: np.ndarray, wavering: bool) -> tuple[float, float]:
             )
         raise InputError(
             f"time: samples are not even: steps from {with_unit(float(steps.min()), 's')} to "
-            f"{with_unit(float(steps.max()), 's')}, sample {worst} {plain(100 * abs(late[worst]) / period, 2)} % of a "
-            f"period off; {remedy}"
+            f"{with_unit(float(steps.max()), 's')}, sample {worst} is {plain(100 * abs(late[worst]) / period, 2)} % of "
+            f"a period off; {remedy}"
         )
-    return period, error / period
+    return place.astype(int), period, error / period
+
+
+def find_even(place: np.ndarray, least: int) -> list[slice]:
+    """The stretches of a log in which no sample is missing, of so many samples or more."""
+    runs = find_runs(np.diff(place) == 1).tolist()
+    return [slice(first, last + 1) for first, last in runs if last + 1 - first >= least]
 
 
 def find_stretches(log: Recording) -> list[str]:

@@ -105,7 +105,14 @@ def respond(
         >>> f"{found.device.frequency.size} lines from {found.records} stretches"
         '409 lines from 5 stretches'
     """
-    logs, period, _ = read_logs(time, position, force)
+    logs, places, period, _ = read_logs(time, position, force)
+    for k, place in enumerate(places, start=1):
+        if place[-1] >= place.size:
+            missing, gap = place[-1] + 1 - place.size, int(np.argmax(np.diff(place)))
+            raise InputError(
+                f"time: log {k} lacks {missing} samples, most of them after sample {gap}; record every sample, or give "
+                "what lies before and behind a gap as two logs"
+            )
     step = min(find_resolution(log.position) for log in logs)
     step = step if resolution is None else check_number("resolution", resolution, "m")
     given = None if cycle is None else int(np.round(check_number("cycle", cycle, "s", POSITIVE) / period))

@@ -86,8 +86,12 @@ def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     if fit.status != Status.OK:
         rows.append((Status(fit.status).name, f"do not rely on these numbers: {name_trouble(fit)}"))
     rows.append(("fitted to", source))
-    if any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
-        count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
+    count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
+    gaps = sum(int(np.count_nonzero(np.diff(motion.time) > 1.5 * fit.period)) for motion in fit.motions)
+    if gaps:
+        behind = "a gap" if gaps == 1 else f"each of {gaps} gaps"
+        rows.append(("of it", f"{count:,} of {total:,} samples: behind {behind} the first are past force alone"))
+    elif any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
         rows.append(("of it", f"{count:,} of {total:,} samples, the first ones; more would only narrow the errors"))
     for name in (*fit.numbers, "stiffness_max"):
         symbol = "J" if name == "mass" and is_rotary() else SYMBOLS.get(name) or _name_part(name, len(fit.modes))

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 # A margin is a difference of dampings; a smaller share of them is their rounding.
 _ROUNDED = 1e-12
+# Columns of a terminal in which a label's 22 leave too few for what it labels.
+_NARROW = 60
+_COLUMN = re.compile(r" {2,}")
 # A space within a quantity, as in "B = 3 N s/m"; after some words as well, where it does no harm.
 _BESIDE = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
@@ -41,11 +44,17 @@ def print_json(result: Any) -> None:
 
 
 def print_folded(lines: Iterable[str], indent: int = 24) -> None:
-    """Print lines for people as wide as their terminal is, the rest of one below it; whole where there is none."""
-    width, rest = shutil.get_terminal_size((10**4, 24)).columns, indent * " "
+    """Print lines for people as wide as their terminal is, the rest of one below it; whole where there is none.
+
+    Where a terminal is narrow no column is kept for labels, which would leave a word a line beside it.
+    """
+    width = shutil.get_terminal_size((10**4, 24)).columns
+    narrow = width < _NARROW
+    rest = (4 if narrow else indent) * " "
     fold = textwrap.TextWrapper(max(width, 40), subsequent_indent=rest, break_long_words=False, break_on_hyphens=False)
     for line in lines:
         # A number keeps its unit beside it.
+        line = _COLUMN.sub("  ", line) if narrow else line
         click.echo(fold.fill(_BESIDE.sub("\xa0", line)).replace("\xa0", " "))
 
 
@@ -225,11 +234,13 @@ def limit_lines(limits: list[Limit]) -> list[str]:
 def friction_lines(rule: FrictionRule) -> list[str]:
     ends = {"2 b/T": rule.by_damping, "2 f_c/Q": rule.by_friction}
     parts = [f"{name} = {with_unit(end, 'N/m')}" for name, end in ends.items() if end is not None]
-    if rule.stiffness is None:
+    if not rule.holds:
+        parts.append("for a rigid device without delay alone is it known which springs these make passive")
+    elif rule.stiffness is None:
         parts.append("both are needed for the rule")
     else:
         known = with_unit(round_safely(rule.stiffness, "below"), "N/m")
-        parts.append(f"a spring alone is passive up to {known} (rigid, without delay; Abbott and Okamura 2005)")
+        parts.append(f"a spring alone is passive up to {known} (Abbott and Okamura 2005)")
     return [row("friction, resolution", ", ".join(parts))]
 
 

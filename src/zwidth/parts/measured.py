@@ -17,6 +17,7 @@ import numpy as np
 
 from zwidth.parts.linear_device import WholeDevice
 from zwidth.words.errors import InputError
+from zwidth.words.files import write_whole
 from zwidth.words.formatting import suggestion
 from zwidth.words.tables import read_columns
 from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, Dimension, split_head
@@ -147,7 +148,7 @@ class MeasuredDevice(WholeDevice):
             heads, columns = [*heads, "deviation [m/N]"], [*columns, self.deviation]
         lines = [f"# {remark}" for remark in remarks] + [",".join(heads)]
         lines += [",".join(repr(float(value)) for value in line) for line in zip(*columns, strict=True)]
-        Path(file).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_whole(Path(file), ("\n".join(lines) + "\n").encode())
 
 
 def _as_line(name: str, values: Any, kind: type) -> np.ndarray:

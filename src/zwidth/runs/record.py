@@ -28,12 +28,11 @@ from zwidth.sweep.files import (
     digest,
     held_briefly,
     is_plain_name,
-    remove_quietly,
     versions,
-    write_whole,
 )
 from zwidth.sweep.store import SUFFIX
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
+from zwidth.words.files import remove_quietly, write_whole
 from zwidth.words.formatting import describe
 
 RUN_FILE = "run.json"

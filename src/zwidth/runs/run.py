@@ -19,10 +19,11 @@ from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
 from zwidth.studies.outcome import LISTENER, ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
-from zwidth.sweep.files import hidden_beside, holding, hopeless
+from zwidth.sweep.files import holding, hopeless
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.words.errors import InputError
+from zwidth.words.files import hidden_beside
 from zwidth.words.rotation import use_kind
 from zwidth.words.status import note_failures
 
@@ -187,7 +188,8 @@ def run(
             record.sweep_up()
         job = _Run(config, record, inputs, progress or (lambda event: None), len(pieces) + len(plans))
         digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
-        record.start(name=config.name, description=config.description, config_sha256=digest)
+        planned = [study.name for study in config.studies]
+        record.start(name=config.name, description=config.description, config_sha256=digest, planned=planned)
         record.keep_config(text, files)
         job.do(pieces)
         about = {"name": config.name, "description": config.description, "config": _spell(config)}
@@ -282,13 +284,17 @@ class _Run:
         """Compute the sweeps, all together, so that workers are started once."""
         clock = time.perf_counter()
         number = {plan.study.name: len(self.results) + k for k, plan in enumerate(plans, start=1)}
-        begun: set[str] = set()
+        # Chunks end one by one, those of several sweeps mixed where there are workers: to each the time before its end.
+        spent = dict.fromkeys(number, 0.0)
 
         def follow(progress: Progress) -> None:
+            nonlocal clock
             event = StudyEvent(number[progress.study], self.total, progress.study, "sweep", progress=progress)
-            if progress.study not in begun:
-                begun.add(progress.study)
+            if not spent[progress.study]:
                 self.tell(replace(event, progress=None))
+            now = time.perf_counter()
+            spent[progress.study] += now - clock
+            clock = now
             self.tell(event)
 
         for plan in plans:
@@ -311,7 +317,7 @@ class _Run:
             counts = store.count_statuses() if state == "done" else {}
             notes = tuple(note for family, each in counts.items() for note in note_failures(each, f"{family}s"))
             error = next(iter(sweep.failed.values()), sweeps.lost)
-            seconds = time.perf_counter() - clock
+            seconds = spent[study.name]
             if not self.hopeless:
                 ended = {"seconds": round(seconds, 3), "notes": [*notes], "error": error}
                 self.record.note({**self._spell_sweep(study, state), **ended})

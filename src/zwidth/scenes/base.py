@@ -224,9 +224,14 @@ def of_scene(
 
     @wraps(function)
     def checked(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if not isinstance(scene, SceneParts):
-            example = "zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3))"
-            raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed, as {example}")
+        check_scene(scene)
         return answer(scene, *args, **kwargs)
 
     return checked
+
+
+def check_scene(scene: object) -> None:
+    """Refuse anything but a scene."""
+    if not isinstance(scene, SceneParts):
+        example = "zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3))"
+        raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed, as {example}")

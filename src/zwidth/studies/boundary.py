@@ -30,6 +30,7 @@ from zwidth.studies.outcome import (
     add_si_of_scene,
     csv_text,
     share_of_device,
+    spell_stiffest,
     summarize_stiffest,
 )
 from zwidth.studies.ridge import find_edges, needed_models, passive_intervals, passive_outlines, ridge_table
@@ -217,6 +218,7 @@ class CompareStudy(ComputedStudy):
             table=stack(rows),
             figures={"": partial(figures.draw_stable_set, table, walls)} if table else {},
             documents={f"{self.name}_outlines.csv": csv_text(table)},
+            answer=tuple(f"{row['label']}: {spell_stiffest(row)}" for row in rows if row["kind"] != "none"),
             notes=tuple(f"{row['label']}: no wall is stable" for row in rows if row["kind"] == "none"),
         )
 

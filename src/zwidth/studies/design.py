@@ -26,9 +26,9 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
-from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, summarize_stiffest, track
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiffest, summarize_stiffest, track
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, header, round_safely, short, spell_enough, with_unit
+from zwidth.words.formatting import describe, header, short, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
@@ -101,6 +101,8 @@ class DesignStudy(ComputedStudy):
     def missing(cls, name: str) -> tuple[str, str]:
         if name == "stiffness":
             return "a design begins with the stiffness that is wanted", "add 'stiffness: [20 kN/m, 40 kN/m]'"
+        if name == "find":
+            return "a design chooses one parameter, the others as they are", "add 'find: damping', or another"
         return super().missing(name)
 
     def limits(self) -> Iterable[LocatedProblem]:
@@ -311,7 +313,7 @@ class FiltersStudy(ComputedStudy):
 
 def _spell_best(row: dict[str, Any]) -> str:
     """The best filter of a damping, in a line."""
-    (stiffness, damping), size = (row[name] for name in SI_COLUMNS), f"{row['samples']:g} samples"
+    size = f"{row['samples']:g} samples"
     size = size if row["samples"] == row["samples"] else with_unit(row["cutoff_Hz"], "Hz")
-    wall = f"K_max = {with_unit(round_safely(stiffness, 'below'), 'N/m')} at B = {with_unit(damping, 'N s/m')}"
-    return f"b = {with_unit(row['damping_N_s_per_m'], 'N s/m')}: {row['estimate'].replace('_', ' ')}, {size}: {wall}"
+    damping, estimate = with_unit(row["damping_N_s_per_m"], "N s/m"), row["estimate"].replace("_", " ")
+    return f"b = {damping}: {estimate}, {size}: {spell_stiffest(row)}"

@@ -22,7 +22,7 @@ from zwidth.figures.table import SI_COLUMNS
 from zwidth.scenes.assessment import name_kind
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
-from zwidth.words.formatting import own_header, to_cell
+from zwidth.words.formatting import own_header, round_safely, to_cell, with_unit
 
 Item = TypeVar("Item")
 
@@ -147,6 +147,12 @@ def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Sce
 def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
     found = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
     return {**found, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
+
+
+def spell_stiffest(row: Mapping[str, Any]) -> str:
+    """The stiffest wall of a row of `summarize_stiffest`, rounded down: it holds as it is read."""
+    stiffness, damping = (row[name] for name in SI_COLUMNS)
+    return f"K_max = {with_unit(round_safely(stiffness, 'below'), 'N/m')} at B = {with_unit(damping, 'N s/m')}"
 
 
 def csv_text(table: dict[str, np.ndarray]) -> str:

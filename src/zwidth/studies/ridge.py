@@ -9,10 +9,11 @@ from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import PrivateAttr, ValidationError
+from pydantic import Field, PrivateAttr, ValidationError, WrapValidator
 
 from zwidth import figures
 from zwidth.config.device_table import DeviceTable, find_file, read_table
+from zwidth.config.devices import find_second_period, read_period
 from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels, HeldStudy, register
@@ -226,8 +227,16 @@ class WorkspaceStudy(ComputedStudy):
     poses: Poses
     """A file with a row for each pose: its mass and damping, and the two columns that they are drawn over."""
 
-    period: Annotated[float, quantity_of("period")]
+    rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
+    period: Annotated[float, quantity_of("period"), WrapValidator(read_period)] = Field(
+        default=None, validate_default=True
+    )
     delay: Delay
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        yield from find_second_period(raw)
+        yield from super().conflicts(raw)
 
     @property
     def sizes(self) -> dict[str, int]:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.sweep.files import hidden_beside
 from zwidth.sweep.store import (
     FILES,
     SEAL,
@@ -22,6 +21,7 @@ from zwidth.sweep.store import (
     silence_zarr,
 )
 from zwidth.words.errors import StoreError, StoreExistsError
+from zwidth.words.files import hidden_beside
 from zwidth.words.formatting import header, to_cell
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 

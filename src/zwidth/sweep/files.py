@@ -17,8 +17,6 @@ import hashlib
 import json
 import os
 import platform
-import secrets
-import shutil
 import socket
 import stat
 import time
@@ -32,19 +30,9 @@ from typing import Any
 
 from zwidth import __version__
 from zwidth.words.errors import InputError, StoreBusyError
+from zwidth.words.files import REMEDIES
 
-REMEDIES = {
-    errno.ENOSPC: "make room on the disk",
-    errno.EDQUOT: "make room within your quota",
-    errno.EFBIG: "raise the limit on the size of files (ulimit -f)",
-    errno.EROFS: "choose a folder that can be written",
-    errno.EACCES: "choose a folder that you may write",
-    errno.EPERM: "choose a folder that you may write",
-    errno.ENOTDIR: "choose a folder whose path holds no file",
-    errno.ENOENT: "choose a folder that can be made",
-    errno.EEXIST: "choose another name",
-}
-"""What helps against errors of the system; no chunk of a sweep would escape the first six of them."""
+# No chunk of a sweep would escape these.
 _HOPELESS = frozenset(list(REMEDIES)[:6])
 # Packages whose release can change the last digit of a result.
 _PACKAGES = ("jax", "jaxlib", "numpy")
@@ -88,36 +76,6 @@ def existing(folder: Path) -> Path:
     """The folder itself or the nearest path above it that exists."""
     folder = folder.absolute()
     return next(path for path in (folder, *folder.parents) if path.exists())
-
-
-@contextmanager
-def hidden_beside(path: Path) -> Iterator[Path]:
-    """A name beside ``path`` for a file or folder in the making; what is left of it goes when the block ends."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        yield partial
-    except OSError as error:
-        # What the system says of it is meant of the path.
-        error.filename = str(path) if error.filename == str(partial) else error.filename
-        raise
-    finally:
-        remove_quietly(partial)
-
-
-def remove_quietly(path: Path) -> None:
-    """Remove a file or a folder, as far as the system lets it."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under another name and rename it when all of it is on its way to the disk."""
-    with hidden_beside(path) as partial:
-        partial.write_bytes(data)
-        os.replace(partial, path)
 
 
 def content(path: Path) -> bytes:

@@ -23,9 +23,10 @@ from typing import Any
 import numpy as np
 
 from zwidth.config.sweep import SweepStudy
-from zwidth.sweep.files import checksum, content, digest, hidden_beside, remove_quietly, write_whole
+from zwidth.sweep.files import checksum, content, digest
 from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.words.errors import InputError, StoreError
+from zwidth.words.files import hidden_beside, remove_quietly, write_whole
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status

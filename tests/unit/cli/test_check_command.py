@@ -180,15 +180,21 @@ def test_a_stiffness_beyond_all_walls_is_doubted_and_usual_values_are_not():
 
 def test_friction_and_resolution():
     given = ["--friction", "0.24", "--resolution", "15.7 um"]
-    printed = json.loads(run("check", *WALL, *DEVICE, *RATE, *given, "--json").stdout)["friction_rule"]
+    known = "for a rigid device without delay alone"
+    late = run("check", *WALL, *DEVICE, *RATE, *given)
+    assert "2 b/T = 20.00 kN/m, 2 f_c/Q = 30.57 kN/m" in late.stdout
+    assert known in late.stdout
+    asked = "check", *WALL, *DEVICE[:-1], "0", *RATE
+    printed = json.loads(run(*asked, *given, "--json").stdout)["friction_rule"]
     assert printed["by_damping"] == 2 * 10 / 1e-3
     assert printed["by_friction"] == pytest.approx(2 * 0.24 / 15.7e-6, rel=1e-15)
     assert printed["stiffness"] == printed["by_damping"]
-    assert "2 b/T = 20.00 kN/m, 2 f_c/Q = 30.57 kN/m" in run("check", *WALL, *DEVICE, *RATE, *given).stdout
+    assert "a spring alone is passive up to 20.00 kN/m" in run(*asked, *given, *PARTS["filter"][0]).stdout
     # As passivity, the rule is for any hand: that of a held device counts on nobody's damping.
-    held = json.loads(run("check", *WALL, *DEVICE, *RATE, *given, "--operator-damping", "5", "--json").stdout)
+    held = json.loads(run(*asked, *given, "--operator-damping", "5", "--json").stdout)
     assert held["friction_rule"] == printed
-    assert "both are needed" in run("check", *WALL, *DEVICE, *RATE, "--friction", "1").stdout
+    assert known in run(*asked, *given, "--coupling-mass", "20 g", "--coupling-stiffness", "20 kN/m").stdout
+    assert "both are needed" in run(*asked, "--friction", "1").stdout
 
 
 def test_a_coded_period_that_is_not_the_loop_s_is_pointed_out():

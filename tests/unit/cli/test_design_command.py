@@ -36,8 +36,11 @@ def test_what_is_needed_agrees_with_the_closed_form_of_a_rigid_device():
         exact = find_required(name, 40e3, low, high, **known(name))
         assert needed(*find, name)["value"] == pytest.approx(exact, rel=1e-9)
     rate = needed(*find, "rate")
-    assert rate["value"] == pytest.approx(needed(*find, "period")["value"], rel=1e-12)
-    assert rate["rate"] == 1 / rate["value"]
+    period = needed(*find, "period")
+    assert 1 / rate["value"] == pytest.approx(period["value"], rel=1e-9)
+    assert (rate["rate"], rate["unit"], rate["enough"]) == (rate["value"], "Hz", "above")
+    assert (period["rate"], period["enough"]) == (1 / period["value"], "below")
+    assert re.search(r"rate needed +[\d.]+ kHz or more \(the same delay in seconds\)", design(*find, "rate"))
 
 
 def test_what_is_printed_is_enough_as_it_is_rounded():

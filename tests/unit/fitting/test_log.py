@@ -213,7 +213,13 @@ TIMES = PERIOD * np.arange(200)
 @pytest.mark.parametrize(
     "time, position, force, words",
     [
-        (np.delete(np.append(TIMES, 0.2), 90), PLACES, FORCE, "not even: steps from 1.000 ms to 2.000 ms"),
+        (TIMES + 0.5e-3 * (TIMES > 0.0905), PLACES, FORCE, "not even: steps from 1.000 ms to 1.500 ms"),
+        (
+            TIMES[np.arange(200) % 40 > 0],
+            PLACES[:195],
+            FORCE[:195],
+            "log 1 has 39 samples without a gap",
+        ),
         (TIMES[::-1], PLACES, FORCE, "does not grow from sample 0 to 1"),
         (TIMES, PLACES, 0.0 * FORCE + 2, "it is 2.000 N all the time"),
         (TIMES, 0.0 * PLACES, FORCE, "position: it never changes"),

@@ -11,6 +11,7 @@ import zwidth
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import FittedModel
 from zwidth.fitting.structure import Recordings
+from zwidth.fitting.words import describe_fit
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -114,12 +115,25 @@ def test_few_positions_are_doubted():
     assert any("only 48 positions count" in doubt for doubt in fit.doubts)
 
 
-def test_missing_samples_are_named():
+def test_what_lies_before_and_behind_a_gap_is_fitted_as_two_logs():
     rng = np.random.default_rng(0)
-    force = push_to_and_fro(rng, 120)
-    position, kept = record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0), np.arange(120) != 50
-    with pytest.raises(InputError, match="missing after sample 49: give what lies before and behind a gap as two logs"):
-        zwidth.fit_log(PERIOD * np.arange(120)[kept], position[kept], force[kept])
+    force = push_to_and_fro(rng, 400)
+    position, clock = record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0), PERIOD * np.arange(400)
+    # The few samples between two gaps are too few.
+    kept = (clock < 0.1495) | (clock > 0.1505) & (clock < 0.1705) | (clock > 0.1905)
+    fit = zwidth.fit_log(clock[kept], position[kept], force[kept])
+    parts = clock < 0.1495, clock > 0.1905
+    apart = zwidth.fit_log(PERIOD, *([each[part] for part in parts] for each in (position, force)))
+    for name in ("mass", "damping", "delay"):
+        assert getattr(fit, name) == pytest.approx(getattr(apart, name), rel=1e-9)
+    (motion,) = fit.motions
+    np.testing.assert_allclose(motion.time, clock[kept], rtol=1e-9, atol=1e-12)
+    both = np.concatenate([each.modelled for each in apart.motions])
+    np.testing.assert_allclose(motion.modelled[(motion.time < 0.1495) | (motion.time > 0.1905)], both, rtol=1e-9)
+    said = dict(describe_fit(fit, "log"))["of it"]
+    assert said == "315 of 379 samples: behind each of 2 gaps the first are past force alone"
+    with pytest.raises(InputError, match="log 1 lacks 21 samples, most of them after sample 169"):
+        zwidth.respond(clock[kept], position[kept], force[kept])
 
 
 def test_milliseconds_read_as_seconds_are_doubted():

@@ -81,6 +81,18 @@ def test_a_run_tells_when_studies_start_and_end(config, tmp_path):
     assert events[1].result.state == "done"
 
 
+def test_each_sweep_has_the_time_of_its_own_chunks(tmp_path):
+    axes = {"alpha": {"linear": {"start": 0.1, "stop": 0.9, "num": 5}}, "beta": 0.1, "delta": 0.1, "d": 0}
+    sweeps = [{"kind": "sweep", "name": name, "axes": axes} for name in ("one", "two")]
+    clock = time.perf_counter()
+    result = run({"version": 1, "name": "both", "studies": sweeps}, out=tmp_path / "out")
+    one, two = (study.seconds for study in result.studies)
+    assert min(one, two) > 0
+    # Together they took no longer than all.
+    assert one + two <= time.perf_counter() - clock
+    assert [entry["seconds"] for entry in record_of(tmp_path / "out")["studies"]] == [round(one, 3), round(two, 3)]
+
+
 def test_a_run_is_never_overwritten_unasked(config, tmp_path):
     out = tmp_path / "out"
     run(config, out=out)

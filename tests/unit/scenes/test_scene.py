@@ -142,7 +142,7 @@ def test_a_scene_without_a_wall_has_none():
     assert (scene.alpha, scene.beta, scene.delta, scene.d) == (0, 0, 0, 0)
 
 
-ASKED: tuple[Any, ...] = zwidth.assess, zwidth.limits_of, zwidth.worst_motion
+ASKED: tuple[Any, ...] = zwidth.assess, zwidth.limits_of, zwidth.worst_motion, zwidth.plot.region
 SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
 
 
@@ -165,6 +165,10 @@ SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
             (lambda ask=ask, given=given: ask(given), "scene: got .*; a zwidth.Scene is needed, as zwidth.Scene")
             for ask in ASKED
             for given in (zwidth.Device(0.1), np.ones(2), 3)
+        ),
+        (
+            lambda: zwidth.plot.region({"one": SCENE, "two": zwidth.Device(0.1)}),  # pyright: ignore[reportArgumentType]
+            "scene: got Device.*; a zwidth.Scene is needed",
         ),
         (lambda: SCENE.max_stiffness(negative_damping=np.ones(2)), "negative_damping: got array.*; it is True, False"),
         (lambda: SCENE.required(np.ones(2), 1e3), "parameter: got array"),

@@ -114,6 +114,7 @@ def test_a_stiffness_that_every_value_reaches_is_told_with_units():
 
 
 REFUSED = {
+    "num: 5": "add 'find: damping', or another",
     "find: dampin": "did you mean 'damping'",
     "find: velocity.cutoff": "this device has",
     "find: velocity.samples": "allowed are 'period'",

@@ -122,6 +122,9 @@ def test_a_comparison_has_a_row_and_outlines_for_each_device():
     assert "free,1,outline" in outcome.documents["c_outlines.csv"]
     (ax,) = outcome.figures[""]()
     assert [line.get_label() for line in ax.lines].count("stiffest") == 3
+    # As README.md has it for this device, and a line for each.
+    assert outcome.answer[0] == "free: K_max = 19.86 kN/m at B = 41.60 N s/m"
+    assert [line.partition(":")[0] for line in outcome.answer] == ["free", "held", "windowed"]
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from sweeping import main_of
 
 import zwidth
 from zwidth.studies.document import load_config
+from zwidth.studies.ridge import WorkspaceStudy
 from zwidth.words.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -39,6 +40,15 @@ def test_every_pose_has_the_wall_of_its_own_device(tmp_path, capsys):
         assert row["virtual_damping_N_s_per_m"] == pytest.approx(float(top.virtual_damping), rel=1e-9)
     assert "at shoulder 60 deg, elbow 30 deg" in said
     assert "stable in 4 of 4 poses" in said
+
+
+@pytest.mark.parametrize("scene", ["", "scene: {mass: 1, period: 3 ms}\n"])
+def test_a_rate_says_the_period_and_comes_before_the_scene_s(scene, tmp_path):
+    (study,) = load_config(write(tmp_path, STUDY.replace("period: 1 ms", "rate: 1 kHz"), scene=scene)).studies
+    assert isinstance(study, WorkspaceStudy)
+    assert study.period == 1e-3
+    with pytest.raises(ConfigError, match=r"studies\[0\].rate: period and rate are both given"):
+        load_config(write(tmp_path, STUDY.replace("delay:", "rate: 1 kHz, delay:")))
 
 
 def test_the_wall_is_tried_in_every_pose(tmp_path, capsys):

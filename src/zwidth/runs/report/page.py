@@ -23,9 +23,9 @@ from zwidth.figures.style import pick_evenly, save, style_sheet
 from zwidth.runs.draw import figures_of, make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
-from zwidth.sweep.files import write_whole
 from zwidth.sweep.store import SUFFIX, Store
 from zwidth.words.errors import StoreError
+from zwidth.words.files import write_whole
 from zwidth.words.formatting import tell_apart
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, VARIABLES
 from zwidth.words.status import Status
@@ -107,6 +107,9 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
     told = {name: content[name] for name in ("name", "description", "precision", "config_sha256")}
     # Days and minutes say enough to people; in the record they are in UTC.
     told["started"] = content["started"][:16].replace("T", " at ")
+    # A study that an interrupted run never began has no entry.
+    begun = {entry["name"]: entry for entry in content["studies"]}
+    planned = [begun.get(name, {"name": name}) for name in content.get("planned", begun)]
     return Template(html).substitute(
         {name: escape(str(each)) for name, each in told.items()},
         release=escape(str(versions["zwidth"])),
@@ -114,7 +117,7 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
         script=script,
         style_digest=digests[0],
         script_digest=digests[1],
-        missing="".join(_miss(entry) for entry in content["studies"] if entry not in done),
+        missing="".join(_miss(entry) for entry in planned if entry not in done),
         contents="".join(f'<li><a href="#{escape(each["name"])}">{escape(each["name"])}</a></li>' for each in done),
         sections="".join(_section(where, entry) for entry in done),
         beside=f" Beside it goes the folder <code>{INPUTS}</code> of the run." if content.get("inputs") else "",

@@ -183,6 +183,18 @@ def test_the_day_of_a_run_is_told_as_people_write_it(page):
     assert re.search(r"Computed on \d{4}-\d\d-\d\d at \d\d:\d\d UTC, in float64", page)
 
 
+def test_a_study_that_an_interrupted_run_never_began_is_named(tmp_path, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("zwidth.studies.boundary.BoundaryStudy.compute", interrupt)
+    walls = [{"kind": "boundary", "name": name, "delta": 0.1, "d": 1} for name in ("walls", "more")]
+    assert zwidth.run({"version": 1, "name": "example", "studies": [TOP, *walls]}, out=tmp_path).interrupted
+    page = zwidth.write_report(tmp_path).read_text(encoding="utf-8")
+    for name in ("walls", "more"):
+        assert f"<strong>{name} is not here</strong>, for it is not finished; " in page
+
+
 def test_a_study_that_failed_is_told_and_has_no_section(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise ValueError("<no luck>")
