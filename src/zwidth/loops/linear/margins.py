@@ -279,18 +279,20 @@ def _find_starts(
 
 def _follow(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) -> float:
     """The delay near a start with which a pole is on the circle, by Newton's method on ``log(-L)``; else NaN."""
+    rest = np.inf
     for _ in range(_TRIALS):
         if not (0.0 < w < np.pi and delay >= 0.0):
-            break
+            return np.nan
         at = circle(np.array([w]))
         here, beside = (open_loop_response(loop_at(chain, delay + h), *wall, at) for h in (0.0, _STEP))
         rest, turn = np.log(-here.value[0]), here.slope[0] / here.value[0]
         slope = np.log(beside.value[0] / here.value[0]) / _STEP
         by_w, by_delay = np.linalg.solve([[turn.real, slope.real], [turn.imag, slope.imag]], [rest.real, rest.imag])
         w, delay = w - by_w, delay - by_delay
+        # On the flank of a narrow resonance the rounding of w alone moves the delay by more.
         if abs(by_delay) <= 1e-14 * (1.0 + delay):
-            return delay if abs(rest) < _ROUNDED else np.nan
-    return np.nan
+            break
+    return delay if abs(rest) < _ROUNDED else np.nan
 
 
 def _is_first_loss(chain: AnyChain, alpha: float, beta: float, margin: float) -> bool:

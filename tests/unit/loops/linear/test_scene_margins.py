@@ -199,6 +199,21 @@ def test_a_zero_of_the_open_loop_is_no_crossover():
     assert np.isnan(found.phase_crossover)
 
 
+def test_the_delay_margin_at_the_flank_of_a_narrow_resonance():
+    """There the last place of the frequency moves the delay by a hundred of its own."""
+    modes = (
+        zwidth.Mode(199.539, damping_ratio=3.4e-5, mass=0.0865),
+        zwidth.Mode(24.85, damping_ratio=0.0015, mass=0.2),
+    )
+    timing = zwidth.Timing(period=0.714e-3, delay=0.714e-3)
+    scene = zwidth.Scene(zwidth.Device(mass=0.0307, modes=modes), timing)
+    found = scene.margins(0.15, 0.0116).delay_margin
+    assert 0 < found < timing.period
+    for share, stable in ((0.5, True), (0.999, True), (1.001, False)):
+        moved = scene.replace(timing=zwidth.Timing(timing.period, timing.delay + share * found))
+        assert moved.is_stable(0.15, 0.0116, method="certified") == stable
+
+
 @pytest.mark.parametrize("stiffness", [1e-2, 1e-6])
 def test_a_soft_wall_on_a_free_device_has_its_crossover_at_any_frequency(stiffness):
     # L = K/(b s) and K (1 + (B/K) s)/(m s^2) so far below every other frequency of the loop.
