@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -257,10 +257,12 @@ def _find_starts(
     more = [phases / w for phases, w in zip(turns, crossed, strict=True)]
     for k, (w, after) in enumerate(pairwise(crossed)):
         if w.size != after.size:
-            # Two crossovers have met in between.
-            for i in (k, k + 1):
-                near = (np.abs(more[i] - np.round(more[i])) <= _SPARE / _PARTS) & (more[i] < _LONGEST)
-                yield from zip(crossed[i][near].tolist(), (delays[i] + more[i][near]).tolist(), strict=True)
+            # Two crossovers have met in between; one may have turned past L = -1 meanwhile.
+            for i, turn in product((k, k + 1), (0.0, 2.0 * np.pi)):
+                left = (turns[i] - turn) / crossed[i]
+                whole = np.round(left)
+                near = (np.abs(left - whole) <= _SPARE / _PARTS) & (whole >= 0.0) & (whole < _LONGEST)
+                yield from zip(crossed[i][near].tolist(), (delays[i] + left[near]).tolist(), strict=True)
             continue
         rise = np.mod(turns[k + 1] - turns[k] + np.pi, 2.0 * np.pi) - np.pi
         for turn in (0.0, 2.0 * np.pi):
