@@ -67,11 +67,12 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     if is_traced(value):
         raise InputError(f"{name}: got a value that JAX traces; give numbers, outside of jit, vmap and grad")
     try:
-        array = np.asarray(value)
+        # NumPy makes an object of a whole number beyond its own.
+        array = np.asarray(float(value) if isinstance(value, int) else value)
         if array.dtype.kind in "OSUcVmM":
             raise TypeError(array.dtype)
         return array.astype(np.float64, copy=False)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(
             f"{name}: got {value!r}, a real number or a rectangular array of real numbers is needed"
         ) from error

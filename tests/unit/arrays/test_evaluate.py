@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import zwidth
 from zwidth.arrays import evaluate as module
 from zwidth.arrays.evaluate import FEW, as_float64, broadcast, check_scalars, evaluate, evaluate_columns, map_blocks
 from zwidth.words.errors import InputError, PrecisionWarning
@@ -160,6 +161,16 @@ def test_an_elementwise_kernel_follows_its_caller_too():
 def test_a_mask_is_not_ignored():
     with pytest.raises(InputError, match="x: got a masked array"):
         as_float64("x", np.ma.masked_array([1.0, 2.0], mask=[True, False]))
+
+
+def test_a_whole_number_that_float64_holds_is_one_like_any_other():
+    """Whatever route takes it: NumPy's own whole numbers end at 2^64."""
+    walls = 2**70, 0.4, 0.1, 1.0
+    assert not zwidth.is_stable(*walls, method="certified")
+    assert zwidth.spectral_radius(*walls) == zwidth.spectral_radius(2.0**70, *walls[1:])
+    assert as_float64("x", -(2**64)) == -(2.0**64)
+    with pytest.raises(InputError, match="x: got 1000"):
+        as_float64("x", 10**400)
 
 
 @pytest.mark.parametrize("value", ["1", None, 1j, ["1"], [1, [2]], {}, np.array(["a"]), object()])

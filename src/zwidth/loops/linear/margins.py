@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -257,10 +257,12 @@ def _find_starts(
     more = [phases / w for phases, w in zip(turns, crossed, strict=True)]
     for k, (w, after) in enumerate(pairwise(crossed)):
         if w.size != after.size:
-            # Two crossovers have met in between.
-            for i in (k, k + 1):
-                near = (np.abs(more[i] - np.round(more[i])) <= _SPARE / _PARTS) & (more[i] < _LONGEST)
-                yield from zip(crossed[i][near].tolist(), (delays[i] + more[i][near]).tolist(), strict=True)
+            # Two crossovers have met in between; one may have turned past L = -1 meanwhile.
+            for i, turn in product((k, k + 1), (0.0, 2.0 * np.pi)):
+                left = (turns[i] - turn) / crossed[i]
+                whole = np.round(left)
+                near = (np.abs(left - whole) <= _SPARE / _PARTS) & (whole >= 0.0) & (whole < _LONGEST)
+                yield from zip(crossed[i][near].tolist(), (delays[i] + left[near]).tolist(), strict=True)
             continue
         rise = np.mod(turns[k + 1] - turns[k] + np.pi, 2.0 * np.pi) - np.pi
         for turn in (0.0, 2.0 * np.pi):
@@ -279,18 +281,20 @@ def _find_starts(
 
 def _follow(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) -> float:
     """The delay near a start with which a pole is on the circle, by Newton's method on ``log(-L)``; else NaN."""
+    rest = np.inf
     for _ in range(_TRIALS):
         if not (0.0 < w < np.pi and delay >= 0.0):
-            break
+            return np.nan
         at = circle(np.array([w]))
         here, beside = (open_loop_response(loop_at(chain, delay + h), *wall, at) for h in (0.0, _STEP))
         rest, turn = np.log(-here.value[0]), here.slope[0] / here.value[0]
         slope = np.log(beside.value[0] / here.value[0]) / _STEP
         by_w, by_delay = np.linalg.solve([[turn.real, slope.real], [turn.imag, slope.imag]], [rest.real, rest.imag])
         w, delay = w - by_w, delay - by_delay
+        # On the flank of a narrow resonance the rounding of w alone moves the delay by more.
         if abs(by_delay) <= 1e-14 * (1.0 + delay):
-            return delay if abs(rest) < _ROUNDED else np.nan
-    return np.nan
+            break
+    return delay if abs(rest) < _ROUNDED else np.nan
 
 
 def _is_first_loss(chain: AnyChain, alpha: float, beta: float, margin: float) -> bool:

@@ -80,9 +80,9 @@ TakeLag = Callable[[Any, Any], Lag]
 
 def short_verdict(alpha: Any, beta: Any, here: Any) -> Verdict:
     """The verdict for d < 1, alpha > 0 and beta > -delta: alpha against the end of its row."""
-    # |L(-1)| < 1 is needed; without it there is no crossover.
+    # |L(-1)| < 1 is needed; without it there is no crossover. By far: what follows is then rounding.
     height, line = here.gap * (alpha + beta * 2.0), (here.c + 1.0) * 2.0
-    below, without = height < line, (height > line) | (height < -line)
+    below, without = (height < line) & (height > -line), (height > line) | (height < -line)
     b = beta + here.delta
     if here.a0 is None:
         left, right = alpha * here.a1 * (here.p1 + here.a2 * b), here.p1 * b * (1.0 - here.a1 * beta)

@@ -199,6 +199,35 @@ def test_a_zero_of_the_open_loop_is_no_crossover():
     assert np.isnan(found.phase_crossover)
 
 
+NARROW = {
+    # At its flank the last place of the frequency moves the delay by a hundred of its own.
+    "flank": (
+        zwidth.Device(
+            mass=0.0307,
+            modes=(zwidth.Mode(199.539, damping_ratio=3.4e-5, mass=0.0865), zwidth.Mode(24.85, 0.0015, mass=0.2)),
+        ),
+        zwidth.Timing(period=0.714e-3, delay=0.714e-3),
+        (0.15, 0.0116),
+    ),
+    # Its two crossovers appear at a delay of about 0.3 periods, and one has turned past -1 at the next that is laid.
+    "appearing": (
+        zwidth.Device(mass=0.026013692, damping=12.0476264, modes=(zwidth.Mode(947.58718, 0.000242737, -0.391404527),)),
+        zwidth.Timing(period=1.3364519965781e-3),
+        (7496.157782518655, 22.952514039378066),
+    ),
+}
+
+
+@pytest.mark.parametrize("device, timing, wall", NARROW.values(), ids=NARROW)
+def test_the_delay_margin_beside_a_narrow_resonance(device, timing, wall):
+    scene = zwidth.Scene(device, timing)
+    found = scene.margins(*wall).delay_margin
+    assert 0 < found < timing.period
+    for share, stable in ((0.5, True), (0.999, True), (1.001, False)):
+        moved = scene.replace(timing=zwidth.Timing(timing.period, timing.delay + share * found))
+        assert moved.is_stable(*wall, method="certified") == stable
+
+
 @pytest.mark.parametrize("stiffness", [1e-2, 1e-6])
 def test_a_soft_wall_on_a_free_device_has_its_crossover_at_any_frequency(stiffness):
     # L = K/(b s) and K (1 + (B/K) s)/(m s^2) so far below every other frequency of the loop.

@@ -52,6 +52,16 @@ def test_softer_walls_at_the_damping_of_a_corner_are_stable():
     assert not zwidth.is_stable((1.0 + 1e-9) * alpha, beta, delta, d).any()
 
 
+def test_a_wall_that_is_the_larger_part_at_every_frequency_is_unstable():
+    """Far beyond ``|L(-1)| = 1`` the formulas of the row hold nothing but rounding errors."""
+    random = np.random.default_rng(0)
+    delta, d = 10 ** random.uniform(-15, -6, 20000), 10 ** random.uniform(-15, -8, 20000)
+    d[::2] = 1.0 - d[::2]
+    alpha = zwidth.alpha_max(delta, d).alpha * 10 ** random.uniform(10, 50, delta.shape)
+    assert not zwidth.is_stable(alpha, alpha * random.uniform(-1.0, 2.0, delta.shape), delta, d).any()
+    assert not zwidth.is_stable(99.57297700720724, 2.978195961433618e17, 8.23821423969356e-09, 0.9999999998914924)
+
+
 @pytest.mark.parametrize("method", ["crossover", "companion", "certified"])
 def test_bad_input_among_good(method):
     bad = [np.nan, np.inf, -np.inf]
