@@ -164,7 +164,7 @@ class LinearLoop:
 
     def holds_softly(self, alpha: float, beta: float) -> bool:
         """Whether a path of stable walls leads from soft ones to a stable wall."""
-        return self.border.pieces.holds_softly(alpha, beta)
+        return self.border.holds_softly(alpha, beta)
 
     def islands(self, least: float) -> list[Island]:
         """The pieces of the stable set without soft walls, with dampings above ``least``."""

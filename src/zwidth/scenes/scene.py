@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64
-from zwidth.loops.linear.border import Outline, outlines
+from zwidth.loops.linear.border import Outline
 from zwidth.loops.linear.curve import curve_at
 from zwidth.scenes.base import WallSI
 from zwidth.scenes.measured_loop import MeasuredLoop
@@ -65,7 +65,7 @@ class Scene(SceneAdvice):
             found = self.loop.outline()
             pieces = [] if found is None else [Outline(*found, False, False)]
         else:
-            pieces = outlines(self.loop.border)
+            pieces = self.loop.border.outlines()
         return [
             Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
             for piece in pieces
