@@ -27,8 +27,8 @@ _ACROSS, _BEYOND = 65, 0.05
 # Rows beside a damping at which columns meet, as shares of the way between the rows that enclosed it.
 # The nearest two enclose it.
 _BESIDE, _CLOSE = np.array([-1e-3, -1e-7, 1e-7, 1e-3]), 3e-7
-# How often rows are added, and steps towards a corner, told to the last digit.
-_ROUNDS, _STEPS, _LAST = 60, 60, 4e-16
+# How often rows are added, and steps towards a corner, which is told to such a share of its damping.
+_ROUNDS, _STEPS, _TOLD = 60, 60, 1e-13
 # Edges of few nodes get so many points.
 _FEW, _FILLED = 5, 33
 # So near to an edge, as a share of its damping, a row is on it.
@@ -72,14 +72,15 @@ class Border:
     boundary: Boundary
 
     @cached_property
-    def _angles(self) -> np.ndarray:
-        """Nodes of the curve, the extremes of alpha among them."""
-        return np.union1d(self.boundary.w, self.boundary.tops)
+    def _nodes(self) -> np.ndarray:
+        """Angles, alpha and beta at the nodes of the curve, the extremes of alpha among them."""
+        w = np.union1d(self.boundary.w, self.boundary.tops)
+        return np.stack([w, *curve_at(self.boundary.loop, w)[:2]])
 
     def _first_rows(self) -> np.ndarray:
         """Rows on both sides of where nodes of the curve cease to be on the edge, and across the set."""
-        b, w = self.boundary, self._angles
-        beta, own, held = curve_at(b.loop, w).beta, b.arc_at(w), b.borders(w)
+        b, (w, _, beta) = self.boundary, self._nodes
+        own, held = b.arc_at(w), b.borders(w)
         if np.ptp(beta) <= _ONE_DAMPING * np.abs(beta).max():
             raise InputError(
                 "device: the pole pairs of a system of first order, not late and behind the difference of two samples, "
@@ -112,22 +113,23 @@ class Border:
     @cached_property
     def _found(self) -> tuple[_Rows, _Meetings]:
         """Rows on both sides of all dampings at which columns meet, and the meetings."""
-        rows, new, corners = self._look(np.empty(0)), self._first_rows(), np.empty((0, 3))
-        looked_at = new
+        looked_at, corners = self._first_rows(), np.empty((0, 3))
+        rows = self._look(looked_at)
+        met = _pair_ends(rows, corners)
         for _ in range(_ROUNDS):
-            parts = [np.concatenate(both) for both in zip(rows, self._look(new), strict=True)]
-            order = np.unique(parts[0], return_index=True)[1]
-            rows = _Rows(*(part[order] for part in parts))
-            met = _pair_ends(rows, corners)
             left = np.flatnonzero(~met.known)
             if not left.size:
                 break
             new, more = self._enclose(rows, met, left)
             new, corners = np.setdiff1d(new, looked_at), np.concatenate([corners, more])
             looked_at = np.append(looked_at, new)
+            parts = [np.concatenate(both) for both in zip(rows, self._look(new), strict=True)]
+            order = np.unique(parts[0], return_index=True)[1]
+            rows = _Rows(*(part[order] for part in parts))
+            met = _pair_ends(rows, corners)
             if not new.size:
                 break
-        return rows, _pair_ends(rows, corners)
+        return rows, met
 
     def _enclose(self, rows: _Rows, met: _Meetings, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows next to where columns meet, and the walls there as far as they are told: as `_pair_ends` takes them."""
@@ -144,7 +146,7 @@ class Border:
         if k.size:
             first, last = first[k], last[k]
             scale = np.sign(first) / (np.abs(first) + np.abs(last))
-            width = _LAST * np.maximum(np.abs(low[k]), np.abs(high[k]))
+            width = _TOLD * np.maximum(np.abs(low[k]), np.abs(high[k]))
             ends = low[k], high[k], first * scale, last * scale
             at[k] = false_position(lambda at: scale * self._gaps(columns[k], at), *ends, _STEPS, width)
             alpha[k] = b.cross(columns[k, 0], at[k])
@@ -176,18 +178,17 @@ class Border:
 
     def _trace(self, column: int, within: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Angles, alpha and beta along a column from one wall to another, of few nodes with more of two angles."""
-        b, w = self.boundary, np.empty(0)
+        b, path = self.boundary, np.empty((3, 0))
         if column < len(b.arcs):
-            w = self._angles[b.arc_at(self._angles) == column]
-            beta = curve_at(b.loop, w).beta
-            w = w[(beta > ends[0, 1]) & (beta < ends[1, 1])]
-            if w.size < _FEW:
+            path = self._nodes[:, b.arc_at(self._nodes[0]) == column]
+            path = path[:, (path[2] > ends[0, 1]) & (path[2] < ends[1, 1])]
+            if path.shape[1] < _FEW:
                 more = np.linspace(within.min(), within.max(), _FILLED)
                 tops = zeros_of(b.loop, more, curve_at(b.loop, more).alpha_slope, "alpha_slope")
-                w = np.unique(np.concatenate([w, more[1:-1], tops]))
-            w = w if b.arcs[column].w[0] < b.arcs[column].w[-1] else w[::-1]
-        path = np.stack([w, *curve_at(b.loop, w)[:2]])
-        return np.insert(path, [0, w.size], np.insert(ends.T, 0, np.nan, 0), 1)
+                w = np.unique(np.concatenate([path[0], more[1:-1], tops]))
+                path = np.stack([w, *curve_at(b.loop, w)[:2]])
+            path = path if b.arcs[column].w[0] < b.arcs[column].w[-1] else path[:, ::-1]
+        return np.insert(path, [0, path.shape[1]], np.insert(ends.T, 0, np.nan, 0), 1)
 
     @cached_property
     def main(self) -> frozenset[int]:
