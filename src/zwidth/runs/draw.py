@@ -64,15 +64,9 @@ def _find_place(values: np.ndarray, coordinate: xarray.DataArray) -> int:
 def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:
     parameters = store.plan.grid.scene_block(tuple(slice(k, k + 1) for k in place)).parameters
     try:
-        scene = store.study.make_scene({name: float(values[0]) for name, values in parameters.items()})
-        if store.study.with_parts:
-            pieces = scene.stable_region()
-            return {"stable": [(np.stack([one.stiffness, one.virtual_damping], -1), one.hole) for one in pieces]}
-        found = find_edges(float(scene.delta), float(scene.d))
+        return find_edges(store.study.make_scene({name: float(values[0]) for name, values in parameters.items()}))
     except InputError:
         return {}
-    units = np.array(scene.units)
-    return {name: [(points * units, hole) for points, hole in outlines] for name, outlines in found.items()}
 
 
 def draw_stores(

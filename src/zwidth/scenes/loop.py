@@ -17,7 +17,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import check_scalars, evaluate
 from zwidth.arrays.held_mass import classify_delays
-from zwidth.loops.linear.border import Border
+from zwidth.loops.linear.border import Border, Outline
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.held import find_roots
 from zwidth.loops.linear.margins import linear_margins, open_loop_response
@@ -164,15 +164,15 @@ class LinearLoop:
 
     def holds_softly(self, alpha: float, beta: float) -> bool:
         """Whether a path of stable walls leads from soft ones to a stable wall."""
-        return self.border.pieces.holds_softly(alpha, beta)
+        return self.border.holds_softly(alpha, beta)
 
     def islands(self, least: float) -> list[Island]:
         """The pieces of the stable set without soft walls, with dampings above ``least``."""
         return self.border.islands(least)
 
-    def outline(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """The whole stable set as one closed curve for pictures, None where only a search finds it."""
-        return None
+    def outlines(self) -> list[Outline]:
+        """Closed outlines of the stable set, the largest first."""
+        return self.border.outlines()
 
     def stiffest(self, negative: bool) -> RidgePoint:
         """The stiffest stable wall, with beta >= 0 unless negative dampings count."""
@@ -279,8 +279,8 @@ class RigidLoop(LinearLoop):
     def islands(self, least: float) -> list[Island]:
         return []
 
-    def outline(self) -> tuple[np.ndarray, np.ndarray]:
-        return stable_region(float(self.scene.delta), float(self.scene.d))[:2]
+    def outlines(self) -> list[Outline]:
+        return [Outline(*stable_region(float(self.scene.delta), float(self.scene.d))[:2], False, False)]
 
     def stiffest(self, negative: bool) -> RidgePoint:
         delta, d, model = self.scene.delta, self.scene.d, self.scene.timing.delay_model

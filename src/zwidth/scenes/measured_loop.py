@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.roots import narrow_dips
+from zwidth.loops.linear.border import Outline
 from zwidth.loops.linear.margins import nearest_gain_crossover, nearest_phase_crossover
 from zwidth.loops.linear.rows import Island, side_by_side
 from zwidth.loops.rigid.verdict import StabilityMethod
@@ -138,14 +139,13 @@ class MeasuredLoop(LinearLoop):
     def _find_tops(self, beta: np.ndarray) -> np.ndarray:
         return np.nanmax(self.soft_rows(beta)[:, :, 1], 1, initial=0.0)
 
-    def outline(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """The stiffest surely stable wall of each damping and the softest, a closed curve for pictures; else None."""
+    def outlines(self) -> list[Outline]:
+        """The stiffest surely stable wall of each damping and the softest, a closed curve for pictures, if any is."""
         beta, top = self._tops
         beta, top = beta[top > 0], top[top > 0]
-        if not beta.size:
-            return None
-        low = self.soft_rows(beta)[:, 0, 0]
-        return np.concatenate([low, top[::-1], low[:1]]), np.concatenate([beta, beta[::-1], beta[:1]])
+        low = self.soft_rows(beta)[:, 0, 0] if beta.size else beta
+        walls = np.concatenate([low, top[::-1], low[:1]]), np.concatenate([beta, beta[::-1], beta[:1]])
+        return [Outline(*walls, False, False)] if beta.size else []
 
     def stiffest(self, negative: bool) -> RidgePoint:
         """The stiffest wall that `holds_softly`, with beta >= 0 unless negative ones count."""

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64
-from zwidth.loops.linear.border import Outline, outlines
+from zwidth.loops.linear.border import Outline
 from zwidth.loops.linear.curve import curve_at
 from zwidth.scenes.base import WallSI
-from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.scenes.recommendation import SceneAdvice
 from zwidth.simulation.simulate import simulate
 from zwidth.words.rotation import wrap_methods
@@ -61,14 +60,9 @@ class Scene(SceneAdvice):
             `islands` means it.
         """
         units = self.units
-        if isinstance(self.loop, MeasuredLoop):
-            found = self.loop.outline()
-            pieces = [] if found is None else [Outline(*found, False, False)]
-        else:
-            pieces = outlines(self.loop.border)
         return [
             Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
-            for piece in pieces
+            for piece in self.loop.outlines()
         ]
 
     simulate = simulate

@@ -23,6 +23,9 @@ from zwidth.loops.rigid.normalization import status_of_results
 from zwidth.loops.rigid.passivity import is_passive
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import is_stable
+from zwidth.parts.device import Device
+from zwidth.parts.timing import Timing
+from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import (
     ComputedStudy,
     CurvesStudy,
@@ -286,7 +289,8 @@ class MapStudy(ComputedStudy, HeldStudy):
 
         def find_edge(name: str, delta: float, d: float) -> Outlines | None:
             passive = name == "passive"
-            return find_edges(delta * (share if passive else 1.0), d).get("passive" if passive else "stable")
+            device = Device(1.0, delta * (share if passive else 1.0))
+            return find_edges(Scene(device, Timing(1.0, d))).get("passive" if passive else "stable")
 
         draw = partial(figures.draw_map, arrays)
         drawn = {f"_{name}": partial(draw, name, edges=partial(find_edge, name)) for name in names}

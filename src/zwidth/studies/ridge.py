@@ -20,7 +20,6 @@ from zwidth.config.study import DelayModels, HeldStudy, register
 from zwidth.config.values import Delay, quantity_of
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.table import SI_COLUMNS, stack
-from zwidth.loops.rigid.boundary import stable_region
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.loops.rigid.verdict import is_stable
@@ -125,12 +124,11 @@ def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
     return passive_edge(Scene(Device(1.0, 1.0), Timing(1.0, d)))
 
 
-def find_edges(delta: float, d: float) -> dict[str, Outlines]:
-    """Where the stable and the passive walls of a rigid device end, normalized."""
-    found = stable_region(delta, d)
-    edges: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1), False)]}
-    if delta > 0:
-        edges["passive"] = [(delta * np.stack(unit_outline(d), -1), False)]
+def find_edges(scene: Scene) -> dict[str, Outlines]:
+    """Where the stable walls of a scene end, and the passive ones of a rigid device."""
+    edges: dict[str, Outlines] = {"stable": [(np.stack(piece[:2], -1), piece.hole) for piece in scene.stable_region()]}
+    if not scene.parts_beyond and scene.device.damping > 0:
+        edges["passive"] = [(np.stack(passive_edge(scene), -1), False)]
     return edges
 
 

@@ -1,52 +1,68 @@
-"""The edge of the stable set of any linear loop: which parts of the boundary it is, and its corners."""
+"""The edge of the stable set of any linear loop and the pieces of the set, by rows between which nothing changes.
+
+A row is stable in intervals, each between two columns of its crossings, which are arcs or lines. As beta moves they
+keep their columns, up to where two columns meet: a corner, or an end of arcs (docs/theory/scenes.md, V20). Rows stand
+on both sides of every such damping, so that what they tell holds between them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from zwidth.arrays.roots import false_position
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.curve import CrossingLine, CurvePoints, curve_at, zeros_of
-from zwidth.loops.linear.rows import Island, StablePieces, bound_intervals
+from zwidth.loops.linear.curve import curve_at, zeros_of
+from zwidth.loops.linear.rows import Island, bound_intervals, reaches_down
 from zwidth.words.errors import InputError
 from zwidth.words.showing import shown
 
-# The place where an edge ends is told to the last digit by so many rounds over so many places.
-_ROUNDS = 11
-# Steps towards a corner at most, and the one, as a share of w, after which it is reached; how far beside it the edge
-# must be seen to end.
-_STEPS, _ARRIVED, _BESIDE = 20, 1e-15, 1e-11
-_SHARES = np.arange(1, 32) / 32.0
-# How often rows are looked at beside the ends of edges, and how far beside, as a share of what these span; edges of few
-# nodes get so many.
-_LOOKS, _BESIDE_ENDS, _FEW, _FILLED = 4, 1e-6, 5, 33
 # A curve whose dampings differ by less, as a share, is none.
 _ONE_DAMPING = 1e-12
-# How far beyond the corners a straight edge is looked for.
-_BEYOND = 0.05
-# Lines whose slopes differ by less, as a share, do not meet.
-_PARALLEL = 1e-12
-# Corners that differ by less, as a share, are one.
-_SAME = 1e-12
+# Rows across the whole of the plane, and how far beyond the edge that nodes show the first and the last one are.
+_ACROSS, _BEYOND = 65, 0.05
+# Rows beside a damping at which columns meet, as shares of the way between the rows that enclosed it.
+# The nearest two enclose it.
+_BESIDE, _CLOSE = np.array([-1e-3, -1e-7, 1e-7, 1e-3]), 3e-7
+# How often rows are added, and steps towards a corner, which is told to such a share of its damping.
+_ROUNDS, _STEPS, _TOLD = 60, 60, 1e-13
+# Edges of few nodes get so many points.
+_FEW, _FILLED = 5, 33
+# So near to an edge, as a share of its damping, a row is on it.
+_NEAR = 1e-9
 
 
 class Edge(NamedTuple):
-    """One part of the edge of the stable set, end to end."""
+    """A part of one column along which stable intervals end, in ascending damping, from meeting to meeting."""
 
-    w: np.ndarray
+    column: int
+    piece: int
+    rows: slice  # those that it ends intervals of
+    meetings: tuple[int, int]  # the numbers of the first and of the last one
+    w: np.ndarray  # NaN at both ends
     alpha: np.ndarray
     beta: np.ndarray
-    line: int  # which of the boundary's lines, or -1 for the curve
 
-    @property
-    def is_point(self) -> bool:
-        """Whether its walls differ by rounding, as those of a hardly sprung device's slowest angles do."""
-        least = _SAME * np.max(np.abs(self.alpha) + np.abs(self.beta))
-        return bool(np.ptp(self.alpha) <= least and np.ptp(self.beta) <= least)
+
+class _Rows(NamedTuple):
+    """Rows in ascending order, and of each column the stable interval that it ends: (rows, columns), NaN for none."""
+
+    beta: np.ndarray
+    alpha: np.ndarray
+    w: np.ndarray
+    upper: np.ndarray  # of the lower end of an interval the column of the upper one, else -1
+
+
+class _Meetings(NamedTuple):
+    """Where two columns cease to end intervals together, or begin to: between which rows, and the wall there."""
+
+    gap: np.ndarray  # the number of the row above
+    columns: np.ndarray  # (meetings, 2)
+    walls: np.ndarray  # (meetings, 2), alpha and beta
+    known: np.ndarray  # whether that is a wall at which they meet, or one between the rows
 
 
 @dataclass(frozen=True)
@@ -56,226 +72,213 @@ class Border:
     boundary: Boundary
 
     @cached_property
-    def curved(self) -> list[Edge]:
-        """The edges on the curve of complex pairs."""
-        # A resonance may sweep past the stable set between two nodes: beside the ends of the edges that these show,
-        # rows tell what else bounds it.
-        w = self.boundary.w
-        beta = curve_at(self.boundary.loop, w).beta
+    def _nodes(self) -> np.ndarray:
+        """Angles, alpha and beta at the nodes of the curve, the extremes of alpha among them."""
+        w = np.union1d(self.boundary.w, self.boundary.tops)
+        return np.stack([w, *curve_at(self.boundary.loop, w)[:2]])
+
+    def _first_rows(self) -> np.ndarray:
+        """Rows on both sides of where nodes of the curve cease to be on the edge, and across the set."""
+        b, (w, _, beta) = self.boundary, self._nodes
+        own, held = b.arc_at(w), b.borders(w)
         if np.ptp(beta) <= _ONE_DAMPING * np.abs(beta).max():
             raise InputError(
                 "device: the pole pairs of a system of first order, not late and behind the difference of two samples, "
                 "are all at one damping, which is no curve; give the lag of its amplifier or its delay"
             )
-        edges, filled = self._edges_among(w), []
-        for _ in range(_LOOKS):
-            more = self._find_missed(edges, filled)
-            if not more.size:
-                break
-            w = np.union1d(w, more)
-            edges = self._edges_among(w)
-        return edges
+        parted = np.pad((held[1:] != held[:-1]) | (held[1:] & (own[1:] != own[:-1])), 1, constant_values=True)
+        near = beta[parted[1:] | parted[:-1]]
+        set_at = beta[held] if held.any() else np.array([arc.beta[[0, -1]] for arc in b.arcs]).ravel()
+        set_at = set_at[np.isfinite(set_at)]
+        if not set_at.size:
+            return set_at
+        room = _BEYOND * (np.ptp(set_at) + abs(set_at[0]) + 1e-300)
+        across = np.linspace(set_at.min() - room, set_at.max() + room, _ACROSS)
+        # Nodes that are not on the edge may be next to where the curve runs to infinity.
+        return np.union1d(across, near[(near > across[0]) & (near < across[-1])])
 
-    def _edges_among(self, w: np.ndarray) -> list[Edge]:
-        """The edges that nodes show."""
+    def _look(self, beta: np.ndarray) -> _Rows:
+        """The stable intervals of rows; of those alone whose crossings do not contradict each other."""
         b = self.boundary
-        here = curve_at(b.loop, w)
-        tops = zeros_of(b.loop, w, here.alpha_slope, "alpha_slope")
-        tops = tops[np.isfinite(curve_at(b.loop, tops).alpha)] if tops.size else tops
-        w = np.unique(np.concatenate([w, tops]))
-        piece = np.searchsorted(b.infinite, w)
-        held = b.borders(w)
-        edges, runs = [], _runs(held, piece)
-        ends = self._ends(w, piece, np.array(runs, int).reshape(-1, 2))
-        for (start, stop), (first, last) in zip(runs, ends, strict=True):
-            at = np.unique(np.concatenate([[first], w[start : stop + 1], [last]]))
-            alpha, beta = curve_at(b.loop, at)[:2]
-            for k, end in ((0, 0.0), (-1, np.pi)):
-                if at[k] == end:
-                    alpha[k], beta[k] = b.limits[end]
-            edges.append(Edge(at, alpha, beta, -1))
-        return edges
-
-    def _find_missed(self, edges: list[Edge], filled: list[tuple[float, float]]) -> np.ndarray:
-        """Angles on edges that are not among these, and within those of few nodes, each time others than before."""
-        b = self.boundary
-        few = [edge.w for edge in edges if edge.w.size < _FEW and not edge.is_point]
-        # Next to z = 1 rounding may part an edge anew with each node: in a part of what was filled are nodes enough.
-        few = [w for w in few if not any(low <= w[0] and w[-1] <= high for low, high in filled)]
-        filled += [(w[0], w[-1]) for w in few]
-        within = [np.empty(0), *(np.linspace(w[0], w[-1], _FILLED)[1:-1] for w in few)]
-        # An undamped mode's angles may be too few for any of these nodes: beside the ends of arcs, then.
-        ends = np.sort(np.concatenate([part.beta[[0, -1]] for part in edges or b.arcs]))
-        ends = ends[np.isfinite(ends)]
-        if not ends.size:
-            return np.empty(0)
-        beside = _BESIDE_ENDS * (np.ptp(ends) or np.abs(ends).max())
-        # Most ends are those of two edges.
-        ends = ends[np.diff(ends, prepend=-np.inf) > 0.1 * beside]
-        rows = (ends[:, None] + beside * np.array([-1.0, 1.0])).ravel()
-        found = bound_intervals(b, rows)
-        for column, angles in ((found.below, found.w_below), (found.above, found.w_above)):
-            w = angles[(column >= 0) & (column < len(b.arcs))]
-            within.append(w[[not any(e.w[0] - _BESIDE <= at <= e.w[-1] + _BESIDE for e in edges) for at in w]])
-        return np.unique(np.concatenate(within))
-
-    def _ends(self, w: np.ndarray, piece: np.ndarray, runs: np.ndarray) -> np.ndarray:
-        """Where runs of nodes on the edge, by their first and last, end beyond these: (runs, 2)."""
-        b = self.boundary
-        ends, after = w[runs], runs + np.array([-1, 1])
-        for k, (end, last) in enumerate(((0.0, 0), (np.pi, w.size - 1))):
-            if np.all(np.isfinite(b.limits[end])):
-                ends[runs[:, k] == last, k] = end
-        within = (after >= 0) & (after < w.size)
-        after = np.where(within, after, runs)
-        # Towards an angle at which the curve runs to infinity it may leave the stable set before.
-        infinite = np.append(b.infinite, np.nan)[piece[runs] + np.array([-1, 0])]
-        beyond = np.where(piece[after] == piece[runs], w[after], infinite)
-        ends[within] = self._corners(ends[within], beyond[within])
-        return ends
-
-    def _corners(self, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
-        """Where the curve stops to be an edge between pairs of angles: another crossing of its row meets it there."""
-        b = self.boundary
-        inside, outside = self._narrow(inside, outside, 1)
-        ends = np.stack([inside, outside])
-        here = curve_at(b.loop, ends.ravel())
-        rows = b.crossings(here.beta)
-        gaps = (rows.alpha - here.alpha[:, None]).reshape(*ends.shape, rows.alpha.shape[1])
-        gaps[:, np.arange(inside.size), b.arc_at(inside)] = np.nan
-        meets = np.sign(gaps[0]) * np.sign(gaps[1]) == -1
-        k, other = np.flatnonzero(meets.sum(1) == 1), meets.argmax(1)
-        other, found = other[k], np.full(inside.size, np.nan)
-        both = np.stack([ends[:, k], rows.w.reshape(gaps.shape)[:, k, other]])
-        found[k] = w = self._meet(both, gaps[:, k, other], other)
-        beside = b.borders((w + _BESIDE * w * np.array([[-1.0], [1.0]])).ravel()).reshape(2, -1)
-        found[k[beside[0] == beside[1]]] = np.nan
-        left = np.flatnonzero(np.isnan(found))
-        found[left] = self._narrow(inside[left], outside[left], _ROUNDS)[0]
-        return found
-
-    def _narrow(self, inside: np.ndarray, outside: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
-        """Narrow the places at which the curve ceases to be an edge; many angles are looked at one time."""
-        for _ in range(rounds if inside.size else 0):
-            places = inside[:, None] + (outside - inside)[:, None] * np.pad(_SHARES, 1, constant_values=(0.0, 1.0))
-            places[:, -1] = outside
-            held = self.boundary.borders(places[:, 1:-1].ravel()).reshape(inside.size, -1)
-            first = np.argmin(np.pad(held, ((0, 0), (0, 1))), axis=1)[:, None]
-            inside, outside = (np.take_along_axis(places, first + step, 1)[:, 0] for step in (0, 1))
-        return inside, outside
-
-    def _meet(self, ends: np.ndarray, gaps: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Where the curve meets other crossings of its rows, by Newton's method."""
-        # ``ends`` (2, 2, meetings) has the angles of the curve and of the crossing between which they meet, ``gaps``
-        # how far their alphas are apart there.
-        b = self.boundary
-        numbers = np.array([*[(np.nan, np.nan)] * len(b.arcs), *((line.q, line.f) for line in b.lines)])
-        (q, f), straight = numbers[other].T, other >= len(b.arcs)
-        low, high = ends.min(1), ends.max(1)
-        w = ends[:, 0] + gaps[0] / (gaps[0] - gaps[1]) * (ends[:, 1] - ends[:, 0])
-        on = np.ones(other.size, bool)
-        for _ in range(_STEPS):
-            if not on.any():
-                break
-            at = CurvePoints(*(part.reshape(w.shape) for part in curve_at(b.loop, w.ravel())))
-            with np.errstate(all="ignore"):
-                beta_slope = at.turn / at.fall**2
-                along = (q - at.beta[0] * f - at.alpha[0]) / (at.alpha_slope[0] + f * beta_slope[0])
-                gap, apart = np.diff(at.alpha, axis=0), np.diff(at.beta, axis=0)
-                across = gap * beta_slope[::-1] - apart * at.alpha_slope[::-1]
-                across /= at.alpha_slope[0] * beta_slope[1] - at.alpha_slope[1] * beta_slope[0]
-                step = np.where(straight, np.stack([along, 0.0 * along]), across)
-            new = np.where(on, np.clip(w + step, low, high), w)
-            on &= np.abs(new[0] - w[0]) > _ARRIVED * new[0]
-            w = new
-        return w[0]
+        beta = beta[b.settle(beta)[1]]
+        found, shape = bound_intervals(b, beta), (beta.size, len(b.arcs) + len(b.lines))
+        rows = _Rows(beta, np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
+        row, k = np.nonzero((found.below >= 0) & (found.above >= 0))
+        below, above = found.below[row, k], found.above[row, k]
+        rows.upper[row, below] = above
+        for column, alpha, w in ((below, found.low, found.w_below), (above, found.high, found.w_above)):
+            rows.alpha[row, column], rows.w[row, column] = alpha[row, k], w[row, k]
+        return rows
 
     @cached_property
-    def pieces(self) -> StablePieces:
-        """The pieces that these edges enclose; what counts as soft is decided where edges pass alpha = 0."""
-        b = self.boundary
-        turns = np.array([(arc.first, arc.beta[np.argmin(arc.w)]) for arc in b.arcs]).reshape(-1, 2)
-        found = [np.array([beta for _, beta, _ in self.line_meetings])]
-        for edge in self.curved:
-            found.append(edge.beta[[0, -1]])
-            found.append(turns[(turns[:, 0] > edge.w[0]) & (turns[:, 0] < edge.w[-1]), 1])
-            k = np.flatnonzero((edge.alpha[1:] > 0) != (edge.alpha[:-1] > 0))
-            found.append(edge.beta[k])
-        corners = np.unique(np.concatenate(found))
-        zeros = np.array([line.q / line.f for line in b.lines if line.f != 0.0])
-        within = zeros[(zeros > corners.min(initial=np.inf)) & (zeros < corners.max(initial=-np.inf))]
-        corners = np.union1d(corners[np.isfinite(corners)], within)
-        apart = np.diff(corners, prepend=-np.inf) > _SAME * np.abs(corners)
-        return StablePieces(b, corners[apart])
+    def _found(self) -> tuple[_Rows, _Meetings]:
+        """Rows on both sides of all dampings at which columns meet, and the meetings."""
+        looked_at, corners = self._first_rows(), np.empty((0, 3))
+        rows = self._look(looked_at)
+        met = _pair_ends(rows, corners)
+        for _ in range(_ROUNDS):
+            left = np.flatnonzero(~met.known)
+            if not left.size:
+                break
+            new, more = self._enclose(rows, met, left)
+            new, corners = np.setdiff1d(new, looked_at), np.concatenate([corners, more])
+            looked_at = np.append(looked_at, new)
+            parts = [np.concatenate(both) for both in zip(rows, self._look(new), strict=True)]
+            order = np.unique(parts[0], return_index=True)[1]
+            rows = _Rows(*(part[order] for part in parts))
+            met = _pair_ends(rows, corners)
+            if not new.size:
+                break
+        return rows, met
 
-    def piece_of(self, edge: Edge) -> int:
-        """The piece that an edge borders, -1 where rows do not see it."""
-        b, k = self.boundary, edge.w.size // 2
-        if edge.line >= 0:
-            return self.pieces.piece_at(float(edge.beta.mean()), len(b.arcs) + edge.line)
-        return self.pieces.piece_at(float(edge.beta[k]), int(b.arc_at(edge.w[k])))
+    def _enclose(self, rows: _Rows, met: _Meetings, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows next to where columns meet, and the walls there as far as they are told: as `_pair_ends` takes them."""
+        b, columns, beta = self.boundary, met.columns[left], rows.beta
+        # The set may go on beyond the first row, or the last one.
+        size = np.ptp(beta[np.isfinite(rows.alpha).any(1)]) + np.spacing(np.abs(beta).max())
+        low, high = np.concatenate([[beta[0] - size], beta, [beta[-1] + size]])[met.gap[left] + np.array([[0], [1]])]
+        # An arc ends; or two columns cross; else the rows are halved.
+        ends = np.moveaxis(b.ends[..., columns], -1, 1).reshape(2, -1, left.size)
+        inside = (ends[1] > low) & (ends[1] < high)
+        alpha, at = np.where(inside.any(0), ends[:, inside.argmax(0), np.arange(left.size)], np.nan)
+        first, last = self._gaps(np.tile(columns, (2, 1)), np.concatenate([low, high])).reshape(2, -1)
+        k = np.flatnonzero(np.isnan(at) & (np.sign(first) * np.sign(last) == -1))
+        if k.size:
+            first, last = first[k], last[k]
+            scale = np.sign(first) / (np.abs(first) + np.abs(last))
+            width = _TOLD * np.maximum(np.abs(low[k]), np.abs(high[k]))
+            ends = low[k], high[k], first * scale, last * scale
+            at[k] = false_position(lambda at: scale * self._gaps(columns[k], at), *ends, _STEPS, width)
+            alpha[k] = b.cross(columns[k, 0], at[k])
+        told = np.isfinite(at) & np.isfinite(alpha)
+        new = np.concatenate([[0.5 * (low + high)], at + (high - low) * _BESIDE[:, None]])
+        return np.unique(new[(new > low) & (new < high)]), np.stack([alpha, at, _CLOSE * (high - low)], -1)[told]
+
+    def _gaps(self, columns: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """How far two columns are apart in each row; NaN where one does not meet it."""
+        return np.subtract(*self.boundary.cross(columns.T.ravel(), np.tile(beta, 2)).reshape(2, -1))
+
+    @cached_property
+    def edges(self) -> list[Edge]:
+        """All of it, and the piece that each edge bounds."""
+        (rows, met), edges = self._found, []
+        held = np.pad(np.isfinite(rows.alpha.T), ((0, 0), (1, 1)))
+        begins, ends = held[:, 1:-1] & ~held[:, :-2], held[:, 1:-1] & ~held[:, 2:]
+        # Edges that one interval of a row is between bound one piece.
+        number = np.cumsum(begins).reshape(begins.shape).T - 1
+        row, below = np.nonzero(rows.upper >= 0)
+        pieces = _join(np.stack([number[row, below], number[row, rows.upper[row, below]]]), int(begins.sum()))
+        numbers = {(gap, column): k for k, gap in enumerate(met.gap.tolist()) for column in met.columns[k].tolist()}
+        (columns, firsts), (_, lasts) = np.nonzero(begins), np.nonzero(ends)
+        for piece, column, first, last in np.stack([pieces, columns, firsts, lasts], 1).tolist():
+            own = numbers[first, column], numbers[last + 1, column]
+            path = self._trace(column, rows.w[[first, last], column], met.walls[list(own)])
+            edges.append(Edge(column, piece, slice(first, last + 1), own, *path))
+        return edges
+
+    def _trace(self, column: int, within: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Angles, alpha and beta along a column from one wall to another, of few nodes with more of two angles."""
+        b, path = self.boundary, np.empty((3, 0))
+        if column < len(b.arcs):
+            path = self._nodes[:, b.arc_at(self._nodes[0]) == column]
+            path = path[:, (path[2] > ends[0, 1]) & (path[2] < ends[1, 1])]
+            if path.shape[1] < _FEW:
+                more = np.linspace(within.min(), within.max(), _FILLED)
+                tops = zeros_of(b.loop, more, curve_at(b.loop, more).alpha_slope, "alpha_slope")
+                w = np.unique(np.concatenate([path[0], more[1:-1], tops]))
+                path = np.stack([w, *curve_at(b.loop, w)[:2]])
+            path = path if b.arcs[column].w[0] < b.arcs[column].w[-1] else path[:, ::-1]
+        return np.insert(path, [0, path.shape[1]], np.insert(ends.T, 0, np.nan, 0), 1)
+
+    @cached_property
+    def main(self) -> frozenset[int]:
+        """The pieces that contain soft walls, as sets do, too, that narrow towards K = 0."""
+        ends: dict[int, list[float]] = {}
+        for edge in self.edges:
+            ends.setdefault(edge.piece, []).extend([edge.alpha.min(), edge.alpha.max()])
+        return frozenset(piece for piece, both in ends.items() if reaches_down(np.min(both), np.max(both)))
+
+    def holds_softly(self, alpha: float, beta: float) -> bool:
+        """Whether a wall is stable in a piece with soft walls."""
+        found = bound_intervals(self.boundary, np.array([beta]))
+        column = found.above[0, (found.low[0] < alpha) & (alpha < found.high[0])]
+        beside = [
+            (max(edge.beta[0] - beta, beta - edge.beta[-1]), edge.piece) for edge in self.edges if edge.column in column
+        ]
+        away, piece = min(beside, default=(np.inf, -1))
+        return away <= _NEAR * abs(beta) and piece in self.main
+
+    def find_highest(self, least: float) -> float:
+        """Up to which alpha rows with that much damping or more are stable in pieces with soft walls; else -inf."""
+        rows, highest = self._found[0], -np.inf
+        for edge in self.edges:
+            counts = (rows.beta[edge.rows] >= least) & (edge.piece in self.main)
+            highest = np.max(rows.alpha[edge.rows, edge.column], where=counts, initial=highest)
+        return float(highest)
 
     def islands(self, least: float) -> list[Island]:
         """The pieces without soft walls, with walls of alpha > 0 and beta > ``least``, the stiffest first."""
-        extents = self.pieces.extents()
-        for edge in (*self.curved, *self.straight) if extents else ():
-            piece = self.piece_of(edge)
-            if piece in extents:
-                walls = np.stack([edge.alpha, edge.beta])
-                low, high = extents[piece]
-                extents[piece] = np.minimum(low, walls.min(1)), np.maximum(high, walls.max(1))
-        ends = [np.stack(extent, 1) for extent in extents.values()]
-        found = [Island(*(tuple(pair.tolist()) for pair in both)) for both in ends]
+        found = []
+        for piece in {edge.piece for edge in self.edges} - self.main:
+            walls = np.concatenate([edge[-2:] for edge in self.edges if edge.piece == piece], 1)
+            found.append(Island(*(tuple(pair) for pair in np.stack([walls.min(1), walls.max(1)], 1).tolist())))
         found = [one for one in found if one.stiffness[1] > 0 and one.virtual_damping[1] > least]
         return sorted(found, key=lambda one: -one.stiffness[1])
 
-    @cached_property
-    def straight(self) -> list[Edge]:
-        """The edges on which a real pole, or a pair at one frequency, is on the circle."""
-        # They end where an edge of the curve does, where two lines meet, or where the curve meets the line.
-        lines = self.boundary.lines
-        crossed = [beta for k, line in enumerate(lines) for beta in _meetings(lines[:k], line)]
-        betas = np.concatenate([*(edge.beta for edge in self.curved), crossed, [0.0] if not self.curved else []])
-        size = np.ptp(betas) + 1e-300
-        first, last = betas.min() - _BEYOND * size, betas.max() + _BEYOND * size
-        ends = np.concatenate([*(edge.beta[[0, -1]] for edge in self.curved), crossed, [m.meeting for m in lines]])
-        ends = np.unique(ends[(ends > first) & (ends < last)])
-        ends = np.concatenate([[first], ends[np.diff(ends, prepend=first) > _SAME * size], [last]])
-        edges = []
-        for place, line in enumerate(lines):
-            held = self.boundary.line_borders(place, 0.5 * (ends[1:] + ends[:-1]))
-            for start, stop in _runs(held, 0 * held):
-                both = ends[[start, stop + 1]]
-                edges.append(Edge(np.full(2, line.w), line.q - both * line.f, both, place))
-        return edges
-
-    @cached_property
-    def line_meetings(self) -> list[tuple[float, float, int]]:
-        """Corners of two lines, alpha, beta and the second line: all other highest points are on the curve."""
-        b = self.boundary
-        found = []
-        for place, line in enumerate(b.lines):
-            for beta in _meetings(b.lines[:place], line):
-                near = beta + 1e-9 * (1.0 + abs(beta)) * np.array([-1.0, 1.0])
-                if b.line_borders(place, near).any():
-                    found.append((float(line.q - beta * line.f), float(beta), place))
-        return found
+    def outlines(self) -> list[Outline]:
+        """All edges as closed outlines, the largest first."""
+        joined: dict[int, list[tuple[int, int]]] = {}
+        for k, edge in enumerate(self.edges):
+            for end, meeting in enumerate(edge.meetings):
+                joined.setdefault(meeting, []).append((k, end))
+        follow = {one: other for both in joined.values() for one, other in (both, both[::-1])}
+        found, left = [], dict.fromkeys(range(len(self.edges)))
+        while left:
+            at, path = (next(iter(left)), 0), []
+            piece = self.edges[at[0]].piece
+            while at[0] in left:
+                del left[at[0]]
+                walls = np.stack(self.edges[at[0]][-2:])
+                path.append((walls[:, ::-1] if at[1] else walls)[:, :-1])
+                at = follow[at[0], 1 - at[1]]
+            stiffness, damping = np.concatenate(path, 1)
+            found.append((piece, Outline(stiffness, damping, False, piece not in self.main)))
+        found.sort(key=lambda each: -each[1].area)
+        # What else bounds a piece than the largest of its outlines are holes.
+        outer = {piece: k for k, (piece, _) in reversed(list(enumerate(found)))}
+        return [outline._replace(hole=outer[piece] != k) for k, (piece, outline) in enumerate(found)]
 
 
-def _meetings(others: Sequence[CrossingLine], line: CrossingLine) -> list[float]:
-    """The dampings at which a line meets others that are not parallel to it."""
-    return [
-        (line.q - other.q) / (line.f - other.f)
-        for other in others
-        if abs(other.f - line.f) > _PARALLEL * (abs(other.f) + abs(line.f))
-    ]
+def _join(pairs: np.ndarray, count: int) -> np.ndarray:
+    """The least number that each of so many is joined to, directly or not, by pairs (2, pairs)."""
+    # A graph of SciPy's would take a third of a second to load.
+    least, before = np.arange(count), np.full(count, -1)
+    while not np.array_equal(least, before):
+        before = least.copy()
+        for one, other in (pairs, pairs[::-1]):
+            np.minimum.at(least, one, before[other])
+        least = least[least]
+    return least
 
 
-def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:
-    """First and last index of every run of true values within one piece."""
-    joined = held[1:] & held[:-1] & (piece[1:] == piece[:-1])
-    first, last = held & ~np.append(False, joined), held & ~np.append(joined, False)
-    return list(zip(np.flatnonzero(first).tolist(), np.flatnonzero(last).tolist(), strict=True))
+def _pair_ends(rows: _Rows, corners: np.ndarray) -> _Meetings:
+    """The meetings between rows, and as their walls the nearest of the corners that these enclose."""
+    # Of each corner (3,) alpha, beta, and how close to each other rows enclose it. Where an interval begins or ends, is
+    # parted, or changes a column, two columns do; in order of alpha they are pairs.
+    alpha = np.pad(rows.alpha, ((1, 1), (0, 0)), constant_values=np.nan)
+    held = np.isfinite(alpha)
+    gap, column = np.nonzero(held[1:] != held[:-1])
+    beside = np.where(held[gap, column], alpha[gap, column], alpha[gap + 1, column])
+    order = np.lexsort((beside, gap))
+    gap, columns, beside = gap[order][::2], column[order].reshape(-1, 2), beside[order].reshape(-1, 2).mean(1)
+    ends = np.concatenate([[-np.inf], rows.beta, [np.inf]])
+    low, high = ends[gap][:, None], ends[gap + 1][:, None]
+    inside = (corners[:, 1] > low) & (corners[:, 1] < high) & (high - low <= corners[:, 2])
+    walls, known = np.stack([beside, 0.5 * (ends[gap] + ends[gap + 1])], -1), np.asarray(inside.any(1))
+    for k in np.flatnonzero(known).tolist():
+        own = corners[inside[k]]
+        walls[k] = own[np.argmin(np.abs(own[:, 0] - beside[k])), :2]
+    return _Meetings(gap, columns, walls, known)
 
 
 @shown()
@@ -292,42 +295,3 @@ class Outline(NamedTuple):
         """Inside, of the polygon."""
         x, y = self.stiffness, self.virtual_damping
         return 0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y)))
-
-
-def outlines(border: Border) -> list[Outline]:
-    """Join the edges to closed outlines, the largest first."""
-    edges = [*border.curved, *border.straight]
-    if not edges:
-        return []
-    scale = np.array([max(np.ptp(np.concatenate([e[k] for e in edges])), 1e-300) for k in (1, 2)])
-    paths = [np.stack([e.alpha, e.beta], -1) for e in edges]
-    main = [border.pieces.is_main(border.piece_of(edge)) for edge in edges]
-    loops = []
-    while paths:
-        path, soft = paths.pop(), main.pop()
-        while True:
-            gaps = [
-                (float(np.abs((path[-1] - other[end]) / scale).max()), k, end)
-                for k, other in enumerate(paths)
-                for end in (0, -1)
-            ]
-            closing = float(np.abs((path[-1] - path[0]) / scale).max())
-            if not gaps or (path.shape[0] > 2 and closing <= min(min(gaps)[0], 1e-3)):
-                break
-            gap, k, end = min(gaps)
-            if gap > 1e-3:
-                break
-            other, soft = paths.pop(k), soft | main.pop(k)
-            path = np.concatenate([path, (other if end == 0 else other[::-1])[1:]])
-        loops.append((path, soft))
-    found = [Outline(path[:, 0], path[:, 1], False, not soft) for path, soft in loops]
-    found.sort(key=lambda outline: -outline.area)
-    return [o._replace(hole=_inside(found, k) % 2 == 1) for k, o in enumerate(found)]
-
-
-def _inside(found: list[Outline], k: int) -> int:
-    """How many of the larger outlines an outline lies in."""
-    from matplotlib.path import Path
-
-    point = found[k].stiffness[0], found[k].virtual_damping[0]
-    return sum(bool(Path(np.stack([o.stiffness, o.virtual_damping], -1)).contains_point(point)) for o in found[:k])

@@ -94,6 +94,28 @@ class Boundary:
             out.leaving[:, place] = line.leaving(beta)
         return out
 
+    def cross(self, column: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """The alpha at which rows cross one column of `crossings` each: shape (rows,), NaN where one does not."""
+        steps, alpha = self._steps, np.full(beta.shape, np.nan)
+        for place, line in enumerate(self.lines, len(self.arcs)):
+            alpha = np.where(column == place, line.q - beta * line.f, alpha)
+        row = np.flatnonzero(column < len(self.arcs))
+        low, high = steps.ends[:, column[row]]
+        row = row[(beta[row] >= low) & (beta[row] < high)]
+        k = steps.find(column[row], np.searchsorted(steps.dampings, beta[row]))
+        alpha[row] = self._solve(beta[row], column[row], k)[1]
+        return alpha
+
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """The walls at both ends of each column of `crossings`: (alpha and beta, 2, columns), NaN where none is."""
+        w = np.array([arc.w[[0, -1]] for arc in self.arcs]).T
+        alpha = curve_at(self.loop, w.ravel()).alpha.reshape(w.shape)
+        for angle, (limit, _) in self.limits.items():
+            alpha[w == angle] = limit
+        walls = np.stack([alpha, self._steps.ends])
+        return np.pad(walls, ((0, 0), (0, 0), (0, len(self.lines))), constant_values=np.nan)
+
     def _solve(self, beta: np.ndarray, place: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The angle before node ``k`` of all arcs' at which each row crosses, and its alpha."""
         # Newton's method, inside a bracket, on ``Im(q - beta F)``, which rises with w where a pair leaves, over what
@@ -154,11 +176,15 @@ class Boundary:
         return np.searchsorted(self._steps.slowest, w, side="right") - 1
 
     @cached_property
+    def tops(self) -> np.ndarray:
+        """The angles at which alpha is extreme along the curve."""
+        tops = zeros_of(self.loop, self.w, curve_at(self.loop, self.w).alpha_slope, "alpha_slope")
+        return tops[np.isfinite(curve_at(self.loop, tops).alpha)]
+
+    @cached_property
     def heights(self) -> tuple[np.ndarray, np.ndarray]:
         """Angles between which alpha is monotone along the curve, and alpha there; NaN where it runs to infinity."""
-        slope = curve_at(self.loop, self.w).alpha_slope
-        tops = zeros_of(self.loop, self.w, slope, "alpha_slope")
-        nodes = np.unique(np.concatenate([self.w, tops]))
+        nodes = np.union1d(self.w, self.tops)
         pieces, heights = [], []
         for a, b in pairwise(sorted(self.limits)):
             inner = nodes[(nodes > a) & (nodes < b)]
@@ -239,12 +265,6 @@ class Boundary:
             held[part] = sound & (self.base + passed == np.where(self._steps.leaving[own[part]] > 0, 0, 2))
         return held
 
-    def line_borders(self, line: int, beta: np.ndarray) -> np.ndarray:
-        """Whether the stable set lies on one side of a line at each damping."""
-        at = self.lines[line]
-        passed, sound = self._passed(at.q - beta * at.f, beta, len(self.arcs) + line)
-        return sound & (self.base + passed == np.where(at.leaving(beta) > 0, 0, at.poles))
-
     @cached_property
     def base(self) -> int:
         """Poles outside far below every crossing (docs/theory/scenes.md, V14)."""
@@ -303,8 +323,11 @@ class _Steps(NamedTuple):
     def meet(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The arcs that rows meet, the rows, and before which of the nodes."""
         place, row = np.nonzero((beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None]))
-        k = np.searchsorted(self.keys, place * self.dampings.size + np.searchsorted(self.dampings, beta)[row])
-        return place, row, np.maximum(k, self.first[place] + 1)
+        return place, row, self.find(place, np.searchsorted(self.dampings, beta)[row])
+
+    def find(self, place: np.ndarray, among: np.ndarray) -> np.ndarray:
+        """The nodes of arcs before which rows meet them, by the rows' places among all dampings."""
+        return np.maximum(np.searchsorted(self.keys, place * self.dampings.size + among), self.first[place] + 1)
 
 
 class _Row(NamedTuple):

@@ -37,9 +37,8 @@ _MEETS, _NEAR = 1e-8, 1e-5
 _STEPS, _ARRIVED = 4, 1e-15
 # By what share rounding may make a row's wall stiffer.
 _ABOVE = 1e-7
-# Rows next to a top, as shares of the plane, that must reach nearly as high; and how many tops are looked at.
+# Rows next to a ridge, as shares of the plane, one of which must reach nearly as high.
 _BESIDE, _NEARLY = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3]), 0.99
-_MOST_TOPS = 32
 
 
 class Condition(IntEnum):
@@ -79,13 +78,14 @@ class BoundRidge(NamedTuple):
 def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     """The stiffest stable wall with alpha > 0 or None; ArithmeticError where the rows contradict what was found."""
     least = -np.inf if negative_damping else 0.0
-    tops = _tops(border, least) if border.curved else []
+    # Along the edge of a real pole that does not depend on B, corners differ by rounding: the most damping counts.
+    tops = sorted(_tops(border, least), key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta))
     # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
-    top = next((top for top in tops[:_MOST_TOPS] if _is_reached(border, top, least)), None)
-    if top is None and len(tops) > _MOST_TOPS:
-        raise ArithmeticError(f"none of the {_MOST_TOPS} highest of {len(tops)} tops holds")
+    top = next((top for top in tops if _is_reached(border, top, least)), None)
     found = None if top is None else _describe(border, top, least)
-    _refuse_stiffer(border, 0.0 if found is None else found.alpha, least)
+    highest = border.find_highest(least)
+    if highest > (0.0 if found is None else found.alpha) * (1.0 + _ABOVE):
+        raise ArithmeticError(f"rows reach {highest!r}, the ridge {found!r}")
     return found
 
 
@@ -95,31 +95,33 @@ class _Top(NamedTuple):
     alpha: float
     beta: float
     w: float
-    place: int
+    column: int
     inner: bool
 
 
-def _tops(border: Border, least: float) -> list[_Top]:
-    """Local maxima of the edges with beta of ``least`` or more, highest first."""
-    found, b = [], border.boundary
-    for edge in border.curved:
-        padded = np.concatenate([[-np.inf], np.where(edge.beta >= least, edge.alpha, -np.inf), [-np.inf]])
+def _tops(border: Border, least: float) -> Iterator[_Top]:
+    """Local maxima of the edges of pieces with soft walls, with beta of ``least`` or more."""
+    for edge in border.edges:
+        padded = np.pad(np.where(edge.beta >= least, edge.alpha, -np.inf), 1, constant_values=-np.inf)
         alpha, last = padded[1:-1], edge.w.size - 1
-        for k in np.flatnonzero((alpha >= padded[:-2]) & (alpha >= padded[2:]) & (alpha > 0)):
-            # An end may be that of an arc as well.
-            place = int(b.arc_at(edge.w[min(max(k, 1), max(last - 1, 0))]))
-            found.append(_Top(float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), place, bool(0 < k < last)))
-    # Straight edges end on the curve or on each other.
-    for alpha, beta, line in border.line_meetings:
-        if alpha > 0 and beta >= least:
-            found.append(_Top(alpha, beta, b.lines[line].w, len(b.arcs) + line, False))
+        high = (alpha >= padded[:-2]) & (alpha >= padded[2:]) & (alpha > 0) & (edge.piece in border.main)
+        for k in np.flatnonzero(high):
+            yield _Top(float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), edge.column, bool(0 < k < last))
     if np.isfinite(least):
         # The upper ends of the row's stable intervals.
-        row = bound_intervals(b, np.array([least]))
-        ends = zip(row.high[0].tolist(), row.w_above[0].tolist(), row.above[0].tolist(), strict=True)
-        found += [_Top(high, least, w, place, False) for high, w, place in ends if 0 < high < np.inf]
-    # Along the edge of a real pole that does not depend on B, corners differ by rounding: the most damping counts.
-    return sorted(found, key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta))
+        found = bound_intervals(border.boundary, np.array([least]))
+        for k in np.flatnonzero(found.high[0] > 0):
+            high = float(found.high[0, k])
+            if border.holds_softly(0.5 * (float(found.low[0, k]) + high), least):
+                yield _Top(high, least, float(found.w_above[0, k]), int(found.above[0, k]), False)
+
+
+def _is_reached(border: Border, top: _Top, least: float) -> bool:
+    """Whether a row next to a top is stable nearly up to it."""
+    size = float(np.ptp([edge.beta[[0, -1]] for edge in border.edges])) + abs(top.beta)
+    found = bound_intervals(border.boundary, np.maximum(top.beta + size * _BESIDE, least))
+    own = (found.above == top.column) | (found.below == top.column)
+    return bool(np.any(own & (found.high >= _NEARLY * top.alpha)))
 
 
 def _describe(border: Border, top: _Top, least: float) -> BoundRidge:
@@ -202,23 +204,6 @@ def _conditions(loop: LoopRoots, wall: BoundRidge) -> tuple[np.ndarray, list[int
 def _list_conditions(rest: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """The five parts of r and dr/dw, or of what moves them, at two angles."""
     return np.array([rest[0].real, rest[0].imag, rest[1].real, rest[1].imag, slope[0].imag])
-
-
-def _is_reached(border: Border, top: _Top, least: float) -> bool:
-    """Whether rows next to a top are stable nearly up to it, the nearest of them in a piece with soft walls."""
-    size = float(np.ptp(border.pieces.corners)) + abs(top.beta)
-    rows = np.maximum(top.beta + size * _BESIDE, least)
-    found = bound_intervals(border.boundary, rows)
-    own = (found.above == top.place) | (found.below == top.place)
-    reached = np.flatnonzero(np.any(own & (found.high >= _NEARLY * top.alpha), axis=1))
-    return any(border.pieces.is_main(border.pieces.piece_at(float(rows[k]), top.place)) for k in reached[:1])
-
-
-def _refuse_stiffer(border: Border, alpha: float, least: float) -> None:
-    """Refuse a ridge above which rows of its piece hold a stable wall."""
-    highest = border.pieces.find_highest(least)
-    if highest > alpha * (1.0 + _ABOVE):
-        raise ArithmeticError(f"rows reach {highest!r}, the ridge {alpha!r}")
 
 
 # The step of a difference, as a share of the parameter; its sixth power is rounding. And that of an imaginary step.

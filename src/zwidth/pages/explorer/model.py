@@ -33,17 +33,11 @@ _SHORTEST, _LONGEST = 30, 3000
 _IMPACT, _APPROACH = 0.1, 5.0
 
 
-def outlines(scene: Scene) -> list[Curve]:
-    """The closed outlines of the stable set, holes and islands among them, as `zwidth` finds them."""
-    outline, units = scene.loop.outline(), scene.units
-    if outline is not None:
-        return [(outline[0] * units.stiffness, outline[1] * units.virtual_damping)]
-    return [(piece.stiffness, piece.virtual_damping) for piece in scene.stable_region()]
-
-
 def show_outlines(scene: Scene) -> Update:
     """All outlines, closed, as one line and as one area, what lies within two of them being a hole; and islands."""
-    xs, ys = ([np.append(outline[axis], outline[axis][:1]) for outline in outlines(scene)] for axis in (0, 1))
+    pieces = scene.stable_region()
+    lines = [piece.stiffness for piece in pieces], [piece.virtual_damping for piece in pieces]
+    xs, ys = ([np.append(line, line[:1]) for line in each] for each in lines)
     x, y = (np.concatenate([np.append(ring, np.nan) for ring in rings] or [np.empty(0)]) for rings in (xs, ys))
     return {"area": {"xs": [[xs]], "ys": [[ys]]}, "edge": {"x": x, "y": y}, "islands": name_islands(scene)}
 

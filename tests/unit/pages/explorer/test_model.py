@@ -33,8 +33,8 @@ def scene(request):
 def test_the_edge_of_a_rigid_device_is_its_boundary():
     scene = Controls().scene
     region = zwidth.stable_region(scene.delta, scene.d)
-    (edge,), units = model.outlines(scene), scene.units
-    np.testing.assert_array_equal(edge, (region.alpha * units.stiffness, region.beta * units.virtual_damping))
+    (edge,), units = scene.stable_region(), scene.units
+    np.testing.assert_array_equal(edge[:2], (region.alpha * units.stiffness, region.beta * units.virtual_damping))
     inner = (region.omega > 0) & (region.omega < np.pi)
     exact = scene.boundary(region.omega[inner] / scene.timing.period)
     np.testing.assert_allclose(edge[0][inner], exact.stiffness, rtol=RIDGE.float64, atol=1e-9 * exact.stiffness.max())
@@ -102,7 +102,7 @@ def test_the_ridge_path_goes_through_the_stiffest_wall():
 
 
 def test_contours_are_where_they_say(scene):
-    across, up = model.frame(model.outlines(scene)[0], (10e3, 40.0))
+    across, up = model.frame(scene.stable_region()[0][:2], (10e3, 40.0))
     found = model.contours(scene, across, up)
     levels = {}
     for x, y in zip(found["xs"], found["ys"], strict=True):
@@ -122,13 +122,13 @@ def test_contours_are_where_they_say(scene):
 
 
 def test_the_frame_holds_the_edge_and_the_wall():
-    (edge,) = model.outlines(Controls().scene)
+    (edge,) = Controls().scene.stable_region()
     for wall in ((0.0, 0.0), (30e3, 150.0), (-9e3, 40.0)):
-        across, up = model.frame(edge, wall)
+        across, up = model.frame(edge[:2], wall)
         assert across[0] <= min(edge[0].min(), wall[0]) < max(edge[0].max(), wall[0]) <= across[1]
         assert up[0] <= min(edge[1].min(), wall[1]) < max(edge[1].max(), wall[1]) <= up[1]
     # What is far away does not make the set a dot.
-    assert model.frame(edge, (1e9, 40.0)) == model.frame(edge, (10e3, 40.0))
+    assert model.frame(edge[:2], (1e9, 40.0)) == model.frame(edge[:2], (10e3, 40.0))
     nothing = np.empty(0), np.empty(0)
     assert all(low < high for low, high in model.frame(nothing, (0.0, 0.0)))
 

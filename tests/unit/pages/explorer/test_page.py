@@ -12,7 +12,6 @@ from open_pages import open_page, say
 
 import zwidth
 from zwidth.cli.commands import cli
-from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls, read_controls, read_link
 
 
@@ -24,7 +23,7 @@ def page():
 def test_a_drag_shows_edge_wall_poles_and_verdict_alone(page):
     say(page, serial=1, set={"damping": 20})
     scene = Controls().change({"damping": 20}).scene
-    (edge,) = model.outlines(scene)
+    (edge,) = scene.stable_region()
     closed = [*edge[0], edge[0][0], np.nan]
     np.testing.assert_array_equal(page.sources["edge"].data["x"], closed)
     assert page.sources["wall"].data == {"x": [10e3], "y": [40.0]}
