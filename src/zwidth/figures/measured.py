@@ -184,10 +184,11 @@ def _mark_walls(
     for kind, mark, words in (("stiffest", "stiffest", "stiffest wall"), ("set", "recommended", "wall to set")):
         found, *values = kinds[kind]
         for fit, K, B in zip(found["fitted_to"], *values, strict=True):
-            mark_wall(ax, (K, B), kind, kind=mark, color=colors[fit])
+            color = colors.get(fit, style.BLACK)
+            mark_wall(ax, (K, B), kind, kind=mark, color=color)
             # With four digits and K rounded down the wall holds as it is read.
             numbers = f"$K = {round_safely(K, 'below'):.4g}$ {stiffness[1]}, $B = {B:.4g}$ {damping[1]}"
-            handles.append(style.line(f"{words}: {numbers}", "", color=colors[fit], **MARKS[mark]))
+            handles.append(style.line(f"{words}: {numbers}", "", color=color, **MARKS[mark]))
     if not kinds["set"][1].size:
         handles.append(style.line("no wall to set: a doubt, or none holds", ""))
     found, K, B = kinds["buzzing"]
