@@ -28,6 +28,8 @@ from zwidth.words.xp import frozen, namespace, repeat
 
 # Continuous zeros slower than this a period lead to sampled ones; Aberth's steps at most, and the last one's share.
 _SLOW, _MOST_STEPS, _ARRIVED = 0.1, 30, 1e-13
+# Zeros so near to z = 0 are taken together where G by its roots differs by more from G by its matrices, at one angle.
+_FORGOTTEN, _AGREES, _LOOK = 1e-2, 1e-11, 0.5
 # The inverse of how far a zero is at most that is kept.
 _FAR = 1e-17
 # Terms of a series; twice a rate that `Chain.check` allows is below 2^36.
@@ -138,9 +140,19 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     slow = slow[np.abs(slow) < _SLOW]
     zeros = np.roots(top).astype(complex)
     zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow
-    # Off the real line, which steps cannot leave: two real ones may have become a pair.
-    zeros *= 1.0 + 1e-6j * (1.0 - 2.0 * (np.arange(zeros.size) % 2))
-    return LoopRoots(float(top[0]), lag, -_polished_zeros(parts, zeros), poles, chain.estimate)
+    found = []
+    # What a period forgets leaves zeros next to z = 0, of which no determinant may tell one from another; of ``top``
+    # they are right together.
+    for moves in (np.full(zeros.shape, True), np.abs(1.0 + zeros) > _FORGOTTEN):
+        # Off the real line, which steps cannot leave: two real ones may have become a pair.
+        off = 1.0 + 1e-6j * (1.0 - 2.0 * (np.arange(zeros.size) % 2)) * moves
+        polished = -_polished_zeros(parts, zeros * off, moves)
+        loop = LoopRoots(float(top[0]), lag, polished, poles, chain.estimate)
+        error = np.abs(loop.required_wall(circle(_LOOK)).value / required_wall(chain, _LOOK, parts) - 1.0)
+        if error < _AGREES:
+            return loop
+        found.append((error, loop))
+    return min(found, key=lambda each: each[0])[1]
 
 
 def _numerator(parts: Sampled, push: np.ndarray, den: np.ndarray) -> np.ndarray:
@@ -152,7 +164,7 @@ def _numerator(parts: Sampled, push: np.ndarray, den: np.ndarray) -> np.ndarray:
     return np.convolve(den, markov)[: den.size - 1]
 
 
-def _polished_zeros(parts: Sampled, zeros: np.ndarray) -> np.ndarray:
+def _polished_zeros(parts: Sampled, zeros: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """Aberth's steps on the determinant of ``[[zeta - Psi, push], [C, 0]]``, where no pole cancels a zero."""
     size = parts.full.size
     at_rest = np.zeros((size + 1, size + 1))
@@ -163,7 +175,7 @@ def _polished_zeros(parts: Sampled, zeros: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
             slope = np.array([_relative_slope(at_rest + zeta * growing, growing) for zeta in zeros])
             step = step_apart(zeros, slope)
-        step = np.where(np.isfinite(step), step, 0.0)
+        step = np.where(np.isfinite(step) & moves, step, 0.0)
         zeros = zeros - step
         if np.all(np.abs(step) <= _ARRIVED * np.abs(zeros)):
             break
