@@ -132,15 +132,16 @@ class Boundary:
         found = np.where(last.ratio == 0, above, np.where(first.ratio == 0, below, _between(below, above, first, last)))
         alpha = np.where(last.ratio == 0, last.alpha, first.alpha)
         here = np.flatnonzero((first.ratio != 0) & (last.ratio != 0))
-        x = found[here]
-        for step in range(_MOST_STEPS if here.size else 0):
+        x, before = found[here], (above - below)[here]
+        for _ in range(_MOST_STEPS if here.size else 0):
             row = self._look(x).of_rows(beta[here])
             ahead = (row.ratio < 0) == rising[here]
             below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
             with np.errstate(all="ignore"):
                 move = -row.ratio / row.ratio_slope
             new = x + move
-            good = (new >= below[here]) & (new <= above[here]) & (step % 6 != 5)
+            # Steps that do not become half as short lead nowhere.
+            good = (new >= below[here]) & (new <= above[here]) & (np.abs(move) <= 0.5 * before)
             # Who has arrived at an end of the bracket may leave it by rounding.
             good |= np.abs(new - x) <= _ARRIVED * x
             new = np.where(good, np.clip(new, below[here], above[here]), 0.5 * (below[here] + above[here]))
@@ -151,7 +152,7 @@ class Boundary:
             on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
             if not on.any():
                 break
-            here, x = here[on], new[on]
+            here, x, before = here[on], new[on], np.abs(new - x)[on]
         return found, alpha
 
     def _look(self, w: np.ndarray) -> _LoopAngles:
@@ -365,11 +366,17 @@ class _LoopAngles(NamedTuple):
 
 @np.errstate(all="ignore")
 def _between(below: np.ndarray, above: np.ndarray, first: _Row, last: _Row) -> np.ndarray:
-    """Where a crossing between two angles is sought first: by the cubic of the inverse, or by the secant."""
+    """Where a crossing between two angles is sought first: by the cubic of the inverse, or by a parabola."""
     rise, far = last.ratio - first.ratio, above - below
     share = -first.ratio / rise
-    known = np.isfinite(first.ratio) & np.isfinite(last.ratio)
-    secant = np.where(known, np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9)), 0.5)
     bends = rise * (1.0 - share) / first.ratio_slope, rise * share / last.ratio_slope
     cubic = below + share * (share * (3.0 - 2.0 * share) * far + (1.0 - share) * (bends[0] - bends[1]))
-    return np.where((share > 0) & (share < 1) & (cubic > below) & (cubic < above), cubic, below + secant * far)
+    # Next to an end at which the arc turns, with the slope of the flatter end.
+    flat = np.abs(first.ratio_slope) < np.abs(last.ratio_slope)
+    start, slope = np.where(flat, first.ratio, last.ratio), np.where(flat, first.ratio_slope, -last.ratio_slope) * far
+    rise = np.where(flat, rise, -rise)
+    root = np.sqrt(np.maximum(slope * slope - 4.0 * (rise - slope) * start, 0.0))
+    away = -2.0 * start / (slope + np.where(rise < 0, -root, root))
+    away = np.clip(np.where(np.isfinite(away), away, 0.5), 1e-9, 1.0 - 1e-9) * far
+    parabola = np.where(flat, below + away, above - away)
+    return np.where((share > 0) & (share < 1) & (cubic > below) & (cubic < above), cubic, parabola)
