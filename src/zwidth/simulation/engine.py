@@ -18,7 +18,7 @@ import numpy as np
 
 from zwidth.simulation.flow import Flow
 from zwidth.simulation.lanes import Course, Given, Lanes, Options
-from zwidth.simulation.motion import BodyState, advance, dot, slide, times
+from zwidth.simulation.motion import BodyState, advance, dot, read, slide, times
 from zwidth.words.types import Array
 from zwidth.words.xp import known_options
 
@@ -47,10 +47,6 @@ class Reading(NamedTuple):
     touching: Array
 
 
-def _read(rows: Array, place: Array) -> Array:
-    return jax.lax.dynamic_index_in_dim(rows, place, keepdims=False, allow_negative_indices=False)
-
-
 def _write(rows: Array, row: Array, place: Array) -> Array:
     return jax.lax.dynamic_update_index_in_dim(rows, row, place, 0, allow_negative_indices=False)
 
@@ -60,7 +56,7 @@ def look_back(ring: Array, k: Array, back: Array) -> Array:
     """The entry of ``back`` samples ago in every lane."""
     place = (k - back) & (len(ring) - 1)
     if back.shape[-1] == 1:
-        return _read(ring, place[0])
+        return read(ring, place[0])
     return jnp.take_along_axis(ring, place[None], 0)[0]
 
 
@@ -97,7 +93,7 @@ def control(lanes: Lanes, options: Options, program: Program, k: Array, sensed: 
     wanted = jnp.where(touching, wanted, 0.0)
     wanted = jnp.where(lanes.pulling, wanted, jnp.minimum(wanted, 0.0))
     ring, motor = program.commands, lanes.motor
-    last = _read(ring, (k - 1) & (len(ring) - 1))
+    last = read(ring, (k - 1) & (len(ring) - 1))
     wanted = jnp.clip(wanted, -motor.max_force, motor.max_force)
     command = jnp.clip(wanted, last - motor.max_rate, last + motor.max_rate)
     commands = _write(ring, command, k & (len(ring) - 1))
@@ -128,13 +124,13 @@ def move(
     work: Array,
     force: Array,
     push: Array,
-    place: tuple[Array, int],
+    place: tuple[Array | int, Array | int],
     time: Array,
 ) -> tuple[BodyState, Array]:
     """The motion over one piece of a period, ``place`` its substep and its number, and what it costs."""
     none, at_once = 0.0 * body.x[0], lanes.rate.shape[1] == lanes.rate.shape[0] + 1
     forces = jnp.stack([force + push + none] if at_once else [force + none, push + none])
-    whole = None if options.jitter else Flow(*(part[:, *place] for part in lanes.pieces))
+    whole = None if options.jitter else Flow(*(read(read(part, place[0], 1), place[1], 1) for part in lanes.pieces))
     if options.friction:
         after, lost, rubbed = slide(lanes, body, forces, time, whole)
     elif whole is None:
@@ -248,27 +244,34 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     durations = given.durations if options.jitter else lanes.durations
     motion = lanes.motion[0]
 
-    def substep(carry: tuple[BodyState, Array], j: Array) -> tuple[tuple[BodyState, Array], Array | None]:
+    def substep(carry: tuple[BodyState, Array], j: Array | int) -> tuple[tuple[BodyState, Array], Array | None]:
         body, work = carry
-        frame = None
+        frame, lasting = None, read(durations, j)
         if options.record:
             # Of pieces that take no time the force is never felt.
             acting = forces[-1]
             for piece in reversed(range(options.pieces - 1)):
-                acting = jnp.where(durations[j, piece] > 0, forces[piece], acting)
+                acting = jnp.where(lasting[piece] > 0, forces[piece], acting)
             positions = [dot(row, body.x) for row in lanes.place]
             frame = jnp.stack([*positions, dot(motion, body.x), acting, body.slip, stored(lanes, body.x), *work])
 
         def one(carry: tuple[BodyState, Array], piece: Any) -> tuple[tuple[BodyState, Array], None]:
             number, force = piece
-            return move(lanes, options, *carry, force, given.push, (j, number), durations[j, number]), None
+            return move(lanes, options, *carry, force, given.push, (j, number), read(lasting, number)), None
 
         # What is long is compiled once, not once a piece.
-        pieces, short = (np.arange(options.pieces), jnp.stack(forces)), not (options.friction or options.jitter)
-        return jax.lax.scan(one, carry, pieces, unroll=short)[0], frame
+        if options.friction or options.jitter:
+            return jax.lax.scan(one, carry, (np.arange(options.pieces), jnp.stack(forces)))[0], frame
+        for piece in enumerate(forces):
+            carry, _ = one(carry, piece)
+        return carry, frame
 
-    start, steps, single = (state.body, state.work), np.arange(options.substeps), options.substeps == 1
-    (body, work), frames = jax.lax.scan(substep, start, steps, unroll=single)
+    carry = state.body, state.work
+    if options.substeps > 1:
+        (body, work), frames = jax.lax.scan(substep, carry, np.arange(options.substeps))
+    else:
+        (body, work), frame = substep(carry, 0)
+        frames = None if frame is None else frame[None]
     summary = _summarize(lanes, state, reading, body, work, given.k, ends, motion)
     rows = jnp.stack([sensed, *reading] if options.record else [sensed])
     return State(body, program, work, summary), (rows, frames)
@@ -289,8 +292,8 @@ def _summarize(
         known.exits + (state.program.touching & ~reading.touching),
         jnp.where(hits, v, known.impact),
         jnp.fmax(known.given, work[0]),
-        _write(known.far, jnp.fmax(_read(known.far, half), jnp.stack([-places, places])), half),
-        _write(known.turns, _read(known.turns, half) + turning, half),
+        _write(known.far, jnp.fmax(read(known.far, half), jnp.stack([-places, places])), half),
+        _write(known.turns, read(known.turns, half) + turning, half),
         jnp.where(turning & (half > 0), turned, known.turned),
     )
 
@@ -302,12 +305,12 @@ def compile_block(options: Options) -> Any:
 
     def block(lanes: Lanes, ends: Array, state: State, given: Inputs) -> tuple[State, Any]:
         size, bodies = state.work.shape[-1], len(lanes.place)
-        rows = jnp.zeros((BLOCK, 5 if options.record else 1, size))
-        frames = jnp.zeros((BLOCK, options.substeps, bodies + 8, size)) if options.record else None
+        rows = np.broadcast_to(0.0, (BLOCK, 5 if options.record else 1, size))
+        frames = np.broadcast_to(0.0, (BLOCK, options.substeps, bodies + 8, size)) if options.record else None
 
         def one(j: Array, carry: Any) -> Any:
             state, kept = carry
-            state, found = _period(lanes, options, ends, state, jax.tree.map(lambda part: _read(part, j), given))
+            state, found = _period(lanes, options, ends, state, jax.tree.map(lambda part: read(part, j), given))
             return state, jax.tree.map(lambda rows, row: _write(rows, row, j), kept, found)
 
         return jax.lax.fori_loop(0, jnp.minimum(BLOCK, ends[-1] - given.k[0]), one, (state, (rows, frames)))

@@ -33,6 +33,11 @@ class BodyState(NamedTuple):
     slip: Array
 
 
+def read(rows: Array, place: Array | int, axis: int = 0) -> Array:
+    """The row at a place that is no less than 0: any other index of JAX's costs some operations to compile."""
+    return jax.lax.dynamic_index_in_dim(rows, place, axis, keepdims=False, allow_negative_indices=False)
+
+
 def times(matrix: Array, vector: Array) -> Array:
     """A small matrix times a vector in every lane, as sums of products: no library call pays off for so little."""
     return jnp.stack([dot(row, vector) for row in matrix])
@@ -56,7 +61,7 @@ def advance(
     # Of the lanes ``which``, where these are not all that have digits.
 
     def pick(part: Array, k: Array) -> Array:
-        ways = [_take(way[k], which) for way in part]
+        ways = [_take(read(way, k), which) for way in part]
         return jnp.where(held, ways[1], ways[0]) if len(ways) > 1 else ways[0]
 
     def remain(state: tuple[Array, ...]) -> Array:
@@ -72,8 +77,8 @@ def advance(
         return k + 1, jnp.where(taken, after, x), jnp.where(taken, longer, time), lost
 
     # No digit longer than all of the time is taken.
-    first = jnp.floor(-jnp.log2(jnp.max(limit))).clip(0, DIGITS - 1).astype(int)
-    return jax.lax.while_loop(remain, step, (first, x, jnp.zeros_like(limit), jnp.zeros_like(limit)))[1:]
+    first = jnp.floor(-jnp.log(jnp.max(limit)) / np.log(2.0)).clip(0, DIGITS - 1).astype(int)
+    return jax.lax.while_loop(remain, step, (first, x, 0.0 * limit, 0.0 * limit))[1:]
 
 
 class _Slide(NamedTuple):
@@ -199,11 +204,12 @@ class _Joint(NamedTuple):
             """All of the way, then to where least remains, then to the event; by one program, for it is long."""
             side = self.find_side(x, trip.far)
             wanted = jnp.stack([self.dips(x, slip, trip.far, side), self.remains(trip.x, slip, side) < 0])
-            wanted = jnp.where(turn == 0, True, wanted[turn - 1])
+            # What the first turn reads counts for nothing.
+            wanted = (turn == 0) | read(wanted, turn - 1)
 
             def keep(after: Array) -> Array:
                 bounds = jnp.stack([self.rises(after, slip, side) < 0, self.remains(after, slip, side) >= 0])
-                return (turn == 0) | bounds[turn - 1]
+                return (turn == 0) | read(bounds, turn - 1)
 
             found = advance(digits, held, x, driven, jnp.where(wanted, trip.time, 0.0), keep, which)
             there, time, lost = (jnp.where(wanted, *each) for each in zip(found, trip[:3], strict=True))

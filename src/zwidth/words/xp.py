@@ -196,14 +196,15 @@ def known_options(*options: tuple[str, int]) -> dict[str, int]:
     """Those of XLA's options that the installed XLA knows: releases drop some, and one of them would stop every run."""
     import jax
 
-    def is_known(name: str, value: int) -> bool:
+    def are_known(wanted: dict[str, int]) -> bool:
         try:
-            jax.jit(abs, compiler_options={name: value}).lower(0.0).compile()
+            jax.jit(abs, compiler_options=wanted).lower(0.0).compile()
         except jax.errors.JaxRuntimeError:
             return False
         return True
 
-    return {name: value for name, value in options if is_known(name, value)}
+    # Most often all are.
+    return wanted if are_known(wanted := dict(options)) else {k: v for k, v in options if are_known({k: v})}
 
 
 def store_once(values: Values, witness: Array) -> Values:
