@@ -229,7 +229,8 @@ def step_response(
         StepResponse: ``time`` in periods; ``position``; ``velocity`` in position a period; ``wall_force``, what the
         wall applies then; all (periods * substeps,). ``final_position`` is force/alpha, NaN for alpha = 0.
         ``settling_time`` in periods is the last instant of all outside 2 % of it, however long was simulated: it comes
-        from the poles, see `loops.rigid.response`. NaN where the wall is not stable, and beyond d = 500.
+        from the poles, see `loops.rigid.response`. NaN where the wall is not stable, beyond d = 500, and of walls so
+        soft that they take some 10^7 periods to settle, at long delays some 10^5.
 
     Numerics:
         Exact between force changes up to rounding; float64, by NumPy. An unstable response that outgrows it ends as
