@@ -12,7 +12,6 @@ import numpy as np
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import CrossingLine, CurvePoints, curve_at, zeros_of
 from zwidth.loops.linear.rows import Island, StablePieces, bound_intervals
-from zwidth.words.errors import InputError
 from zwidth.words.showing import shown
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.
@@ -24,7 +23,7 @@ _SHARES = np.arange(1, 32) / 32.0
 # How often rows are looked at beside the ends of edges, and how far beside, as a share of what these span; edges of few
 # nodes get so many.
 _LOOKS, _BESIDE_ENDS, _FEW, _FILLED = 4, 1e-6, 5, 33
-# A curve whose dampings differ by less, as a share, is none.
+# What of |q| and |beta F| may be left of their difference where a curve has one damping.
 _ONE_DAMPING = 1e-12
 # How far beyond the corners a straight edge is looked for.
 _BEYOND = 0.05
@@ -61,12 +60,10 @@ class Border:
         # A resonance may sweep past the stable set between two nodes: beside the ends of the edges that these show,
         # rows tell what else bounds it.
         w = self.boundary.w
-        beta = curve_at(self.boundary.loop, w).beta
-        if np.ptp(beta) <= _ONE_DAMPING * np.abs(beta).max():
-            raise InputError(
-                "device: the pole pairs of a system of first order, not late and behind the difference of two samples, "
-                "are all at one damping, which is no curve; give the lag of its amplifier or its delay"
-            )
+        if self._upright.size:
+            ends = [self.boundary.limits[angle][0] for angle in (0.0, np.pi)]
+            alpha = np.concatenate([ends[:1], curve_at(self.boundary.loop, w).alpha, ends[1:]])
+            return [Edge(np.concatenate([[0.0], w, [np.pi]]), alpha, np.repeat(self._upright, alpha.size), -1)]
         edges, filled = self._edges_among(w), []
         for _ in range(_LOOKS):
             more = self._find_missed(edges, filled)
@@ -75,6 +72,13 @@ class Border:
             w = np.union1d(w, more)
             edges = self._edges_among(w)
         return edges
+
+    @cached_property
+    def _upright(self) -> np.ndarray:
+        """The one damping of all pole pairs, of a loop of two poles whose product has the damping alone in it; else none."""
+        here, damping = curve_at(self.boundary.loop, self.boundary.w), self.boundary.limits[0.0][1]
+        away = np.abs((here.beta - damping) * here.fall)
+        return np.repeat(damping, int(np.all(away <= _ONE_DAMPING * here.size)))
 
     def _edges_among(self, w: np.ndarray) -> list[Edge]:
         """The edges that nodes show."""
@@ -113,6 +117,8 @@ class Border:
         # Most ends are those of two edges.
         ends = ends[np.diff(ends, prepend=-np.inf) > 0.1 * beside]
         rows = (ends[:, None] + beside * np.array([-1.0, 1.0])).ravel()
+        # Soft walls without damping are stable on a device that comes to rest, however few angles its edge has.
+        rows = rows if edges else np.append(rows, 0.0)
         found = bound_intervals(b, rows)
         for column, angles in ((found.below, found.w_below), (found.above, found.w_above)):
             w = angles[(column >= 0) & (column < len(b.arcs))]
@@ -194,7 +200,8 @@ class Border:
     def pieces(self) -> StablePieces:
         """The pieces that these edges enclose; what counts as soft is decided where edges pass alpha = 0."""
         b = self.boundary
-        turns = np.array([(arc.first, arc.beta[np.argmin(arc.w)]) for arc in b.arcs]).reshape(-1, 2)
+        arcs = () if self._upright.size else b.arcs
+        turns = np.array([(arc.first, arc.beta[np.argmin(arc.w)]) for arc in arcs]).reshape(-1, 2)
         found = [np.array([beta for _, beta, _ in self.line_meetings])]
         for edge in self.curved:
             found.append(edge.beta[[0, -1]])
@@ -226,7 +233,9 @@ class Border:
                 extents[piece] = np.minimum(low, walls.min(1)), np.maximum(high, walls.max(1))
         ends = [np.stack(extent, 1) for extent in extents.values()]
         found = [Island(*(tuple(pair.tolist()) for pair in both)) for both in ends]
-        found = [one for one in found if one.stiffness[1] > 0 and one.virtual_damping[1] > least]
+        # Of one that ends at K = 0 rounding may leave a little above it.
+        found = [one for one in found if one.stiffness[1] > _SAME * np.ptp(one.stiffness)]
+        found = [one for one in found if one.virtual_damping[1] > least]
         return sorted(found, key=lambda one: -one.stiffness[1])
 
     @cached_property
@@ -251,11 +260,11 @@ class Border:
 
     @cached_property
     def line_meetings(self) -> list[tuple[float, float, int]]:
-        """Corners of two lines, alpha, beta and the second line: all other highest points are on the curve."""
+        """Corners of two lines, or of one and an upright curve: alpha, beta, a line; all other tops are on the curve."""
         b = self.boundary
         found = []
         for place, line in enumerate(b.lines):
-            for beta in _meetings(b.lines[:place], line):
+            for beta in [*_meetings(b.lines[:place], line), *self._upright]:
                 near = beta + 1e-9 * (1.0 + abs(beta)) * np.array([-1.0, 1.0])
                 if b.line_borders(place, near).any():
                     found.append((float(line.q - beta * line.f), float(beta), place))
