@@ -158,8 +158,20 @@ def _read(given: Any) -> RationalResponse:
             f"device: got a numerator of degree {top.degree()} over a denominator of degree {bottom.degree()}; a force "
             "must not move the position at once, so the denominator's must be higher: add the lag that is missing"
         )
-    first, second = (tuple(Fraction(int(c.p), int(c.q)) for c in reversed(part.coeffs())) for part in (top, bottom))
+    parts = (top, bottom, top.gcd(bottom))
+    first, second, common = (tuple(Fraction(int(c.p), int(c.q)) for c in reversed(part.coeffs())) for part in parts)
+    _refuse_stuck(find_roots(common), "z" if dt else "s")
     return RationalResponse(first, second, float(dt) if dt else None)
+
+
+def _refuse_stuck(roots: np.ndarray, letter: str) -> None:
+    """Refuse matrices with a mode that no wall moves and that does not come to rest."""
+    stuck = roots[(np.abs(roots) >= 1.0) if letter == "z" else (np.real(roots) >= 0.0)]
+    for root in stuck.tolist():
+        raise InputError(
+            f"device: a mode of {letter} = {root if root.imag else root.real:.4g} is not moved by the force, or not "
+            "seen in the position, so that with every wall it does not come to rest; leave it out of the matrices"
+        )
 
 
 def _read_form(given: Any, flint: Any) -> tuple[Any, Any]:
@@ -187,12 +199,17 @@ def _read_form(given: Any, flint: Any) -> tuple[Any, Any]:
             raise ValueError("a root without its conjugate")
         return found
 
+    def reduce(top: Any, bottom: Any) -> tuple[Any, Any]:
+        """Without common factors, as sums of responses have them: a response knows of no hidden motion."""
+        common = top.gcd(bottom) if top.degree() < bottom.degree() else 1
+        return top // common, bottom // common
+
     if len(given) == 2:
         top, bottom = (flint.fmpq_poly([exact(c) for c in np.ravel(part)[::-1]]) for part in given)
-        return top, bottom
+        return reduce(top, bottom)
     if np.ndim(given[0]) < 2:
         zeros, poles, gain = given
-        return expand(zeros) * exact(gain), expand(poles)
+        return reduce(expand(zeros) * exact(gain), expand(poles))
     A, B, C, *D = given
     size = len(A)
     if np.shape(A) != (size, size) or np.size(B) != size or np.size(C) != size or np.any(D):

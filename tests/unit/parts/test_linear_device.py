@@ -178,6 +178,43 @@ def test_a_sampled_system_belongs_to_its_period(change, words):
         scene.replace(**change).is_stable(1.0)
 
 
+@pytest.mark.parametrize("zeros", [[0.0, 0.0], [1.0, 1.0], [-1.0, 0.2 + 0.6j, 0.2 - 0.6j, 1.0]], ids=str)
+@pytest.mark.parametrize("gain", [1e-4, -1e-4])
+def test_a_sampled_system_with_zeros_at_rest_and_on_the_circle(zeros, gain):
+    # Its closed loop as a polynomial: spring alone, and with the difference of two samples.
+    poles = [0.9, 0.7, 0.5 + 0.2j, 0.5 - 0.2j, -0.3]
+    for whole in (0, 1):
+        scene = zwidth.Scene(
+            zwidth.LinearDevice(SIGNAL.dlti(zeros, poles, gain, dt=1e-3)), zwidth.Timing(1e-3, whole * 1e-3)
+        )
+        loop, top = np.poly(poles + [0.0] * (whole + 1)), gain * np.poly(zeros)
+
+        def radius(K: float, B: float, loop: Any = loop, top: Any = top) -> float:
+            return np.abs(np.roots(np.polyadd(loop, np.convolve(top, [K + B / 1e-3, -B / 1e-3])))).max()
+
+        for B in (0.0, 0.3, -0.3):
+            K = np.linspace(-2e4, 2e4, 81) + 17.0
+            radii = np.array([radius(stiffness, B) for stiffness in K])
+            np.testing.assert_array_equal(scene.is_stable(K, B), radii < 1.0)
+            np.testing.assert_allclose(scene.spectral_radius(K, B), radii, rtol=1e-9)
+            for end in scene.stable_stiffness(B)[0]:
+                assert radius(end, B) == pytest.approx(1.0, abs=1e-9)
+        wall = scene.max_stiffness(negative_damping=False)
+        # Of two poles that meet there roots know half the digits.
+        assert (wall.status, radius(*wall[:2])) == (zwidth.Status.OK, pytest.approx(1.0, abs=1e-7))
+
+
+def test_a_factor_of_numerator_and_denominator_is_not_there():
+    # As sums of two responses have it: each has an integrator.
+    both: Any = control.tf([1.0], [0.1, 10.0, 0.0]) + control.tf([1.0], [1.0, 200.0, 0.0])
+    assert zwidth.LinearDevice(both) == zwidth.LinearDevice(([1.1, 210.0], [0.1, 30.0, 2000.0, 0.0]))
+    assert zwidth.LinearDevice(SIGNAL.dlti([1.0], [1.0, 1.0, 0.5], 1e-5, dt=1e-3)).zeros.size == 0
+    # Matrices say that there is such a motion.
+    hidden = [[0.0, 1.0, 0.0], [0.0, -100.0, 0.0], [0.0, 0.0, 0.5]], [0.0, 10.0, 0.0], [1.0, 0.0, 0.0]
+    with pytest.raises(zwidth.InputError, match="a mode of s = 0.5 is not moved by the force"):
+        zwidth.LinearDevice(hidden)
+
+
 @pytest.mark.parametrize(
     "system, words",
     [

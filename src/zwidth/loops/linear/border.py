@@ -17,10 +17,9 @@ from zwidth.arrays.roots import false_position
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import curve_at, zeros_of
 from zwidth.loops.linear.rows import Island, bound_intervals, reaches_down
-from zwidth.words.errors import InputError
 from zwidth.words.showing import shown
 
-# A curve whose dampings differ by less, as a share, is none.
+# What of |q| and |beta F| may be left of their difference where a curve has one damping.
 _ONE_DAMPING = 1e-12
 # Rows across the whole of the plane, and how far beyond the edge that nodes show the first and the last one are.
 _ACROSS, _BEYOND = 65, 0.05
@@ -77,15 +76,17 @@ class Border:
         w = np.union1d(self.boundary.w, self.boundary.tops)
         return np.stack([w, *curve_at(self.boundary.loop, w)[:2]])
 
+    @cached_property
+    def _upright(self) -> float:
+        """The one damping of all pole pairs, of a loop of two poles whose product depends on it alone; else NaN."""
+        here, damping = curve_at(self.boundary.loop, self.boundary.w), self.boundary.limits[0.0][1]
+        away = np.abs((here.beta - damping) * here.fall)
+        return damping if np.all(away <= _ONE_DAMPING * here.size) else np.nan
+
     def _first_rows(self) -> np.ndarray:
         """Rows on both sides of where nodes of the curve cease to be on the edge, and across the set."""
         b, (w, _, beta) = self.boundary, self._nodes
         own, held = b.arc_at(w), b.borders(w)
-        if np.ptp(beta) <= _ONE_DAMPING * np.abs(beta).max():
-            raise InputError(
-                "device: the pole pairs of a system of first order, not late and behind the difference of two samples, "
-                "are all at one damping, which is no curve; give the lag of its amplifier or its delay"
-            )
         parted = np.pad((held[1:] != held[:-1]) | (held[1:] & (own[1:] != own[:-1])), 1, constant_values=True)
         near = beta[parted[1:] | parted[:-1]]
         set_at = beta[held] if held.any() else np.array([arc.beta[[0, -1]] for arc in b.arcs]).ravel()
@@ -94,6 +95,8 @@ class Border:
             return set_at
         room = _BEYOND * (np.ptp(set_at) + abs(set_at[0]) + 1e-300)
         across = np.linspace(set_at.min() - room, set_at.max() + room, _ACROSS)
+        # Soft walls without damping are stable on a device that comes to rest, however few angles its edge has.
+        across = across if held.any() else np.union1d(across, 0.0)
         # Nodes that are not on the edge may be next to where the curve runs to infinity.
         return np.union1d(across, near[(near > across[0]) & (near < across[-1])])
 
@@ -113,6 +116,11 @@ class Border:
     @cached_property
     def _found(self) -> tuple[_Rows, _Meetings]:
         """Rows on both sides of all dampings at which columns meet, and the meetings."""
+        if np.isfinite(self._upright):
+            one, other = self.boundary.lines
+            corner = (one.q - other.q) / (one.f - other.f)
+            rows = self._look(np.unique(corner + (self._upright - corner) * np.linspace(0.0, 1.0, _ACROSS + 1)[1:-1]))
+            return rows, _pair_ends(rows, np.array([[one.q - corner * one.f, corner, np.inf]]))
         looked_at, corners = self._first_rows(), np.empty((0, 3))
         rows = self._look(looked_at)
         met = _pair_ends(rows, corners)
@@ -162,6 +170,8 @@ class Border:
     def edges(self) -> list[Edge]:
         """All of it, and the piece that each edge bounds."""
         (rows, met), edges = self._found, []
+        if np.isfinite(self._upright):
+            return self._triangle if met.gap.size else []
         held = np.pad(np.isfinite(rows.alpha.T), ((0, 0), (1, 1)))
         begins, ends = held[:, 1:-1] & ~held[:, :-2], held[:, 1:-1] & ~held[:, 2:]
         # Edges that one interval of a row is between bound one piece.
@@ -175,6 +185,23 @@ class Border:
             path = self._trace(column, rows.w[[first, last], column], met.walls[list(own)])
             edges.append(Edge(column, piece, slice(first, last + 1), own, *path))
         return edges
+
+    @property
+    def _triangle(self) -> list[Edge]:
+        """The edges where all pole pairs are at one damping: two lines, and the curve upright between them."""
+        b, ends, edges = self.boundary, [], []
+        corner = next(wall[1] for wall in self._found[1].walls[self._found[1].known].tolist())
+        for k, line in enumerate(b.lines):
+            beta = np.sort([corner, self._upright])
+            ends.append((line.w, float(line.q - self._upright * line.f)))
+            meetings = (0, k + 1) if beta[0] == corner else (k + 1, 0)
+            own = slice(0, self._found[0].beta.size)
+            edges.append(Edge(len(b.arcs) + k, 0, own, meetings, np.full(2, np.nan), line.q - beta * line.f, beta))
+        (first, low), (_, high) = ends
+        w = b.w if first == 0.0 else b.w[::-1]
+        alpha = np.concatenate([[low], curve_at(b.loop, w).alpha, [high]])
+        w = np.concatenate([[np.nan], w, [np.nan]])
+        return [*edges, Edge(-1, 0, slice(0), (1, 2), w, alpha, np.full(w.size, self._upright))]
 
     def _trace(self, column: int, within: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Angles, alpha and beta along a column from one wall to another, of few nodes with more of two angles."""
@@ -222,7 +249,9 @@ class Border:
         for piece in {edge.piece for edge in self.edges} - self.main:
             walls = np.concatenate([edge[-2:] for edge in self.edges if edge.piece == piece], 1)
             found.append(Island(*(tuple(pair) for pair in np.stack([walls.min(1), walls.max(1)], 1).tolist())))
-        found = [one for one in found if one.stiffness[1] > 0 and one.virtual_damping[1] > least]
+        # Of one that ends at K = 0 rounding may leave a little above it.
+        found = [one for one in found if one.stiffness[1] > _NEAR * np.ptp(one.stiffness)]
+        found = [one for one in found if one.virtual_damping[1] > least]
         return sorted(found, key=lambda one: -one.stiffness[1])
 
     def outlines(self) -> list[Outline]:

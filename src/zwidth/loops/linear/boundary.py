@@ -10,7 +10,7 @@ with one number ``base`` for the whole plane: far below every crossing the zeros
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
@@ -37,6 +37,8 @@ _MOST_STEPS, _ARRIVED = 120, 1e-10
 _SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
 # How near to an angle where the curve has no point of its own it is looked at, as a share of the way to a node.
 _PROBE = 1e-6
+# A pole that leaves a zero on the circle along it, to such a share, goes where that way bends to.
+_ALONG = 1e-9
 # Pairs of rows and arcs that are looked at in one go: what they need stays in caches.
 _BLOCK = 1 << 17
 
@@ -280,9 +282,15 @@ class Boundary:
         """Where the wall's spring is all there is, the poles are at the device's zeros, the others at infinity."""
         loop = self.loop
         depth, on = depths(loop.zeros), are_on_circle(loop.zeros)
-        answer = loop.response(circle(np.abs(np.angle(1.0 - loop.zeros[on]))))
-        # Towards a zero on the circle: G(w) = -1/alpha, and |z| > 1 where Im w < 0.
-        leaving = int(np.sum(side * answer.slope.imag < 0))
+        leaving = 0
+        for zero, times in zip(*np.unique(loop.zeros[on], return_counts=True), strict=True):
+            # Next to such a zero G(w) = c x^times (1 + e x), x = w - w0, is -1/alpha, and |z| > 1 where Im x < 0.
+            at = circle(np.angle(1.0 - zero))
+            rest = replace(loop, zeros=loop.zeros[loop.zeros != zero]).response(at)
+            power = -side / (rest.value * (1j * at.z) ** times)
+            x = power ** (1.0 / times) * np.exp(2j * np.pi * np.arange(times) / times)
+            bend = -(rest.slope / rest.value + 0.5j * times) * x * x / times
+            leaving += int(np.sum(np.where(np.abs(x.imag) > _ALONG * np.abs(x), x.imag, bend.imag) < 0))
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
 
 

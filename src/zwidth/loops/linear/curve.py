@@ -53,7 +53,7 @@ def nodes_of(loop: LoopRoots) -> np.ndarray:
     """Angles from nearly 0 to nearly pi, so close that the loop hardly changes from one to the next."""
     roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
     sizes, far = np.abs(roots), np.abs(roots - 2.0)
-    turn = 1.0 / (abs(loop.lag) + loop.estimate.window + 1.0)
+    turn = 1.0 / (loop.lag + loop.estimate.window + 1.0)
     first = 1e-3 * min([turn, *sizes[sizes > 1e-13]])
     # Next to z = -1 imaginary parts x = pi - w have lost eps/x of themselves, and beta varies by (x/far)^2: closer than
     # this its slope is rounding.

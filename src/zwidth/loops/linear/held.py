@@ -113,10 +113,11 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     parts = sampled(chain)
     if isinstance(chain, System) and chain.sampled:
         zeros, poles = chain.device.offsets
-        # Roots at z = 0 are periods of delay.
-        lag = chain.whole + int(np.sum(poles == 1)) - int(np.sum(zeros == 1))
+        # Poles at z = 0 are periods of delay, which zeros there take away as far as there are any.
+        lag, still = chain.whole + int(np.sum(poles == 1)), int(np.sum(zeros == 1))
+        zeros = np.append(zeros[zeros != 1], np.ones(max(still - lag, 0)))
         gain = chain.device.gain * float(chain.mass) / float(chain.period) ** 2
-        return LoopRoots(gain, lag, zeros[zeros != 1], poles[poles != 1], chain.estimate)
+        return LoopRoots(gain, max(lag - still, 0), zeros, poles[poles != 1], chain.estimate)
     if isinstance(chain, System):
         held = chain.d != chain.whole
         gain, zeros = prove_zeros(chain.device, float(chain.period), (float(chain.d), chain.whole))

@@ -142,18 +142,18 @@ def _condition(w: float) -> Condition:
 def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     """The two conditions that meet at a corner."""
     # By Newton's method on rows: an edge's end is as far off, beside an undamped mode, as a digit of its angle tells.
-    (w, other), heights, slopes = _nearest_two(border.boundary, alpha, beta)
+    (w, other), heights, slopes, step = _nearest_two(border.boundary, alpha, beta)
     for _ in range(_STEPS):
-        step = (heights[1] - heights[0]) / ((slopes[0] - slopes[1]) or np.inf)
         if not _ARRIVED * abs(beta) < abs(step) <= _NEAR * abs(beta):
             break
         alpha, beta = heights[0] + slopes[0] * step, beta + step
-        (w, other), heights, slopes = _nearest_two(border.boundary, alpha, beta)
+        (w, other), heights, slopes, step = _nearest_two(border.boundary, alpha, beta)
     w, other = sorted((w, other))
     # Of the place in beta the flatter one makes the less of alpha.
     apart, missed = abs(slopes[0] - slopes[1]), abs(heights[1] - heights[0]) / abs(alpha)
     flat = min(1.0, min(map(abs, slopes)) / apart) if apart > 0 else 1.0
-    if missed <= _NEAR and flat * missed <= _MEETS and other - w > 1e-6:
+    size = float(np.ptp([edge.beta[[0, -1]] for edge in border.edges])) + abs(beta)
+    if abs(step) <= _NEAR * size and flat * missed <= _MEETS and other - w > 1e-6:
         return BoundRidge(alpha, beta, w, other, _condition(w), _condition(other))
     # A double pole at z = -1, or at z = 1 of a device that moves against its force: the curve ends on the line there.
     for w in (np.pi, 0.0):
@@ -163,8 +163,8 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
 
 
-def _nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[float], ...]:
-    """Angles of the two crossings of a row that are nearest to a wall, their alphas and the slopes of these in beta."""
+def _nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[float], list[float], list[float], float]:
+    """Angles of a row's two crossings nearest to a wall, their alphas, these' slopes in beta, and how far they meet."""
     found = b.crossings(np.array([beta]))
     away = np.abs(found.alpha[0] - alpha)
     near = np.resize(np.argsort(np.where(np.isnan(away), np.inf, away))[:2], 2)
@@ -173,7 +173,9 @@ def _nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[float], .
         slopes = here.alpha_slope * here.fall**2 / here.turn
     for k in np.flatnonzero(near >= len(b.arcs)):
         slopes[k] = -b.lines[near[k] - len(b.arcs)].f
-    return found.w[0, near].tolist(), found.alpha[0, near].tolist(), slopes.tolist()
+    heights = found.alpha[0, near]
+    step = (heights[1] - heights[0]) / ((slopes[0] - slopes[1]) or np.inf)
+    return found.w[0, near].tolist(), heights.tolist(), slopes.tolist(), float(step)
 
 
 def _conditions(loop: LoopRoots, wall: BoundRidge) -> tuple[np.ndarray, list[int]]:

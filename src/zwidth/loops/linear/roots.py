@@ -54,7 +54,7 @@ class LoopRoots:
         # A factor of a root on the circle changes its size there, not its argument: no need to look closer.
         floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(depths(roots)))
         near = (1.0 / np.maximum(far, floor)).sum(-1)
-        return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0
+        return near + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0
 
 
 def step_apart(roots: Array, rate: Array) -> Array:
@@ -83,8 +83,7 @@ def estimate_polynomials(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
 def affine_polynomial(loop: LoopRoots) -> Affine:
     """D, N1 and N2 of the closed loop."""
     top, bottom = estimate_polynomials(loop)
-    device = np.pad(_product(loop.poles), (0, max(loop.lag, 0)))
-    answer = np.pad(loop.gain * _product(loop.zeros), (0, max(-loop.lag, 0)))
+    device, answer = np.pad(_product(loop.poles), (0, loop.lag)), loop.gain * _product(loop.zeros)
     parts = [np.convolve(device, bottom), np.convolve(answer, bottom), np.convolve(answer, top)]
     length = max(part.size for part in parts)
     return Affine(*(np.pad(part, (length - part.size, 0)) for part in parts))
@@ -95,6 +94,6 @@ def closed_loop_roots(loop: LoopRoots, alpha: float, beta: float) -> tuple[np.nd
     f, (top, bottom) = loop.estimate, estimate_polynomials(loop)
     wall = np.trim_zeros(np.polyadd(alpha * bottom, beta * top), "f")
     lag = loop.lag + max(f.window + f.lag, 0)
-    zeros = np.concatenate([1.0 - loop.zeros, np.roots(wall), np.zeros(max(-lag, 0))])
+    zeros = np.concatenate([1.0 - loop.zeros, np.roots(wall)])
     poles = 1.0 - np.concatenate([loop.poles, f.poles])
-    return zeros, poles, loop.gain * float(wall[0] if wall.size else 0.0), max(lag, 0)
+    return zeros, poles, loop.gain * float(wall[0] if wall.size else 0.0), lag

@@ -11,6 +11,7 @@ from typing import Any
 import any_loop
 import numpy as np
 import pytest
+import scipy.signal
 from scipy import ndimage
 
 import zwidth
@@ -173,15 +174,55 @@ def _widths(scene, dampings):
     return [float(np.sum(np.diff(scene.stable_stiffness(row)))) for row in rows.tolist()], rows
 
 
-def test_the_pole_pairs_of_a_first_order_are_no_curve():
-    scene = Scene(zwidth.LinearDevice(([1.0], [0.1, 10.0])), Timing(1e-3))
-    with pytest.raises(zwidth.InputError, match="first order"):
-        scene.stable_region()
-    assert scene.max_stiffness().status == zwidth.Status.NOT_CONVERGED
-    # z^2 + (gK + gB/T - a) z - gB/T: rows and labels are known nevertheless.
-    pole = np.exp(-0.1)
+def sampled(*system) -> zwidth.LinearDevice:
+    """A device by coefficients or roots in z, for a period of 1 ms."""
+    model: Any = scipy.signal.dlti
+    return zwidth.LinearDevice(model(*system, dt=1e-3))
+
+
+def test_two_poles_whose_product_has_the_damping_alone_in_it_have_a_triangle():
+    # z^2 + (gK + gB/T - a) z - gB/T: all pole pairs are at B = -T/g.
+    scene, pole = Scene(zwidth.LinearDevice(([1.0], [0.1, 10.0])), Timing(1e-3)), np.exp(-0.1)
     gain = (1.0 - pole) / 10.0
     assert scene.stable_stiffness(0.0)[0] == pytest.approx([-10.0, (1.0 + pole) / gain], rel=1e-12)
     assert scene.stable_damping(1.0)[0] == pytest.approx(
         1e-3 / gain * np.array([-1.0, (1.0 + pole - gain) / 2.0]), rel=1e-12
     )
+    (outline,) = scene.stable_region()
+    assert outline.area == pytest.approx(4e-3 / gain**2, rel=1e-9)
+    assert scene.max_stiffness()[:2] == pytest.approx([(3.0 + pole) / gain, -1e-3 / gain], rel=1e-12)
+    assert scene.max_stiffness(negative_damping=False)[:2] == pytest.approx([(1.0 + pole) / gain, 0.0], rel=1e-12)
+    # A mass as Euler's method steps it, the position by the new velocity: K < 4 m/T^2, and B > 0 without friction.
+    euler = Scene(sampled([1e-5, 0.0], [1.0, -2.0, 1.0]), Timing(1e-3))
+    for negative in (False, True):
+        assert euler.max_stiffness(negative_damping=negative)[:2] == pytest.approx([4e5, 0.0], rel=1e-12, abs=1e-12)
+    assert euler.islands(negative_damping=True) == []
+    (outline,) = euler.stable_region()
+    assert outline.area == pytest.approx(4e7, rel=1e-9)
+
+
+def test_a_response_without_inertia_has_a_corner_at_no_damping():
+    # z^4 + g (K z + B (z - 1)/T): with B = 0 three poles reach the circle at one time.
+    wall = Scene(sampled([4.05e-6], [1.0, 0.0]), Timing(1e-3, 2e-3)).max_stiffness(negative_damping=False)
+    assert (wall.status, wall.stiffness) == (zwidth.Status.OK, pytest.approx(1.0 / 4.05e-6, rel=1e-12))
+    assert wall.virtual_damping == pytest.approx(0.0, abs=1e-9)
+
+
+def test_soft_walls_are_found_between_two_nodes_where_no_edge_is_seen():
+    poles = [-0.7852, 0.9938, -0.99991 + 0.00296j, 0.795 + 0.086j, -0.8538 + 0.5165j]
+    poles += [pole.conjugate() for pole in poles[2:]]
+    device = sampled([], poles, -2.646e-5)
+    scene = Scene(device, Timing(1e-3, 1e-3), velocity=zwidth.Butterworth(70.66, order=3))
+    ends, wall = scene.stable_stiffness(0.0), scene.max_stiffness()
+    assert (wall.status, wall.stiffness) == (zwidth.Status.OK, pytest.approx(ends[0, 1], rel=1e-12))
+    loop = np.poly(poles).real
+    for share, stable in ((1.0 - 1e-4, True), (1.0 + 1e-4, False)):
+        closed = np.append(loop, 0.0)
+        closed[-1] -= 2.646e-5 * share * wall.stiffness
+        assert (np.abs(np.roots(closed)).max() < 1.0) == stable
+
+
+def test_rounding_above_no_stiffness_is_no_island():
+    # A force moves it against itself: no wall with K > 0 is stable.
+    device = sampled([-3.9e-6], [1.0, -1.98, 0.98])
+    assert Scene(device, Timing(1e-3, 1e-3)).islands() == []

@@ -92,6 +92,20 @@ def test_a_corner_on_the_curve_of_a_mode_without_damping():
     assert wall.virtual_damping == pytest.approx(83.445589797423724, rel=1e-11)
 
 
+def test_a_corner_with_an_edge_that_is_nearly_upright():
+    # Three integrators, and a resonance that the dampings beyond the corner let grow. Expected: labels in balls.
+    device = zwidth.LinearDevice(
+        "1.5 209.3 4016.6 66588 947790 3897200 49966000 / 1 68.482 106720 7232800 151560000 2445200000 0 0 0"
+    )
+    scene = Scene(device, Timing(1e-3, 1e-3), velocity=LowPass(38.8))
+    wall = scene.max_stiffness()
+    assert (wall.status, wall.kind) == (Status.OK, RidgeKind.CORNER)
+    K, B = (1.0 + np.array(s) for s in ([-1e-6, 1e-6, -1e-6], [-1e-8, -1e-8, 1e-8]))
+    found = scene.decide_stability(K * wall.stiffness, B * wall.virtual_damping, method="certified")
+    np.testing.assert_array_equal(found.status, Status.OK)
+    np.testing.assert_array_equal(found.stable, [True, False, False])
+
+
 def test_an_island_of_negative_damping_does_not_count():
     free = WINDOW.replace(damping=0.0)
     for negative in (False, True):
