@@ -31,6 +31,8 @@ _STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
 _LEAST_MARGIN = float(np.finfo(np.float32).tiny)
 # A phase in radians below which its rounding may matter.
 _SMALL_PHASE = 0.1
+# A damping whose square float64 does not have.
+_NO_DAMPING = 1e-150
 # A phase that says unstable, where |L| is above 1 at every frequency.
 _NO_CROSSOVER = -1e-3
 
@@ -92,8 +94,8 @@ def margins_kernel(
     spoiled = nan_with_nan_slopes(ok, alpha, beta, delta, d)
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
-    # A damping whose inverse is infinite moves no margin.
-    delta = xp.where((delta > 0) & (delta < float(xp.finfo(delta.dtype).tiny)), 0.0, delta)
+    # A damping whose square or inverse is beyond what there is moves no margin.
+    delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), _NO_DAMPING)), 0.0, delta)
     here = store_once(device(delta, d), delta)
     w, phase, crosses = gain_frequency(alpha, beta, here)
     stable = store_once(stable_at(*frozen((alpha, beta, here), xp), ANY), delta)

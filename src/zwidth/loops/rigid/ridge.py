@@ -92,32 +92,13 @@ def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: st
         return ridge
     # The corner is left as soon as d > 0, alpha like -d^(2/3), omega like -d^(1/3), with infinite slopes.
     corner = ridge.s >= 1.0
-    fall = jnp.where(corner, _leave_corner()(jnp.where(corner, lag, 1.0)), 0.0)
+    fall = jnp.where(corner, jnp.sqrt(jnp.where(corner, lag, 1.0)), 0.0)
     # Turned by pi d the curve's alpha(q) and beta(q), q = 1 - s^2, become alpha + a1 q - 2 t, beta + b1 q + t, and the
     # largest alpha has t = -a1 q: it moves by 3 a1 q, beta by (b1 - a1) q.
     phi1, body = plant.a2 + plant.a1, plant.a1 * (1.0 + plant.a2 * ridge.beta)
     lean = plant.a2 + plant.c * plant.a1 - plant.a1 * (2.0 * ridge.beta * phi1 + ridge.alpha * plant.a2)
     share = frozen(jnp.where(corner, (body / lean - 1.0) / 3.0, 0.0), jnp)
     return ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - share * fall, omega=ridge.omega - fall)
-
-
-@cache
-def _leave_corner() -> Any:
-    """A square root, whose infinite slope at 0 does not make NaN of what moves with the damping alone."""
-    import jax
-    import jax.numpy as jnp
-
-    function = jax.custom_jvp(jnp.sqrt)
-
-    @function.defjvp
-    def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-        ((lag,), (change,)) = primals, tangents
-        steep = jnp.where(lag == 0.0, jnp.finfo(lag.dtype).max, 0.0)
-        # 0, and NaN as it moves with lag: no second derivative is known there.
-        still = steep * (steep * lag) - steep * (steep * lag)
-        return function(lag), jnp.where(change == 0.0, still, 0.5 * change / jnp.sqrt(lag))
-
-    return function
 
 
 @cache

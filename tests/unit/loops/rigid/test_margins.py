@@ -358,3 +358,13 @@ def test_second_derivatives_of_the_modulus_margin_and_of_its_frequency(x64):
     for side, bend in zip(np.eye(4), np.moveaxis(differentiate([wall, wall])[1][0], -1, 0), strict=True):
         up, down = differentiate([wall + sign * 1e-5 * side for sign in (1, -1)])[0]
         np.testing.assert_allclose(bend, (up - down) / 2e-5, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("delta", [1e-300, 1e-200, 1e-153])
+def test_a_damping_whose_square_float64_does_not_have_is_none(delta):
+    """Where no gain is stable without it the gain margin is 0, at no frequency."""
+    walls = [1e-8, 0.686, 0.1], [-0.18, 0.0, 0.4], delta, [0.3, 0.0, 1.0]
+    found, without = zwidth.margins(*walls), zwidth.margins(*walls[:2], 0.0, walls[3])
+    np.testing.assert_array_equal(found, without)
+    assert found.gain_margin.tolist()[:2] == [0.0, 0.0]
+    assert np.isnan(found.phase_crossover[:2]).all()

@@ -143,19 +143,6 @@ def test_the_corner_is_left_with_infinite_slopes_of_the_right_sign(delta, beta):
     np.testing.assert_array_equal(np.sign(moves), np.sign([-np.inf, beta, -np.inf]))
 
 
-@pytest.mark.parametrize("delta", [3.7, 100.0])
-def test_the_infinite_slopes_of_a_corner_leave_those_in_delta_as_they_are(delta, x64):
-    def differentiate(model):
-        return jax.grad(lambda delta, d: zwidth.alpha_max(delta, d, delay=model).alpha, (0, 1))(delta, 0.0)
-
-    by_delta, by_d = differentiate("fractional_power")
-    assert by_d == -np.inf
-    assert by_delta == pytest.approx(float(differentiate("held")[0]), rel=1e-14)
-    # Of the second derivatives, those with d do not exist.
-    bend = jax.jit(jax.hessian(lambda p: zwidth.alpha_max(p[0], p[1], delay="fractional_power").alpha))
-    assert not np.isfinite(bend(jnp.array([delta, 0.0]))[:, 1]).any()
-
-
 # Whole and broken delays, the corner of d = 0 on both sides of its take-over, its first and its last device.
 HARD = [(0.0, 0.0), (1e-12, 0.0), (3.6593, 0.0), (3.6594, 0.0), (50.0, 0.0), (1e6, 0.0), (0.0, 1.0), (0.3, 1.0)]
 HARD += [(0.3, 1.5), (1e6, 0.37), (1e-9, 499.5), (2.0, 500.0), (1e6, 500.0), (30.0, 0.01), (-1.0, 1.0), (np.nan, 2.0)]
