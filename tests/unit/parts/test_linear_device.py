@@ -211,7 +211,7 @@ def test_a_factor_of_numerator_and_denominator_is_not_there():
     assert zwidth.LinearDevice(SIGNAL.dlti([1.0], [1.0, 1.0, 0.5], 1e-5, dt=1e-3)).zeros.size == 0
     # Matrices say that there is such a motion.
     hidden = [[0.0, 1.0, 0.0], [0.0, -100.0, 0.0], [0.0, 0.0, 0.5]], [0.0, 10.0, 0.0], [1.0, 0.0, 0.0]
-    with pytest.raises(zwidth.InputError, match="a mode of s = 0.5 is not moved by the force"):
+    with pytest.raises(zwidth.InputError, match=r"a mode of s = 0.5 is not moved by the force"):
         zwidth.LinearDevice(hidden)
 
 
