@@ -223,7 +223,7 @@ def draw_stable_set(
         handles.append(style.line(style.literal(label), color=color, **mark))
     handles += [style.line(name, dash) for name, dash in _DASHES.items() if name in pieces and name != "outline"]
     handles += [] if alone else [style.line("mark: stiffest wall", "")]
-    style.legend(panels, handles, outside=axes is None, ncols=3)
+    style.legend(panels, handles, outside=axes is None, ncols=3, loc="upper right")
     return panels
 
 

@@ -142,13 +142,15 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
         ax.set(xlabel=x, ylabel=y)
 
 
-def legend(axes: np.ndarray | Sequence[Axes], handles: Sequence[Any], *, outside: bool, **keywords: Any) -> None:
-    """Explain what is drawn, if anything is, above the panels in as many columns as fit, or within the first."""
+def legend(
+    axes: np.ndarray | Sequence[Axes], handles: Sequence[Any], *, outside: bool, loc: str = "best", **keywords: Any
+) -> None:
+    """Explain what is drawn, if anything is, above the panels in as many columns as fit, or at ``loc`` in the first."""
     if not handles:
         return
     if not outside:
         # Said, or matplotlib warns on a busy machine that it looks for the place.
-        axes[0].legend(handles=handles, loc=keywords.get("loc", "best"))
+        axes[0].legend(handles=handles, loc=loc)
         return
     figure, columns = figure_of(axes), keywords.pop("ncols", 1)
     keywords = {"loc": "outside upper center"} | keywords | {"handles": handles}
