@@ -81,6 +81,8 @@ def problem(what: str, allowed: str = "", remedy: str = "", *, on_key: bool = Fa
 _PLAIN = {
     "bool_type": ("it must be true or false", "write true or false, without quotes"),
     "string_type": ("it must be text", "put the text in quotes"),
+    "list_type": ("it must be a list", "write '- ' before each entry"),
+    "dict_type": ("it must be a mapping", "write 'key: value' lines, or {key: value}"),
 }
 
 

@@ -42,7 +42,9 @@ def _read_range(raw: Any, info: ValidationInfo) -> tuple[float, ...]:
     name = info.data.get("find")
     if not isinstance(raw, list | tuple) or len(raw) != 2:
         raise problem(f"got {describe(raw)}", "a range is a list of its two ends", "write [low, high]")
-    ends = read_entries(raw, replace(quantity_of(name), periods=False).read if name else float)
+    if name is None:
+        raise problem(f"got {describe(raw)}", "it has the unit of what is to be found", "mend 'find' first")
+    ends = read_entries(raw, replace(quantity_of(name), periods=False).read)
     if not 0 < ends[0] < ends[1]:
         raise problem(f"got {short(ends[0])} and {short(ends[1])}", "0 < low < high", "write the lower end first")
     return ends

@@ -118,6 +118,7 @@ FAULTS = {
         ("6:3: scene.delta: normalized key, after physical ones", "remove it, or write all keys"),
         ("7:3: scene.beta: normalized key, after physical ones", "remove it, or write all keys"),
     ],
+    "modes_text": [("6:10: scene.modes: got '120 Hz'; it must be a list", "write '- ' before each entry")],
     "name_number": [("2:7: name: got 2006", "write a name, in quotes where it is all")],
     "name_slash": [("2:7: name: got '../bad'", "write 'bad'")],
     "not_a_mapping": [("1:1: got 'just a text'", "write 'key: value' lines, or {key: value}")],
