@@ -160,15 +160,16 @@ class Chain:
                     f"{what} that rings {max(found) / (2 * np.pi):.3g} times a period cannot be resolved; leave the "
                     f"{name} out, so {'stiff a link is rigid' if name == 'coupling' else 'fast a one is not there'}"
                 )
-        dampings = [float(body.damping / body.mass) for body in self.bodies]
-        dampings += [float(link.damping / light) for link in self.links]
-        if isinstance(lag, Resonance):
-            dampings.append(2.0 * float(lag.damping_ratio * lag.rate))
-        if max(dampings) > STRONGEST:
-            raise InputError(
-                f"damping: a damper that stops what moves in {1.0 / max(dampings):.3g} periods cannot be resolved; "
-                "check the units of what damps the device, its coupling, actuator and operator"
-            )
+        own, *others = [float(body.damping / body.mass) for body in self.bodies]
+        dampers = {"damping": [own], "operator.damping": others}
+        dampers["coupling.damping"] = [float(link.damping / light) for link in self.links]
+        ratio = [2.0 * float(lag.damping_ratio * lag.rate)] if isinstance(lag, Resonance) else []
+        for name, found in (dampers | {"actuator.damping_ratio": ratio}).items():
+            if max(found, default=0.0) > STRONGEST:
+                raise InputError(
+                    f"{name}: a damper that stops what moves in {1.0 / max(found):.3g} periods cannot be resolved; "
+                    "check its unit"
+                )
 
 
 AnyChain: TypeAlias = Chain | System

@@ -81,8 +81,8 @@ CASES = {
     ),
     "damper that cannot be resolved": (
         lambda: zwidth.Scene(zwidth.Device(0.1, coupling=zwidth.Coupling(0.1, 1e4, 1e14)), TIMING).check_parts(),
-        "damping",
-        "check the units",
+        "coupling.damping",
+        "check its unit",
     ),
 }
 
