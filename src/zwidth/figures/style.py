@@ -143,7 +143,7 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
 
 
 def legend(
-    axes: np.ndarray | Sequence[Axes], handles: Sequence[Any], *, outside: bool, loc: str = "best", **keywords: Any
+    axes: np.ndarray | Sequence[Axes], handles: Sequence[Any], *, outside: bool, loc: Any = "best", **keywords: Any
 ) -> None:
     """Explain what is drawn, if anything is, above the panels in as many columns as fit, or at ``loc`` in the first."""
     if not handles:
