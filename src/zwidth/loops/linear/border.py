@@ -218,6 +218,11 @@ class Border:
         return np.insert(path, [0, path.shape[1]], np.insert(ends.T, 0, np.nan, 0), 1)
 
     @cached_property
+    def width(self) -> float:
+        """Over which dampings its edges reach."""
+        return float(np.ptp([edge.beta[[0, -1]] for edge in self.edges]))
+
+    @cached_property
     def main(self) -> frozenset[int]:
         """The pieces that contain soft walls, as sets do, too, that narrow towards K = 0."""
         ends: dict[int, list[float]] = {}

@@ -118,7 +118,7 @@ def _tops(border: Border, least: float) -> Iterator[_Top]:
 
 def _is_reached(border: Border, top: _Top, least: float) -> bool:
     """Whether a row next to a top is stable nearly up to it."""
-    size = float(np.ptp([edge.beta[[0, -1]] for edge in border.edges])) + abs(top.beta)
+    size = border.width + abs(top.beta)
     found = bound_intervals(border.boundary, np.maximum(top.beta + size * _BESIDE, least))
     own = (found.above == top.column) | (found.below == top.column)
     return bool(np.any(own & (found.high >= _NEARLY * top.alpha)))
@@ -152,8 +152,7 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     # Of the place in beta the flatter one makes the less of alpha.
     apart, missed = abs(slopes[0] - slopes[1]), abs(heights[1] - heights[0]) / abs(alpha)
     flat = min(1.0, min(map(abs, slopes)) / apart) if apart > 0 else 1.0
-    size = float(np.ptp([edge.beta[[0, -1]] for edge in border.edges])) + abs(beta)
-    if abs(step) <= _NEAR * size and flat * missed <= _MEETS and other - w > 1e-6:
+    if abs(step) <= _NEAR * (border.width + abs(beta)) and flat * missed <= _MEETS and other - w > 1e-6:
         return BoundRidge(alpha, beta, w, other, _condition(w), _condition(other))
     # A double pole at z = -1, or at z = 1 of a device that moves against its force: the curve ends on the line there.
     for w in (np.pi, 0.0):
