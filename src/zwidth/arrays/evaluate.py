@@ -64,6 +64,12 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     # The module that defines masked arrays is loaded by those who make some.
     if isinstance(value, getattr(sys.modules.get("numpy.ma"), "MaskedArray", ())):
         raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
+    # By position axes of other names would meet.
+    if getattr(value, "dims", ()):
+        raise InputError(
+            f"{name}: got a DataArray, whose names of axes would be lost; call through xarray.apply_ufunc, or give its "
+            "values"
+        )
     if is_traced(value):
         raise InputError(f"{name}: got a value that JAX traces; give numbers, outside of jit, vmap and grad")
     try:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray
 
 import zwidth
 from zwidth.arrays import evaluate as module
@@ -161,6 +162,18 @@ def test_an_elementwise_kernel_follows_its_caller_too():
 def test_a_mask_is_not_ignored():
     with pytest.raises(InputError, match="x: got a masked array"):
         as_float64("x", np.ma.masked_array([1.0, 2.0], mask=[True, False]))
+
+
+def test_names_of_axes_are_not_ignored():
+    """Two axes of one length but of other names would meet wall by wall; xarray itself calls with what belongs."""
+    stiffness, damping = xarray.DataArray([5e3, 40e3], dims="K"), xarray.DataArray([20.0, 30.0], dims="B")
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
+    with pytest.raises(InputError, match=r"stiffness: got a DataArray.*xarray\.apply_ufunc"):
+        scene.is_stable(stiffness, damping)
+    stable = xarray.apply_ufunc(scene.is_stable, stiffness, damping)
+    assert stable.dims == ("K", "B")
+    assert stable.values.tolist() == [[True, True], [False, False]]
+    assert zwidth.alpha_max(xarray.DataArray(0.1), 1) == zwidth.alpha_max(0.1, 1)
 
 
 def test_a_whole_number_that_float64_holds_is_one_like_any_other():
