@@ -1,4 +1,4 @@
-"""Options that several commands share, quantities and those of a scene, with doubts of values that no device has."""
+"""Options that several commands share, quantities and those of a scene."""
 
 from __future__ import annotations
 
@@ -20,42 +20,16 @@ from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import ESTIMATES
 from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import short
-from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_LOGS, OF_PARTS, PARAMETERS, Range
-from zwidth.words.rotation import is_rotary, own_unit, use_kind
+from zwidth.words.plausible import list_doubts
+from zwidth.words.quantities import ANY, CHOICES, OF_LOGS, OF_PARTS, PARAMETERS, Range
+from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.units import find_dimension, read_quantity, tell_kind
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
 
-# What devices have, by what kind of quantity it is, from and up to in its SI unit. An inertia of a rotary device, in
-# kg m^2, is far below any mass.
-_PLAUSIBLE = {
-    "mass": (1e-9, 20.0),
-    "damping": (0.0, 1e4),
-    "stiffness": (0.0, 1e7),
-    "spring": (0.0, 1e9),
-    "period": (1e-6, 0.2),
-    "rate": (5.0, 1e6),
-    "delay": (0.0, 5.0),
-    "cutoff": (0.05, 1e6),
-    "time_constant": (1e-7, 5.0),
-}
 # In bytes.
 _LONG = 2**23
-# Kinds of quantities with another name.
-_OF_UNIT = {"N s/m": "damping", "N/m": "spring", "s": "period", "kg": "mass"}
-# The slips: the same number with another unit, or as another quantity.
-_SLIPS = {
-    "mass": (("{flag} '{value} g'", "mass", 1e-3),),
-    "damping": (("{flag} '{value} mN s/m'", "damping", 1e-3),),
-    "stiffness": (("a thousandth of it, with kN/m or N/mm counted once", "stiffness", 1e-3),),
-    "period": (("{flag} '{value} ms'", "period", 1e-3), ("--rate '{value} Hz'", "rate", 1.0)),
-    "rate": (("{flag} '{value} kHz'", "rate", 1e3), ("--period '{value} s'", "period", 1.0)),
-    "delay": (("{flag} '{value} ms'", "delay", 1e-3), ("{flag} '{value} us'", "delay", 1e-6)),
-    "time_constant": (("{flag} '{value} ms'", "time_constant", 1e-3),),
-    "cutoff": (("{flag} '{value} kHz'", "cutoff", 1e3),),
-}
 # Where the texts of options are kept whose units tell linear and rotary devices apart.
 _TOLD = "zwidth.told"
 _BOTH = "--period and --rate are both given: they are one thing, give one of them"
@@ -67,30 +41,6 @@ _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.r
 # What a device that is given as a whole holds already.
 _HELD = ("operator", "coupling", "actuator", "modes")
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
-
-
-def doubts_of(given: dict[str, Any]) -> list[str]:
-    """A line for every value, by path, that lies far from what any device has; it is taken all the same."""
-    lines = []
-    for path, value in given.items():
-        unit, name = FIELDS[path].unit if path in FIELDS else "", path.rpartition(".")[2]
-        kind = name if name in _PLAUSIBLE and path != "coupling.stiffness" else _OF_UNIT.get(unit, "")
-        number = value.value if isinstance(value, Span) and value.unit == "s" else value
-        if isinstance(number, int | float) and kind in _PLAUSIBLE and not _is_plausible(kind, number):
-            flag = flag_of(path)
-            meant = [
-                text.format(flag=flag, value=short(number))
-                for text, other, scale in _SLIPS.get(kind, ())
-                if _is_plausible(other, number * scale) and not (is_rotary() and own_unit(unit) != unit)
-            ]
-            remedy = f"did you mean {meant[0]}?" if meant else "check its unit"
-            lines.append(f"{flag} is {short(number)} {own_unit(unit)}, far from any device; {remedy}")
-    return lines
-
-
-def _is_plausible(kind: str, value: float) -> bool:
-    low, high = _PLAUSIBLE[kind]
-    return value == 0 or low <= abs(value) <= high
 
 
 OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
@@ -247,7 +197,10 @@ def build_scene(given: dict[str, Any], instead: str = "") -> Scene | None:
     known = {"--mass or --device": device or "mass" in given, "--rate or --period": {"period", "rate"} & given.keys()}
     if missing := [flags for flags, there in known.items() if not there]:
         raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
-    for line in doubts_of(given):
+    numbers = {
+        path: value.value if isinstance(value, Span) and value.unit == "s" else value for path, value in given.items()
+    }
+    for line in list_doubts(numbers, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
         click.echo(f"zwidth: {line}", err=True)
 
     def some(*names: str) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from zwidth.words.formatting import plain
 
 if TYPE_CHECKING:
     from zwidth.runs.run import RunResult, StudyEvent
+    from zwidth.studies.document import Config
     from zwidth.sweep.engine import Progress
 
 _SECONDS_BETWEEN_LINES = 10.0
@@ -86,9 +87,13 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **op
     """
     from zwidth.figures.style import style_sheet
     from zwidth.runs.run import run as run_studies
+    from zwidth.studies.document import load_config
 
+    config = load_config(path)
+    for line in getattr(config.scene, "doubts", ()):
+        click.echo(f"zwidth: {path}: {line}", err=True)
     if dry_run:
-        _print_plan(path, **options)
+        _print_plan(config, **options)
         return
     command = _spell_resume_command(path, size=size, **options)
     with _interrupt_on_sigterm() as stopped_by:
@@ -124,13 +129,11 @@ def _interrupt_on_sigterm() -> Iterator[list[int]]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _print_plan(path: Path, *, out: Path | None, memory: int, workers: int | None, **_: Any) -> None:
+def _print_plan(config: Config, *, out: Path | None, memory: int, workers: int | None, **_: Any) -> None:
     """The plan, or why it does not fit."""
     from zwidth.runs.run import plan_run
-    from zwidth.studies.document import load_config
     from zwidth.sweep.plan import Plan, check_resources
 
-    config = load_config(path)
     folder = out or Path("runs", config.name)
     steps = plan_run(config, memory=memory)
     for step in steps:

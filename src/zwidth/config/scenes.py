@@ -22,7 +22,9 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
+from zwidth.words.plausible import list_doubts
 from zwidth.words.quantities import LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
+from zwidth.words.rotation import use_kind
 from zwidth.words.types import DelayModel
 from zwidth.words.xp import within
 
@@ -186,6 +188,14 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
         if not self._is_double and self.delay_model not in self.to_scene().loop.delay_models:
             allowed = "velocity filters, hands and other parts are computed in the model 'held'"
             yield ("delay_model",), problem(f"got {self.delay_model!r}", allowed, "write 'delay_model: held'")
+
+    @property
+    def doubts(self) -> list[str]:
+        """A line for every value that lies far from what any device has."""
+        own = {path: value for path, value in self.to_scene().parameters().items() if path not in ("period", "rate")}
+        own |= {"period": self.period} if self.rate is None else {"rate": self.rate}
+        with use_kind(bool(self.rotary)):
+            return list_doubts(own, lambda path, value: f"'{path}: {value}'" if value else f"scene.{path}")
 
     @property
     def wall(self) -> PhysicalWall | None:

@@ -157,6 +157,7 @@ def test_rate_and_period_are_one_thing():
         (["--mass", "1", "--period", "1"], "--period is 1 s, .* did you mean --period '1 ms'?"),
         (["--mass", "1", "--rate", "1"], "--rate is 1 Hz, .* did you mean --rate '1 kHz'?"),
         (["--mass", "1", *RATE, "--delay", "20"], "--delay is 20 s, .* did you mean --delay '20 ms'?"),
+        (["--mass", "1", *RATE, "--delay", "1"], "--delay is 1 s, .* did you mean --delay '1 ms'?"),
         (
             ["--mass", "1", *RATE, "--damping", "2e4"],
             "--damping is 20000 N s/m, .* did you mean --damping '20000 mN s/m'?",

@@ -61,3 +61,24 @@ def test_a_study_asks_for_margins(run):
     assert " ".join(first.split()) == f"best {found.lines()[0]}"
     (told,) = run("scene: {mass: 0.1, period: 1e-3}\n" + MARGINS % (30, "true"), "--overwrite")
     assert "no wall: none was found that keeps a phase margin of 30 degrees and passivity" in told
+
+
+def test_a_scene_that_no_device_has_is_doubted_before_anything_is_computed(tmp_path, monkeypatch, unpainted):
+    monkeypatch.chdir(tmp_path)
+
+    def doubts_of(scene):
+        (tmp_path / "small.yaml").write_text(HEAD + f"scene: {scene}\n" + STUDY % 0.5, encoding="utf-8")
+        result = CliRunner().invoke(cli, ["run", "small.yaml", "--dry-run"], catch_exceptions=False)
+        assert result.stdout.startswith("study best\n")
+        return [line.removeprefix("zwidth: small.yaml: scene.") for line in result.stderr.splitlines()]
+
+    assert doubts_of("{mass: 100, damping: 10, rate: 1, delay: 1}") == [
+        "mass is 100 kg, far from any device; did you mean 'mass: 100 g'?",
+        "delay is 1 s, far from any device; did you mean 'delay: 1 ms'?",
+        "rate is 1 Hz, far from any device; did you mean 'rate: 1 kHz'?",
+    ]
+    (of_a_part,) = doubts_of("{mass: 1, rate: 1 kHz, operator: {mass: 70, stiffness: 100}}")
+    assert of_a_part == "operator.mass is 70 kg, far from any device; did you mean 'operator.mass: 70 g'?"
+    (of_a_turn,) = doubts_of("{rotary: true, mass: 50, rate: 1 kHz}")
+    assert of_a_turn == "mass is 50 kg m^2, far from any device; check its unit"
+    assert doubts_of("{mass: 0.1, damping: 10, period: 1e-3, delay: 2 periods, stiffness: 5 kN/m}") == []

@@ -1,0 +1,63 @@
+"""Doubts of values that no device has: slips of a unit, or of a period for a rate. They are taken all the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from zwidth.words.formatting import short
+from zwidth.words.quantities import FIELDS
+from zwidth.words.rotation import is_rotary, own_unit
+
+# What devices have, by what kind of quantity it is, from and up to in its SI unit. An inertia of a rotary device, in
+# kg m^2, is far below any mass.
+_PLAUSIBLE = {
+    "mass": (1e-9, 20.0),
+    "damping": (0.0, 1e4),
+    "stiffness": (0.0, 1e7),
+    "spring": (0.0, 1e9),
+    "period": (1e-6, 0.2),
+    "rate": (5.0, 1e6),
+    "delay": (0.0, 0.5),
+    "cutoff": (0.05, 1e6),
+    "time_constant": (1e-7, 5.0),
+}
+# Kinds of quantities with another name.
+_OF_UNIT = {"N s/m": "damping", "N/m": "spring", "s": "period", "kg": "mass"}
+# The slips: the same number of another unit and how much that is, here or as another quantity; or in words.
+_SLIPS = {
+    "mass": (("", "g", 1e-3, ""),),
+    "damping": (("", "mN s/m", 1e-3, ""),),
+    "stiffness": (("", "", 1e-3, "a thousandth of it, with kN/m or N/mm counted once"),),
+    "period": (("", "ms", 1e-3, ""), ("rate", "Hz", 1.0, "")),
+    "rate": (("", "kHz", 1e3, ""), ("period", "s", 1.0, "")),
+    "delay": (("", "ms", 1e-3, ""), ("", "us", 1e-6, "")),
+    "time_constant": (("", "ms", 1e-3, ""),),
+    "cutoff": (("", "kHz", 1e3, ""),),
+}
+
+
+def list_doubts(given: Mapping[str, Any], spell: Callable[[str, str], str]) -> list[str]:
+    """A line for every value in SI units, by path, that lies far from what any device has.
+
+    ``spell`` says how a path is written, with a value or, where that is empty, alone.
+    """
+    lines = []
+    for path, value in given.items():
+        unit, name = FIELDS[path].unit if path in FIELDS else "", path.rpartition(".")[2]
+        kind = name if name in _PLAUSIBLE and path != "coupling.stiffness" else _OF_UNIT.get(unit, "")
+        if isinstance(value, int | float) and kind in _PLAUSIBLE and not _is_plausible(kind, value):
+            number = short(value)
+            meant = [
+                text or spell(other or path, f"{number} {smaller}")
+                for other, smaller, scale, text in _SLIPS.get(kind, ())
+                if _is_plausible(other or kind, value * scale) and not (is_rotary() and own_unit(unit) != unit)
+            ]
+            remedy = f"did you mean {meant[0]}?" if meant else "check its unit"
+            lines.append(f"{spell(path, '')} is {number} {own_unit(unit)}, far from any device; {remedy}")
+    return lines
+
+
+def _is_plausible(kind: str, value: float) -> bool:
+    low, high = _PLAUSIBLE[kind]
+    return value == 0 or low <= abs(value) <= high
