@@ -84,7 +84,7 @@ def _nothing_is_left_open():
     yield
     if what_is_open().beyond(before):
         gc.collect()
-    wait_for(lambda: not what_is_open().beyond(before), lambda: f"still open: {what_is_open().beyond(before)}")
+        wait_for(lambda: not what_is_open().beyond(before), lambda: f"still open: {what_is_open().beyond(before)}")
 
 
 @pytest.fixture
