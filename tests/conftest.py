@@ -24,15 +24,11 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1]
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
-import jax
 import pytest
 from _pytest.doctest import DoctestModule
 from hypothesis import HealthCheck, settings
 from leftovers import what_is_open
 from waiting import wait_for
-
-# Silent broadcasting across ranks hides transposed axes.
-jax.config.update("jax_numpy_rank_promotion", "raise")
 
 settings.register_profile(
     "zwidth",
@@ -56,6 +52,13 @@ def pytest_configure(config: pytest.Config) -> None:
     config.option.loadscopereorder = False
     # What is imported and collected stays: Python need not look for garbage in it again and again.
     gc.set_threshold(1_000_000)
+
+
+def pytest_collection_modifyitems() -> None:
+    """Silent broadcasting across ranks hides transposed axes; the process that only hands out tests needs no JAX."""
+    import jax
+
+    jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def pytest_collection_finish() -> None:
@@ -84,7 +87,7 @@ def _nothing_is_left_open():
     yield
     if what_is_open().beyond(before):
         gc.collect()
-    wait_for(lambda: not what_is_open().beyond(before), lambda: f"still open: {what_is_open().beyond(before)}")
+        wait_for(lambda: not what_is_open().beyond(before), lambda: f"still open: {what_is_open().beyond(before)}")
 
 
 @pytest.fixture
@@ -118,5 +121,7 @@ def unpainted():
 @pytest.fixture
 def x64():
     """Enable float64 in JAX for one test, as a user who traces the library's functions would."""
+    import jax
+
     with jax.enable_x64(True):
         yield

@@ -134,10 +134,10 @@ def test_a_broken_link_fails_the_build(tmp_path):
     shutil.copytree(DOCS / "stylesheets", folder / "stylesheets")
     shutil.copy(DOCS / "hooks.py", folder)
     (folder / "mkdocs.yml").write_text(re.sub(r"(?ms)^plugins:.*?(?=^\w)", "plugins: []\n", text), encoding="utf-8")
-    for link, code in (("index.md", 0), ("nowhere.md", 1)):
-        (folder / "index.md").write_text(f"# Here\n\n[link]({link})\n", encoding="utf-8")
-        done = build(tmp_path, tmp_path / "site")
-        assert done.returncode == code, done.stderr
+    (folder / "index.md").write_text("# Here\n\n[to itself](index.md), [to none](nowhere.md)\n", encoding="utf-8")
+    done = build(tmp_path, tmp_path / "site")
+    assert done.returncode == 1, done.stderr
+    # Nothing but that link fails it.
     assert "nowhere.md" in done.stderr
     assert done.stderr.count("WARNING") == 1
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 from waiting import LONGEST
 
 CELLS = {
@@ -36,6 +34,9 @@ PICTURES = ("region", "bode")
 @pytest.fixture(scope="module")
 def shown() -> dict[str, list[Any]]:
     """The outputs of every cell."""
+    import nbformat
+    from nbclient import NotebookClient
+
     book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(text.strip()) for text in CELLS.values()])
     # In a loop that is closed afterwards.
     asyncio.run(NotebookClient(book, timeout=LONGEST, kernel_name="python3").async_execute())

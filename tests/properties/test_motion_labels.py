@@ -148,7 +148,7 @@ def test_a_longer_motion_belies_no_label():
     labels = [
         label
         for kind in ("linear", "contact and encoder", "friction")
-        for label in label_motions(kind, 12, SEED, PERIODS // 2)
+        for label in label_motions(kind, 12, SEED, PERIODS // 4)
     ]
     assert [label for label in labels if label.wrong] == []
     assert not any(label.label == MotionKind.UNCLEAR for label in labels if label.kind == "linear")

@@ -80,7 +80,8 @@ class Batch:
             law=course.law,
         )
         windows = [each.samples if isinstance(each, FOAW) else each.window for each in self.estimates]
-        self.rings = round_up(max(windows) + 1), round_up(int(self.late.max()) + 3)
+        # Reading a ring takes no longer where it is: as long as most are, it needs no program of its own.
+        self.rings = round_up(max(*windows, 3) + 1), round_up(max(int(self.late.max()), 5) + 3)
 
     def lay(self, places: np.ndarray) -> tuple[Lanes, Given]:
         """Some of the simulations side by side."""

@@ -16,32 +16,6 @@ use_compilation_cache()
 import jax
 print(float(jax.jit(lambda x: x * 3 + 1)(2.0)))
 """
-
-
-def test_half_an_entry_is_removed_without_a_word(tmp_path):
-    def run():
-        environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
-        environment["XDG_CACHE_HOME"] = str(tmp_path)
-        result = subprocess.run(
-            [sys.executable, "-c", PROGRAM],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=LONGEST,
-            env=environment,
-        )
-        assert (result.stdout, result.stderr) == ("7.0\n", "")
-        return sorted((tmp_path / "zwidth" / "jax").glob("*-cache"))
-
-    entries = run()
-    assert entries
-    whole = [entry.read_bytes() for entry in entries]
-    for entry, data in zip(entries, whole, strict=True):
-        entry.write_bytes(data[: len(data) // 2])
-    assert run() == entries
-    assert all(entry.stat().st_size > len(data) // 2 for entry, data in zip(entries, whole, strict=True))
-
-
 LATE = """
 import jax
 from zwidth.arrays.kernel_cache import use_compilation_cache
@@ -52,13 +26,26 @@ print(empty.nbytes, full.nbytes > 1000, full.folder == empty.folder)
 """
 
 
-def test_it_may_be_asked_for_after_jax_was_imported(tmp_path):
+def run(program, folder):
+    """What a program says whose user's cache is there, and the entries behind it."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
-    environment["XDG_CACHE_HOME"] = str(tmp_path)
+    environment["XDG_CACHE_HOME"] = str(folder)
     result = subprocess.run(
-        [sys.executable, "-c", LATE], capture_output=True, text=True, check=True, timeout=LONGEST, env=environment
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=LONGEST, env=environment
     )
-    assert result.stdout == "0 True True\n", result.stderr
+    assert result.stderr == ""
+    return result.stdout, sorted((folder / "zwidth" / "jax").glob("*-cache"))
+
+
+def test_it_may_be_asked_for_after_jax_was_imported_and_half_an_entry_is_removed_without_a_word(tmp_path):
+    said, entries = run(LATE, tmp_path)
+    assert said == "0 True True\n"
+    assert entries
+    whole = [entry.read_bytes() for entry in entries]
+    for entry, data in zip(entries, whole, strict=True):
+        entry.write_bytes(data[: len(data) // 2])
+    assert run(PROGRAM, tmp_path) == ("7.0\n", entries)
+    assert all(entry.stat().st_size > len(data) // 2 for entry, data in zip(entries, whole, strict=True))
 
 
 @pytest.fixture

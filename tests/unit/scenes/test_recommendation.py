@@ -18,9 +18,10 @@ TIP = zwidth.Scene(zwidth.Device(0.1, 10.0, zwidth.Coupling(0.05, 20e3, 1.0, "ti
 
 
 def keeps(scene, stiffness, damping, wanted):
-    """By the margins that users ask for."""
-    margins = scene.margins(stiffness, damping)
-    good = scene.is_stable(stiffness, damping)
+    """By the margins that users ask for, of the walls that are stable: of them there are fewer."""
+    damping = np.atleast_1d(damping)
+    damping = damping[scene.is_stable(stiffness, damping)]
+    margins, good = scene.margins(stiffness, damping), np.full(damping.shape, True)
     if "gain_margin" in wanted:
         good = good & (np.abs(np.log(margins.gain_margin)) >= np.log(wanted["gain_margin"]))
     if "phase_margin" in wanted:

@@ -56,8 +56,9 @@ def test_a_rotary_scene_has_the_numbers_of_the_linear_one(seed):
         )
         for turns in (False, True)
     )
-    K = linear.max_stiffness().stiffness * random.uniform(0.1, 1.5, 5)
-    B = linear.max_stiffness().virtual_damping * random.uniform(0.0, 2.0, 5)
+    top = linear.max_stiffness()
+    K = top.stiffness * random.uniform(0.1, 1.5, 5)
+    B = top.virtual_damping * random.uniform(0.0, 2.0, 5)
     for question in ("max_stiffness", "sensitivities", "islands", "stable_region"):
         np.testing.assert_equal(getattr(rotary, question)(), getattr(linear, question)())
     for question in ("is_stable", "spectral_radius", "margins", "poles"):

@@ -42,7 +42,7 @@ def needed_by_scan(alpha, beta, d, frequencies=100_000):
     That is slow, and asked of the hundredth where float64 finds most.
     """
     w = np.linspace(0, math.pi, frequencies + 1, dtype=np.longdouble)[1:]
-    most = np.argsort(needed_at(w.astype(float), alpha, beta, d))[-(frequencies // 100) :]
+    most = np.argpartition(needed_at(w.astype(float), alpha, beta, d), -(frequencies // 100))[-(frequencies // 100) :]
     return max(float(needed_at(w[most], alpha, beta, d).max()), 0.0)
 
 
