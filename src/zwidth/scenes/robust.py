@@ -284,7 +284,7 @@ def _halve_boxes(lows: np.ndarray, highs: np.ndarray) -> tuple[np.ndarray, np.nd
     width = (highs - lows).T
     delta, d = damping * period / mass, delay / period
     # Next to a whole delay all changes within a time constant of the device.
-    turn = 0.1 * delta / (1.0 + delta * np.abs(d - np.round(d)))
+    turn = 0.05 * delta / (1.0 + delta * np.abs(d - np.round(d)))
     weights = width[0] / mass, width[1] * period / mass / (0.3 + delta)
     late = (2.0 + d * turn) * width[2] / period, (1.0 / (d + 0.5) + turn) * width[3] / period
     along = np.argmax(np.stack([*weights, *late]), axis=0)
