@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from math import frexp
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -186,15 +186,14 @@ class Form(Ball):
         """Of what is positive throughout; nothing is known elsewhere."""
         low, high = self.lower(), self.upper()
         low = np.where(low > 0, low, np.nan)
-        ends = 1.0 / low, 1.0 / high
-        return chord(self, ends, 2.0 / low**3, 2.0 * UNIT)
+        return chord(self, (low, high), (1.0 / low, 1.0 / high), 2.0 / low**3, 2.0 * UNIT)
 
     def sqrt(self) -> Form:
         """Of what is positive throughout; nothing is known elsewhere."""
         low, high = self.lower(), self.upper()
         low = np.where(low > 0, low, np.nan)
         root = np.sqrt(low)
-        return chord(self, (root, np.sqrt(high)), -0.25 / (low * root), 2.0 * UNIT)
+        return chord(self, (low, high), (root, np.sqrt(high)), -0.25 / (low * root), 2.0 * UNIT)
 
 
 def quantities(low: np.ndarray, high: np.ndarray) -> list[Form]:
@@ -209,10 +208,16 @@ def quantities(low: np.ndarray, high: np.ndarray) -> list[Form]:
     return forms
 
 
-def chord(x: Form, ends: tuple[np.ndarray, np.ndarray], bend: np.ndarray, error: Any) -> Form:
-    """A function of x by the chord between its ``ends``, each of a relative ``error``; ``bend`` is its largest f''."""
+Pair: TypeAlias = tuple[np.ndarray, np.ndarray]
+
+
+def chord(x: Form, between: Pair, ends: Pair, bend: np.ndarray, error: Any) -> Form:
+    """A function of x by its chord ``between`` two x, its values there each of a relative ``error``; else unknown.
+
+    ``bend`` is the largest f'' between them.
+    """
     # Of one sign throughout, f'' keeps it on one side of the chord, at most ``bend width^2/8`` from it.
-    low, high = x.lower(), x.upper()
+    low, high = between
     width = np.maximum(high - low, TINY)
     slope = (ends[1] - ends[0]) / width
     size = np.abs(ends[0]) + np.abs(ends[1])

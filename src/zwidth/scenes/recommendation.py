@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.roots import false_position, find_lowest
+from zwidth.arrays.roots import find_lowest
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
@@ -38,9 +38,9 @@ from zwidth.words.units import to_float
 # Dampings tried at a stiffness, and to what share of itself the best is then found: passive ones of a weakly damped
 # device are few of those that are stable.
 _SAMPLES, _NEAR = 18, 2e-4
-# Stiffnesses tried downwards from the most that is allowed, each this much of the one before; and how close to the
-# stiffest that keeps all margins the wall lies.
-_DOWN, _TRIALS, _CLOSE = 0.25, 15, 1e-4
+# Stiffnesses tried downwards from the most that is allowed, each this much of the one before; and the halvings between
+# two of them, to less than 1e-4.
+_DOWN, _TRIALS, _HALVINGS = 0.25, 15, 14
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
 _OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
@@ -264,41 +264,37 @@ def _measure(scene: SceneOptima, wanted: Wanted) -> Surplus:
 
 def _search(scene: SceneOptima, surplus: Surplus, most: float) -> tuple[float, float]:
     """K and B of the stiffest wall that has all that is wanted, from the most downwards; NaN where none was found."""
-    dampings: dict[float, float] = {}
 
-    def spare(log_stiffness: Any) -> np.float64:
-        """The most that any damping leaves to spare of what is scarcest."""
-        stiffness, unit = math.exp(float(log_stiffness)), scene.units.virtual_damping
+    def suit(log_stiffness: float) -> tuple[float, float] | None:
+        """The wall that has the most to spare of what is scarcest, if it has all that is wanted."""
+        stiffness, unit = math.exp(log_stiffness), scene.units.virtual_damping
 
         def cost(beta: Any) -> np.ndarray:
             return -np.min(list(surplus(stiffness, beta * unit).values()), axis=0)
 
         found = (find_lowest(cost, *ends, _SAMPLES, _NEAR) for ends in soft_dampings(scene, stiffness))
         lowest, beta = min(found, default=(1.0, math.nan))
-        dampings[stiffness] = beta * unit
-        return np.float64(-lowest)
+        return (stiffness, beta * unit) if lowest <= 0 else None
 
-    high, above = np.float64(math.log(most)), spare(math.log(most))
-    if above >= 0:
-        return most, dampings[math.exp(float(high))]
+    low = high = math.log(most)
+    wall = suit(high)
+    if wall is not None:
+        return most, wall[1]
     for _ in range(_TRIALS):
-        low = high + math.log(_DOWN)
-        below = spare(low)
-        if below >= 0:
+        low, high = low + math.log(_DOWN), low
+        wall = suit(low)
+        if wall is not None:
             break
-        high, above = low, below
     else:
         return math.nan, math.nan
-    edge = false_position(spare, low, high, below, above, 40, 0.3 * _CLOSE)
-    # On the safe side of the edge, or, where that is not proved, at the wall that is known to be.
-    for place in (edge - _CLOSE, low):
-        if spare(place) >= 0:
-            stiffness = math.exp(float(place))
-            exact = stiffness, dampings[stiffness]
-            # A wall to type in: no more digits than a device can tell apart, where what is wanted allows it.
-            short = float(f"{exact[0]:.6g}"), float(f"{exact[1]:.6g}")
-            return short if min(map(float, surplus(*short).values())) >= 0 else exact
-    return math.nan, math.nan
+    # By halves: where a margin without an end ends, what is to spare jumps.
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        stiffer = suit(middle)
+        low, high, wall = (low, middle, wall) if stiffer is None else (middle, high, stiffer)
+    # A wall to type in: no more digits than a device can tell apart, where what is wanted allows it.
+    short = float(f"{wall[0]:.6g}"), float(f"{wall[1]:.6g}")
+    return short if min(map(float, surplus(*short).values())) >= 0 else wall
 
 
 class SceneAdvice(SceneOptima):
@@ -329,7 +325,7 @@ class SceneAdvice(SceneOptima):
         Numerics:
             A share of K_max alone is in closed form, with the damping of the stiffest wall where it is stable. Margins
             take a search over K and B: each wall is judged by `margins` and `passivity_margin` themselves, and K lies
-            within 2e-4 of the largest that was found; 0.3 s for a rigid device, some seconds with other parts.
+            within 1e-4 of the largest that was found; 0.3 s for a rigid device, some seconds with other parts.
 
         Example:
             >>> import zwidth

@@ -282,9 +282,12 @@ def _halve_boxes(lows: np.ndarray, highs: np.ndarray) -> tuple[np.ndarray, np.nd
     """Cut each part in two, across the quantity whose width matters most."""
     mass, damping, period, delay = (0.5 * (lows + highs)).T
     width = (highs - lows).T
-    delta = damping * period / mass
-    weights = (width[0] / mass, width[1] * period / mass / (0.3 + delta), 2 * width[2] / period)
-    along = np.argmax(np.stack([*weights, width[3] / (delay + 0.5 * period)]), axis=0)
+    delta, d = damping * period / mass, delay / period
+    # Next to a whole delay all changes within a time constant of the device.
+    turn = 0.05 * delta / (1.0 + delta * np.abs(d - np.round(d)))
+    weights = width[0] / mass, width[1] * period / mass / (0.3 + delta)
+    late = (2.0 + d * turn) * width[2] / period, (1.0 / (d + 0.5) + turn) * width[3] / period
+    along = np.argmax(np.stack([*weights, *late]), axis=0)
     rows, middle = np.arange(len(lows)), 0.5 * (lows + highs)
     upper, lower = lows.copy(), highs.copy()
     upper[rows, along], lower[rows, along] = middle[rows, along], middle[rows, along]

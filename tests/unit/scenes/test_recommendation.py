@@ -102,6 +102,27 @@ def test_a_wall_that_damping_only_harms_has_none_at_all():
     assert "B = 0 N s/m" in found.lines()[0]
 
 
+def test_a_device_on_a_spring_whose_soft_walls_have_margins_without_an_end():
+    held = zwidth.Scene(zwidth.Device(0.1, 1.0), zwidth.Timing(1e-3), operator=zwidth.Operator(0.0, 0.0, 1e6))
+    found = held.recommend(phase_margin=30)
+    assert held.margins(0.1 * found.stiffness, 0.1 * found.virtual_damping).phase_margin == np.inf
+    assert held.margins(found.stiffness, found.virtual_damping).phase_margin >= 30
+    stiffer = 1.0002 * found.stiffness
+    low, high = held.stable_damping(stiffer)[0].tolist()
+    dampings = np.linspace(low, high, 22)[1:-1]
+    assert np.all(held.margins(stiffer, dampings).phase_margin < 30)
+
+
+def test_a_margin_that_ends_all_of_a_sudden_does_not_keep_the_stiffest_wall_from_being_found():
+    # Up to 0.98 of K_max the spring alone has no gain crossover, and a phase margin without an end.
+    hand = zwidth.Operator(6.4e-6, 206.5, 2.8e7, coupling_stiffness=1.43e9, coupling_damping=8.03e5)
+    timing, window = zwidth.Timing(6.608e-5, 1.98248e-4), zwidth.WindowedDifference(samples=7)
+    held = zwidth.Scene(zwidth.Device(1.06, 181.0), timing, velocity=window, operator=hand)
+    found = held.recommend(phase_margin=30)
+    assert held.loop.margins(*held.normalize_walls(found.stiffness, 0.0), ["phase_margin"]).phase_margin >= 30
+    assert found.stiffness > 0.9 * held.max_stiffness().stiffness
+
+
 def test_the_wall_of_the_scene_does_not_matter():
     own = RIGID.replace(stiffness=1e3, virtual_damping=3.0).recommend(phase_margin=25)
     assert own.stiffness == RIGID.recommend(phase_margin=25).stiffness

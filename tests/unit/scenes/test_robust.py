@@ -115,6 +115,20 @@ def test_a_dip_over_the_period_at_strong_damping():
     assert not worst.is_vertex
 
 
+def test_strongly_damped_devices_whose_delays_are_about_a_period():
+    # The middle of the stable dampings jumps there within a time constant of the device, a thousandth of a period.
+    damping = Interval(9.5e2, 1.05e3)
+    box = {
+        "mass": Interval(0.98, 1.02),
+        "damping": damping,
+        "period": Interval(0.98, 1.02),
+        "delay": Interval(0.8, 1.2),
+    }
+    worst = robust_max_stiffness(**box)
+    assert worst.status == Status.OK
+    assert worst.stiffness <= np.min(max_stiffness(**sampled(box, 20_000)))
+
+
 def test_what_is_known_exactly_has_the_ridge_s_wall():
     known = {"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 1e-3}
     expected = max_stiffness(**known)

@@ -174,10 +174,13 @@ class Border:
             return self._triangle if met.gap.size else []
         held = np.pad(np.isfinite(rows.alpha.T), ((0, 0), (1, 1)))
         begins, ends = held[:, 1:-1] & ~held[:, :-2], held[:, 1:-1] & ~held[:, 2:]
-        # Edges that one interval of a row is between bound one piece.
+        # Edges that one interval of a row is between bound one piece, and edges that meet.
         number = np.cumsum(begins).reshape(begins.shape).T - 1
         row, below = np.nonzero(rows.upper >= 0)
-        pieces = _join(np.stack([number[row, below], number[row, rows.upper[row, below]]]), int(begins.sum()))
+        pairs = [number[row, below], number[row, rows.upper[row, below]]]
+        gap = met.gap[:, None]
+        meeting = number[gap - ~held[met.columns, gap + 1], met.columns].T
+        pieces = _join(np.concatenate([pairs, meeting], 1), int(begins.sum()))
         numbers = {(gap, column): k for k, gap in enumerate(met.gap.tolist()) for column in met.columns[k].tolist()}
         (columns, firsts), (_, lasts) = np.nonzero(begins), np.nonzero(ends)
         for piece, column, first, last in np.stack([pieces, columns, firsts, lasts], 1).tolist():
@@ -277,6 +280,8 @@ class Border:
                 at = follow[at[0], 1 - at[1]]
             stiffness, damping = np.concatenate(path, 1)
             found.append((piece, Outline(stiffness, damping, False, piece not in self.main)))
+        # Where the curve has one damping but for rounding, rounding draws outlines of its own.
+        found = [(piece, one) for piece, one in found if np.ptp(one.virtual_damping) > _TOLD * self.width]
         found.sort(key=lambda each: -each[1].area)
         # What else bounds a piece than the largest of its outlines are holes.
         outer = {piece: k for k, (piece, _) in reversed(list(enumerate(found)))}

@@ -200,10 +200,8 @@ _PARTS, _SPARE = 8, 1.5
 # And how long before a whole delay, in time constants of the fastest pole: within ln 2 of them a strongly damped device
 # bears less than at it. Slower ones than this the parts resolve.
 _EARLY, _FAST = np.array([1.0, 0.5, 0.25, 0.1]), 2.0
-# The longest delay that is looked for, in periods; the step of a derivative in it.
-_LONGEST, _STEP = 1 << 17, 1e-5
-# Newton steps at most, and a logarithm of L that is rounding.
-_TRIALS, _ROUNDED = 30, 1e-9
+# The step of a derivative in a delay, with a share of it; Newton steps at most, and a logarithm of L that is rounding.
+_STEP, _PART, _TRIALS, _ROUNDED = 1e-5, 1e-9, 30, 1e-9
 # Shares of the margin at which the wall must still be stable, and one at which it must not be.
 _WITNESSES, _BEYOND = (0.25, 0.5, 0.75, 1.0 - 1e-5), 1.0 + 1e-5
 
@@ -261,20 +259,20 @@ def _find_starts(
             for i, turn in product((k, k + 1), (0.0, 2.0 * np.pi)):
                 left = (turns[i] - turn) / crossed[i]
                 whole = np.round(left)
-                near = (np.abs(left - whole) <= _SPARE / _PARTS) & (whole >= 0.0) & (whole < _LONGEST)
+                near = (np.abs(left - whole) <= _SPARE / _PARTS) & (whole >= 0.0)
                 yield from zip(crossed[i][near].tolist(), (delays[i] + left[near]).tolist(), strict=True)
             continue
         rise = np.mod(turns[k + 1] - turns[k] + np.pi, 2.0 * np.pi) - np.pi
         for turn in (0.0, 2.0 * np.pi):
             first, last = (turns[k] - turn) / w, (turns[k] + rise - turn) / after
             whole = np.maximum(np.ceil(np.minimum(first, last)), 0.0)
-            for j in np.flatnonzero((whole <= np.maximum(first, last)) & (whole < _LONGEST)):
+            for j in np.flatnonzero(whole <= np.maximum(first, last)):
                 share = (whole[j] - first[j]) / (last[j] - first[j]) if first[j] != last[j] else 0.0
                 at = delays[k] + share * (delays[k + 1] - delays[k])
                 yield float(w[j] + share * (after[j] - w[j])), float(at + whole[j])
     for k, (before, here, after) in enumerate(zip(more, more[1:], more[2:], strict=False), 1):
         if before.size == here.size == after.size:
-            lowest = (here <= before) & (here <= after) & (here < _LONGEST)
+            lowest = (here <= before) & (here <= after)
             for j in np.flatnonzero(lowest & (here - np.floor(here) <= np.maximum(before, after) - here)):
                 yield float(crossed[k][j]), float(delays[k] + here[j])
 
@@ -285,10 +283,10 @@ def _follow(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) 
     for _ in range(_TRIALS):
         if not (0.0 < w < np.pi and delay >= 0.0):
             return np.nan
-        at = circle(np.array([w]))
-        here, beside = (open_loop_response(loop_at(chain, delay + h), *wall, at) for h in (0.0, _STEP))
+        at, step = circle(np.array([w])), _STEP + _PART * delay
+        here, beside = (open_loop_response(loop_at(chain, delay + h), *wall, at) for h in (0.0, step))
         rest, turn = np.log(-here.value[0]), here.slope[0] / here.value[0]
-        slope = np.log(beside.value[0] / here.value[0]) / _STEP
+        slope = np.log(beside.value[0] / here.value[0]) / step
         by_w, by_delay = np.linalg.solve([[turn.real, slope.real], [turn.imag, slope.imag]], [rest.real, rest.imag])
         w, delay = w - by_w, delay - by_delay
         # On the flank of a narrow resonance the rounding of w alone moves the delay by more.

@@ -197,22 +197,21 @@ def has_rows(points: Points) -> bool:
     return points.is_dense and apart and points.alpha.size >= 64
 
 
-# Of the phi-functions, slightly negative arguments included.
+# Of the phi-functions.
 _PHI_ERROR = 100.0 * UNIT
 _ARCSINE_ERROR = 2.0**-45
 
 
 def _phi_forms(x: Form) -> tuple[Form, Form, Form]:
     """c, phi2 and psi: integrals of e^(-x t) over weights, so that all derivatives fall in size with x."""
-    low, high = x.lower(), x.upper()
-    # The series behind them are right for slightly negative arguments too, which a box round 0 has.
-    low = np.where(low > -1.0, low, np.nan)
+    # Of a box that reaches beyond f = 0 or f = 1 only what has x >= 0 counts.
+    low, high = (np.maximum(end, 0.0) for end in (x.lower(), x.upper()))
     first, last = ((at.c, at.phi2, at.psi) for at in map(functions, (low, high)))
     size = np.maximum(low, 1e-3)
     at_low = first[2]
     bends = (first[0], np.minimum(0.25 * at_low, 2.0 / size**3), np.minimum(at_low, 6.0 / size**4))
     forms = [
-        chord(x, ends, bend * (1.0 + _PHI_ERROR), _PHI_ERROR)
+        chord(x, (low, high), ends, bend * (1.0 + _PHI_ERROR), _PHI_ERROR)
         for ends, bend in zip(zip(first, last, strict=True), bends, strict=True)
     ]
     return forms[0], forms[1], forms[2]
@@ -251,7 +250,7 @@ def take_lag_form(u: Form, whole: np.ndarray) -> Lag:
     turns = whole + 0.5
     ends = 2.0 * turns * np.arcsin(np.sqrt(0.5 * low)), 2.0 * turns * np.arcsin(np.sqrt(0.5 * high))
     square = low * (2.0 - low)
-    angle = chord(u, ends, -turns * (1.0 - low) / (square * np.sqrt(square)), _ARCSINE_ERROR)
+    angle = chord(u, (low, high), ends, -turns * (1.0 - low) / (square * np.sqrt(square)), _ARCSINE_ERROR)
     spread = angle.radius
     within = good & (angle.mid + spread < np.pi * (1.0 - 1e-15))
     beyond = good & ((angle.mid - spread) * (whole + 1.0) > np.pi * turns * (1.0 + 1e-15))

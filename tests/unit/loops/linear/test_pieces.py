@@ -226,3 +226,14 @@ def test_rounding_above_no_stiffness_is_no_island():
     # A force moves it against itself: no wall with K > 0 is stable.
     device = sampled([-3.9e-6], [1.0, -1.98, 0.98])
     assert Scene(device, Timing(1e-3, 1e-3)).islands() == []
+
+
+@pytest.mark.parametrize("damping", [1e7, 1e8])
+@pytest.mark.parametrize("hand", [(0.1, 1.0, 10.0, 1e3, 1.0), (0.05, 1.0, 1.0)])
+def test_a_strongly_damped_device_with_a_spring_has_one_piece(damping, hand):
+    """At its lower end dampings differ by rounding alone, and its rows were told to be pieces of their own."""
+    timing = zwidth.Timing(1e-3, 1e-3)
+    held = zwidth.Scene(zwidth.Device(0.1, damping), timing, operator=zwidth.Operator(*hand))
+    (outline,) = held.stable_region()
+    assert not (outline.hole or outline.island)
+    assert outline.stiffness.max() == pytest.approx(held.max_stiffness().stiffness, rel=1e-6)
