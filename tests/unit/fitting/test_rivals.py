@@ -103,6 +103,17 @@ def test_a_strong_damper_hides_no_friction(seed):
     assert max(abs(getattr(fit, name) - value) / fit.errors[name] for name, value in truth.items()) < 4.0
 
 
+# K_max falls from 71 to 10 kN/m over the delays that these coarse encoders leave open: by its slope alone the interval
+# ended at 31 to 54.
+@pytest.mark.parametrize("seed", [3, 4, 7, 9, 12])
+def test_the_interval_of_the_stiffest_wall_reaches_to_a_device_without_delay(seed):
+    fit = play(0.02, 0.0, 0.0, 20.0, 0.3, seed, count=280)
+    true = zwidth.Scene(zwidth.Device(mass=0.1, damping=2.0), zwidth.Timing(period=1e-3)).max_stiffness()
+    low, high = fit.intervals["stiffness_max"]
+    assert fit.intervals["delay"].low == 0.0
+    assert 0.0 < low < fit.stiffness_max < true.stiffness < high
+
+
 @pytest.mark.parametrize("lag, expected", [(0.0, 1.0), (4.0, 4.0), (30.0, None)])
 def test_a_rival_is_as_many_errors_away_as_its_squares_say(lag, expected):
     random = np.random.default_rng(4)
