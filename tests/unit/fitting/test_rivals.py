@@ -84,7 +84,7 @@ def test_errors_are_alike_wherever_a_device_returns_to_the_same_place():
 
 
 def play(delta, d, friction, steps, noise, seed, count=600):
-    """The fit of a log of 100 g, by b T/m, the delay in periods, N, the encoder's steps over the way, and their noise."""
+    """The fit of a log of 100 g: b T/m, the delay in periods, N, the encoder's steps over the way, and their noise."""
     random = np.random.default_rng(seed)
     force = np.concatenate([np.zeros(SKIP + 2), np.repeat(random.choice([-1.0, 1.0], count // 20 + 1), 20)[:count]])
     moved = Recording(force, np.zeros(count + 2), SKIP).move(1e-5, delta, d, 0.0, 0.0, 0.0, 1e-5 * friction).position
