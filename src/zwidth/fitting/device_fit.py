@@ -194,19 +194,22 @@ class DeviceFit(DeviceEstimate):
 
         Where K_max has more damping than the walls that buzzed, it reaches down to what buzzed at the most of them.
         """
-        errors = self.errors | {"stiffness_max": self.stiffness_error}
-        reaches = {name: (self.value_of(name), self.reach * error) for name, error in errors.items()}
-        signed = [name for name in errors if name == "offset" or (name.startswith("modes") and name.endswith("mass"))]
+        reaches = {name: (self.value_of(name), self.reach * error) for name, error in self.errors.items()}
+        signed = [name for name in reaches if name == "offset" or (name.startswith("modes") and name.endswith("mass"))]
         # A NaN stays one; a constant force and the mass of a mode may be negative.
         bars = {
             name: ErrorBar(float(value - far if name in signed else np.maximum(0.0, value - far)), value + far)
             for name, (value, far) in reaches.items()
         }
-        (low, high), stiffness = bars["stiffness_max"], self.stiffness_max
-        if self.hidden is not None and self.stiffness_error > 0:
-            low, high = self._average(*self.hidden)
+        stiffness = self.stiffness_max
+        with np.errstate(all="ignore"):
+            # By its logarithm: K_max falls ever less as the delay grows, and near a delay of 0 it is many times more.
+            error = np.divide(self.stiffness_error, stiffness)
+            ends = np.array([-self.reach, self.reach]) * error
+            if self.hidden is not None and error > 0:
+                ends = self._average(error, *self.hidden)
             # What is printed beside the interval lies in it, also where most devices have another K_max.
-            low, high = min(low, stiffness), max(high, stiffness)
+            low, high = (stiffness * np.exp([min(ends[0], 0.0), max(ends[1], 0.0)])).tolist()
         if self.damping_tried is not None and self.virtual_damping > self.damping_tried:
             # Beyond the dampings tried K_max is what the model says; it is at least what buzzed there.
             low = min(low, self.bear_tried(UPPER))
@@ -214,23 +217,22 @@ class DeviceFit(DeviceEstimate):
             high += max(self.lag.stiffness_max - stiffness, 0.0)
         return bars | {"stiffness_max": ErrorBar(low, high)}
 
-    def _average(self, odds: float, ratios: np.ndarray) -> ErrorBar:
-        """The interval of K_max over the device without a hidden resonance and those with one."""
+    def _average(self, error: float, odds: float, ratios: np.ndarray) -> list[float]:
+        """The interval of ln K_max, from that of the device, with a hidden resonance or none."""
         from scipy.optimize import brentq
         from scipy.special import stdtr
 
-        middles = self.stiffness_max * np.append(ratios, 1.0)
+        middles = np.log(np.append(ratios, 1.0))
         weights = np.append(np.full(ratios.size, odds / ratios.size), 1.0) / (1.0 + odds)
-        far = middles.max() + _FAR * self.stiffness_error
+        far = np.abs(middles).max() + _FAR * error
 
-        def exceed(stiffness: float, share: float) -> float:
-            return float(weights @ stdtr(self.freedom, (stiffness - middles) / self.stiffness_error)) - share
+        def exceed(away: float, share: float) -> float:
+            return float(weights @ stdtr(self.freedom, (away - middles) / error)) - share
 
-        low, high = (
+        return [
             float(brentq(exceed, -far, far, args=(0.5 + side * (UPPER - 0.5),)))  # pyright: ignore[reportArgumentType]  (a number unless asked)
             for side in (-1.0, 1.0)
-        )
-        return ErrorBar(max(0.0, low), high)
+        ]
 
     def safe_wall(self, reliability: float = RELIABILITY, *, rigid: bool = False) -> SafeWall:
         """Find the stiffest wall that nearly all devices bear that the records allow.

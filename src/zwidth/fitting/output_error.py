@@ -228,7 +228,7 @@ def _start(model: Recordings) -> list[np.ndarray]:
         base[-1] = friction
         # The more friction, the less damping is left to find.
         delta, d = search(_DELTAS[: _DELTAS.index(delta) + 2])
-        starts.append(start(delta, d))
+        starts.append(refine(model, start(delta, d), (-1,), arrived=_NEAR)[0])
     return starts
 
 

@@ -27,7 +27,7 @@ from zwidth.fitting.required_wall import list_poles
 # Of differences to both sides: of delta and of a followed pole absolute, of all else relative.
 _STEP = 1e-6
 # Time constants of amplifiers in periods, frequencies in radians a period, damping ratios.
-LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (5e-4, 4.0)
+LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (1e-6, 4.0)
 # The delays at low frequencies of those of second order.
 _SLOW = 2.0 * RATIOS[0] * LAGS[0], 2.0 * LAGS[1]
 

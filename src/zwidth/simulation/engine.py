@@ -60,10 +60,12 @@ def look_back(ring: Array, k: Array, back: Array) -> Array:
     return jnp.take_along_axis(ring, place[None], 0)[0]
 
 
+@np.errstate(all="ignore")
 def round_to(quantum: Any, position: Any) -> Any:
-    """A position as an encoder of these steps reads it; as it is where they are 0."""
+    """A position as an encoder of these steps reads it; as it is where they are 0, or too fine to be counted."""
     xp = np if isinstance(position, np.ndarray) else jnp
-    return xp.where(quantum > 0, quantum * xp.floor(position / xp.where(quantum > 0, quantum, 1.0) + 0.5), position)
+    read = quantum * xp.floor(position / quantum + 0.5)
+    return xp.where(xp.isfinite(read), read, position)
 
 
 # Of FOAW's bound.

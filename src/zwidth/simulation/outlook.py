@@ -30,6 +30,8 @@ from zwidth.simulation.maps import (
 _LONG = 1e3
 # What bounds between samples have room for.
 _ROOM = 2.0
+# So many numbers of maps at once: behind a long delay each has the square of its commands on their way.
+_AT_ONCE = 1 << 22
 # How near, in steps of the encoder, a motion must come to where it was a cycle ago.
 _AGAIN = 0.1
 
@@ -63,10 +65,12 @@ def foresee(
         known = known & (lanes.motor.static == 0)
     shapes = np.stack([late, window], 1)
     for shape in np.unique(shapes[known & finite], axis=0):
-        at = np.flatnonzero(known & finite & (shapes == shape).all(1))
-        group = gather(lanes, options, state, push, periods, at)
-        for whole, part in zip(outlook, _foresee(group, sensed[:, at], periods, options.bodies), strict=True):
-            whole[at] = part
+        own = np.flatnonzero(known & finite & (shapes == shape).all(1))
+        numbers = own.size * (shape.sum() + len(lanes.rate)) ** 2
+        for at in np.array_split(own, 1 + numbers // _AT_ONCE):
+            group = gather(lanes, options, state, push, periods, at)
+            for whole, part in zip(outlook, _foresee(group, sensed[:, at], periods, options.bodies), strict=True):
+                whole[at] = part
     return outlook
 
 

@@ -78,7 +78,7 @@ def _draw(motion: Motion) -> str:
     {
         "frequency": "the velocity does not turn twice in the tail",
         "impact_velocity": "the wall is not entered from outside",
-        "trend": "nothing moves",
+        "trend": "nothing moves, or the tail is one period",
     },
     outcome=MotionKind,
     time="s",
@@ -205,6 +205,8 @@ def to_si(
     period, mass, instants = given.period, given.mass, given.instants
     known, force = state.summary, mass / period**2
     low, high = (part[1:, 0] for part in (known.low, known.high))
+    # Of a tail of one period the second half has no sample.
+    width = np.where(high >= low, high - low, np.nan)
     finite = np.isfinite(state.body.x).all(0)
     turns = known.turns[1:].sum(0)
     frequency = (turns - 1) / (np.diff(known.turned, axis=0)[0] * period)
@@ -213,7 +215,7 @@ def to_si(
     outcome = np.where(lost, MotionKind.INVALID, classify(known, outlook, course))
     columns = {
         "amplitude": np.where(outcome == MotionKind.DIVERGED, np.inf, 0.5 * (high.max(0) - low.min(0))),
-        "trend": (high[1] - low[1]) / (high[0] - low[0]),
+        "trend": width[1] / width[0],
         "frequency": np.where((turns > 1) & (outcome != MotionKind.REST), frequency, np.nan),
         "penetration": known.deepest,
         "bounces": known.exits.astype(int),

@@ -261,10 +261,11 @@ def test_the_result_as_plain_numbers():
     fit = zwidth.fit_buzz([*HEARD, (19307.6, 50.0, 101.017455)], period=1e-3, noise=0.02)
     plain = fit.as_dict()
     assert plain["mass"] == fit.mass
-    assert plain["intervals"]["stiffness_max"] == [
-        fit.stiffness_max - fit.reach * fit.stiffness_error,
-        fit.stiffness_max + fit.reach * fit.stiffness_error,
-    ]
+    # By the logarithm of K_max.
+    spread = np.exp(fit.reach * fit.stiffness_error / fit.stiffness_max)
+    assert plain["intervals"]["stiffness_max"] == pytest.approx(
+        [fit.stiffness_max / spread, fit.stiffness_max * spread], rel=1e-14
+    )
     assert fit.scene.device.mass == fit.mass
 
 

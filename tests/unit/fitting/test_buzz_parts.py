@@ -167,7 +167,7 @@ def test_the_interval_of_what_was_not_tried_reaches_down_to_what_was():
     assert not fit.is_structured
     assert fit.damping_tried == 24.16
     assert fit.virtual_damping > 24.16
-    bar, spread = fit.intervals["stiffness_max"], fit.reach * fit.stiffness_error
-    assert bar == (pytest.approx(8703 * (1 - 0.02 * fit.reach)), pytest.approx(fit.stiffness_max + spread))
+    bar, spread = fit.intervals["stiffness_max"], np.exp(fit.reach * fit.stiffness_error / fit.stiffness_max)
+    assert bar == (pytest.approx(8703 * (1 - 0.02 * fit.reach)), pytest.approx(fit.stiffness_max * spread))
     assert bar.low < true.limit_of_walls() < bar.high
     assert fit.safe_wall().stiffness <= fit.bear_tried(0.99)

@@ -77,7 +77,7 @@ def test_the_interval_is_that_of_all_devices_alike():
         alike = replace(fit, hidden=HiddenResonances(odds, np.array(ratios)), lag=None)
         hides = rng.random(count) < odds / (1.0 + odds)
         middle = fit.stiffness_max * np.where(hides, rng.choice(ratios, count), 1.0)
-        drawn = middle + fit.stiffness_error * rng.standard_t(fit.freedom, count)
+        drawn = middle * np.exp(fit.stiffness_error / fit.stiffness_max * rng.standard_t(fit.freedom, count))
         low, high = np.quantile(drawn, [0.025, 0.975])
         found = alike.intervals["stiffness_max"]
         assert found == pytest.approx((low, high), abs=0.1 * fit.stiffness_error)

@@ -8,6 +8,7 @@ from tolerances import SIMULATED_AGAIN
 
 import zwidth
 from zwidth import MotionKind, Status
+from zwidth.simulation import outlook
 from zwidth.words.errors import InputError
 
 TIMING = zwidth.Timing(period=1e-3, delay=1e-3)
@@ -103,6 +104,32 @@ def test_the_amplitude_is_that_of_the_whole_tail():
     tail = found.position[-60:]
     assert found.amplitude == pytest.approx(0.5 * np.ptp(tail))
     assert found.trend == pytest.approx(np.ptp(tail[30:]) / np.ptp(tail[:30]))
+
+
+@pytest.mark.parametrize("coulomb", [0.0, 0.1])
+def test_a_tail_of_one_period_has_no_trend(coulomb):
+    found = SCENE.simulate(1e3, 5.0, start_velocity=0.1, periods=5, tail=1, coulomb=coulomb)
+    assert found.amplitude == 0.0
+    assert np.isnan(found.trend)
+
+
+@pytest.mark.parametrize("resolution", [5e-324, 1e-310])
+def test_steps_too_fine_to_be_counted_are_none(resolution):
+    fine, exact = (SCENE.simulate(1e3, 5.0, start_velocity=0.1, periods=50, resolution=r) for r in (resolution, 0.0))
+    np.testing.assert_array_equal(fine.position, exact.position)
+
+
+def test_behind_a_long_delay_motions_are_foreseen_a_few_at_a_time(monkeypatch):
+    late = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=1e-3, delay=40.3e-3))
+    ask = {"stiffness": np.linspace(5.0, 50.0, 30), "virtual_damping": 0.1, "start_velocity": 0.1, "periods": 200}
+    together = late.simulate(**ask).outcome
+    lay, sizes = outlook.gather, []
+    monkeypatch.setattr(outlook, "gather", lambda *given: sizes.append(given[-1].size) or lay(*given))
+    monkeypatch.setattr(outlook, "_AT_ONCE", 10_000)
+    np.testing.assert_array_equal(late.simulate(**ask).outcome, together)
+    # Each has 44 numbers: five or six at a time.
+    assert max(sizes) <= 6
+    assert sum(sizes) >= 30
 
 
 def test_a_motion_beyond_all_numbers_diverges_without_a_warning():
