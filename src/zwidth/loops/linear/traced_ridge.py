@@ -31,7 +31,7 @@ from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.xp import is_traced, nan_with_nan_slopes
 
-# A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
+# A harmless start for a lane without a ridge.
 _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
 
 
@@ -85,7 +85,8 @@ def compiled_ridge(structure: Structure, *values: Array) -> RidgePoint:
     status = told[-1].astype(jnp.int32)
     found = status == Status.OK
     told = jnp.where(found, told[:-1], jnp.asarray(_NOWHERE, dtype))
-    alpha, beta, w1, w2, close = _solve(structure, _fill(structure, values), told[:4], told[4:6].astype(jnp.int32))
+    codes = told[4:6].astype(jnp.int32)
+    alpha, beta, w1, w2, close = _solve(structure, _fill(structure, values), told[:4], codes, found)
     status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
     spoiled = nan_with_nan_slopes(status == Status.OK, *values)
     omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
@@ -109,7 +110,9 @@ def _fill(structure: Structure, values: Iterable[Any]) -> Any:
     return replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
 
 
-def _solve(structure: Structure, scene: Any, start: Array, codes: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _solve(
+    structure: Structure, scene: Any, start: Array, codes: Array, found: Array
+) -> tuple[Array, Array, Array, Array, Array]:
     """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
     delay, period = scene.timing.delay, scene.timing.period
     d = float(structure.whole) if structure.held else in_periods(jnp.asarray(delay), jnp.asarray(period))
@@ -125,10 +128,10 @@ def _solve(structure: Structure, scene: Any, start: Array, codes: Array) -> tupl
     }
     begin = start / scales
     args = (jax.tree.map(jnp.asarray, respond(chain)), moving, start, codes, scales)
-    found = polish(partial(_residual, chain), begin, args)
+    end = polish(partial(_residual, chain), begin, args, found)
     # Newton must stay where the search put it; a double root is met to half of the digits.
-    close = jnp.all(jnp.abs(found - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
-    return *(found * scales), close
+    close = jnp.all(jnp.abs(end - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
+    return *(end * scales), close
 
 
 def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
