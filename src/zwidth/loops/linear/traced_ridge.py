@@ -21,7 +21,6 @@ from zwidth.arrays.roots import polish
 from zwidth.loops.linear.held import required_wall, respond
 from zwidth.loops.linear.ridge import Condition, moving_paths
 from zwidth.parts.chain import AnyChain, chain_of
-from zwidth.parts.checks import in_periods
 from zwidth.parts.circle import circle
 from zwidth.parts.paths import replace_parameters
 from zwidth.parts.wall import VirtualWall
@@ -40,13 +39,12 @@ class Structure(NamedTuple):
 
     template: Any
     paths: tuple[str, ...]
-    whole: int
-    held: bool
+    d: float
     negative: bool
 
 
 def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
-    """What is static of a scene when these parameters move; how many whole periods the delay has must be."""
+    """What is static of a scene when these parameters move; the delay in periods must be."""
     delay, period = scene.timing.delay, scene.timing.period
     undelayed = isinstance(delay, float) and delay == 0.0
     if is_traced(delay, period) and not undelayed:
@@ -54,11 +52,8 @@ def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structur
             "timing: got a traced delay or period, but the number of poles depends on the whole periods of the delay; "
             "pass both as plain numbers, or ask scene.sensitivities() for the derivatives in them"
         )
-    whole = 0 if undelayed else scene.whole_delay
-    fixed = "delay" not in paths and (undelayed or "period" not in paths)
-    held = fixed and (undelayed or scene.d == whole)
     template = replace_parameters(scene, {"wall": VirtualWall(0.0), **dict.fromkeys(paths, 1.0)})
-    return Structure(template, paths, whole, held, negative)
+    return Structure(template, paths, 0.0 if undelayed else float(scene.d), negative)
 
 
 def trace_stiffest(scene: Any, negative: bool) -> RidgePoint:
@@ -114,9 +109,7 @@ def _solve(
     structure: Structure, scene: Any, start: Array, codes: Array, found: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
     """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
-    delay, period = scene.timing.delay, scene.timing.period
-    d = float(structure.whole) if structure.held else in_periods(jnp.asarray(delay), jnp.asarray(period))
-    chain = chain_of(scene, (d, structure.whole))
+    chain = chain_of(scene, (structure.d, int(structure.d)))
     estimate, complexes = chain.estimate, jnp.result_type(start.dtype, jnp.complex64)
     # The size of the unknowns.
     scales = jnp.stack([start[0], jnp.abs(start[0]) + jnp.abs(start[1]), start[2], start[3]])
