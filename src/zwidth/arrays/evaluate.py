@@ -75,7 +75,8 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     try:
         # NumPy makes an object of a whole number beyond its own.
         array = np.asarray(float(value) if isinstance(value, int) else value)
-        if array.dtype.kind in "OSUcVmM":
+        # NumPy has no kind of its own for bfloat16 and its like.
+        if array.dtype.kind in "OSUcmM" or array.dtype.type is np.void:
             raise TypeError(array.dtype)
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError) as error:

@@ -243,11 +243,18 @@ def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes:
     return xp.sum(function(points) * weights, axis=-1)
 
 
-def polish(residual: Callable[[Array, Any], Array], start: Array, args: Any) -> Array:
-    """The zero of real equations next to a start by optimistix' Newton method, differentiable in ``args``."""
+def polish(residual: Callable[[Array, Any], Array], start: Array, args: Any, usable: Array) -> Array:
+    """The zero of real equations next to a ``usable`` start by optimistix' Newton method, differentiable in args."""
     import jax.numpy as jnp
     import optimistix
 
+    def equations(unknowns: Array, known: Any) -> Array:
+        # Another start stays: what is not finite, or has no slope, would stop the solver for all lanes that share it.
+        args, usable, start = known
+        return jnp.where(usable, residual(unknowns, args), unknowns - start)
+
     tolerance = float(16 * jnp.finfo(start.dtype).eps)
     solver = optimistix.Newton(rtol=tolerance, atol=tolerance)
-    return optimistix.root_find(residual, solver, start, args=args, max_steps=_NEWTON_STEPS, throw=False).value
+    return optimistix.root_find(
+        equations, solver, start, args=(args, usable, start), max_steps=_NEWTON_STEPS, throw=False
+    ).value

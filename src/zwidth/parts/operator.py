@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 from zwidth.parts.checks import Part, check_number
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.xp import is_jax
 
 # That of the reference below.
 _HAND = {"mass": 0.554, "damping": 6.45, "stiffness": 135.0}
@@ -54,7 +55,8 @@ class Operator(Part):
         if not self.rigid:
             check_number("operator.mass", self.mass, allowed=POSITIVE)
         super().__post_init__()
-        if self.rigid and isinstance(self.coupling_damping, float) and self.coupling_damping:
+        # Which number JAX holds, nobody can ask.
+        if self.rigid and (is_jax(self.coupling_damping) or self.coupling_damping):
             raise InputError(
                 f"operator.coupling_damping: got {self.coupling_damping!r} without a spring beside it; give "
                 "operator.coupling_stiffness as well, or add the damping to the device"

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple, get_args
 
 import numpy as np
 
-from zwidth.arrays.evaluate import check_scalars, evaluate
+from zwidth.arrays.evaluate import as_float64, check_scalars, evaluate
 from zwidth.arrays.held_mass import classify_delays
 from zwidth.loops.linear.border import Border, Outline
 from zwidth.loops.linear.boundary import Boundary
@@ -75,6 +75,9 @@ class LinearLoop:
     @cached_property
     def chain(self) -> AnyChain:
         """Its masses, springs and dampers, or its linear system."""
+        # A search of numbers: what JAX traces is refused by name.
+        for path, value in list_parameters(self.scene).items():
+            as_float64(path, value)
         return chain_of(self.scene)
 
     @cached_property

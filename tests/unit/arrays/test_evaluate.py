@@ -186,13 +186,15 @@ def test_a_whole_number_that_float64_holds_is_one_like_any_other():
         as_float64("x", 10**400)
 
 
-@pytest.mark.parametrize("value", ["1", None, 1j, ["1"], [1, [2]], {}, np.array(["a"]), object()])
+@pytest.mark.parametrize(
+    "value", ["1", None, 1j, ["1"], [1, [2]], {}, np.array(["a"]), np.zeros(2, "f8, f8"), object()]
+)
 def test_what_is_no_real_number(value):
     with pytest.raises(InputError, match=r"x: got .*, a real number or a rectangular array of real numbers is needed"):
         as_float64("x", value)
 
 
-@pytest.mark.parametrize("value", [True, 3, np.int8(3), np.float16(0.5), [1, 2.5], np.uint64(7)])
+@pytest.mark.parametrize("value", [True, 3, np.int8(3), np.float16(0.5), [1, 2.5], np.uint64(7), jnp.bfloat16(0.5)])
 def test_what_is_a_real_number(value):
     got = as_float64("x", value)
     assert got.dtype == np.float64

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 
@@ -43,6 +44,11 @@ CASES = {
     ),
     "damper without a spring": (
         lambda: zwidth.Operator(mass=0.5, coupling_damping=1.0),
+        "operator.coupling_damping",
+        "give operator.coupling_stiffness",
+    ),
+    "traced damper without a spring": (
+        lambda: jax.jit(lambda c: zwidth.Operator(mass=0.5, coupling_damping=c).mass)(0.0),
         "operator.coupling_damping",
         "give operator.coupling_stiffness",
     ),

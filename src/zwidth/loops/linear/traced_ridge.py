@@ -21,7 +21,6 @@ from zwidth.arrays.roots import polish
 from zwidth.loops.linear.held import required_wall, respond
 from zwidth.loops.linear.ridge import Condition, moving_paths
 from zwidth.parts.chain import AnyChain, chain_of
-from zwidth.parts.checks import in_periods
 from zwidth.parts.circle import circle
 from zwidth.parts.paths import replace_parameters
 from zwidth.parts.wall import VirtualWall
@@ -31,7 +30,7 @@ from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.xp import is_traced, nan_with_nan_slopes
 
-# A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
+# A harmless start for a lane without a ridge.
 _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
 
 
@@ -40,13 +39,12 @@ class Structure(NamedTuple):
 
     template: Any
     paths: tuple[str, ...]
-    whole: int
-    held: bool
+    d: float
     negative: bool
 
 
 def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
-    """What is static of a scene when these parameters move; how many whole periods the delay has must be."""
+    """What is static of a scene when these parameters move; the delay in periods must be."""
     delay, period = scene.timing.delay, scene.timing.period
     undelayed = isinstance(delay, float) and delay == 0.0
     if is_traced(delay, period) and not undelayed:
@@ -54,11 +52,8 @@ def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structur
             "timing: got a traced delay or period, but the number of poles depends on the whole periods of the delay; "
             "pass both as plain numbers, or ask scene.sensitivities() for the derivatives in them"
         )
-    whole = 0 if undelayed else scene.whole_delay
-    fixed = "delay" not in paths and (undelayed or "period" not in paths)
-    held = fixed and (undelayed or scene.d == whole)
     template = replace_parameters(scene, {"wall": VirtualWall(0.0), **dict.fromkeys(paths, 1.0)})
-    return Structure(template, paths, whole, held, negative)
+    return Structure(template, paths, 0.0 if undelayed else float(scene.d), negative)
 
 
 def trace_stiffest(scene: Any, negative: bool) -> RidgePoint:
@@ -85,7 +80,8 @@ def compiled_ridge(structure: Structure, *values: Array) -> RidgePoint:
     status = told[-1].astype(jnp.int32)
     found = status == Status.OK
     told = jnp.where(found, told[:-1], jnp.asarray(_NOWHERE, dtype))
-    alpha, beta, w1, w2, close = _solve(structure, _fill(structure, values), told[:4], told[4:6].astype(jnp.int32))
+    codes = told[4:6].astype(jnp.int32)
+    alpha, beta, w1, w2, close = _solve(structure, _fill(structure, values), told[:4], codes, found)
     status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
     spoiled = nan_with_nan_slopes(status == Status.OK, *values)
     omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
@@ -109,11 +105,11 @@ def _fill(structure: Structure, values: Iterable[Any]) -> Any:
     return replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
 
 
-def _solve(structure: Structure, scene: Any, start: Array, codes: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _solve(
+    structure: Structure, scene: Any, start: Array, codes: Array, found: Array
+) -> tuple[Array, Array, Array, Array, Array]:
     """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
-    delay, period = scene.timing.delay, scene.timing.period
-    d = float(structure.whole) if structure.held else in_periods(jnp.asarray(delay), jnp.asarray(period))
-    chain = chain_of(scene, (d, structure.whole))
+    chain = chain_of(scene, (structure.d, int(structure.d)))
     estimate, complexes = chain.estimate, jnp.result_type(start.dtype, jnp.complex64)
     # The size of the unknowns.
     scales = jnp.stack([start[0], jnp.abs(start[0]) + jnp.abs(start[1]), start[2], start[3]])
@@ -125,10 +121,10 @@ def _solve(structure: Structure, scene: Any, start: Array, codes: Array) -> tupl
     }
     begin = start / scales
     args = (jax.tree.map(jnp.asarray, respond(chain)), moving, start, codes, scales)
-    found = polish(partial(_residual, chain), begin, args)
+    end = polish(partial(_residual, chain), begin, args, found)
     # Newton must stay where the search put it; a double root is met to half of the digits.
-    close = jnp.all(jnp.abs(found - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
-    return *(found * scales), close
+    close = jnp.all(jnp.abs(end - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
+    return *(end * scales), close
 
 
 def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:

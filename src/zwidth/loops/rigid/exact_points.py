@@ -87,13 +87,13 @@ def _residual(line: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Arra
     return jnp.append(value, (by_beta[0] * by_omega[1] - by_beta[1] * by_omega[0]) / size)
 
 
-def _solve(line: str, start: Array, number: Array, loop: FrequencyLoop) -> tuple[Array, Wall]:
+def _solve(line: str, start: Array, bracketed: Array, number: Array, loop: FrequencyLoop) -> tuple[Array, Wall]:
     """The frequency at which the three equations hold, next to a start, and the wall there, differentiable."""
     wall = jax.lax.stop_gradient(store_once(frequency_boundary(start, loop), start))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
     unknowns = jnp.stack([*wall, start]) / scales
-    omega = polish(lambda *at: _residual(line, *at), unknowns, (loop, number, scales))[2]
+    omega = polish(lambda *at: _residual(line, *at), unknowns, (loop, number, scales), bracketed)[2]
     omega = store_once(omega, start)
     return omega, frequency_boundary(omega, loop)
 
@@ -116,7 +116,7 @@ def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
     upper = jnp.where(end < jnp.pi, end, jnp.pi * (1.0 - 1e-7))
     start, bracketed = bisect(slope, 1e-6 * end, upper, loop)
     start = store_once(start, d)
-    omega, smooth = _solve("ridge", start, d, loop)
+    omega, smooth = _solve("ridge", start, bracketed, d, loop)
     # Rounding can keep Newton from its last tolerance; what counts is that it stayed where the bracket put it.
     converged = summit.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
     spoiled = nan_with_nan_slopes(ok & converged, *inputs)
@@ -152,7 +152,7 @@ def point_kernel(
         loop,
         number,
     )
-    omega, wall = _solve(line, start, number, loop)
+    omega, wall = _solve(line, start, on_lobe, number, loop)
     near = float(jnp.finfo(start.dtype).eps) ** 0.5
     # Of a very soft wall the frequency is below what a bracket resolves.
     hit = jnp.abs(offset(wall, number)) <= 0.1 * near * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))

@@ -41,6 +41,8 @@ _COUNTED, _RELATIVE = 4096.0, 2e-11
 # crossovers depend on it.
 _SMALLEST, _HALVINGS, _POLISHING, _NEWTON = -690.0, 62, 6, 3
 _TOGETHER = 3
+# Counts that the last proof tries, each ten times as far from the pole as the one before: rounding may blur near ones.
+_FARTHER = 6
 # Inside a transformation walls are taken in so many parts, or fewer of so many walls.
 _PARTS, _LEAST_PART = 16, 1 << 9
 # Off the real axis, of the angle of the first pair.
@@ -273,7 +275,8 @@ def _find_part(begin: Any, end: Any, loop: Loop, fractional: bool) -> tuple[Arra
     last = looks + _POLISHING + _NEWTON
     # By rounds: the steps on a pole, the first of which look at the places, and the counts, the last of which proves.
     steps = xp.asarray([(looks + _POLISHING - _LARGER, last), (last, last), (0, last)])
-    counts = xp.asarray([(_HALVINGS + 1, _HALVINGS + 2), (0, _HALVINGS + 1), (_HALVINGS + 1, _HALVINGS + 2)])
+    first = _HALVINGS + 1
+    counts = xp.asarray([(first, first + 1), (0, first), (first, first + _FARTHER)])
 
     def run(state: tuple[Any, _Round]) -> tuple[Any, _Round]:
         turn, known = state
@@ -299,7 +302,8 @@ def _find_part(begin: Any, end: Any, loop: Loop, fractional: bool) -> tuple[Arra
 
         def look(k: Any, at: _Round) -> _Round:
             middle = xp.where(k < _HALVINGS, 0.5 * (at.low + at.high), at.high)
-            log_r = xp.where(k > _HALVINGS, re + certification_width(re, tolerance), middle)
+            width = xp.minimum(certification_width(re, tolerance) * 10.0 ** (k - first), epsilon(re) ** 0.5)
+            log_r = xp.where(k > _HALVINGS, re + width, middle)
             seen = count(log_r, loop, fractional)
             inside = store_once(xp.where(seen.full, xp.where(seen.sure, 2.0, 1.0), 0.0), log_r)
             proved = (k > _HALVINGS) & ~at.proved & (inside > 1) & (at_one | (_AFTER * within <= tolerance))

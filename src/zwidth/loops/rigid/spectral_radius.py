@@ -61,10 +61,11 @@ def spectral_radius(
 
     Numerics:
         Float64 when called directly, maps and up to 262,144 other walls without JAX; the ambient precision inside
-        `jit`, where d may be traced. On a map a Taylor series serves a cell of walls (`loops.rigid.pole_map`); its
-        terms fall faster than the bound that is proved of them. Derivatives are those of the outermost pole, of every
-        order up to the second; NaN where it is a multiple one. Next to a k-fold pole the radius is known to about
-        1e-16^(1/k). How slowly a loop decays that is stable by less than 1e-16, `decay_rate` tells.
+        `jit`, where d may be traced, and a radius within rounding of 1 may lie on either side of it. On a map a Taylor
+        series serves a cell of walls (`loops.rigid.pole_map`); its terms fall faster than the bound that is proved of
+        them. Derivatives are those of the outermost pole, of every order up to the second; NaN where it is a multiple
+        one. Next to a k-fold pole the radius is known to about 1e-16^(1/k). How slowly a loop decays that is stable by
+        less than 1e-16, `decay_rate` tells.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).

@@ -7,6 +7,7 @@ import any_loop
 import jax
 import numpy as np
 import pytest
+from compiling import QUICKLY
 from waiting import LONGEST
 
 import zwidth
@@ -262,10 +263,9 @@ def filtered(cutoff):
 
 def test_inside_transformations(x64):
     assert float(jax.jit(filtered)(30.0)) == pytest.approx(filtered(30.0), rel=1e-12)
-    # The third lane has no filter, and spoils no other.
-    many = jax.vmap(jax.value_and_grad(filtered))(np.array([30.0, 10.0, -1.0, 100.0]))
-    assert np.isnan(many[0][2])
-    assert np.isnan(many[1][2])
+    # Three lanes have no filter, and spoil no other.
+    many = jax.vmap(jax.value_and_grad(filtered))(np.array([30.0, 10.0, -1.0, 100.0, 500.0, np.nan]))
+    assert np.isnan(np.array(many)[:, [2, 4, 5]]).all()
     good = np.array([0, 1, 3])
     np.testing.assert_allclose(many[0][good], [filtered(f) for f in (30.0, 10.0, 100.0)], rtol=1e-12)
     slope = _difference(PAPER.replace(velocity=LowPass(cutoff=100.0)), "velocity.cutoff", False) / 100.0
@@ -295,10 +295,27 @@ def test_a_traced_delay_is_refused():
             jax.grad(lambda value, path=path: scene.replace(**{path: value}).max_stiffness().stiffness)(1e-3)
 
 
+@pytest.mark.parametrize("question", ["is_stable", "margins", "stable_stiffness", "passivity_margin", "state_space"])
+def test_what_takes_numbers_says_which_one_is_traced(question):
+    scene = PAPER.replace(velocity=LowPass(cutoff=100.0), stiffness=1e3, virtual_damping=1.0)
+    with pytest.raises(InputError, match="damping: got a value that JAX traces; give numbers"):
+        jax.jit(lambda damping: getattr(scene.replace(damping=damping), question)())(5.0)
+
+
 def test_without_a_delay_the_period_may_be_traced(x64):
     scene = PAPER.replace(velocity=LowPass(cutoff=100.0), delay=0.0)
     slope = jax.grad(lambda period: scene.replace(period=period).max_stiffness().stiffness)(1e-3)
     assert float(slope) == pytest.approx(_difference(scene, "period", False) / 1e-3, rel=1e-8)
+
+
+def test_a_linear_device_with_a_delay_of_no_whole_periods(x64):
+    scene = Scene(zwidth.LinearDevice(([1.0], [0.1, 10.0, 0.0])), Timing(1e-3, 0.4e-3), velocity=LowPass(cutoff=100.0))
+
+    def stiffness(cutoff):
+        return scene.replace(velocity=LowPass(cutoff=cutoff)).max_stiffness().stiffness
+
+    slope = jax.jit(jax.grad(stiffness), compiler_options=QUICKLY)(100.0)
+    assert float(slope) == pytest.approx(scene.sensitivities().per["velocity.cutoff"], rel=1e-9)
 
 
 def test_no_stable_wall_is_no_number():

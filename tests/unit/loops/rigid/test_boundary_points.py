@@ -196,6 +196,23 @@ def test_optimistix_agrees(side):
         assert (np.abs(one - two) <= tol.BOUNDARY_POINT.float64 * size)[mine.status == Status.OK].all()
 
 
+def test_a_row_without_walls_leaves_the_slopes_of_others_alone(x64):
+    beta, delta, d = (
+        np.array([0.1, -4732.43624518642]),
+        np.array([0.1, 4732.43624518642]),
+        np.array([1.0, 0.3945414887199974]),
+    )
+
+    def solve(beta, delta, d):
+        return zwidth.boundary_point(delta, d, beta=beta, method="optimistix").alpha
+
+    slopes = jax.jit(jax.vmap(jax.grad(solve)), compiler_options=QUICKLY)(beta, delta, d)
+    omega, step = zwidth.boundary_point(0.1, 1.0, beta=0.1).omega, 1e-5
+    low, high = (zwidth.boundary(omega + side, 0.1, 1.0) for side in (-step, step))
+    assert slopes[0] == pytest.approx((high.alpha - low.alpha) / (high.beta - low.beta), rel=1e-8)
+    assert np.isnan(slopes[1])
+
+
 def test_scalars_need_no_jax():
     code = "import sys, zwidth; zwidth.boundary_point(.1, 1.3, alpha=.1); zwidth.boundary_point(.1, 0, beta=.1)"
     code += "; zwidth.boundary_point(.1, 2, alpha=.1, side='upper'); zwidth.stable_region(.5, 1)"

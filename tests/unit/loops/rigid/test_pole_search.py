@@ -173,8 +173,19 @@ def test_many_walls_inside_jit_are_those_called_directly(labels):
         alpha, beta, delta, d = walls
         found = quick_kernel(alpha, beta, delta, d, np.full(alpha.size, 3e-10), fractional=True)
     left = np.flatnonzero(~found.proved)
-    walls = [np.concatenate([column[:1300], np.resize(column[left], 700)]) for column in walls]
+    # A pair next to 1 and two real poles next to -1 blur the count right outside of them.
+    blurred = np.array(
+        [
+            (1.8183874317401205e-06, -7.052473545074463, 7.05266809463501, 1.6817187070846558),
+            (7.981878297869116e-06, -34.8948974609375, 34.89617919921875, 1.0),
+            (9.925483936967794e-07, -6.349642753601074, 6.355916976928711, 0.0),
+            (1110.008154243134, -260.7505798339844, 292.2397155761719, 0.0),
+            (18.894075255914455, -0.7544297575950623, 4.545729160308838, 0.02368774265050888),
+        ]
+    ).T
+    walls = [np.concatenate([column[:1300], np.resize(column[left], 695)]) for column in walls]
     walls[0][::97], walls[3][1::97] = np.nan, -1.0
+    walls = [np.concatenate(columns) for columns in zip(walls, blurred, strict=True)]
     direct = zwidth.spectral_radius(*walls)
     with jax.enable_x64(True):
         inside = np.asarray(jax.jit(zwidth.spectral_radius, compiler_options=QUICKLY)(*walls))
@@ -183,4 +194,5 @@ def test_many_walls_inside_jit_are_those_called_directly(labels):
     # Of multiple poles a program with derivatives says nothing.
     known = np.isfinite(inside)
     assert 0.95 < known.mean() < 0.99
+    assert known[-5:].all()
     np.testing.assert_allclose(inside[known], direct[known], rtol=2e-9)
