@@ -90,7 +90,9 @@ class LinearLoop:
     @cached_property
     def border(self) -> Border:
         """The edge of its stable set."""
-        return Border(self.boundary)
+        # The poles of a loop in z^k come k at a time, and so would its edges.
+        k = self.roots.common_power
+        return Border(self.boundary if k == 1 else Boundary.trace(self.roots.take_root(k)))
 
     @cached_property
     def poles_sought(self) -> int:
@@ -194,7 +196,9 @@ class LinearLoop:
         border = self.border
         if negative not in self._ridges:
             try:
-                self._ridges[negative] = find_ridge(border, negative)
+                found = find_ridge(border, negative)
+                k = self.roots.common_power
+                self._ridges[negative] = found and found._replace(w1=found.w1 / k, w2=found.w2 / k)
             except (ArithmeticError, ZwidthError):
                 return None, Status.NOT_CONVERGED
         found = self._ridges[negative]

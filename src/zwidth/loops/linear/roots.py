@@ -10,7 +10,8 @@ their offsets ``1 - root``: next to z = 1, where slow loops live, a root itself 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import gcd
 
 import numpy as np
 
@@ -45,6 +46,19 @@ class LoopRoots:
         """How many poles the loop with a wall that has damping has."""
         f = self.estimate
         return self.poles.size + self.lag + f.poles.size + max(f.window + f.lag, 0)
+
+    @property
+    def common_power(self) -> int:
+        """The largest k of which the loop is one in ``z^k``: of pure delays behind a window's difference, else 1."""
+        f = self.estimate
+        bare = not (self.zeros.size + self.poles.size + f.zeros.size + f.poles.size)
+        return gcd(self.lag, f.window, f.lag) if bare else 1
+
+    def take_root(self, k: int) -> LoopRoots:
+        """The loop in z whose poles are the k-th powers of those of one in ``z^k``."""
+        f = self.estimate
+        slow = replace(f, window=f.window // k, gain=f.gain / k, lag=f.lag // k)
+        return replace(self, lag=self.lag // k, estimate=slow)
 
     def turning(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """How fast q and F vary at most within ``reach`` of w, relative to themselves."""
