@@ -91,8 +91,8 @@ class LinearLoop:
     def border(self) -> Border:
         """The edge of its stable set."""
         # The poles of a loop in z^k come k at a time, and so would its edges.
-        k = self.roots.common_power
-        return Border(self.boundary if k == 1 else Boundary.trace(self.roots.take_root(k)))
+        roots, k = self.roots.take_root()
+        return Border(self.boundary if k == 1 else Boundary.trace(roots))
 
     @cached_property
     def poles_sought(self) -> int:
@@ -197,7 +197,7 @@ class LinearLoop:
         if negative not in self._ridges:
             try:
                 found = find_ridge(border, negative)
-                k = self.roots.common_power
+                _, k = self.roots.take_root()
                 self._ridges[negative] = found and found._replace(w1=found.w1 / k, w2=found.w2 / k)
             except (ArithmeticError, ZwidthError):
                 return None, Status.NOT_CONVERGED

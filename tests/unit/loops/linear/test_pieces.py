@@ -247,6 +247,15 @@ def test_a_loop_in_powers_of_z_has_the_edges_of_one_in_z(delay, samples):
             assert wall.frequency == pytest.approx(wanted.frequency / power, rel=1e-9)
 
 
+def test_poles_at_equal_angles_make_a_loop_in_powers_of_z():
+    # y^2 + (g K + g B/(2 T) - 1/4) y - g B/(2 T) with y = z^2: all pole pairs are at B = -2 T/g.
+    scene = Scene(sampled([1e-4], [1.0, 0.0, -0.25]), Timing(1e-3), velocity=WindowedDifference(2))
+    assert scene.max_stiffness(negative_damping=True)[:2] == pytest.approx([32_500.0, -20.0], rel=1e-12)
+    assert scene.max_stiffness()[:2] == pytest.approx([12_500.0, 0.0], rel=1e-12)
+    (outline,) = scene.stable_region()
+    assert outline.area == pytest.approx(800e3, rel=1e-9)
+
+
 @pytest.mark.parametrize("delay", [2.0, 2.5])
 def test_edges_that_meet_at_no_damping_hold_soft_walls(delay):
     """Three of them do there, and none of them was found to be that of the row B = 0: no stiffest wall."""
