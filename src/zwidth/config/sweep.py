@@ -269,11 +269,14 @@ class SweepStudy(_Parts, HeldStudy):
             for name in list_parts(self):
                 yield (name,), problem(f"got {name!r} beside normalized axes", "parts are in SI units", "remove it")
             return
+        parts = build_parts(self)
+        # A device that is given as a whole has what such a condition asks for inside.
+        obstacle = find_obstacle(**(vars(parts["device"]) if "device" in parts else parts))
         for index, name in enumerate(self.outputs):
             if name not in OUTPUTS_WITH_PARTS:
                 allowed = f"with a velocity filter, a hand or another part there are {listing(OUTPUTS_WITH_PARTS)}"
                 yield ("outputs", index), problem(f"got {name!r}", allowed, "choose from these")
-            elif name == "passive" and (obstacle := find_obstacle(**build_parts(self))):
+            elif name == "passive" and obstacle:
                 allowed = "it is known where a command acts at once, on the body whose position is sensed"
                 yield ("outputs", index), problem(f"got 'passive' {obstacle.partition(':')[0]}", allowed, "remove it")
         twice = [] if self.device is None else list(find_second_device(dict.fromkeys(given, True)))

@@ -93,7 +93,9 @@ class LinearLoop:
     @cached_property
     def border(self) -> Border:
         """The edge of its stable set."""
-        return Border(self.boundary)
+        # The poles of a loop in z^k come k at a time, and so would its edges.
+        roots, k = self.roots.take_root()
+        return Border(self.boundary if k == 1 else Boundary.trace(roots))
 
     @cached_property
     def poles_sought(self) -> int:
@@ -197,7 +199,9 @@ class LinearLoop:
         border = self.border
         if negative not in self._ridges:
             try:
-                self._ridges[negative] = find_ridge(border, negative)
+                found = find_ridge(border, negative)
+                _, k = self.roots.take_root()
+                self._ridges[negative] = found and found._replace(w1=found.w1 / k, w2=found.w2 / k)
             except (ArithmeticError, ZwidthError):
                 return None, Status.NOT_CONVERGED
         found = self._ridges[negative]

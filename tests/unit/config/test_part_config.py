@@ -116,6 +116,16 @@ def test_a_sweep_of_passivity_needs_the_sensor_where_the_force_acts(load):
     assert [fault.field for fault in caught.value.faults] == ["studies[0].outputs[1]"]
 
 
+def test_a_sweep_of_a_linear_device_has_no_passivity(load):
+    """It was computed, and refused wall by wall, whose labels were lost with it."""
+    walls = "axes: {period: 1 ms, stiffness: [1 kN/m, 5 kN/m], virtual_damping: 10}"
+    sweep = f"studies: [{{kind: sweep, name: s, device: 1 / 0.1 10 0, {walls}, outputs: OUTPUTS}}]\n"
+    assert load(sweep.replace("OUTPUTS", "[stable]")).studies
+    with pytest.raises(ConfigFileError, match="got 'passive' with a linear device") as caught:
+        load(sweep.replace("OUTPUTS", "[stable, passive]"))
+    assert [fault.field for fault in caught.value.faults] == ["studies[0].outputs[1]"]
+
+
 # What such studies cannot do without.
 NEEDED = {"step": ", stiffness_fraction: 0.5", "map": ", alpha: 1, beta: 1"}
 

@@ -235,20 +235,25 @@ class Border:
 
     def holds_softly(self, alpha: float, beta: float) -> bool:
         """Whether a wall is stable in a piece with soft walls."""
-        found = bound_intervals(self.boundary, np.array([beta]))
-        column = found.above[0, (found.low[0] < alpha) & (alpha < found.high[0])]
-        beside = [
-            (max(edge.beta[0] - beta, beta - edge.beta[-1]), edge.piece) for edge in self.edges if edge.column in column
-        ]
-        away, piece = min(beside, default=(np.inf, -1))
-        return away <= _NEAR * abs(beta) and piece in self.main
+        # The edges above it, on its row or beside: where several meet, that of the row may be another one.
+        rows = beta + _NEAR * (abs(beta) + self.width) * np.array([0.0, -1.0, 1.0])
+        found = bound_intervals(self.boundary, rows)
+        row, k = np.nonzero((found.low < alpha) & (alpha < found.high))
+        above = set(zip(rows[row].tolist(), found.above[row, k].tolist(), strict=True))
+        edges = self.soft_edges(-np.inf)
+        return any(edge.beta[0] <= at <= edge.beta[-1] and edge.column == end for edge in edges for at, end in above)
+
+    def soft_edges(self, least: float) -> list[Edge]:
+        """The edges of pieces with soft walls that reach beyond a damping: not by rounding of a meeting there."""
+        main = [edge for edge in self.edges if edge.piece in self.main]
+        return [edge for edge in main if edge.beta[-1] - least > _TOLD * np.ptp(edge.beta)]
 
     def find_highest(self, least: float) -> float:
         """Up to which alpha rows with that much damping or more are stable in pieces with soft walls; else -inf."""
         rows, highest = self._found[0], -np.inf
-        for edge in self.edges:
-            counts = (rows.beta[edge.rows] >= least) & (edge.piece in self.main)
-            highest = np.max(rows.alpha[edge.rows, edge.column], where=counts, initial=highest)
+        for edge in self.soft_edges(least):
+            own = rows.alpha[edge.rows, edge.column]
+            highest = np.max(own, where=rows.beta[edge.rows] >= least, initial=highest)
         return float(highest)
 
     def islands(self, least: float) -> list[Island]:

@@ -111,18 +111,16 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         return _rigid_loop(chain)
     chain.check()
     parts = sampled(chain)
-    if isinstance(chain, System) and chain.sampled:
-        zeros, poles = chain.device.offsets
-        # Poles at z = 0 are periods of delay, which zeros there take away as far as there are any.
-        lag, still = chain.whole + int(np.sum(poles == 1)), int(np.sum(zeros == 1))
-        zeros = np.append(zeros[zeros != 1], np.ones(max(still - lag, 0)))
-        gain = chain.device.gain * float(chain.mass) / float(chain.period) ** 2
-        return LoopRoots(gain, max(lag - still, 0), zeros, poles[poles != 1], chain.estimate)
     if isinstance(chain, System):
-        held = chain.d != chain.whole
-        gain, zeros = prove_zeros(chain.device, float(chain.period), (float(chain.d), chain.whole))
-        poles = -np.expm1(chain.device.poles * float(chain.period))
-        return LoopRoots(gain, chain.whole + held, zeros, poles, chain.estimate)
+        lag, (zeros, poles) = chain.whole + (chain.d != chain.whole), chain.device.offsets
+        gain = chain.device.gain * float(chain.mass) / float(chain.period) ** 2
+        if not chain.sampled:
+            gain, zeros = prove_zeros(chain.device, float(chain.period), (float(chain.d), chain.whole))
+            poles = -np.expm1(chain.device.poles * float(chain.period))
+        # Poles at z = 0 are periods of delay, which zeros there take away as far as there are any.
+        lag, still = int(lag + np.sum(poles == 1)), int(np.sum(zeros == 1))
+        zeros = np.append(zeros[zeros != 1], np.ones(max(still - lag, 0)))
+        return LoopRoots(gain, max(lag - still, 0), zeros, poles[poles != 1], chain.estimate)
     seen, poles = chain.continuous
     poles = -np.expm1(poles)
     den = np.atleast_1d(np.poly(-poles)).real

@@ -287,7 +287,9 @@ def _follow(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) 
         here, beside = (open_loop_response(loop_at(chain, delay + h), *wall, at) for h in (0.0, step))
         rest, turn = np.log(-here.value[0]), here.slope[0] / here.value[0]
         slope = np.log(beside.value[0] / here.value[0]) / step
-        by_w, by_delay = np.linalg.solve([[turn.real, slope.real], [turn.imag, slope.imag]], [rest.real, rest.imag])
+        # Where L is the same for a while, as of a device that has come to rest before, this leads to no angle.
+        with np.errstate(all="ignore"):
+            by_w, by_delay = np.imag([slope * rest.conj(), rest * turn.conj()]) / np.imag(slope * turn.conj())
         w, delay = w - by_w, delay - by_delay
         # On the flank of a narrow resonance the rounding of w alone moves the delay by more.
         if abs(by_delay) <= 1e-14 * (1.0 + delay):

@@ -101,19 +101,19 @@ class _Top(NamedTuple):
 
 def _tops(border: Border, least: float) -> Iterator[_Top]:
     """Local maxima of the edges of pieces with soft walls, with beta of ``least`` or more."""
-    for edge in border.edges:
+    edges = border.soft_edges(least)
+    for edge in edges:
         padded = np.pad(np.where(edge.beta >= least, edge.alpha, -np.inf), 1, constant_values=-np.inf)
         alpha, last = padded[1:-1], edge.w.size - 1
-        high = (alpha >= padded[:-2]) & (alpha >= padded[2:]) & (alpha > 0) & (edge.piece in border.main)
-        for k in np.flatnonzero(high):
+        for k in np.flatnonzero((alpha >= padded[:-2]) & (alpha >= padded[2:]) & (alpha > 0)):
             yield _Top(float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), edge.column, bool(0 < k < last))
     if np.isfinite(least):
-        # The upper ends of the row's stable intervals.
-        found = bound_intervals(border.boundary, np.array([least]))
-        for k in np.flatnonzero(found.high[0] > 0):
-            high = float(found.high[0, k])
-            if border.holds_softly(0.5 * (float(found.low[0, k]) + high), least):
-                yield _Top(high, least, float(found.w_above[0, k]), int(found.above[0, k]), False)
+        # Where edges pass the least damping.
+        row = border.boundary.crossings(np.array([least]))
+        for edge in edges:
+            high, w = float(row.alpha[0, edge.column]), float(row.w[0, edge.column])
+            if edge.beta[0] <= least and high > 0:
+                yield _Top(high, least, w, edge.column, False)
 
 
 def _is_reached(border: Border, top: _Top, least: float) -> bool:

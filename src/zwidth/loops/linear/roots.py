@@ -10,7 +10,9 @@ their offsets ``1 - root``: next to z = 1, where slow loops live, a root itself 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
+from math import gcd
 
 import numpy as np
 
@@ -18,6 +20,9 @@ from zwidth.arrays.polynomials import Affine
 from zwidth.parts.circle import CirclePoints, Jet, are_on_circle, circle, depths, lag_jet, product_jet
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
+
+# Of the largest coefficient: a power with less of it is not there.
+_NO_TERM = 1e-12
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,20 @@ class LoopRoots:
         """How many poles the loop with a wall that has damping has."""
         f = self.estimate
         return self.poles.size + self.lag + f.poles.size + max(f.window + f.lag, 0)
+
+    def take_root(self) -> tuple[LoopRoots, int]:
+        """The loop in z whose poles are the k-th powers of its own, and the largest such k: mostly itself and 1."""
+        f = self.estimate
+        parts = [_product(each) for each in (self.zeros, self.poles, f.zeros, f.poles)]
+        behind = [self.lag + parts[1].size - parts[0].size, f.lag + parts[3].size - parts[2].size]
+        kept = [np.flatnonzero(np.abs(part) > _NO_TERM * np.abs(part).max()).tolist() for part in parts]
+        k = gcd(f.window, *behind, *chain.from_iterable(kept))
+        if k <= 1:
+            return self, 1
+        roots = [1.0 - np.roots(part[: each[-1] + 1 : k]) for part, each in zip(parts, kept, strict=True)]
+        lags = [late // k - roots[j + 1].size + roots[j].size for late, j in zip(behind, (0, 2), strict=True)]
+        slow = replace(f, window=f.window // k, gain=f.gain / k, lag=lags[1], zeros=roots[2], poles=roots[3])
+        return replace(self, lag=lags[0], zeros=roots[0], poles=roots[1], estimate=slow), k
 
     def turning(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """How fast q and F vary at most within ``reach`` of w, relative to themselves."""

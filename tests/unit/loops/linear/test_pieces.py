@@ -237,3 +237,45 @@ def test_a_strongly_damped_device_with_a_spring_has_one_piece(damping, hand):
     (outline,) = held.stable_region()
     assert not (outline.hole or outline.island)
     assert outline.stiffness.max() == pytest.approx(held.max_stiffness().stiffness, rel=1e-6)
+
+
+@pytest.mark.parametrize("delay, samples", [(2, 2), (2, 4), (3, 3), (4, 6), (8, 2)])
+def test_a_loop_in_powers_of_z_has_the_edges_of_one_in_z(delay, samples):
+    """Its poles come several at a time: edges that fell on each other took a minute, three lines were a traceback."""
+    power = int(np.gcd(delay, samples))
+    # A force that is late, and a device that has come to rest within the period.
+    late = Scene(sampled([1e-4], np.eye(1, delay + 1)[0]), Timing(1e-3))
+    fast = Scene(zwidth.LinearDevice(([16.0], [1.0, 1.6e5])), Timing(1e-3, (delay - 1) * 1e-3))
+    simple = Scene(sampled([1e-4], np.eye(1, delay // power + 1)[0]), Timing(1e-3))
+    simple = simple.replace(velocity=WindowedDifference(samples // power))
+    for negative in (False, True):
+        wanted = simple.max_stiffness(negative_damping=negative)
+        for scene in (late, fast):
+            wall = scene.replace(velocity=WindowedDifference(samples)).max_stiffness(negative_damping=negative)
+            assert wall.status == wanted.status == zwidth.Status.OK
+            assert wall.stiffness == pytest.approx(wanted.stiffness, rel=1e-9)
+            assert wall.virtual_damping == pytest.approx(power * wanted.virtual_damping, rel=1e-9, abs=1e-9)
+            assert wall.frequency == pytest.approx(wanted.frequency / power, rel=1e-9)
+
+
+def test_poles_at_equal_angles_make_a_loop_in_powers_of_z():
+    # y^2 + (g K + g B/(2 T) - 1/4) y - g B/(2 T) with y = z^2: all pole pairs are at B = -2 T/g.
+    scene = Scene(sampled([1e-4], [1.0, 0.0, -0.25]), Timing(1e-3), velocity=WindowedDifference(2))
+    assert scene.max_stiffness(negative_damping=True)[:2] == pytest.approx([32_500.0, -20.0], rel=1e-12)
+    assert scene.max_stiffness()[:2] == pytest.approx([12_500.0, 0.0], rel=1e-12)
+    (outline,) = scene.stable_region()
+    assert outline.area == pytest.approx(800e3, rel=1e-9)
+
+
+@pytest.mark.parametrize("delay", [2.0, 2.5])
+def test_edges_that_meet_at_no_damping_hold_soft_walls(delay):
+    """Three of them do there, and none of them was found to be that of the row B = 0: no stiffest wall."""
+    # z^3 + g K with a pole that is gone within the period, behind a slow filter; and a delay behind a window.
+    gone = zwidth.LinearDevice(([5e6], [1.0, 5e6]))
+    slow = Scene(gone, Timing(3.2e-5, delay * 3.2e-5), velocity=LowPass(cutoff=59.23))
+    window = Scene(sampled([1e-4], np.eye(1, 6)[0]), Timing(1e-3), velocity=WindowedDifference(2))
+    for scene, stiffest in ((slow, 1.0), (window, 1e4)):
+        wall = scene.max_stiffness()
+        assert wall.status == zwidth.Status.OK
+        assert wall[:2] == pytest.approx([stiffest, 0.0], rel=1e-9, abs=1e-9)
+        assert scene.loop.holds_softly(0.5 * stiffest / scene.units.stiffness, 0.0)

@@ -247,3 +247,17 @@ def test_a_soft_wall_on_a_free_device_has_its_crossover_at_any_frequency(stiffne
     assert found.delay_margin == pytest.approx(lead - 1.5e-3, rel=1e-4)
     # Where |L| passes 1 it is nearest to -1.
     assert found.modulus_margin == pytest.approx(turn, rel=1e-3)
+
+
+@pytest.mark.parametrize("periods", [0, 1, 2])
+@pytest.mark.parametrize("rate", [10.0, 30.0, 56.0])
+def test_the_delay_margin_of_a_device_that_rests_before_the_period_is_over(rate, periods):
+    """A little more delay changes nothing of such a loop: the way to the next crossing was a division by zero."""
+    device = zwidth.LinearDevice(([rate * 1e3], [1.0, rate * 1e3]))
+    scene, wall = zwidth.Scene(device, zwidth.Timing(1e-3, periods * 1e-3)), (1.05, -0.5e-3)
+    found = scene.margins(*wall).delay_margin
+    # Four periods are too long, up to what the device moves within the time constants before it.
+    assert found == pytest.approx((4 - periods) * 1e-3, abs=1e-2 * 1e-3)
+    for share, stable in ((0.5, True), (1 - 1e-9, True), (1 + 1e-9, False)):
+        moved = scene.replace(delay=periods * 1e-3 + share * found)
+        assert moved.is_stable(*wall, method="certified") == stable
