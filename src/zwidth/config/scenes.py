@@ -88,7 +88,8 @@ class _PhysicalPlant(_Parts, SampledMass):
 
     @cached_property
     def _scene(self) -> Scene:
-        timing = Timing(period=self.period, delay=self.delay.seconds(self.period))
+        # As a length of time of its own: seconds of a delay in periods may miss it by a rounding error.
+        timing = Timing(self.period, self.delay, getattr(self, "delay_model", "held"))
         # A device that is given as a whole is one of the parts, and takes the place of this one.
         device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
         return replace_parameters(Scene(device, timing), build_parts(self))
@@ -173,10 +174,9 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
 
     @cached_property
     def _scene(self) -> Scene:
-        bare = super()._scene
         # One that is not given has no stiffness and no damping.
         wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
-        return replace(bare, timing=replace(bare.timing, delay_model=self.delay_model), wall=wall)
+        return replace(super()._scene, wall=wall)
 
     def bare(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
         """The scene without its wall, as a device of a kind; by default of one whose velocity estimate is linear."""

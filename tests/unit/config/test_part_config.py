@@ -45,6 +45,14 @@ def test_hand_and_coupling_in_units(load):
     assert scene.device.coupling == zwidth.Coupling(0.05, 20e3, 1, "tip")
 
 
+def test_a_delay_in_periods_is_exact_in_the_scene_too(load):
+    """Of its seconds the period makes 0.8869999999999999."""
+    scene = "scene: {mass: 0.1, period: 3e-4, delay: 0.887 periods, velocity: {kind: low_pass, cutoff: 100}}\n"
+    config = load(scene + "studies: [{kind: recommend, name: r}]\n")
+    assert zwidth.Timing(3e-4, 0.887 * 3e-4).d != 0.887
+    assert config.scene.to_scene().d == 0.887
+
+
 def test_a_hand_held_rigidly_adds_to_the_mass_of_every_kind(load):
     """Such a scene is the rigid one of both masses: the same walls in the same units."""
     studies = "studies: [{kind: recommend, name: r}]\n"
