@@ -69,8 +69,10 @@ def test_a_scene_that_no_device_has_is_doubted_before_anything_is_computed(tmp_p
     def doubts_of(scene):
         (tmp_path / "small.yaml").write_text(HEAD + f"scene: {scene}\n" + STUDY % 0.5, encoding="utf-8")
         result = CliRunner().invoke(cli, ["run", "small.yaml", "--dry-run"], catch_exceptions=False)
-        assert result.stdout.startswith("study best\n")
-        return [line.removeprefix("zwidth: small.yaml: scene.") for line in result.stderr.splitlines()]
+        # Older versions of click's runner do not tell stderr from the answer.
+        doubts, plan, _ = result.output.partition("study best\n")
+        assert plan
+        return [line.removeprefix("zwidth: small.yaml: scene.") for line in doubts.splitlines()]
 
     assert doubts_of("{mass: 100, damping: 10, rate: 1, delay: 1}") == [
         "mass is 100 kg, far from any device; did you mean 'mass: 100 g'?",
