@@ -95,6 +95,25 @@ def test_one_wall_for_all():
         assert not np.all(stable(vertices, stiffer, 1 + 1e-6))
 
 
+def test_devices_within_a_box_that_bind_are_found_by_the_proof():
+    """With the walls of the devices that were searched for, three parts of the box show one that is unstable."""
+    box = {
+        "mass": (9.54e-3, 14.14e-3),
+        "damping": (1.66, 2.48),
+        "period": (7e-3, 8.72e-3),
+        "delay": (0.355e-3, 0.61e-3),
+    }
+    box = {name: Interval(*ends) for name, ends in box.items()}
+    wall = robust_wall(**box)
+    assert wall.status == Status.OK
+    assert search(box, row_end(wall), 3) > 1.0
+    low, high = ends_of(box)
+    vertices = dict(zip(NAMES, (part.ravel() for part in np.meshgrid(*zip(low, high, strict=True))), strict=True))
+    stiffer = wall._replace(stiffness=wall.limit)
+    assert np.all(stable(vertices, stiffer, 1 + 1e-4))
+    assert not np.all(stable(sampled(box, 2000), stiffer, 1 + 1e-2))
+
+
 def test_a_worst_case_inside():
     # Strong damping: over the mass K_max has a minimum.
     box = {"mass": Interval(0.01, 1.0), "damping": 100.0, "period": 1e-3, "delay": 2e-3}

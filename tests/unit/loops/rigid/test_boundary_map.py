@@ -86,3 +86,13 @@ def test_rows_are_solved_to_the_last_digits(d, delta, monkeypatch):
     more = long_row_point(beta, fields)[0]
     # beta itself is known to an ulp of delta, which near the lobe's end is more of the limit.
     np.testing.assert_allclose(limit, more, rtol=1e-13, atol=2e-13 * more.max())
+
+
+def test_rows_that_are_compiled_are_those_that_are_not():
+    random = np.random.default_rng(4)
+    delta, d = 10.0 ** random.uniform(-8, 6, 400), random.uniform(0, 6, 400)
+    d[::2] = np.floor(d[::2])
+    beta = random.uniform(-1, 1, 400) * (delta + 1.0)
+    few, many = (row_limits(beta, delta, d, route=route) for route in ("numpy", "jax"))
+    assert 100 < np.sum(few > 0) < 400
+    np.testing.assert_allclose(many, few, rtol=1e-12, atol=1e-13 * np.nanmax(few))

@@ -15,6 +15,7 @@ from waiting import LONGEST
 
 import oracles
 import zwidth
+from zwidth.loops.rigid.outermost_poles import outermost_poles
 from zwidth.loops.rigid.pole_search import quick_kernel
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
@@ -196,3 +197,11 @@ def test_many_walls_inside_jit_are_those_called_directly(labels):
     assert 0.95 < known.mean() < 0.99
     assert known[-5:].all()
     np.testing.assert_allclose(inside[known], direct[known], rtol=2e-9)
+
+
+def test_poles_that_are_compiled_are_those_that_are_not(labels):
+    columns = [labels[name][::7] for name in ("alpha", "beta", "delta", "d")]
+    few, many = (outermost_poles(columns, 1e-9, route) for route in ("numpy", "jax"))
+    assert few.proved.sum() > 100
+    np.testing.assert_array_equal(many.proved, few.proved)
+    np.testing.assert_allclose(many.re[few.proved], few.re[few.proved], rtol=0, atol=2e-9)
