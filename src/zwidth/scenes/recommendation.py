@@ -325,7 +325,7 @@ class SceneAdvice(SceneOptima):
         Numerics:
             A share of K_max alone is in closed form, with the damping of the stiffest wall where it is stable. Margins
             take a search over K and B: each wall is judged by `margins` and `passivity_margin` themselves, and K lies
-            within 1e-4 of the largest that was found; 0.3 s for a rigid device, some seconds with other parts.
+            within 1e-4 of the largest that was found; 0.5 s for a rigid device, some seconds with other parts.
 
         Example:
             >>> import zwidth
