@@ -91,10 +91,14 @@ class LinearLoop:
         return Boundary.trace(self.roots)
 
     @cached_property
+    def _in_powers(self) -> tuple[LoopRoots, int]:
+        """The loop of which its own has the k-th roots as poles, and k: they come k at a time, and so would edges."""
+        return self.roots.take_root()
+
+    @cached_property
     def border(self) -> Border:
         """The edge of its stable set."""
-        # The poles of a loop in z^k come k at a time, and so would its edges.
-        roots, k = self.roots.take_root()
+        roots, k = self._in_powers
         return Border(self.boundary if k == 1 else Boundary.trace(roots))
 
     @cached_property
@@ -199,8 +203,7 @@ class LinearLoop:
         border = self.border
         if negative not in self._ridges:
             try:
-                found = find_ridge(border, negative)
-                _, k = self.roots.take_root()
+                found, k = find_ridge(border, negative), self._in_powers[1]
                 self._ridges[negative] = found and found._replace(w1=found.w1 / k, w2=found.w2 / k)
             except (ArithmeticError, ZwidthError):
                 return None, Status.NOT_CONVERGED
