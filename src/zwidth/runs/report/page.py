@@ -182,10 +182,17 @@ def _draw_curves(data: xarray.Dataset, study: str) -> Iterator[str]:
                 yield _show_figure(file, study)
 
 
+_AGREEMENT = {True: "agrees", False: "differs", None: "cited"}
+
+
+def _computed(row: dict[str, Any]) -> str:
+    return escape(row["note"]) if row["computed"] is None else f"{row['computed']:.10g}"
+
+
 def _published(content: dict[str, Any]) -> str:
     rows = [
         f"<td>{escape(row['quantity'])}</td><td>{escape(row['where'])}</td><td>{escape(str(row['printed']))}</td>"
-        f'<td class="number">{row["computed"]:.10g}</td><td>{"agrees" if row["agrees"] else "differs"}</td>'
+        f'<td class="number">{_computed(row)}</td><td>{_AGREEMENT[row["agrees"]]}</td>'
         for row in content["published"]
     ]
     head = "".join(f'<th scope="col">{word}</th>' for word in ("quantity", "where", "printed", "computed", ""))
