@@ -40,7 +40,9 @@ FIG10_DELAYS = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 LINEAR_WITHIN = 0.1  # relative distance of d alpha_max/d delta from its limit g that counts as linear
 FILTER_LAG = 0.05  # s: lag of the velocity filter that section VIII cites
 _LINE = "delta above which the line appears for d = 0"
-_LINEAR = f"delta above which alpha_max is linear: derivative within {LINEAR_WITHIN:.0%} of g, all curves of Fig. 10"
+_LINEAR = (
+    f"delta above which alpha_max is linear: derivative within {100 * LINEAR_WITHIN:g} % of g, all curves of Fig. 10"
+)
 
 
 @dataclass(frozen=True)
