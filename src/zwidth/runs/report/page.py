@@ -263,7 +263,8 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
     embedded = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
     return (
         f'<div class="slices"><h3>{escape(name)}</h3><p class="soft">{escape(words)}. '
-        f"{colors}; gray: {'0, ' if scale.logarithmic else ''}{_GRAY}.{_LINES if any(content['edges']) else ''}{thinned} "
+        f"{colors}; gray: {'0, ' if scale.logarithmic else ''}{_GRAY}."
+        f"{_LINES if any(content['edges']) else ''}{thinned} "
         "Point, or focus the map and use the arrow keys, to read a value.</p>"
         f'{sliders}<canvas tabindex="0" role="img" aria-label="{escape(words)}"></canvas><output aria-live="polite">'
         f'</output><script type="application/json">{embedded}</script></div>'
