@@ -67,8 +67,11 @@ class Parsed(click.ParamType):
             self.fail(f"got {value!r}; {self.remedy}" if self.remedy else str(error), param, ctx)
 
 
-def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> Parsed:
-    """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`."""
+def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, counts: bool = False) -> Parsed:
+    """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`.
+
+    With ``counts`` it is the step of an encoder, also as "2000 counts".
+    """
 
     def read(text: str) -> Any:
         try:
@@ -78,7 +81,9 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> 
             number = text
         # Whether all are of one kind of device is asked when all are known.
         with use_kind(bool(tell_kind(number))):
-            return read_span(number, allowed) if periods else read_quantity(number, find_dimension(unit), allowed)[0]
+            if periods:
+                return read_span(number, allowed)
+            return read_quantity(number, find_dimension(unit), allowed, counts=counts)[0]
 
     return Parsed("quantity", read)
 
@@ -184,6 +189,12 @@ def _read_period(given: dict[str, Any]) -> float | None:
 period_options = _take_options("period", ("period", "rate"), (), _read_period)
 
 
+def warn_implausible(given: dict[str, Any]) -> None:
+    """Write a line on the error stream for each value in SI units, by path, that lies far from any device."""
+    for line in list_doubts(given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
+        click.echo(f"zwidth: {line}", err=True)
+
+
 def build_scene(given: dict[str, Any], instead: str = "") -> Scene | None:
     """The scene of some options by path; None where nothing describes one and other options may stand instead."""
     from zwidth.parts.devices import KnownDevice
@@ -200,8 +211,7 @@ def build_scene(given: dict[str, Any], instead: str = "") -> Scene | None:
     numbers = {
         path: value.value if isinstance(value, Span) and value.unit == "s" else value for path, value in given.items()
     }
-    for line in list_doubts(numbers, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
-        click.echo(f"zwidth: {line}", err=True)
+    warn_implausible(numbers)
 
     def some(*names: str) -> dict[str, Any]:
         return {name: given[name] for name in names if name in given}
