@@ -30,7 +30,7 @@ from zwidth.pages.words import row
 from zwidth.parts.device import Device
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
-from zwidth.words.errors import InputError, ZwidthError, check_choice
+from zwidth.words.errors import InputError, ZwidthError, check_choice, how_to_install
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
 from zwidth.words.status import Status
@@ -57,7 +57,11 @@ def cli() -> None:
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
 @click.option("--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N.")
-@click.option("--resolution", type=quantity_type("m", POSITIVE), help="One step Q of the position sensor, in m.")
+@click.option(
+    "--resolution",
+    type=quantity_type("m", POSITIVE, counts=True),
+    help="One step Q of the position sensor, in m; or '2000 counts'.",
+)
 @verbose_option
 @json_option
 def check(scene: Any, friction: float | None, resolution: float | None, verbose: bool, as_json: bool) -> None:
@@ -277,7 +281,9 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("bokeh", "tornado"):
             raise
-        raise InputError("explore: bokeh is not installed; pip install 'zwidth[explore]'") from error
+        raise InputError(
+            f"explore: needs bokeh, which is not installed; install it: {how_to_install('explore')}"
+        ) from error
     from zwidth.pages.explorer.controls import read_controls
     from zwidth.runs.record import find_config
 
