@@ -63,6 +63,10 @@ from .scenes.assessment import Limit as Limit
 from .scenes.assessment import assess as assess
 from .scenes.assessment import assess_many as assess_many
 from .scenes.assessment import limits_of as limits_of
+from .scenes.diagnosis import Diagnosis as Diagnosis
+from .scenes.diagnosis import Hardware as Hardware
+from .scenes.diagnosis import Remedy as Remedy
+from .scenes.diagnosis import diagnose as diagnose
 from .scenes.recommendation import Recommendation as Recommendation
 from .scenes.robust import Interval as Interval
 from .scenes.robust import RobustStiffness as RobustStiffness
