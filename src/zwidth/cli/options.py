@@ -343,7 +343,16 @@ def _make_velocity(given: dict[str, Any]) -> Any:
 
 
 figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
+verbose_option = click.option("--verbose", is_flag=True, help="Print everything that is known.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+
+
+def find_silent() -> frozenset[str]:
+    """Return the names among damping and delay that are 0 because neither an option nor a file gives a value."""
+    given = click.get_current_context().params
+    if given.get("scene_file") is not None:
+        return frozenset()
+    return frozenset(name for name in ("damping", "delay") if given.get(name) is None)
 
 
 def log_options(command: Command) -> Command:
