@@ -179,6 +179,5 @@ OTHERS = {
     "step_response": "one wall: tests/unit/loops/rigid/test_response.py",
     "to_control": "one scene: tests/unit/scenes/test_answers.py",
     "use_compilation_cache": "a setting: tests/unit/arrays/test_kernel_cache.py",
-    "worst_motion": "one scene and wall: tests/unit/scenes/test_worst_motion.py",
     "write_report": "a folder: tests/unit/runs/report/test_page.py",
 }

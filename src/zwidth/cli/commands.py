@@ -22,6 +22,7 @@ from zwidth.cli.options import (
     save_figure,
     scene_options,
     show_example,
+    warn_implausible,
 )
 from zwidth.pages import words
 from zwidth.pages.words import row
@@ -55,7 +56,11 @@ def cli() -> None:
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
 @click.option("--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N.")
-@click.option("--resolution", type=quantity_type("m", POSITIVE), help="One step Q of the position sensor, in m.")
+@click.option(
+    "--resolution",
+    type=quantity_type("m", POSITIVE, counts=True),
+    help="One step Q of the position sensor, in m; or '2000 counts'.",
+)
 @json_option
 def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
     """Judge one wall: stable, passive, how far from the boundary.
@@ -70,6 +75,8 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
     if as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
+    if resolution is not None:
+        warn_implausible({"resolution": resolution})
     if friction is not None or resolution is not None:
         rule = friction_rule(scene, friction, resolution)
         result["friction_rule"] = rule._asdict()
