@@ -262,7 +262,7 @@ def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, *
 
 
 @cli.command()
-@click.option("--quick", is_flag=True, help="Few delays and small maps: less than a minute instead of some.")
+@click.option("--quick", is_flag=True, help="Few delays and small maps: one to three minutes on two cores.")
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
