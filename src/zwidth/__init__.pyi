@@ -75,12 +75,11 @@ from .scenes.stiffness import sensitivities as sensitivities
 from .scenes.tolerances import Tolerance as Tolerance
 from .scenes.tolerances import ToleranceEstimate as ToleranceEstimate
 from .scenes.tolerances import simulate_tolerances as simulate_tolerances
-from .scenes.worst_motion import WorstMotion as WorstMotion
-from .scenes.worst_motion import worst_motion as worst_motion
 from .simulation.result import Motion as Motion
 from .simulation.result import MotionKind as MotionKind
 from .simulation.simulate import simulate as simulate
 from .studies.document import load_config as load_config
+from .studies.document import load_scene as load_scene
 from .sweep.dataset import open_dataset as open_dataset
 from .words.errors import ConfigError as ConfigError
 from .words.errors import InputError as InputError

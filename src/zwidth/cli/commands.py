@@ -22,13 +22,14 @@ from zwidth.cli.options import (
     save_figure,
     scene_options,
     show_example,
+    warn_implausible,
 )
 from zwidth.pages import words
 from zwidth.pages.words import row
 from zwidth.parts.device import Device
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
-from zwidth.words.errors import InputError, ZwidthError, check_choice
+from zwidth.words.errors import InputError, ZwidthError, check_choice, how_to_install
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
 from zwidth.words.status import Status
@@ -55,12 +56,17 @@ def cli() -> None:
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
 @click.option("--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N.")
-@click.option("--resolution", type=quantity_type("m", POSITIVE), help="One step Q of the position sensor, in m.")
+@click.option(
+    "--resolution",
+    type=quantity_type("m", POSITIVE, counts=True),
+    help="One step Q of the position sensor, in m; or '2000 counts'.",
+)
 @json_option
 def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
     """Judge one wall: stable, passive, how far from the boundary.
 
     It needs --stiffness, --mass (or --device) and --rate (or --period); damping and delay are 0 where left out.
+    SCENE.yaml (or the folder of a run) supplies what no option gives; options override it.
     """
     from zwidth.scenes.assessment import assess, friction_rule, limits_of
 
@@ -69,6 +75,8 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
     if as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
+    if resolution is not None:
+        warn_implausible({"resolution": resolution})
     if friction is not None or resolution is not None:
         rule = friction_rule(scene, friction, resolution)
         result["friction_rule"] = rule._asdict()
@@ -92,7 +100,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     """Print the stiffest stable wall of a device.
 
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
-    would change is printed as well. `zwidth recommend` says which softer wall to set.
+    would change is printed as well. `zwidth recommend` says which softer wall to set. SCENE.yaml (or the folder of a
+    run) supplies what no option gives; options override it.
     """
     from zwidth.scenes.assessment import name_kind
     from zwidth.scenes.scene import Scene
@@ -264,7 +273,9 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("bokeh", "tornado"):
             raise
-        raise InputError("explore: bokeh is not installed; pip install 'zwidth[explore]'") from error
+        raise InputError(
+            f"explore: needs bokeh, which is not installed; install it: {how_to_install('explore')}"
+        ) from error
     from zwidth.pages.explorer.controls import read_controls
     from zwidth.runs.record import find_config
 
@@ -309,7 +320,8 @@ def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wante
     """Say which wall to set: the stiffest one with wanted margins.
 
     Then what else is known of that wall, and what would allow a stiffer one. It needs --mass (or --device) and --rate
-    (or --period); damping and delay are 0 where left out.
+    (or --period); damping and delay are 0 where left out. SCENE.yaml (or the folder of a run) supplies what no option
+    gives; options override it.
     """
     if code and as_json:
         raise click.UsageError("give --code or --json: each has all of the output")

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
-from zwidth.arrays.roots import find_lowest
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
@@ -25,66 +23,22 @@ from zwidth.scenes.assessment import (
     name_kind,
     round_margin,
 )
-from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, soft_dampings
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.scenes.wall_code import write_wall
+from zwidth.scenes.wall_search import Wanted, choose_wall, measure_slack
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
-from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, WALL, Range
+from zwidth.words.quantities import WALL
 from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
-from zwidth.words.units import to_float
 
-# Dampings tried at a stiffness, and to what share of itself the best is then found: passive ones of a weakly damped
-# device are few of those that are stable.
-_SAMPLES, _NEAR = 18, 2e-4
-# Stiffnesses tried downwards from the most that is allowed, each this much of the one before; and the halvings between
-# two of them, to less than 1e-4.
-_DOWN, _TRIALS, _HALVINGS = 0.25, 15, 14
-
-RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
-_OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
 _UNITS = {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m"}
 _UNITS |= {"mass": "kg", "time": "s", "frequency": "Hz"}
-_EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
 _JUDGED = (
     *("alpha", "beta", "virtual_damping_lower", "virtual_damping_upper", "spectral_radius", "passive"),
     *("passivity_margin", "time_constant", "frequency", "gain_margin", "phase_margin", "delay_margin"),
 )
-
-
-class Wanted(NamedTuple):
-    """What is asked of a wall; None where nothing is."""
-
-    stiffness_fraction: float | None = None  # at most this share of K_max
-    gain_margin: float | None = None  # at least, a factor
-    phase_margin: float | None = None  # at least, in degrees
-    passive: bool = False
-
-    @classmethod
-    def check(
-        cls, stiffness_fraction: float | None, gain_margin: float | None, phase_margin: float | None, passive: bool
-    ) -> Wanted:
-        """What is asked, with the usual share of K_max where nothing else is; or `InputError`."""
-        ranges = {"stiffness_fraction": FRACTION, **RANGES}
-        given = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
-        for name, value in given.items():
-            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if value is not None and not (number and math.isfinite(to_float(value)) and ranges[name].holds(value)):
-                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, as {_EXAMPLES[name]}")
-        if not isinstance(passive, bool | np.bool_):
-            raise InputError(f"passive: got {passive!r}; True or False is needed")
-        if gain_margin is None and phase_margin is None and not passive and stiffness_fraction is None:
-            given["stiffness_fraction"] = RECOMMENDED_SHARE
-        return cls(**given, passive=bool(passive))
-
-    def spell(self, name: str) -> str:
-        """One of them in words."""
-        return {
-            "gain_margin": f"a gain margin of {self.gain_margin:g}" if self.gain_margin else "",
-            "phase_margin": f"a phase margin of {self.phase_margin:g} degrees" if self.phase_margin else "",
-            "passive": "passivity",
-        }[name]
 
 
 @shown(("stiffness", "virtual_damping", "limited_by", "status", "reason", "notes"))
@@ -127,14 +81,14 @@ class Recommendation:
 
         K is rounded down; of a tip that leans, or of a narrow column, B needs more digits than others.
         """
-        surplus = _measure(self.scene, self.wanted)
+        slack = measure_slack(self.scene, self.wanted)
 
         def rounded(digits: int) -> tuple[float, float]:
             return round_safely(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
 
         def holds(digits: int) -> bool:
             wall = rounded(digits)
-            return bool(self.scene.is_stable(*wall)) and all(spare >= 0 for spare in surplus(*wall).values())
+            return bool(self.scene.is_stable(*wall)) and all(spare >= 0 for spare in slack(*wall).values())
 
         digits = count_digits(holds)
         return *rounded(digits), digits
@@ -237,66 +191,6 @@ class Recommendation:
         return to_json(found)
 
 
-Surplus = Callable[[float, Any], dict[str, np.ndarray]]
-
-
-def _measure(scene: SceneOptima, wanted: Wanted) -> Surplus:
-    """By how much walls have more than is wanted beside a share of K_max, by its name, negative for too little."""
-    own = float(scene.device.damping)
-    asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
-
-    def surplus(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
-        alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
-        stable, found = scene.loop.labels(alpha, beta), {}
-        if asked:
-            margins = scene.loop.margins(alpha, beta, asked)
-            if wanted.gain_margin:
-                with np.errstate(all="ignore"):
-                    found["gain_margin"] = np.abs(np.log(margins.gain_margin)) / math.log(wanted.gain_margin) - 1.0
-            if wanted.phase_margin:
-                found["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
-        if wanted.passive:
-            found["passive"] = np.asarray(scene.passivity_margin(stiffness, damping)) / (own or 1.0)
-        return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in found.items()}
-
-    return surplus
-
-
-def _search(scene: SceneOptima, surplus: Surplus, most: float) -> tuple[float, float]:
-    """K and B of the stiffest wall that has all that is wanted, from the most downwards; NaN where none was found."""
-
-    def suit(log_stiffness: float) -> tuple[float, float] | None:
-        """The wall that has the most to spare of what is scarcest, if it has all that is wanted."""
-        stiffness, unit = math.exp(log_stiffness), scene.units.virtual_damping
-
-        def cost(beta: Any) -> np.ndarray:
-            return -np.min(list(surplus(stiffness, beta * unit).values()), axis=0)
-
-        found = (find_lowest(cost, *ends, _SAMPLES, _NEAR) for ends in soft_dampings(scene, stiffness))
-        lowest, beta = min(found, default=(1.0, math.nan))
-        return (stiffness, beta * unit) if lowest <= 0 else None
-
-    low = high = math.log(most)
-    wall = suit(high)
-    if wall is not None:
-        return most, wall[1]
-    for _ in range(_TRIALS):
-        low, high = low + math.log(_DOWN), low
-        wall = suit(low)
-        if wall is not None:
-            break
-    else:
-        return math.nan, math.nan
-    # By halves: where a margin without an end ends, what is to spare jumps.
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        stiffer = suit(middle)
-        low, high, wall = (low, middle, wall) if stiffer is None else (middle, high, stiffer)
-    # A wall to type in: no more digits than a device can tell apart, where what is wanted allows it.
-    short = float(f"{wall[0]:.6g}"), float(f"{wall[1]:.6g}")
-    return short if min(map(float, surplus(*short).values())) >= 0 else wall
-
-
 class SceneAdvice(SceneOptima):
     """The question of `zwidth.Scene` what to set."""
 
@@ -340,31 +234,10 @@ class SceneAdvice(SceneOptima):
             raise InputError(f"passive: got True {obstacle}")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)
-        if top.status != Status.OK:
-            status = Status(int(top.status))
-            reason = "no stiffness is stable at any damping" if status == Status.NO_BOUNDARY else status.message
-            return Recommendation(bare, top, wanted, "", status, reason, tuple(notes))
-        most = (wanted.stiffness_fraction or 1.0) * float(top.stiffness)
-        usual = choose_damping(bare, top, most)
-        limit, stiffness, damping = "stiffness_fraction", most, usual
-        surplus = _measure(bare, wanted)
-        spare = surplus(most, usual)
-        if spare and not (wanted.stiffness_fraction and min(spare.values()) >= 0):
-            stiffness, damping = _search(bare, surplus, most)
-            if math.isnan(stiffness):
-                asked = " and ".join(map(wanted.spell, spare))
-                undamped = wanted.passive and bare.device.damping == 0
-                why = "without damping of the device no wall is passive" if undamped else "ask for less"
-                reason = f"none was found that keeps {asked}, however soft; {why}"
-                return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, reason, tuple(notes))
-            spare = surplus(stiffness, damping)
-            if stiffness < most:
-                limit = min(spare, key=lambda name: float(spare[name]))
-        elif not np.all(bare.is_stable(stiffness, damping)):
-            share = most / float(top.stiffness)
-            reason = f"none was found that is stable at {share:g} of the largest stiffness; choose another share"
-            return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, reason, tuple(notes))
-        elif damping != top.virtual_damping:
-            notes.append(_OTHER_DAMPING)
-        wall = VirtualWall(check_number("stiffness", stiffness), check_number("virtual_damping", damping))
-        return Recommendation(bare.replace(wall=wall), top, wanted, limit, Status.OK, notes=tuple(notes))
+        found = choose_wall(bare, wanted, top)
+        notes += [found.note] if found.note else []
+        if found.status == Status.OK:
+            stiffness = check_number("stiffness", found.stiffness)
+            wall = VirtualWall(stiffness, check_number("virtual_damping", found.damping))
+            bare = bare.replace(wall=wall)
+        return Recommendation(bare, top, wanted, found.limit, found.status, found.reason, tuple(notes))

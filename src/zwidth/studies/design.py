@@ -73,7 +73,7 @@ class DesignStudy(ComputedStudy):
     kind: Literal["design"]
 
     device: PhysicalDevice
-    """Device in SI units. A delay stays as it is in seconds."""
+    """Device in SI units. A delay stays in the unit, seconds or periods, in which it is given."""
 
     find: Parameter
     """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
@@ -252,7 +252,7 @@ class FiltersStudy(ComputedStudy):
     samples: Annotated[Axis, axis_of("velocity.samples")] | None = None
     """Lengths of a window, in periods."""
 
-    resolution: Annotated[float, Quantity("m", POSITIVE)] | None = None
+    resolution: Annotated[float, Quantity("m", POSITIVE, counts=True)] | None = None
     """One count of the position, in m or with a unit: the noise that it makes of the velocity is computed as well."""
 
     noise_limit: Annotated[float, Quantity("m/s", POSITIVE)] | None = None

@@ -34,7 +34,8 @@ from zwidth.loops.rigid.response import step_response
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
-from zwidth.scenes.recommendation import RANGES, Recommendation
+from zwidth.scenes.recommendation import Recommendation
+from zwidth.scenes.wall_search import RANGES
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range

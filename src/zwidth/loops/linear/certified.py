@@ -20,7 +20,7 @@ from zwidth.parts.chain import AnyChain, chain_of
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.system import System
 from zwidth.parts.velocity import Estimate
-from zwidth.words.errors import InputError
+from zwidth.words.errors import InputError, how_to_install
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _NOTHING = Estimate(0, 0.0)
 def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels and statuses of walls of one shape, in SI units."""
     if not available():
-        raise InputError("method: 'certified' needs python-flint for this scene; pip install 'zwidth[certified]'")
+        raise InputError(f"method: 'certified' needs python-flint for this scene: {how_to_install('certified')}")
     polynomials = cache(lambda bits: _polynomials(scene))
     stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)
     for place in np.ndindex(stiffness.shape):
