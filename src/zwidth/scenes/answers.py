@@ -263,7 +263,8 @@ class SceneAnswers(SceneParts):
 def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     """Whether walls with B < 0 count: by default only where B acts on the plain difference of two samples."""
     if negative_damping is None:
-        return scene.velocity.estimate(scene.timing.period).is_difference
+        estimate = scene.velocity.estimate(scene.timing.period)
+        return estimate.is_difference and bool(is_traced(estimate.gain) or estimate.gain > 0)
     if not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; it is True, False or None")
     return bool(negative_damping)

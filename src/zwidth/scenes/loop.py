@@ -131,6 +131,7 @@ class LinearLoop:
         elif method == "companion":
             with np.errstate(invalid="ignore"):
                 stable = log_size(poles_less_one(self.roots, *np.broadcast_arrays(alpha, beta))).max(-1) < 0
+            stable &= ~self.boundary.are_lossless(beta)
             used = Method.COMPANION
         else:
             stable, used = label_walls(self.boundary, alpha, beta), Method.CROSSOVER
