@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -262,7 +262,7 @@ def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, *
 
 
 @cli.command()
-@click.option("--quick", is_flag=True, help="Few delays and small maps: less than a minute instead of some.")
+@click.option("--quick", is_flag=True, help="Few delays and small maps: one to three minutes on two cores.")
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
@@ -292,25 +292,16 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
 
 @contextmanager
 def reporter() -> Iterator[Callable[[StudyEvent], None]]:
-    """A callback for `zwidth.run` that tells on stderr how far it is: a bar on a terminal, else a line in a while."""
-    from rich.console import Console
-    from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    console, told = Console(stderr=True), time.monotonic()
-    words = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[state]}")
-    columns = SpinnerColumn(), *words, TimeElapsedColumn()
-    with Bar(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
-        shown = bar.add_task("starting", total=None, state="")
-
-        def say(line: str) -> None:
-            if bar.disable:
-                click.echo(line, err=True)
-            else:
-                console.print(line, markup=False, highlight=False)
+    """Yield a callback for `zwidth.run` that reports progress on stderr: a bar on a terminal, else occasional lines."""
+    printed, template = time.monotonic(), "%(label)s  [%(bar)s]  %(info)s"
+    options: dict[str, Any] = {"show_eta": False, "item_show_func": lambda state: state, "bar_template": template}
+    shown: Any = nullcontext()
+    if sys.stderr.isatty():
+        shown = click.progressbar(length=1, label="starting", file=sys.stderr, width=0, **options)
+    with shown as bar:
 
         def show(event: StudyEvent) -> None:
-            nonlocal told
+            nonlocal printed
             done, total, state, line, due = event.index - (event.result is None), event.total, "", "", False
             if event.progress is not None:
                 done, total, state = event.progress.points, event.progress.total_points, _state(event.progress)
@@ -319,12 +310,18 @@ def reporter() -> Iterator[Callable[[StudyEvent], None]]:
             elif event.parts is not None:
                 done, total = event.parts
                 line = f"{done}/{total} done"
-            bar.update(shown, description=f"{event.name} ({event.kind})", completed=done, total=total, state=state)
-            if line and bar.disable and (due or time.monotonic() - told >= _SECONDS_BETWEEN_LINES):
-                told = time.monotonic()
-                say(f"{event.name:<20} {line}")
-            for text in _lines(event):
-                say(text)
+            lines = list(_lines(event))
+            if bar is not None:
+                # Lines replace the bar, which is drawn again below them.
+                lines = [f"\r\033[K{text}" for text in lines]
+                bar.label, bar.pos, bar.length, bar.current_item = f"{event.name} ({event.kind})", done, total, state
+            elif line and (due or time.monotonic() - printed >= _SECONDS_BETWEEN_LINES):
+                printed = time.monotonic()
+                lines = [f"{event.name:<20} {line}", *lines]
+            for text in lines:
+                click.echo(text, err=True)
+            if bar is not None:
+                bar.render_progress()
 
         yield show
 

@@ -105,7 +105,7 @@ def respond(
         >>> f"{found.device.frequency.size} lines from {found.records} stretches"
         '409 lines from 5 stretches'
     """
-    logs, places, period, _ = read_logs(time, position, force)
+    logs, places, period, _, notes = read_logs(time, position, force, resolution=resolution)
     for k, place in enumerate(places, start=1):
         if place[-1] >= place.size:
             missing, gap = place[-1] + 1 - place.size, int(np.argmax(np.diff(place)))

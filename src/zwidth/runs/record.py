@@ -43,7 +43,7 @@ _SEAL = "record_sha256"
 _MOVE = f"move it away, or {ELSEWHERE}"
 
 # Beside those that can change a result.
-_PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
+_PACKAGES = ("scipy", "matplotlib", "optimistix", "jaxopt")
 
 # As `hidden_beside` calls what is not finished.
 _HALF_MADE = re.compile(r"\..+\.[0-9a-f]{8}\.partial")

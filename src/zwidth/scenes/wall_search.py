@@ -1,6 +1,7 @@
 """Search for the stiffest wall of a scene that keeps required margins.
 
-``slack`` is the relative excess of a wall over each requirement: 0 on the limit, negative for too little, -1 for an unstable wall.
+``slack`` is the relative excess of a wall over each requirement: 0 on the limit, negative for too little, -1 for an
+unstable wall.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from zwidth.words.units import to_float
 
 # Of a recommendation without any wish; docs/guides/my-device.md gives the reasons.
 DEFAULT_PHASE_MARGIN = 30.0  # degrees
-DEFAULT_GAIN_MARGIN = 1.6  # factor on K and B together
+DEFAULT_GAIN_MARGIN = 2.0  # factor on K and B together, 6 dB
 
 SAMPLES = 18  # dampings tried at each stiffness; passive ones of a weakly damped device are few of the stable ones
-NEAR = 2e-4  # relative accuracy of the best damping
+NEAR = 5.0  # relative accuracy of the best damping, in units of that of K
 LEAST = 1e-9  # least stiffness that is tried, relative to the largest allowed
 STEP_DOWN = 0.25  # ratio of two stiffnesses, until one has a wall with the margins
 FIRST_STEP = 0.9  # the same near a guess
@@ -85,7 +86,7 @@ class WallChoice(NamedTuple):
 
 
 def measure_slack(scene: SceneOptima, wanted: Wanted) -> Slack:
-    """Return a function of K in N/m and B in N s/m that computes the slack of each requirement but the share of K_max."""
+    """Return a function of K in N/m and B in N s/m that computes the slack of each requirement on margins."""
     own = float(scene.device.damping)
     asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
 
@@ -100,7 +101,9 @@ def measure_slack(scene: SceneOptima, wanted: Wanted) -> Slack:
             if wanted.phase_margin:
                 found["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
         if wanted.passive:
-            found["passive"] = np.asarray(scene.passivity_margin(stiffness, damping)) / (own or 1.0)
+            margin = np.asarray(scene.passivity_margin(stiffness, damping)) / (own or 1.0)
+            # A wall without any margin is not passive.
+            found["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
         return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in found.items()}
 
     return slack
@@ -127,7 +130,7 @@ def find_stiffest(
         def cost(beta: Any) -> np.ndarray:
             return -np.min(list(slack(stiffness, beta * unit).values()), axis=0)
 
-        dips = (find_lowest(cost, *ends, SAMPLES, NEAR) for ends in soft_dampings(scene, stiffness))
+        dips = (find_lowest(cost, *ends, SAMPLES, NEAR * width) for ends in soft_dampings(scene, stiffness))
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
             found[log_stiffness] = beta * unit
@@ -149,9 +152,8 @@ def find_stiffest(
     if at_low <= 0:
         return math.nan, math.nan
     if low < high and at_high <= 0:
-        false_position(
-            np.vectorize(best_slack, otypes=[float]), *map(np.float64, (low, high, at_low, at_high)), MAX_STEPS, width
-        )
+        ends = np.float64(low), np.float64(high), np.float64(at_low), np.float64(at_high)
+        false_position(np.vectorize(best_slack, otypes=[float]), *ends, MAX_STEPS, width)
     log_stiffness = max(found)
     wall = most if log_stiffness == top else math.exp(log_stiffness), found[log_stiffness]
     if wall[0] == most:

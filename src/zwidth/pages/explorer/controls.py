@@ -71,7 +71,8 @@ def _make_slider(parameter: Parameter, rotary: bool = False) -> Slider:
         # Walls are set on a chart that is in SI units.
         unit, per_si = (ROTARY[parameter.unit], 1.0) if parameter.name in _WALL else _TURNED[parameter.unit]
         low, high = low * _SMALLER[parameter.unit], high * _SMALLER[parameter.unit]
-        words, symbol = words.replace("mass", "inertia"), "J" if parameter.name == "mass" else symbol
+        with use_kind(True):
+            words, symbol = parameter.own_words, parameter.own_symbol.lstrip(chr(92))
     return Slider(f"{words} {symbol}", unit, per_si, low * per_si, high * per_si, parameter.whole)
 
 
