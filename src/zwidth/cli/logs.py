@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
+from zwidth.cli.help import show_example
 from zwidth.cli.options import (
     SHARE,
     Parsed,
@@ -19,7 +20,6 @@ from zwidth.cli.options import (
     quantity_type,
     read_logs,
     save_figure,
-    show_example,
     velocity_options,
 )
 from zwidth.pages.words import row, tell

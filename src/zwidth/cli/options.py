@@ -47,14 +47,6 @@ _BARE = {"mass", "damping"}
 _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
-OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
-
-
-def show_example(command: str, *more: str) -> dict[str, str]:
-    """What a command is declared with so that its help ends with an example, on lines of their own."""
-    return {"epilog": "\b\nExample:\n" + " \\\n    ".join((f"  zwidth {command}", *more))}
-
-
 class Parsed(click.ParamType):
     """What a function reads of an option's text, or raises a `ValueError` for: then ``remedy`` says what to write."""
 

@@ -21,6 +21,7 @@ from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.assessment import Assessment
+    from zwidth.scenes.diagnosis import Diagnosis
     from zwidth.scenes.scene import Scene
 
 WIDTH = 100  # columns of printed answers, at most
@@ -150,6 +151,16 @@ def scene_notes(scene: Scene) -> list[str]:
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
     return [*undecided, *coded_period_notes(scene), *describe_islands(scene)]
+
+
+@in_own_units
+def diagnosis_lines(found: Diagnosis) -> list[str]:
+    """Return the result of a simulation with encoder, friction and motor, and the remedies if it oscillates."""
+    advice = found.advise()
+    return [
+        line("simulated", f"{found.word}: {found.explain()}"),
+        *([line("", f"to stop it: {advice}")] if advice else []),
+    ]
 
 
 def note_lines(notes: list[str]) -> list[str]:
