@@ -63,6 +63,11 @@ class Parsed(click.ParamType):
             self.fail(f"got {value!r}; {self.remedy}" if self.remedy else str(error), param, ctx)
 
 
+def get_told() -> dict[str, Any]:
+    """Return the texts of options of the running command whose units are those of one kind of device."""
+    return click.get_current_context().meta.get(_TOLD, {})
+
+
 def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, counts: bool = False) -> Parsed:
     """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`.
 
