@@ -15,6 +15,7 @@ from zwidth.cli.options import (
     OF_SCENE,
     SHARE,
     Parsed,
+    beyond_safe_option,
     figure_option,
     json_option,
     quantity_type,
@@ -302,6 +303,7 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option("--gain-margin", type=_FACTOR, help="At least this factor on K and B together.")
 @click.option("--phase-margin", type=_DEGREES, help="At least so many degrees.")
 @click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
+@beyond_safe_option
 @figure_option
 @click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
 @json_option

@@ -160,7 +160,19 @@ DeviceForm = Annotated[SystemSection | ResponseSection, WrapValidator(lambda raw
 
 
 PHYSICAL_KEYS = frozenset(
-    {"device", "rotary", "mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES}
+    {
+        "device",
+        "rotary",
+        "mass",
+        "damping",
+        "period",
+        "rate",
+        "delay",
+        "stiffness",
+        "virtual_damping",
+        "safe_limit",
+        *PART_NAMES,
+    }
 )
 NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
 

@@ -17,6 +17,7 @@ from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.device import Device
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.paths import find_parts
+from zwidth.parts.wall import NoWall
 from zwidth.words.formatting import plain, round_safely, short, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
@@ -265,7 +266,19 @@ def scene_notes(scene: Scene) -> list[str]:
     from zwidth.scenes.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
-    return [*undecided, *coded_period_notes(scene), *describe_islands(scene)]
+    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *_compare_with_limit(scene)]
+
+
+def _compare_with_limit(scene: Scene) -> list[str]:
+    """Return the notes on the safe limit of a scene that has a wall: is the wall within, and the warnings."""
+    limit, wall = scene.safe_limit, scene.wall
+    if limit is None or isinstance(wall, NoWall):
+        return []
+    within = limit.allows(float(wall.stiffness), float(wall.virtual_damping))
+    beyond = (
+        [] if within else [f"this wall exceeds the safe limit, and the true device may be unstable; {limit.describe()}"]
+    )
+    return [*beyond, *limit.warnings]
 
 
 def note_lines(notes: list[str]) -> list[str]:

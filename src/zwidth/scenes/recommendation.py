@@ -14,6 +14,7 @@ from zwidth.arrays.roots import find_lowest
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
+from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.assessment import (
     Assessment,
@@ -84,6 +85,7 @@ class Wanted(NamedTuple):
             "gain_margin": f"a gain margin of {self.gain_margin:g}" if self.gain_margin else "",
             "phase_margin": f"a phase margin of {self.phase_margin:g} degrees" if self.phase_margin else "",
             "passive": "passivity",
+            "safe_limit": "the safe limit",
         }[name]
 
 
@@ -97,7 +99,7 @@ class Recommendation:
         stiffest: the stiffest stable wall of the device.
         wanted: what was asked of the wall.
         limited_by: which of that allows no stiffer wall: "stiffness_fraction", "gain_margin", "phase_margin" or
-            "passive"; "" where there is no wall.
+            "passive", or "safe_limit", the limit of the scene; "" where there is no wall.
         status: code of `zwidth.Status`; where it is not OK there is no wall to set.
         reason: why there is none.
         notes: what else to know, in sentences.
@@ -262,7 +264,17 @@ def _measure(scene: SceneOptima, wanted: Wanted) -> Surplus:
     return surplus
 
 
-def _search(scene: SceneOptima, surplus: Surplus, most: float) -> tuple[float, float]:
+def _clip_dampings(scene: SceneOptima, stiffness: float, limit: SafeLimit | None) -> list[tuple[float, float]]:
+    """Return the intervals of beta, connected to K = 0, that are stable and within the safe limit."""
+    intervals = soft_dampings(scene, stiffness)
+    if limit is None:
+        return intervals
+    low, high = np.array(limit.dampings(stiffness) or (math.inf, -math.inf)) / scene.units.virtual_damping
+    clipped = [(max(start, low), min(end, high)) for start, end in intervals]
+    return [(start, end) for start, end in clipped if start <= end]
+
+
+def _search(scene: SceneOptima, surplus: Surplus, most: float, limit: SafeLimit | None) -> tuple[float, float]:
     """K and B of the stiffest wall that has all that is wanted, from the most downwards; NaN where none was found."""
 
     def suit(log_stiffness: float) -> tuple[float, float] | None:
@@ -272,7 +284,7 @@ def _search(scene: SceneOptima, surplus: Surplus, most: float) -> tuple[float, f
         def cost(beta: Any) -> np.ndarray:
             return -np.min(list(surplus(stiffness, beta * unit).values()), axis=0)
 
-        found = (find_lowest(cost, *ends, _SAMPLES, _NEAR) for ends in soft_dampings(scene, stiffness))
+        found = (find_lowest(cost, *ends, _SAMPLES, _NEAR) for ends in _clip_dampings(scene, stiffness, limit))
         lowest, beta = min(found, default=(1.0, math.nan))
         return (stiffness, beta * unit) if lowest <= 0 else None
 
@@ -297,6 +309,18 @@ def _search(scene: SceneOptima, surplus: Surplus, most: float) -> tuple[float, f
     return short if min(map(float, surplus(*short).values())) >= 0 else wall
 
 
+def _describe_limit(limit: SafeLimit | None, ignored: bool) -> list[str]:
+    """Return the notes on a safe limit: the limit with its reason, and its warnings."""
+    if limit is None:
+        return []
+    return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe()}", *limit.warnings]
+
+
+def _forbid(limit: SafeLimit) -> str:
+    """Return the reason that no wall is recommended within a limit that supports none."""
+    return f"no wall is safe: {'; '.join(limit.warnings) or limit.reason or 'the safe limit is 0'}"
+
+
 class SceneAdvice(SceneOptima):
     """The question of `zwidth.Scene` what to set."""
 
@@ -307,6 +331,7 @@ class SceneAdvice(SceneOptima):
         gain_margin: float | None = None,
         phase_margin: float | None = None,
         passive: bool = False,
+        beyond_safe: bool = False,
     ) -> Recommendation:
         """The stiffest wall that keeps some distance from trouble: the one to set on this device.
 
@@ -315,6 +340,8 @@ class SceneAdvice(SceneOptima):
             gain_margin: at least this factor on stiffness and damping together, > 1.
             phase_margin: at least so many degrees, > 0.
             passive: whether the wall must be passive.
+            beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its stiffness is
+                at most ``stiffness_fraction`` (or 0.75) of the limit's.
 
         Returns:
             Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, what allows no more; ``verdict``,
@@ -339,18 +366,27 @@ class SceneAdvice(SceneOptima):
         if wanted.passive and (obstacle := find_obstacle(**vars(self.device))):
             raise InputError(f"passive: got True {obstacle}")
         bare = self.replace(wall=NoWall())
-        top, notes = bare.max_stiffness(), describe_islands(bare)
+        limit = None if beyond_safe else self.safe_limit
+        top, notes = bare.max_stiffness(), [*describe_islands(bare), *_describe_limit(self.safe_limit, beyond_safe)]
         if top.status != Status.OK:
             status = Status(int(top.status))
             reason = "no stiffness is stable at any damping" if status == Status.NO_BOUNDARY else status.message
             return Recommendation(bare, top, wanted, "", status, reason, tuple(notes))
-        most = (wanted.stiffness_fraction or 1.0) * float(top.stiffness)
+        most, binding = (wanted.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
+        if limit is not None:
+            if limit.forbids_all:
+                return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, _forbid(limit), tuple(notes))
+            # The reserve is the same, whichever limit binds.
+            safe = (wanted.stiffness_fraction or RECOMMENDED_SHARE) * limit.stiffness
+            most, binding = (safe, "safe_limit") if safe < most else (most, binding)
         usual = choose_damping(bare, top, most)
-        limit, stiffness, damping = "stiffness_fraction", most, usual
+        if limit is not None:
+            usual = float(np.clip(usual, *limit.dampings(most)))
+        stiffness, damping = most, usual
         surplus = _measure(bare, wanted)
         spare = surplus(most, usual)
         if spare and not (wanted.stiffness_fraction and min(spare.values()) >= 0):
-            stiffness, damping = _search(bare, surplus, most)
+            stiffness, damping = _search(bare, surplus, most, limit)
             if math.isnan(stiffness):
                 asked = " and ".join(map(wanted.spell, spare))
                 undamped = wanted.passive and bare.device.damping == 0
@@ -359,12 +395,12 @@ class SceneAdvice(SceneOptima):
                 return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, reason, tuple(notes))
             spare = surplus(stiffness, damping)
             if stiffness < most:
-                limit = min(spare, key=lambda name: float(spare[name]))
+                binding = min(spare, key=lambda name: float(spare[name]))
         elif not np.all(bare.is_stable(stiffness, damping)):
             share = most / float(top.stiffness)
             reason = f"none was found that is stable at {share:g} of the largest stiffness; choose another share"
             return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, reason, tuple(notes))
-        elif damping != top.virtual_damping:
+        elif damping != top.virtual_damping and limit is None:
             notes.append(_OTHER_DAMPING)
         wall = VirtualWall(check_number("stiffness", stiffness), check_number("virtual_damping", damping))
-        return Recommendation(bare.replace(wall=wall), top, wanted, limit, Status.OK, notes=tuple(notes))
+        return Recommendation(bare.replace(wall=wall), top, wanted, binding, Status.OK, notes=tuple(notes))
