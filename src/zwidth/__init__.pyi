@@ -82,6 +82,7 @@ from .simulation.result import Motion as Motion
 from .simulation.result import MotionKind as MotionKind
 from .simulation.simulate import simulate as simulate
 from .studies.document import load_config as load_config
+from .studies.document import load_scene as load_scene
 from .sweep.dataset import open_dataset as open_dataset
 from .words.errors import ConfigError as ConfigError
 from .words.errors import InputError as InputError

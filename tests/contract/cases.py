@@ -167,6 +167,7 @@ OTHERS = {
     "fit_log": "one device: tests/unit/fitting/test_log.py",
     "limits_of": "one scene: tests/unit/scenes/test_limits.py",
     "load_config": "a file: tests/unit/config/test_reader.py",
+    "load_scene": "a file: tests/unit/cli/test_scene_file.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",
     "respond": "one record: tests/unit/fitting/test_respond.py",
     "robust_max_stiffness": "boxes of devices: tests/unit/scenes/test_robust.py",

@@ -13,7 +13,7 @@ ORDER = ["Args", "Attributes", "Returns", "Raises", "Numerics", "References", "E
 FUNCTIONS = sorted(name for name in zwidth.__all__ if inspect.isfunction(getattr(zwidth, name)))
 CLASSES = sorted(name for name in zwidth.__all__ if inspect.isclass(getattr(zwidth, name)))
 # What handles files holds no formula that somebody published.
-WITHOUT_REFERENCES = {"limits_of", "load_config", "open_dataset", "run", "use_compilation_cache"}
+WITHOUT_REFERENCES = {"limits_of", "load_config", "load_scene", "open_dataset", "run", "use_compilation_cache"}
 
 
 def each(names):

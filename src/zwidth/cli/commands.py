@@ -62,6 +62,7 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     """Judge one wall: stable, passive, how far from the boundary.
 
     It needs --stiffness, --mass (or --device) and --rate (or --period); damping and delay are 0 where left out.
+    SCENE.yaml (or the folder of a run) supplies what no option gives; options override it.
     """
     from zwidth.scenes.assessment import assess, friction_rule, limits_of
 
@@ -93,7 +94,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     """Print the stiffest stable wall of a device.
 
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
-    would change is printed as well. `zwidth recommend` says which softer wall to set.
+    would change is printed as well. `zwidth recommend` says which softer wall to set. SCENE.yaml (or the folder of a
+    run) supplies what no option gives; options override it.
     """
     from zwidth.scenes.assessment import name_kind
     from zwidth.scenes.scene import Scene
@@ -311,7 +313,8 @@ def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wante
     """Say which wall to set: the stiffest one with wanted margins.
 
     Then what else is known of that wall, and what would allow a stiffer one. It needs --mass (or --device) and --rate
-    (or --period); damping and delay are 0 where left out.
+    (or --period); damping and delay are 0 where left out. SCENE.yaml (or the folder of a run) supplies what no option
+    gives; options override it.
     """
     if code and as_json:
         raise click.UsageError("give --code or --json: each has all of the output")

@@ -67,7 +67,8 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
     With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given;
     or the virtual damping with which a wall of --stiffness settles fastest. With --tolerance: the share of devices on
     which the wall (--stiffness, --virtual-damping) is stable, the stiffness that 99 % of them bear, and, for uniform
-    tolerances of a rigid device, what is proved for every one of them.
+    tolerances of a rigid device, what is proved for every one of them. SCENE.yaml (or the folder of a run) supplies
+    what no option gives; options override it.
     """
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -15,10 +15,10 @@ from zwidth.pages.words import row
 from zwidth.parts.checks import Span, find_kind, read_span
 from zwidth.parts.device import Device
 from zwidth.parts.mode import Mode
-from zwidth.parts.paths import PARTS
+from zwidth.parts.paths import PARTS, find_parts, spell_part
 from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import ESTIMATES
-from zwidth.parts.wall import VirtualWall
+from zwidth.parts.velocity import ESTIMATES, name_estimate
+from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError
 from zwidth.words.plausible import list_doubts
 from zwidth.words.quantities import ANY, CHOICES, OF_LOGS, OF_PARTS, PARAMETERS, Range
@@ -41,6 +41,9 @@ _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.r
 # What a device that is given as a whole holds already.
 _HELD = ("operator", "coupling", "actuator", "modes")
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
+# Parameters of a rigid device.
+_BARE = {"mass", "damping"}
+_ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
 OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
@@ -113,7 +116,7 @@ def flag_of(path: str) -> str:
     return "--" + path.replace(".", "-").replace("_", "-")
 
 
-def _add_option(command: Command, path: str, required: bool = False) -> Command:
+def _add_option(command: Command, path: str) -> Command:
     if path == "device":
         words = (
             "A device with published mass and damping, linear or rotary, as `zwidth devices` lists them; or in place "
@@ -130,20 +133,25 @@ def _add_option(command: Command, path: str, required: bool = False) -> Command:
         kind = click.INT if known.whole else quantity_type(known.unit, allowed, periods=path == "delay")
         unit, note = "" if known.unit == "1" else f", in {known.unit}", f"; {known.note}" if known.note else ""
         text = f"{known.sentence}{unit}{note}"
-    return click.option(flag_of(path), path.replace(".", "__"), type=kind, required=required, help=f"{text}.")(command)
+    return click.option(flag_of(path), path.replace(".", "__"), type=kind, help=f"{text}.")(command)
 
 
 def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
-    """The options that describe a scene, and perhaps its wall; the command gets a `zwidth.Scene` as ``scene``."""
-    # Where other options may stand instead it is None without any of them.
+    """Add the options of a scene, with or without its wall, and the file that may supply it.
+
+    The command receives a `zwidth.Scene` as ``scene``; None if ``instead`` names other options and no option of a
+    scene is given.
+    """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
-    return _take_options("scene", (*bare, *_PARTS), ("stiffness",), lambda given: build_scene(given, instead))
+    take = _take_options("scene", (*bare, *_PARTS), lambda given: build_scene(given, instead, wall=wall))
+    file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
+    return lambda command: file(take(command))
 
 
 def _take_options(
-    name: str, paths: Sequence[str], needed: Sequence[str], make: Callable[[dict[str, Any]], Any]
+    name: str, paths: Sequence[str], make: Callable[[dict[str, Any]], Any]
 ) -> Callable[[Command], Command]:
-    """The options of some parameters, of which the command gets what is made, under a name."""
+    """Add the options of some parameters; the command receives the object made from them under ``name``."""
 
     def decorate(function: Command) -> Command:
         @wraps(function)
@@ -152,11 +160,16 @@ def _take_options(
             known = {path: each for path, each in named.items() if each is not None}
             context = click.get_current_context()
             try:
+                told = context.meta.get(_TOLD, {})
+                if (file := given.pop("scene_file", None)) is not None:
+                    known["scene"] = read_scene_file(file)
+                    told = {file.name: known["scene"].device, **told}
                 if "device" in known:
                     from zwidth.parts.devices import read_device
 
                     known["device"] = read_device(known["device"])
-                told = context.meta.get(_TOLD, {}) | ({"--device": known["device"]} if "device" in known else {})
+                    # A device given on the command line replaces the one of the file.
+                    told = context.meta.get(_TOLD, {}) | {"--device": known["device"]}
                 with use_kind(bool(find_kind(told))):
                     return function(**{name: make(known)}, **given)
             except InputError as error:
@@ -168,7 +181,7 @@ def _take_options(
 
         command = with_made
         for path in reversed(paths):
-            command = _add_option(command, path, required=path in needed)
+            command = _add_option(command, path)
         return command
 
     return decorate
@@ -181,27 +194,88 @@ def _read_period(given: dict[str, Any]) -> float | None:
     return 1.0 / given["rate"] if "rate" in given else given.get("period")
 
 
-period_options = _take_options("period", ("period", "rate"), (), _read_period)
+period_options = _take_options("period", ("period", "rate"), _read_period)
 
 
-def build_scene(given: dict[str, Any], instead: str = "") -> Scene | None:
-    """The scene of some options by path; None where nothing describes one and other options may stand instead."""
-    from zwidth.parts.devices import KnownDevice
-    from zwidth.scenes.scene import Scene
+def read_scene_file(path: Path) -> Scene:
+    """Return the scene of a configuration file or of the run in a folder, after printing its warnings."""
+    from zwidth.runs.record import find_config
+    from zwidth.studies.document import load_config, load_scene
 
+    file = find_config(path) if path.is_dir() else path
+    for line in getattr(load_config(file).scene, "doubts", ()):
+        click.echo(f"zwidth: {line}", err=True)
+    return load_scene(file)
+
+
+def build_scene(given: dict[str, Any], instead: str = "", *, wall: bool = False) -> Scene | None:
+    """Return the scene that options describe, by path; ``given["scene"]`` supplies what they leave out.
+
+    Return None if no option is given and other options may stand ``instead``.
+    """
     if not given and instead:
         return None
     if {"period", "rate"} <= given.keys():
         raise click.UsageError(_BOTH)
-    device = given.pop("device", None)
-    known = {"--mass or --device": device or "mass" in given, "--rate or --period": {"period", "rate"} & given.keys()}
-    if missing := [flags for flags, there in known.items() if not there]:
-        raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
+    base = given.pop("scene", None)
+    if wall and "stiffness" not in given and (base is None or isinstance(base.wall, NoWall)):
+        raise click.UsageError("give --stiffness" + ("" if base is None else ": the scene of the file has no wall"))
     numbers = {
         path: value.value if isinstance(value, Span) and value.unit == "s" else value for path, value in given.items()
     }
     for line in list_doubts(numbers, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
         click.echo(f"zwidth: {line}", err=True)
+    scene = _make_scene(given, instead) if base is None else _change_scene(base, given)
+    scene.check_parts()
+    return scene
+
+
+def _change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
+    """Return the scene of a file with the parameters that options give in place of its own."""
+    from zwidth.parts.devices import KnownDevice
+
+    changes = {path: value for path, value in given.items() if "." not in path}
+    device = changes.get("device")
+    if isinstance(device, KnownDevice):
+        changes["device"] = device.to_device(**{name: changes.pop(name) for name in _BARE & changes.keys()})
+    if own := _own(given, "velocity"):
+        same = "kind" not in own and own.keys() <= {item.name for item in fields(scene.velocity)}
+        kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
+        if own.keys() & _ONE_OF_TWO:
+            # A low-pass takes its cutoff or its time constant: the one that is given replaces the other.
+            kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
+        changes["velocity"] = _make_velocity({**kept, **own})
+    parts = {} if device else find_parts(scene)
+    modes = list(() if device else scene.device.modes)
+    for name, kind in {**PARTS, **dict.fromkeys(_MODES, Mode)}.items():
+        if own := _own(given, name):
+            part = replace(parts[name], **own) if name in parts else _make_part(name, kind, own)
+            if kind is not Mode:
+                changes[name] = part
+            elif name in parts:
+                modes[int(name.removeprefix("modes."))] = part
+            else:
+                modes.append(part)
+    if isinstance(scene.device, Device) and tuple(modes) != scene.device.modes:
+        changes["modes"] = tuple(modes)
+    try:
+        return scene.replace(**changes)
+    except InputError as error:
+        if not str(error).startswith("parameter: "):
+            raise
+        flags = ", ".join(map(flag_of, sorted(_BARE & given.keys())))
+        raise click.UsageError(f"{flags}: the device of the file is given as a whole; change it there") from None
+
+
+def _make_scene(given: dict[str, Any], instead: str) -> Scene:
+    """Return the scene that options alone describe."""
+    from zwidth.parts.devices import KnownDevice
+    from zwidth.scenes.scene import Scene
+
+    device = given.pop("device", None)
+    known = {"--mass or --device": device or "mass" in given, "--rate or --period": {"period", "rate"} & given.keys()}
+    if missing := [flags for flags, there in known.items() if not there]:
+        raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
 
     def some(*names: str) -> dict[str, Any]:
         return {name: given[name] for name in names if name in given}
@@ -219,9 +293,8 @@ def build_scene(given: dict[str, Any], instead: str = "") -> Scene | None:
         for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _HELD):
             raise click.UsageError(f"--device is given as a whole and holds {flag_of(path)}: give one of the two")
     wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
-    scene = Scene(device, Timing(**some("period", "rate", "delay")), wall, _make_velocity(given)).replace(**parts)
-    scene.check_parts()
-    return scene
+    velocity = _make_velocity(_own(given, "velocity"))
+    return Scene(device, Timing(**some("period", "rate", "delay")), wall, velocity).replace(**parts)
 
 
 def _list_needed(kind: Any) -> list[str]:
@@ -243,8 +316,8 @@ def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
     return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
 
 
-def _make_velocity(options: dict[str, Any]) -> Any:
-    given = _own(options, "velocity")
+def _make_velocity(given: dict[str, Any]) -> Any:
+    """Return the velocity estimate of some options, by the names of its fields."""
     kind = given.pop("kind", None)
     if kind is None:
         low = {"cutoff", "time_constant"} & set(given)
@@ -290,7 +363,9 @@ def save_figure(drawn: Any, file: Path) -> str:
 
 
 velocity_options = _take_options(
-    "velocity", [path for path in _PARTS if path.startswith("velocity.")], (), _make_velocity
+    "velocity",
+    [path for path in _PARTS if path.startswith("velocity.")],
+    lambda given: _make_velocity(_own(given, "velocity")),
 )
 
 

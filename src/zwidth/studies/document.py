@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterable
 from contextlib import suppress
@@ -32,6 +33,9 @@ from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
 from zwidth.config.values import Quantity
+from zwidth.parts.wall import NoWall
+from zwidth.scenes.scene import Scene
+from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe
 from zwidth.words.quantities import Range
 from zwidth.words.rotation import is_rotary
@@ -257,3 +261,40 @@ def load_config(path: str | bytes | os.PathLike[str]) -> Config:
         array([0., 1.])
     """
     return read_model(path, Config)
+
+
+def load_scene(path: str | bytes | os.PathLike[str]) -> Scene:
+    """Return the scene of a configuration file: device, timing, parts and wall, without the studies.
+
+    Args:
+        path: the file, as for `zwidth.load_config`.
+
+    Returns:
+        A `zwidth.Scene` in SI units; its wall is absent if the file gives neither stiffness nor virtual damping.
+
+    Raises:
+        ConfigError: the file cannot be read or has faults.
+        InputError: the file has no section ``scene``, or a normalized one.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> import zwidth
+        >>> text = "{version: 1, name: a, scene: {mass: 100 g, rate: 1 kHz}, studies: [{kind: ridge, name: r}]}"
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder, "a.yaml")
+        ...     _ = file.write_text(text)
+        ...     zwidth.load_scene(file).timing
+        Timing(period=0.001)
+    """
+    given = load_config(path).scene
+    if given is None:
+        raise InputError(
+            f"{os.fsdecode(path)}: scene: missing; add a section 'scene' with mass, damping, rate and delay"
+        )
+    if isinstance(given, NormalizedScene):
+        raise InputError(
+            f"{os.fsdecode(path)}: scene: got normalized parameters; SI units are needed, write mass, damping, rate "
+            "and delay in place of delta and d"
+        )
+    scene = given.to_scene()
+    return scene if given.wall else dataclasses.replace(scene, wall=NoWall())

@@ -1,0 +1,157 @@
+"""Commands take a scene from a configuration file or from the folder of a run; options override the file."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+import zwidth
+from zwidth.cli.commands import cli
+
+SCENE = """\
+version: 1
+name: knob
+scene:
+{scene}
+studies:
+  - {{kind: ridge, name: top, delta: 0.1, d: 1}}
+"""
+LINEAR = {"mass": "100 g", "damping": "10 N s/m", "rate": "1 kHz", "delay": "1 ms"}
+WALL = {"stiffness": "10 kN/m", "virtual_damping": "40 N s/m"}
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(**keys):
+        file = tmp_path / "scene.yaml"
+        file.write_text(SCENE.format(scene="\n".join(f"  {key}: {value}" for key, value in keys.items())))
+        return str(file)
+
+    return write
+
+
+def run(*words):
+    return CliRunner().invoke(cli, [str(word) for word in words])
+
+
+def refused(*words):
+    """Return the message of a refused call, which `main` prints on stderr."""
+    done = run(*words)
+    assert done.exit_code != 0, done.output
+    assert isinstance(done.exception, SystemExit | zwidth.ZwidthError)
+    return done.stderr if isinstance(done.exception, SystemExit) else str(done.exception)
+
+
+def printed(*words):
+    done = run(*words, "--json")
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def options_of(keys):
+    return [word for key, value in keys.items() for word in (f"--{key.replace('_', '-')}", value)]
+
+
+@pytest.mark.parametrize(
+    ("command", "more"),
+    [
+        ("check", []),
+        ("check", ["--stiffness", "12 kN/m"]),
+        ("recommend", ["--phase-margin", "30"]),
+        ("ridge", []),
+        ("design", ["--stiffness", "30 kN/m", "--find", "rate"]),
+    ],
+)
+def test_a_file_answers_as_the_same_options_do(command, more, write):
+    file = write(**LINEAR, **WALL)
+    wall = {key: value for key, value in WALL.items() if f"--{key.replace('_', '-')}" not in more}
+    given = options_of(LINEAR | (wall if command in ("check", "design") else {}))
+    assert printed(command, file, *more) == printed(command, *given, *more)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"mass": "70 g"},
+        {"damping": "2"},
+        {"rate": "2 kHz"},
+        {"period": "0.5 ms"},
+        {"delay": "1.5 periods"},
+        {"velocity_cutoff": "50 Hz"},
+        {"velocity_samples": "5"},
+        {"operator_mass": "500 g"},
+        {"coupling_mass": "20 g", "coupling_stiffness": "20 kN/m"},
+        {"actuator_cutoff": "200 Hz"},
+        {"modes_0_frequency": "140 Hz", "modes_0_mass": "600 g", "modes_0_damping_ratio": "0.02"},
+        {"stiffness": "5 kN/m"},
+        {"virtual_damping": "30"},
+    ],
+    ids=lambda changed: next(iter(changed)),
+)
+def test_an_option_overrides_the_file(changed, write):
+    keys = LINEAR | WALL
+    timing = {"rate"} if "period" in changed else set()
+    both = {key: value for key, value in keys.items() if key not in timing} | changed
+    assert printed("check", write(**keys), *options_of(changed)) == printed("check", *options_of(both))
+
+
+def test_options_change_single_parameters_of_a_part(write):
+    file = write(**LINEAR, **WALL, velocity="{kind: butterworth, cutoff: 100 Hz, order: 4}", operator="{mass: 500 g}")
+    changed = printed("check", file, "--velocity-cutoff", "200 Hz", "--operator-mass", "0.2")
+    scene = zwidth.Scene(
+        zwidth.Device(0.1, 10),
+        zwidth.Timing(rate=1000, delay=1e-3),
+        zwidth.VirtualWall(10e3, 40),
+        velocity=zwidth.Butterworth(cutoff=200, order=4),
+        operator=zwidth.Operator(mass=0.2),
+    )
+    assert changed["spectral_radius"] == pytest.approx(float(scene.spectral_radius()), rel=1e-12)
+
+
+def test_a_device_on_the_command_line_replaces_that_of_the_file(write):
+    file = write(**LINEAR, **WALL, coupling="{mass: 20 g, stiffness: 20 kN/m}")
+    changed = printed("check", file, "--device", "1 / 0.1 10 0")
+    assert changed["spectral_radius"] == pytest.approx(
+        printed("check", *options_of(LINEAR | WALL))["spectral_radius"], rel=1e-9
+    )
+
+
+def test_a_rotary_file_is_read_in_rotary_units(write):
+    file = write(mass="60 g cm^2", damping="0.02 mN m s/rad", rate="1 kHz", delay="0.7 periods")
+    done = run("check", file, "--stiffness", "0.05")
+    assert done.exit_code == 0, done.output
+    assert "mN m/rad" in done.output
+    assert "in units of a linear device, beside scene.yaml" in refused("check", file, "--stiffness", "10 N/m")
+
+
+def test_the_folder_of_a_run_stands_for_its_configuration(write, tmp_path):
+    file = write(**LINEAR, **WALL)
+    assert run("run", file, "--out", tmp_path / "out").exit_code == 0
+    assert printed("check", tmp_path / "out") == printed("check", file)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words", "message"),
+    [
+        (LINEAR, ["check"], "give --stiffness: the scene of the file has no wall"),
+        (LINEAR, ["check", "--virtual-damping", "3"], "give --stiffness: the scene of the file has no wall"),
+        ({"delta": 0.1, "d": 1}, ["ridge"], "scene: got normalized parameters"),
+        (LINEAR, ["check", "--rate", "1 kHz", "--period", "1 ms"], "--period and --rate are both given"),
+        (
+            {"device": "{numerator: [1], denominator: [0.1, 10, 0]}", "rate": "1 kHz"},
+            ["check", "--stiffness", "1", "--mass", "1"],
+            "--mass: the device of the file is given as a whole; change it there",
+        ),
+    ],
+)
+def test_what_a_file_lacks_or_excludes_is_named(keys, words, message, write):
+    assert message in refused(words[0], write(**keys), *words[1:])
+
+
+def test_a_file_without_a_scene_or_that_is_missing_is_named(tmp_path):
+    file = tmp_path / "bare.yaml"
+    file.write_text("version: 1\nname: bare\nstudies:\n  - {kind: ridge, name: top, delta: 0.1, d: 1}\n")
+    assert "add a section 'scene'" in refused("ridge", file)
+    assert "absent.yaml" in refused("ridge", tmp_path / "absent.yaml")
+    with pytest.raises(zwidth.ConfigError):
+        zwidth.load_scene(tmp_path / "absent.yaml")
