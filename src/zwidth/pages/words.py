@@ -274,11 +274,9 @@ def _compare_with_limit(scene: Scene) -> list[str]:
     limit, wall = scene.safe_limit, scene.wall
     if limit is None or isinstance(wall, NoWall):
         return []
-    within = limit.allows(float(wall.stiffness), float(wall.virtual_damping))
-    beyond = (
-        [] if within else [f"this wall exceeds the safe limit, and the true device may be unstable; {limit.describe()}"]
-    )
-    return [*beyond, *limit.warnings]
+    if limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
+        return list(limit.warnings)
+    return [f"this wall exceeds the safe limit: the true device may be unstable. {limit.describe()}", *limit.warnings]
 
 
 def note_lines(notes: list[str]) -> list[str]:

@@ -381,7 +381,8 @@ class SceneAdvice(SceneOptima):
             most, binding = (safe, "safe_limit") if safe < most else (most, binding)
         usual = choose_damping(bare, top, most)
         if limit is not None:
-            usual = float(np.clip(usual, *limit.dampings(most)))
+            low, high = limit.dampings(most) or (usual, usual)
+            usual = min(max(usual, low), high)
         stiffness, damping = most, usual
         surplus = _measure(bare, wanted)
         spare = surplus(most, usual)
