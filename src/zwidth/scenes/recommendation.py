@@ -284,7 +284,11 @@ def _search(scene: SceneOptima, surplus: Surplus, most: float, limit: SafeLimit 
         def cost(beta: Any) -> np.ndarray:
             return -np.min(list(surplus(stiffness, beta * unit).values()), axis=0)
 
-        found = (find_lowest(cost, *ends, _SAMPLES, _NEAR) for ends in _clip_dampings(scene, stiffness, limit))
+        intervals = _clip_dampings(scene, stiffness, limit)
+        found = [
+            find_lowest(cost, low, high, _SAMPLES, _NEAR) if high > low else (float(cost(low)), low)
+            for low, high in intervals
+        ]
         lowest, beta = min(found, default=(1.0, math.nan))
         return (stiffness, beta * unit) if lowest <= 0 else None
 
