@@ -113,8 +113,8 @@ class DeviceFit(DeviceEstimate):
             ``errors_of_log`` and ``errors``, NaN where the log leaves open how much is of which.
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
         motions: of a log, each with its fit, a `zwidth.FittedMotion`.
-        scene: the estimated device in its loop, a `zwidth.Scene` with the safe limit of its walls; parameters are rounded
-            to a thousandth of their standard errors, as `zwidth fit --yaml` writes them.
+        scene: the estimated device in its loop, a `zwidth.Scene` with the safe limit of its walls; parameters are
+            rounded to a thousandth of their standard errors, as `zwidth fit --yaml` writes them.
         nominal, period, velocity: the same loop without rounding and without the limit.
         response: of a log, a `zwidth.MeasuredDevice`: the response of the estimated device, with the radius by which a
             resonance of a damping ratio of 0.005 or more may move it and not show in the log. None of buzzing walls, of

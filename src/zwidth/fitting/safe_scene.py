@@ -16,10 +16,11 @@ from zwidth.words.status import Status
 
 if TYPE_CHECKING:
     from zwidth.fitting.device_fit import DeviceFit
+    from zwidth.fitting.safe_wall import SafeWall
 
 EXACT_DIGITS = 12  # of a parameter without a standard error
 PERIOD_DIGITS = 7  # of a period that was read from timestamps: finer than any clock's accuracy
-LIMIT_DIGITS = 6  # of the safe limit
+LIMIT_DIGITS = 4  # of the safe limit, as walls are printed
 # The status of a fit in words; its warnings say more.
 _TROUBLES = {
     Status.NOT_CONVERGED: "the search did not converge",
@@ -69,14 +70,17 @@ def limit_walls(fit: DeviceFit) -> SafeLimit:
         if wall.status != Status.OK or not wall.stiffness > 0:
             return SafeLimit(0.0, reason="the records leave the device too uncertain for any wall; record longer")
         stiffness = round_safely(wall.stiffness, "below", LIMIT_DIGITS)
-        return SafeLimit(stiffness, float(f"{wall.virtual_damping:.{LIMIT_DIGITS}g}"), _explain(fit, wall))
+        # Toward 0: beyond the damping of the limit the stiffness often falls steeply.
+        damping = math.copysign(round_safely(abs(wall.virtual_damping), "below", LIMIT_DIGITS), wall.virtual_damping)
+        return SafeLimit(float(f"{stiffness:.12g}"), float(f"{damping:.12g}"), _explain(fit, wall))
 
 
-def _explain(fit: DeviceFit, wall) -> str:
+def _explain(fit: DeviceFit, wall: SafeWall) -> str:
     """Return the cause of a safe limit, and the measurement that would raise it."""
     if math.isfinite(wall.resonance):
         near = with_unit(wall.resonance, "Hz", 3)
-        return f"a resonance near {near} could make stiffer walls unstable without showing in the log; {advise_record(fit)}"
+        hidden = f"a resonance near {near} could make stiffer walls unstable without showing in the log"
+        return f"{hidden}; {advise_record(fit)}"
     if fit.damping_tried is not None and wall.virtual_damping >= fit.damping_tried:
         tried = with_unit(fit.damping_tried, "N s/m")
         step = "" if fit.next is None else f", as {with_unit(fit.next.virtual_damping, 'N s/m', 3)}"
@@ -90,6 +94,6 @@ def advise_record(fit: DeviceFit) -> str:
     options = {
         "rate": with_unit(1.0 / round_period(fit), "Hz"),
         "force": with_unit(force, "N", 2),
-        "resolution": with_unit(fit.resolution or fit.noise, "m", 3),
+        "resolution": with_unit(fit.resolution or float(np.max(fit.noise)), "m", 3),
     }
     return "record again with " + " ".join(["zwidth excite", *(f"--{name} '{text}'" for name, text in options.items())])

@@ -100,6 +100,9 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     if "rate" in changed.get("timing", {}):
         # Period and rate are one thing; what was given last counts.
         changed["timing"].setdefault("period", None)
+    if "timing" in changed:
+        # A delay given in periods stays in periods.
+        changed["timing"].setdefault("delay", scene.timing.span)
     if isinstance(scene.wall, NoWall):
         parts["wall"] = VirtualWall(0.0)
     whole, own = changed.pop("", {}), changed.pop("device", {})

@@ -9,8 +9,7 @@ from zwidth.parts.checks import Part
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import name_wall
 
-# Relative rounding error of a wall that was converted between units.
-_ROUNDING = 1e-9
+ROUNDING = 5e-4  # relative; a wall printed with four digits still lies within the limit
 
 
 @dataclass(frozen=True, repr=False)
@@ -56,7 +55,7 @@ class SafeLimit(Part):
 
     def dampings(self, stiffness: float) -> tuple[float, float] | None:
         """Return the least and the largest damping within the limit at a stiffness; None if there is none."""
-        if self.forbids_all or not 0 <= stiffness <= (1.0 + _ROUNDING) * self.stiffness:
+        if self.forbids_all or not 0 <= stiffness <= (1.0 + ROUNDING) * self.stiffness:
             return None
         scaled = min(stiffness / self.stiffness, 1.0) * self.virtual_damping
         return min(scaled, self.virtual_damping), max(scaled, self.virtual_damping)
@@ -64,7 +63,7 @@ class SafeLimit(Part):
     def allows(self, stiffness: float, virtual_damping: float) -> bool:
         """Return True if a wall lies within the limit."""
         ends = self.dampings(stiffness)
-        slack = _ROUNDING * abs(self.virtual_damping)
+        slack = ROUNDING * abs(self.virtual_damping)
         return ends is not None and ends[0] - slack <= virtual_damping <= ends[1] + slack
 
     def warn(self, text: str) -> SafeLimit:

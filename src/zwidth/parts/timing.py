@@ -9,6 +9,7 @@ import numpy as np
 
 from zwidth.parts.checks import Part, Span, check_number, check_span, in_periods
 from zwidth.words.errors import InputError, check_choice
+from zwidth.words.formatting import spell_periods, with_unit
 from zwidth.words.types import DELAY_MODELS, DelayModel
 from zwidth.words.xp import is_jax
 
@@ -20,7 +21,7 @@ class Timing(Part):
     Args:
         period: T in s, > 0; or give the rate.
         delay: t_d, from a sample to the moment its force acts, in s, >= 0, whole periods or not; or exactly in
-            periods, as "1.5 periods".
+            periods, as "1.5 periods". A delay given in periods stays in periods if the period changes.
         delay_model: "held" (exact for every delay) or "fractional_power" (the paper's z^(1+d), boundary and
             ridge only).
         rate: 1/T in Hz, > 0, in place of the period.
@@ -28,14 +29,14 @@ class Timing(Part):
     Example:
         >>> import zwidth
         >>> zwidth.Timing(rate="4 kHz", delay="1.5 periods")
-        Timing(period=0.00025, delay=0.000375)
+        Timing(period=0.00025, delay='1.5 periods')
     """
 
     period: Any = None
     delay: Any = 0.0
     delay_model: DelayModel = "held"
     rate: Any = None
-    # A delay that was given in periods: dividing its seconds by the period might miss it by a rounding error.
+    # A delay given in periods: the quotient of its seconds and the period may have a rounding error.
     _periods: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
@@ -51,6 +52,28 @@ class Timing(Part):
             object.__setattr__(self, "_periods", delay.value if delay.unit == "periods" else None)
             object.__setattr__(self, "delay", delay.seconds(self.period))
         check_choice("delay_model", self.delay_model, DELAY_MODELS)
+
+    def __repr__(self) -> str:
+        """Return a call that creates this timing, with the delay in the unit in which it was given."""
+        text = super().__repr__()
+        return text if self._periods is None else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
+
+    @property
+    def in_periods(self) -> bool:
+        """True if the delay was given in periods, so that it stays in periods if the period changes."""
+        return self._periods is not None
+
+    @property
+    def span(self) -> Any:
+        """The delay in the unit in which it was given: a `Span` in periods, or a number of seconds."""
+        return self.delay if self._periods is None else Span(self._periods, "periods")
+
+    @property
+    def kept_delay(self) -> str:
+        """The delay that stays the same if the period changes, as "1 period" or "1.000 ms"."""
+        if self._periods is None:
+            return with_unit(float(self.delay), "s")
+        return spell_periods(self._periods)
 
     @property
     def d(self) -> Any:

@@ -191,6 +191,8 @@ class SceneParts(Part):
     def replace(self, **changes: Any) -> Self:
         """A new scene with one or several parameters changed; all others stay as they are, in SI units.
 
+        A delay given in periods stays in periods if the period changes.
+
         Args:
             **changes: by dotted path, as ``**{"velocity.cutoff": 50}``, ``period=5e-4`` or ``rate=2000``; or a whole
                 part, as ``operator=zwidth.Operator(mass=0.5)``.

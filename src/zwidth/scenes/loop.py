@@ -338,6 +338,9 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
     with np.errstate(invalid="ignore"):
         stiffness, *slopes = stiffness_slopes(found, scene.mass, scene.timing.period, *values)
     per = dict(zip(("mass", "damping", "period", "delay"), slopes, strict=True))
+    if scene.timing.in_periods and scene.timing.d:
+        # The delay grows with the period: dK/dT = dK/dT at fixed t_d + d dK/dt_d.
+        per["period"] = per["period"] + scene.timing.d * per["delay"]
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
         # A spring to ground that is not there yet has no closed form.

@@ -1,16 +1,14 @@
-"""The wall to set on a device: as stiff as what is wanted of it allows, and what would allow more."""
+"""The wall to set on a device: the stiffest with the required margins, its risks, and improvements of the device."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
-from zwidth.arrays.roots import find_lowest
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
@@ -21,72 +19,28 @@ from zwidth.scenes.assessment import (
     Limit,
     assess,
     check_held,
+    compute_gains,
     describe_islands,
-    limits_of,
     name_kind,
     round_margin,
 )
-from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, soft_dampings
+from zwidth.scenes.cautions import judge_grasps, list_cautions
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.scenes.wall_code import write_wall
+from zwidth.scenes.wall_search import COARSE, Wanted, choose_wall, measure_slack
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
-from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, WALL, Range
+from zwidth.words.quantities import WALL
 from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
-from zwidth.words.units import to_float
 
-# Dampings tried at a stiffness, and to what share of itself the best is then found: passive ones of a weakly damped
-# device are few of those that are stable.
-_SAMPLES, _NEAR = 18, 2e-4
-# Stiffnesses tried downwards from the most that is allowed, each this much of the one before; and the halvings between
-# two of them, to less than 1e-4.
-_DOWN, _TRIALS, _HALVINGS = 0.25, 15, 14
-
-RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
-_OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
 _UNITS = {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m"}
 _UNITS |= {"mass": "kg", "time": "s", "frequency": "Hz"}
-_EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
 _JUDGED = (
     *("alpha", "beta", "virtual_damping_lower", "virtual_damping_upper", "spectral_radius", "passive"),
     *("passivity_margin", "time_constant", "frequency", "gain_margin", "phase_margin", "delay_margin"),
 )
-
-
-class Wanted(NamedTuple):
-    """What is asked of a wall; None where nothing is."""
-
-    stiffness_fraction: float | None = None  # at most this share of K_max
-    gain_margin: float | None = None  # at least, a factor
-    phase_margin: float | None = None  # at least, in degrees
-    passive: bool = False
-
-    @classmethod
-    def check(
-        cls, stiffness_fraction: float | None, gain_margin: float | None, phase_margin: float | None, passive: bool
-    ) -> Wanted:
-        """What is asked, with the usual share of K_max where nothing else is; or `InputError`."""
-        ranges = {"stiffness_fraction": FRACTION, **RANGES}
-        given = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
-        for name, value in given.items():
-            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if value is not None and not (number and math.isfinite(to_float(value)) and ranges[name].holds(value)):
-                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, as {_EXAMPLES[name]}")
-        if not isinstance(passive, bool | np.bool_):
-            raise InputError(f"passive: got {passive!r}; True or False is needed")
-        if gain_margin is None and phase_margin is None and not passive and stiffness_fraction is None:
-            given["stiffness_fraction"] = RECOMMENDED_SHARE
-        return cls(**given, passive=bool(passive))
-
-    def spell(self, name: str) -> str:
-        """One of them in words."""
-        return {
-            "gain_margin": f"a gain margin of {self.gain_margin:g}" if self.gain_margin else "",
-            "phase_margin": f"a phase margin of {self.phase_margin:g} degrees" if self.phase_margin else "",
-            "passive": "passivity",
-            "safe_limit": "the safe limit",
-        }[name]
 
 
 @shown(("stiffness", "virtual_damping", "limited_by", "status", "reason", "notes"))
@@ -98,8 +52,8 @@ class Recommendation:
         scene: the device with this wall as its own, for `zwidth.assess`, `zwidth.simulate` and pictures.
         stiffest: the stiffest stable wall of the device.
         wanted: what was asked of the wall.
-        limited_by: which of that allows no stiffer wall: "stiffness_fraction", "gain_margin", "phase_margin" or
-            "passive", or "safe_limit", the limit of the scene; "" where there is no wall.
+        limited_by: which of that allows no stiffer wall: "stiffness_fraction", "gain_margin", "phase_margin",
+            "passive" or "safe_limit", the limit of the scene; "" where there is no wall.
         status: code of `zwidth.Status`; where it is not OK there is no wall to set.
         reason: why there is none.
         notes: what else to know, in sentences.
@@ -129,14 +83,14 @@ class Recommendation:
 
         K is rounded down; of a tip that leans, or of a narrow column, B needs more digits than others.
         """
-        surplus = _measure(self.scene, self.wanted)
+        slack = measure_slack(self.scene, self.wanted)
 
         def rounded(digits: int) -> tuple[float, float]:
             return round_safely(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
 
         def holds(digits: int) -> bool:
             wall = rounded(digits)
-            return bool(self.scene.is_stable(*wall)) and all(spare >= 0 for spare in surplus(*wall).values())
+            return bool(self.scene.is_stable(*wall)) and all(spare >= 0 for spare in slack(*wall).values())
 
         digits = count_digits(holds)
         return *rounded(digits), digits
@@ -148,9 +102,37 @@ class Recommendation:
 
     @cached_property
     def steps(self) -> list[Limit]:
-        """What would allow a stiffer wall, in steps that can be bought, by `zwidth.limits_of`: the best first."""
-        known = limits_of(self.scene) if self.stiffest.status == Status.OK else []
-        return [step for step in known if step.gain > 1.0]
+        """The improvements of `zwidth.limits_of` that allow a stiffer wall under the same requirements, the best first.
+
+        Their stiffness is that of the wall recommended for the improved device, right to some 0.2 %.
+        """
+        if self.status != Status.OK:
+            return []
+        found = compute_gains(self.scene.replace(wall=NoWall()), self.stiffness, self._choose_again)
+        return [step for step in found if step.gain > 1.0]
+
+    def _choose_again(self, improved: SceneOptima) -> float:
+        """Return K of the wall recommended for another device under the same requirements; NaN without one."""
+        try:
+            top = improved.max_stiffness()
+            near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
+            return choose_wall(improved, self.wanted, top, near, COARSE).stiffness
+        except InputError:
+            # At twice the rate a long delay may be more periods than the model is computed for.
+            return math.nan
+
+    @cached_property
+    def cautions(self) -> tuple[str, ...]:
+        """Thin margins of the wall and hands that destabilize it, each with its remedy, in sentences."""
+        return () if self.verdict is None else list_cautions(self)
+
+    @cached_property
+    def grasps(self) -> dict[str, bool]:
+        """Stability of the wall in each of `zwidth.REFERENCE_GRASPS`, by name; empty for a device given as a whole.
+
+        A rotary device is held at a radius of 50 mm. If the scene has an operator, "released" is the device without it.
+        """
+        return {} if self.status != Status.OK else judge_grasps(self.scene)
 
     def code(self, language: Literal["c", "python"] = "c") -> str:
         """The wall with its velocity estimate as the difference equations of a control loop.
@@ -171,28 +153,48 @@ class Recommendation:
         return write_wall(self.scene, language)
 
     def lines(self) -> tuple[str, ...]:
-        """The wall in two lines, what to set and how far that is from trouble; in one why there is none."""
+        """Return the wall, its margins and its cautions, a line each; or the reason why no wall exists."""
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        K, B, digits = self.read
-        wall = f"K = {spell_stiffness(K, digits)}, B = {with_unit(B, 'N s/m', digits)}"
-        largest = float(self.stiffest.stiffness)
-        share = 100.0 * self.stiffness / largest
-        first = f"{wall}: {share:.4g} % of the stiffest stable wall, {spell_stiffness(largest)}"
-        if self.limited_by != "stiffness_fraction":
-            first += f"; {self.wanted.spell(self.limited_by)} allows no more"
         lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
-        # A unit that both have stands once.
-        lower = lower.removesuffix(f" {upper.partition(' ')[2]}")
-        gain, phase, late = (round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay"))
-        delay = "not known" if math.isnan(late) else with_unit(late, "s")
-        apart = f"gain {plain(gain)}, phase {plain(phase)} degrees, delay {delay}"
-        rest = f"margins: {apart}; passive: {self.spell_passive()}"
-        return first, f"stable for B from {lower} to {upper}; {rest}"
+        room = f"B from {lower} to {upper} is stable at this K"
+        margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
+        cautions = (f"caution: {caution}" for caution in self.cautions)
+        return f"{self.spell_wall()}: {self.spell_limit()}", margins, *cautions
+
+    def spell_wall(self) -> str:
+        """Return the wall to set in words."""
+        K, B, digits = self.read
+        return f"K = {spell_stiffness(K, digits)}, B = {with_unit(B, 'N s/m', digits)}"
+
+    def spell_limit(self) -> str:
+        """Return the share of K_max and the requirement that allows no stiffer wall, in words."""
+        largest = float(self.stiffest.stiffness)
+        share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {spell_stiffness(largest)}"
+        if self.limited_by == "stiffness_fraction":
+            return share
+        within = " within the safe limit" if self.limited_by != "safe_limit" and self._is_clipped else ""
+        return f"{share}; limited by {self.wanted.spell(self.limited_by)}{within}"
+
+    @property
+    def _is_clipped(self) -> bool:
+        """True if the virtual damping lies at an end of the safe limit."""
+        limit = None if self.wanted.beyond_safe else self.scene.safe_limit
+        ends = None if limit is None else limit.dampings(self.stiffness)
+        return ends is not None and any(math.isclose(self.virtual_damping, end, rel_tol=1e-3) for end in ends)
+
+    def spell_margins(self) -> str:
+        """Return the margins of the wall in words, rounded to the safe side."""
+        verdict = self.verdict
+        if verdict is None:
+            return "none"
+        gain, phase, late = (round_margin(f"{name}_margin", verdict, True, 3) for name in ("gain", "phase", "delay"))
+        delay = "not known" if math.isnan(late) else with_unit(late, "s", 3)
+        return f"gain {plain(gain, 3)}, phase {plain(phase, 3)} deg, delay {delay}"
 
     def spell_passive(self) -> str:
-        """Whether the wall is passive, or why that is not known."""
+        """Return the passivity of the wall in words."""
         passive = None if self.verdict is None else self.verdict.passive
         obstacle = find_obstacle(**vars(self.scene.device)).partition(":")[0]
         return {True: "yes", False: "no", None: f"not known {obstacle}".rstrip()}[passive]
@@ -230,6 +232,8 @@ class Recommendation:
                 "settling_time": None,
             },
             "steps": [step._asdict() for step in self.steps],
+            "grasps": self.grasps,
+            "cautions": list(self.cautions),
             "reason": self.reason,
             "notes": list(self.notes),
         }
@@ -239,90 +243,11 @@ class Recommendation:
         return to_json(found)
 
 
-Surplus = Callable[[float, Any], dict[str, np.ndarray]]
-
-
-def _measure(scene: SceneOptima, wanted: Wanted) -> Surplus:
-    """By how much walls have more than is wanted beside a share of K_max, by its name, negative for too little."""
-    own = float(scene.device.damping)
-    asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
-
-    def surplus(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
-        alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
-        stable, found = scene.loop.labels(alpha, beta), {}
-        if asked:
-            margins = scene.loop.margins(alpha, beta, asked)
-            if wanted.gain_margin:
-                with np.errstate(all="ignore"):
-                    found["gain_margin"] = np.abs(np.log(margins.gain_margin)) / math.log(wanted.gain_margin) - 1.0
-            if wanted.phase_margin:
-                found["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
-        if wanted.passive:
-            found["passive"] = np.asarray(scene.passivity_margin(stiffness, damping)) / (own or 1.0)
-        return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in found.items()}
-
-    return surplus
-
-
-def _clip_dampings(scene: SceneOptima, stiffness: float, limit: SafeLimit | None) -> list[tuple[float, float]]:
-    """Return the intervals of beta, connected to K = 0, that are stable and within the safe limit."""
-    intervals = soft_dampings(scene, stiffness)
-    if limit is None:
-        return intervals
-    low, high = np.array(limit.dampings(stiffness) or (math.inf, -math.inf)) / scene.units.virtual_damping
-    clipped = [(max(start, low), min(end, high)) for start, end in intervals]
-    return [(start, end) for start, end in clipped if start <= end]
-
-
-def _search(scene: SceneOptima, surplus: Surplus, most: float, limit: SafeLimit | None) -> tuple[float, float]:
-    """K and B of the stiffest wall that has all that is wanted, from the most downwards; NaN where none was found."""
-
-    def suit(log_stiffness: float) -> tuple[float, float] | None:
-        """The wall that has the most to spare of what is scarcest, if it has all that is wanted."""
-        stiffness, unit = math.exp(log_stiffness), scene.units.virtual_damping
-
-        def cost(beta: Any) -> np.ndarray:
-            return -np.min(list(surplus(stiffness, beta * unit).values()), axis=0)
-
-        intervals = _clip_dampings(scene, stiffness, limit)
-        found = [
-            find_lowest(cost, low, high, _SAMPLES, _NEAR) if high > low else (float(cost(low)), low)
-            for low, high in intervals
-        ]
-        lowest, beta = min(found, default=(1.0, math.nan))
-        return (stiffness, beta * unit) if lowest <= 0 else None
-
-    low = high = math.log(most)
-    wall = suit(high)
-    if wall is not None:
-        return most, wall[1]
-    for _ in range(_TRIALS):
-        low, high = low + math.log(_DOWN), low
-        wall = suit(low)
-        if wall is not None:
-            break
-    else:
-        return math.nan, math.nan
-    # By halves: where a margin without an end ends, what is to spare jumps.
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        stiffer = suit(middle)
-        low, high, wall = (low, middle, wall) if stiffer is None else (middle, high, stiffer)
-    # A wall to type in: no more digits than a device can tell apart, where what is wanted allows it.
-    short = float(f"{wall[0]:.6g}"), float(f"{wall[1]:.6g}")
-    return short if min(map(float, surplus(*short).values())) >= 0 else wall
-
-
 def _describe_limit(limit: SafeLimit | None, ignored: bool) -> list[str]:
     """Return the notes on a safe limit: the limit with its reason, and its warnings."""
     if limit is None:
         return []
     return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe()}", *limit.warnings]
-
-
-def _forbid(limit: SafeLimit) -> str:
-    """Return the reason that no wall is recommended within a limit that supports none."""
-    return f"no wall is safe: {'; '.join(limit.warnings) or limit.reason or 'the safe limit is 0'}"
 
 
 class SceneAdvice(SceneOptima):
@@ -340,18 +265,21 @@ class SceneAdvice(SceneOptima):
         """The stiffest wall that keeps some distance from trouble: the one to set on this device.
 
         Args:
-            stiffness_fraction: at most this share of K_max, between 0 and 1; 0.75 where nothing is asked for.
+            stiffness_fraction: at most this share of K_max, between 0 and 1.
             gain_margin: at least this factor on stiffness and damping together, > 1.
             phase_margin: at least so many degrees, > 0.
-            passive: whether the wall must be passive.
+            passive: require a passive wall.
             beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its stiffness is
                 at most ``stiffness_fraction`` (or 0.75) of the limit's.
 
+        Without any requirement these are the defaults: at most 0.75 of K_max, a gain margin of 2 and a phase margin of
+        30 degrees. Any requirement replaces all of them.
+
         Returns:
-            Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, what allows no more; ``verdict``,
-            what `zwidth.assess` says of the wall; ``steps``, what could be bought for a stiffer one; ``code("c")``, the
-            wall for a control loop. ``status`` is UNREACHABLE, and there is no wall, where nothing softer keeps what is
-            asked for either.
+            Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, the active requirement; ``cautions``,
+            thin margins and grasps that destabilize the wall; ``verdict``, the `zwidth.assess` of the wall; ``steps``,
+            improvements of the device that allow a stiffer wall under the same requirements; ``code("c")``, the wall
+            for a control loop. ``status`` is UNREACHABLE if no wall, however soft, satisfies the requirements.
 
         Numerics:
             A share of K_max alone is in closed form, with the damping of the stiffest wall where it is stable. Margins
@@ -364,48 +292,20 @@ class SceneAdvice(SceneOptima):
             >>> found = scene.recommend(phase_margin=30)
             >>> print(f"{found.stiffness:.0f} N/m and {found.virtual_damping:.0f} N s/m")
             8009 N/m and 33 N s/m
+            >>> scene.recommend().limited_by
+            'phase_margin'
         """
         check_held(self)
-        wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive)
+        wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe)
         if wanted.passive and (obstacle := find_obstacle(**vars(self.device))):
             raise InputError(f"passive: got True {obstacle}")
         bare = self.replace(wall=NoWall())
-        limit = None if beyond_safe else self.safe_limit
-        top, notes = bare.max_stiffness(), [*describe_islands(bare), *_describe_limit(self.safe_limit, beyond_safe)]
-        if top.status != Status.OK:
-            status = Status(int(top.status))
-            reason = "no stiffness is stable at any damping" if status == Status.NO_BOUNDARY else status.message
-            return Recommendation(bare, top, wanted, "", status, reason, tuple(notes))
-        most, binding = (wanted.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
-        if limit is not None:
-            if limit.forbids_all:
-                return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, _forbid(limit), tuple(notes))
-            # The reserve is the same, whichever limit binds.
-            safe = (wanted.stiffness_fraction or RECOMMENDED_SHARE) * limit.stiffness
-            most, binding = (safe, "safe_limit") if safe < most else (most, binding)
-        usual = choose_damping(bare, top, most)
-        if limit is not None:
-            low, high = limit.dampings(most) or (usual, usual)
-            usual = min(max(usual, low), high)
-        stiffness, damping = most, usual
-        surplus = _measure(bare, wanted)
-        spare = surplus(most, usual)
-        if spare and not (wanted.stiffness_fraction and min(spare.values()) >= 0):
-            stiffness, damping = _search(bare, surplus, most, limit)
-            if math.isnan(stiffness):
-                asked = " and ".join(map(wanted.spell, spare))
-                undamped = wanted.passive and bare.device.damping == 0
-                why = "without damping of the device no wall is passive" if undamped else "ask for less"
-                reason = f"none was found that keeps {asked}, however soft; {why}"
-                return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, reason, tuple(notes))
-            spare = surplus(stiffness, damping)
-            if stiffness < most:
-                binding = min(spare, key=lambda name: float(spare[name]))
-        elif not np.all(bare.is_stable(stiffness, damping)):
-            share = most / float(top.stiffness)
-            reason = f"none was found that is stable at {share:g} of the largest stiffness; choose another share"
-            return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, reason, tuple(notes))
-        elif damping != top.virtual_damping and limit is None:
-            notes.append(_OTHER_DAMPING)
-        wall = VirtualWall(check_number("stiffness", stiffness), check_number("virtual_damping", damping))
-        return Recommendation(bare.replace(wall=wall), top, wanted, binding, Status.OK, notes=tuple(notes))
+        top, notes = bare.max_stiffness(), describe_islands(bare)
+        found = choose_wall(bare, wanted, top)
+        notes += [found.note] if found.note else []
+        notes += _describe_limit(self.safe_limit, beyond_safe)
+        if found.status == Status.OK:
+            stiffness = check_number("stiffness", found.stiffness)
+            wall = VirtualWall(stiffness, check_number("virtual_damping", found.damping))
+            bare = bare.replace(wall=wall)
+        return Recommendation(bare, top, wanted, found.limit, found.status, found.reason, tuple(notes))

@@ -120,11 +120,12 @@ def _range(scene: SceneAnswers, parameter: str, now: float, within: tuple[Any, A
         if not now > 0:
             raise InputError(f"within: {parameter} is 0 now; give the range to search, as within=(0.1, 10)")
         # The cost grows with the square of the delay in periods, and a filter has no cut-off from half its rate on.
+        fixed = 0.0 if timing.in_periods else timing.delay
         longest = max(float(timing.delay / timing.period), _MOST_PERIODS)
         ends = {
             "delay": (0.0, longest * timing.period),
-            "period": (timing.delay / longest, math.inf),
-            "rate": (0.0, longest / timing.delay if timing.delay else math.inf),
+            "period": (fixed / longest, math.inf),
+            "rate": (0.0, longest / fixed if fixed else math.inf),
             "velocity.cutoff": (0.0, 0.499 / (getattr(scene.velocity, "coded_period", None) or timing.period)),
         }
         low, high = ends.get(parameter, (0.0, math.inf))
@@ -235,7 +236,8 @@ class SceneOptima(SceneAnswers):
 
         Returns:
             ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
-            "operator.mass", ...) in N/m per SI unit, each with all others held fixed; ``status``, NOT_CONVERGED where
+            "operator.mass", ...) in N/m per SI unit, each with all others held fixed (the delay in the unit, seconds
+            or periods, in which it was given); ``status``, NOT_CONVERGED where
             one of them is NaN, as all are without a K_max. Whole numbers and coefficients of a filter have none. At
             zero they are those of a little more, as at a whole delay of a linear system without inertia; of all others
             both sides agree there.

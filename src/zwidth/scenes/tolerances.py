@@ -57,7 +57,8 @@ def simulate_tolerances(
 ) -> ToleranceEstimate:
     """Draw devices within tolerances and judge the scene's wall on each of them.
 
-    The parameters are independent of each other; all that is not named is exact. A delay is kept in seconds.
+    The parameters are independent of each other; all that is not named is exact. A delay stays in the unit, seconds or
+    periods, in which it was given.
 
     Args:
         scene: nominal device, timing, parts, and the wall.
@@ -123,6 +124,8 @@ def _draw(scene: Scene, tolerances: dict[str, Any], count: int, seed: int) -> di
         if nominal[name] == 0:
             raise InputError(f"tolerances: {name} is 0, and so is any share of it; give it a value, or leave it out")
         drawn[name] = nominal[name] * _factors(generator, float(share), distribution, count)
+    if scene.timing.in_periods and {"delay", "period"} <= drawn.keys():
+        drawn["delay"] = drawn["delay"] * (drawn["period"] / nominal["period"])
     return drawn
 
 

@@ -65,7 +65,9 @@ class RigidVariants(Variants):
         with np.errstate(all="ignore"):
             self.rate = mass / self.period
             self.delta = damping / self.rate
-            self.d = delay / self.period if {"delay", "period"} & set(drawn) else np.full(self.count, float(scene.d))
+            # A delay given in periods does not change with the period.
+            moving = {"delay"} if scene.timing.in_periods else {"delay", "period"}
+            self.d = delay / self.period if moving & set(drawn) else np.full(self.count, float(scene.d))
 
     @np.errstate(all="ignore")
     def labels(self, stiffness: float, damping: float) -> np.ndarray:

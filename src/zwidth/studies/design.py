@@ -72,7 +72,7 @@ class DesignStudy(ComputedStudy):
     kind: Literal["design"]
 
     device: PhysicalDevice
-    """Device in SI units. A delay stays as it is in seconds."""
+    """Device in SI units. A delay stays in the unit, seconds or periods, in which it is given."""
 
     find: Parameter
     """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""

@@ -34,7 +34,8 @@ from zwidth.loops.rigid.response import step_response
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
-from zwidth.scenes.recommendation import RANGES, Recommendation
+from zwidth.scenes.recommendation import Recommendation
+from zwidth.scenes.wall_search import RANGES
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range
@@ -181,7 +182,8 @@ class RecommendStudy(ResponseStudy):
     """Device in SI units."""
 
     stiffness_fraction: Fraction | None = None
-    """Stiffness of the recommended wall as a share of the maximum, at most; 0.75 where nothing else is asked for."""
+    """Stiffness of the recommended wall as a share of the maximum, at most. Without any requirement the defaults apply:
+    0.75 of the maximum, a gain margin of 2 and a phase margin of 30 degrees."""
 
     gain_margin: Annotated[float, Quantity(allowed=RANGES["gain_margin"])] | None = None
     """The factor on stiffness and damping together that the wall must bear, at least."""
@@ -248,7 +250,7 @@ def _describe(found: Recommendation, told: dict[str, Any]) -> str:
         *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
         *("", *(f"- {text}" for text in said), ""),
         *(text for note in found.notes for text in (f"Note: {note}", "")),
-        *(("What would raise the maximum:", "") if found.steps else ()),
+        *(("To gain stiffness under the same requirements:", "") if found.steps else ()),
         *(f"- {step.spell()}" for step in found.steps),
     ]
     return "\n".join(lines).rstrip() + "\n"

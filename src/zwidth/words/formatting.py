@@ -49,6 +49,11 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     return f"{plain(value / 10**power, digits)} {PREFIXES[power]}{unit}"
 
 
+def spell_periods(count: float) -> str:
+    """Return a count of sampling periods with its noun: ``1 period``, ``0.7 periods``."""
+    return f"{short(float(f'{count:.6g}'))} period{'' if count == 1 else 's'}"
+
+
 def name_wall(stiffness: Any, virtual_damping: Any) -> str:
     """A wall by its numbers, K rounded down: it holds as it is read."""
     K = with_unit(round_safely(float(stiffness), "below"), "N/m")

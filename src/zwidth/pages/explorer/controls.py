@@ -256,6 +256,11 @@ def read_controls(path: Path | None) -> Controls:
     return _show_scene(given, path)
 
 
+def _in_seconds(scene: Scene) -> Scene:
+    """Return the scene with its delay in seconds, the unit of the slider."""
+    return scene.replace(delay=float(scene.timing.delay)) if scene.timing.in_periods else scene
+
+
 def _show_scene(given: Any, origin: Any) -> Controls:
     """The scene of a configuration; where it has no wall, one well inside of the stable set, if there is one."""
     if given.delay_model != "held":
@@ -270,7 +275,7 @@ def _show_scene(given: Any, origin: Any) -> Controls:
             "system does not tell; judge it by zwidth check, draw it by zwidth run"
         )
     bare = isinstance(given, NormalizedScene)
-    controls = normalized_controls(0, 0, given.delta, given.d) if bare else Controls(given.to_scene())
+    controls = normalized_controls(0, 0, given.delta, given.d) if bare else Controls(_in_seconds(given.to_scene()))
     wall = (given.wall.alpha, given.wall.beta) if given.wall and controls.normalized else controls.wall
     if given.wall is None:
         best = controls.scene.max_stiffness()
