@@ -162,6 +162,7 @@ CASES = [
 OTHERS = {
     "assess": "one scene: tests/unit/studies/test_published.py, tests/properties/test_consistency.py",
     "assess_many": "scenes by name: tests/unit/scenes/test_assessment.py",
+    "diagnose": "one scene and wall: tests/unit/scenes/test_diagnosis.py",
     "excite": "one signal: tests/unit/fitting/test_respond.py",
     "fit_buzz": "one device: tests/unit/fitting/test_buzz.py",
     "fit_log": "one device: tests/unit/fitting/test_log.py",
@@ -179,6 +180,5 @@ OTHERS = {
     "step_response": "one wall: tests/unit/loops/rigid/test_response.py",
     "to_control": "one scene: tests/unit/scenes/test_answers.py",
     "use_compilation_cache": "a setting: tests/unit/arrays/test_kernel_cache.py",
-    "worst_motion": "one scene and wall: tests/unit/scenes/test_worst_motion.py",
     "write_report": "a folder: tests/unit/runs/report/test_page.py",
 }

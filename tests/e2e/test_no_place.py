@@ -78,8 +78,8 @@ def test_no_room_for_a_file_ends_the_run_and_room_lets_it_go_on(tmp_path):
     words = [sys.executable, "-c", LIMITED, *command("run", config, "--out", out)]
     result = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LONGEST, env=environment)
     assert result.returncode == 1
-    first, second = (line for line in result.stderr.splitlines() if line.startswith("zwidth:"))
-    assert first.startswith(f"zwidth: out: {out}: ")
+    first, second = (line for line in result.stderr.splitlines() if line.startswith(("zwidth:", "Error:")))
+    assert first.startswith(f"Error: out: {out}: ")
     assert "File too large" in first
     assert f"make room and go on with: zwidth run {config} --out {out} --resume" in second
     for noise in ("Traceback", "UserWarning", "compilation cache"):
@@ -99,7 +99,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(config, words, name, tmp_p
     for out, says in ((file, "is a file"), (file / "below", f"cannot be made, for {file} is a file")):
         assert main_of(*words, config, "--out", out) == 2
         message = capsys.readouterr().err
-        assert message.startswith(f"zwidth: out: {out} {says}")
+        assert message.startswith(f"Error: out: {out} {says}")
         assert "choose another" in message
     assert file.read_bytes() == b""
 
@@ -113,7 +113,7 @@ def test_a_read_only_folder_is_refused(config, tmp_path, capsys):
     folder.chmod(0o555)
     with as_nobody():
         assert main_of("run", config, "--out", folder / "out") == 2
-    says = f"zwidth: out: {folder}/out cannot be made, for {folder} is read-only, at least to you; choose another"
+    says = f"Error: out: {folder}/out cannot be made, for {folder} is read-only, at least to you; choose another"
     assert capsys.readouterr().err.startswith(says)
 
 
@@ -158,7 +158,7 @@ def test_verify_names_a_damaged_chunk_and_resume_repairs_it_alone(config, finish
     out, err = capsys.readouterr()
     assert "map.zarr: 8 of 8 chunks done, 1 damaged" in out
     (line,) = err.splitlines()
-    assert line.startswith(f"zwidth: {copy}/map.zarr: wall/3 (d ")
+    assert line.startswith(f"Error: {copy}/map.zarr: wall/3 (d ")
     assert line.endswith(f": {says}")
     assert main_of("verify", copy, "--json") == 1
     report = json.loads(capsys.readouterr().out)["map.zarr"]
@@ -177,7 +177,7 @@ def test_a_chunk_that_fails_is_named_and_the_exit_code_is_1(config, tmp_path, mo
     assert main_of("run", config, "--out", tmp_path / "out") == 1
     out, err = capsys.readouterr()
     assert "7 of 8 chunks done" in out
-    assert "zwidth: chunk map/wall/2 (d 1:2, delta 0:2, alpha 0:40, beta 0:300) failed: ArithmeticError: no" in err
+    assert "Error: chunk map/wall/2 (d 1:2, delta 0:2, alpha 0:40, beta 0:300) failed: ArithmeticError: no" in err
     assert f"try again what failed with: zwidth run {config} --out {tmp_path}/out --resume" in err
     assert main_of("verify", tmp_path / "out") == 1
     assert "map.zarr: 7 of 8 chunks done, none damaged" in capsys.readouterr().out

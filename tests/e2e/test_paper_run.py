@@ -75,7 +75,8 @@ def test_every_printed_number_is_reproduced(paper):
     assert content["all_agree"] is True
     printed = {row["quantity"]: row["printed"] for row in content["published"]}
     assert printed.items() >= PRINTED.items()
-    assert all(row["agrees"] for row in content["published"])
+    # Two numbers are cited from other papers.
+    assert [row["agrees"] for row in content["published"]] == 15 * [True] + 2 * [None]
     sharpened = {row["where"]: row["computed"] for row in content["sharpened"]}
     assert sharpened["remark 3: 'delta > 2.3'"] == pytest.approx(2.310571356753694, abs=1e-14)
     values = [row["computed"] for row in content["sharpened"]]

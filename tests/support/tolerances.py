@@ -125,12 +125,7 @@ JUDGE = Tolerance(
     1e-9, "Relative to the largest value. An integration to 1e-12 a step of some hundred, its rounding and its growth."
 )
 
-WORST_ENERGY = Tolerance(
-    1e-12,
-    "Relative to the sum of the terms' magnitudes: a filter by its coefficients loses what its poles next to 1 cost, "
-    "and instants add up the rounding of thousands of periods; measured below 2e-13 over 7,000 scenes.",
-)
-WORST_NEED = Tolerance(
+LEAST_DAMPING = Tolerance(
     1e-9, "Relative: a generalized eigenvalue of forms with condition (periods)^2, and the condition's own 1e-13."
 )
 

@@ -1,20 +1,13 @@
-"""Compiled kernels kept between runs, in a folder of the user's cache that mends itself.
-
-JAX writes its cache without a safeguard: a program that is killed meanwhile, or finds the disk full, leaves half an
-entry behind, which JAX then complains about, compiles again and never replaces.
-"""
+"""Compiled kernels kept between runs, in a folder of the user's cache."""
 
 from __future__ import annotations
 
 import os
 import sys
-import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 _VARIABLE = "JAX_COMPILATION_CACHE_DIR"
-# Reading: half an entry. Writing: no room for one, which leaves half an entry.
-_COMPLAINTS = ("Error reading persistent compilation cache", "Error writing persistent compilation cache")
 
 
 class KernelCache(NamedTuple):
@@ -28,7 +21,8 @@ def use_compilation_cache(folder: str | Path | None = None) -> KernelCache:
     """Keep compiled kernels between processes, so that only the first one compiles.
 
     The command line does so by itself; in Python it is one call, before or after JAX is imported. To empty the cache,
-    delete the folder.
+    delete the folder. Do so if JAX warns of an error while reading it: a killed process or a full disk can leave an
+    incomplete entry, which JAX ignores and does not replace.
 
     Args:
         folder: where to keep them; where it is left out, what JAX's own variable JAX_COMPILATION_CACHE_DIR says, or
@@ -55,27 +49,8 @@ def use_compilation_cache(folder: str | Path | None = None) -> KernelCache:
             jax.config.update("jax_compilation_cache_dir", os.environ[_VARIABLE])
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
             jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    mend_compilation_cache()
     used = Path(os.environ[_VARIABLE])
     return KernelCache(used, sum(entry.stat().st_size for entry in used.glob("*") if entry.is_file()))
-
-
-def mend_compilation_cache() -> None:
-    """From now on, empty the folder when JAX finds half an entry in it; leave a folder of the user's choice alone."""
-    folder = _own_folder()
-    if os.environ.get(_VARIABLE) != str(folder):
-        return
-    show = warnings.showwarning
-
-    def mend_or_show(message: Any, *details: Any, **more: Any) -> None:
-        if not str(message).startswith(_COMPLAINTS):
-            show(message, *details, **more)
-            return
-        # Which entry it is, JAX does not say. The folder itself stays, for JAX has made sure of it once and for all.
-        for entry in folder.glob("*-cache"):
-            entry.unlink(missing_ok=True)
-
-    warnings.showwarning = mend_or_show
 
 
 def _own_folder() -> Path:

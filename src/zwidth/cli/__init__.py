@@ -6,6 +6,7 @@ Exit code 0: done; 1: the work failed; 2: the input was wrong. Errors go to stde
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from importlib import import_module
@@ -43,17 +44,30 @@ def main(arguments: list[str] | None = None) -> None:
         click.echo("zwidth: stopped", err=True)
         sys.exit(130)
     except click.ClickException as error:
-        error.show()
+        _report(_format_fault(error))
         sys.exit(error.exit_code)
     except ZwidthError as error:
         for line in str(error).splitlines():
-            click.echo(f"zwidth: {line}", err=True)
+            _report(line)
         sys.exit(EXIT_INPUT)
     except Exception as error:
         if os.environ.get("ZWIDTH_TRACEBACK"):
             raise
-        click.echo(f"zwidth: {_describe(error)}", err=True)
+        _report(_describe(error))
         sys.exit(EXIT_FAILED)
+
+
+def _report(message: str) -> None:
+    click.echo(f"Error: {message}", err=True)
+
+
+def _format_fault(error: click.ClickException) -> str:
+    """Return the message of a fault in the arguments, its option first, or with the command whose help lists them."""
+    message = error.format_message()
+    if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
+        return re.sub(r"^Invalid value for '?(.*?)'?: ", r"\1: ", message, count=1)
+    context = getattr(error, "ctx", None)
+    return f"{message.rstrip('.')}; see {context.command_path} --help" if context else message
 
 
 def _describe(error: Exception) -> str:

@@ -70,8 +70,11 @@ class Parsed(click.ParamType):
             self.fail(f"got {value!r}; {self.remedy}" if self.remedy else str(error), param, ctx)
 
 
-def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> Parsed:
-    """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`."""
+def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, counts: bool = False) -> Parsed:
+    """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`.
+
+    With ``counts`` it is the step of an encoder, also as "2000 counts".
+    """
 
     def read(text: str) -> Any:
         try:
@@ -81,7 +84,9 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> 
             number = text
         # Whether all are of one kind of device is asked when all are known.
         with use_kind(bool(tell_kind(number))):
-            return read_span(number, allowed) if periods else read_quantity(number, find_dimension(unit), allowed)[0]
+            if periods:
+                return read_span(number, allowed)
+            return read_quantity(number, find_dimension(unit), allowed, counts=counts)[0]
 
     return Parsed("quantity", read)
 
@@ -197,6 +202,12 @@ def _read_period(given: dict[str, Any]) -> float | None:
 period_options = _take_options("period", ("period", "rate"), _read_period)
 
 
+def warn_implausible(given: dict[str, Any]) -> None:
+    """Write a line on the error stream for each value in SI units, by path, that lies far from any device."""
+    for line in list_doubts(given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
+        click.echo(f"zwidth: {line}", err=True)
+
+
 def read_scene_file(path: Path) -> Scene:
     """Return the scene of a configuration file or of the run in a folder, after printing its warnings."""
     from zwidth.runs.record import find_config
@@ -223,8 +234,7 @@ def build_scene(given: dict[str, Any], instead: str = "", *, wall: bool = False)
     numbers = {
         path: value.value if isinstance(value, Span) and value.unit == "s" else value for path, value in given.items()
     }
-    for line in list_doubts(numbers, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
-        click.echo(f"zwidth: {line}", err=True)
+    warn_implausible(numbers)
     scene = _make_scene(given, instead) if base is None else _change_scene(base, given)
     scene.check_parts()
     return scene
@@ -334,7 +344,16 @@ def _make_velocity(given: dict[str, Any]) -> Any:
 
 figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
 beyond_safe_option = click.option("--beyond-safe", is_flag=True, help="Ignore the safe limit of a fitted scene.")
+verbose_option = click.option("--verbose", is_flag=True, help="Print everything that is known.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+
+
+def find_silent() -> frozenset[str]:
+    """Return the names among damping and delay that are 0 because neither an option nor a file gives a value."""
+    given = click.get_current_context().params
+    if given.get("scene_file") is not None:
+        return frozenset()
+    return frozenset(name for name in ("damping", "delay") if given.get(name) is None)
 
 
 def log_options(command: Command) -> Command:

@@ -168,16 +168,16 @@ def _report_end(result: RunResult, command: str) -> None:
     if any(study.sweep and study.state in ("done", "kept") for study in result.studies):
         click.echo(f"figures of the sweeps: {shlex.join(['zwidth', 'figures', str(result.folder)])}")
     if result.hopeless:
-        click.echo(f"zwidth: out: {result.folder}: {result.hopeless}", err=True)
+        click.echo(f"Error: out: {result.folder}: {result.hopeless}", err=True)
         click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {command}", err=True)
         return
     for study in result.failed:
         for chunk, error in study.sweep.failed.items() if study.sweep else ():
-            click.echo(f"zwidth: chunk {chunk} failed: {error}", err=True)
+            click.echo(f"Error: chunk {chunk} failed: {error}", err=True)
         if not study.sweep:
-            click.echo(f"zwidth: study {study.name!r} failed: {study.error}", err=True)
+            click.echo(f"Error: study {study.name!r} failed: {study.error}", err=True)
     if result.lost:
-        click.echo(f"zwidth: {result.lost}; what is done is kept, go on with: {command}", err=True)
+        click.echo(f"Error: {result.lost}; what is done is kept, go on with: {command}", err=True)
     elif result.failed and not result.interrupted:
         click.echo(f"zwidth: try again what failed with: {command}", err=True)
 
@@ -199,7 +199,7 @@ def verify(folder: Path, as_json: bool) -> None:
         state = store.error or f"{store.done} of {store.chunks} chunks done, {len(store.damaged) or 'none'} damaged"
         click.echo(f"{store.path.name}: {state}")
         for damaged in store.damaged:
-            click.echo(f"zwidth: {store.path}: {damaged}", err=True)
+            click.echo(f"Error: {store.path}: {damaged}", err=True)
     if not all(store.ok for store in found):
         raise SystemExit(EXIT_FAILED)
 

@@ -52,6 +52,7 @@ class Quantity:
     periods: bool = False  # whether it is a length of time, in s or in sampling periods: a `Span`
     remedy: str = ""  # what helps where another number is given
     turns: bool = True  # whether it is an angle, a torque, ... where the device is rotary
+    counts: bool = False  # whether it is the step of an encoder, also as "2000 counts"
 
     def read(self, value: Any) -> Any:
         """A value of a configuration in the unit."""
@@ -61,7 +62,7 @@ class Quantity:
             if self.unit == "1":
                 return self._read_number(value)
             with use_kind(self.turns and is_rotary()):
-                return read_quantity(value, find_dimension(self.unit), self.allowed)[0]
+                return read_quantity(value, find_dimension(self.unit), self.allowed, counts=self.counts)[0]
         except UnusableValueError as error:
             raise problem(*error.parts) from None
 
@@ -119,7 +120,8 @@ class Quantity:
 
 def quantity_of(name: str) -> Quantity:
     parameter = FIELDS[name]
-    return Quantity(parameter.unit, parameter.allowed, parameter.whole, name == "delay")
+    counts = name == "resolution"
+    return Quantity(parameter.unit, parameter.allowed, parameter.whole, name == "delay", counts=counts)
 
 
 Number = Annotated[float, Quantity()]

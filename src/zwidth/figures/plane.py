@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import matplotlib
 import numpy as np
@@ -35,6 +35,7 @@ _FINITE_IF_STABLE = ("settling_time", "delay_margin")
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 # Beyond this multiple of the smallest, a output that grows without end has one color.
 _STEEP = 100.0
+LEAST_POSITIVE = 1e-300  # values below have no place on a logarithmic scale
 # A color bar of fewer decades than this has 2 and 5 between them.
 _FEW_TICKS = 1000.0
 # A region that fills less of its panel than this has no room for labels.
@@ -44,6 +45,16 @@ _SEEN = 0.003
 # The boundary where it is known.
 _EDGE: dict[str, Any] = {"color": style.BLACK, "linestyle": style.SOLID, "linewidth": 1.3, "zorder": 2.2}
 _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
+
+
+class ColorScale(NamedTuple):
+    """The colors of an output: those of a colormap from one value to another, and its end colors outside."""
+
+    colormap: str  # of matplotlib
+    low: float
+    high: float
+    logarithmic: bool
+    extend: Literal["neither", "min", "max", "both"]  # the ends of the color bar with an arrow: values lie outside
 
 
 class Panel(NamedTuple):
@@ -262,45 +273,60 @@ def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
 
 
 def _colors(output: Output) -> Any:
+    return matplotlib.colormaps[_name_colormap(output)]
+
+
+def _name_colormap(output: Output) -> str:
     if output.look == "diverging":
-        return matplotlib.colormaps["PuOr_r" if output.below else "PuOr"]
-    return matplotlib.colormaps["viridis_r" if output.look == "steep" else "viridis"]
+        return "PuOr_r" if output.below else "PuOr"
+    return "viridis_r" if output.look == "steep" else "viridis"
+
+
+def choose_scale(output: Output, finite: np.ndarray) -> ColorScale:
+    """Choose the colors of an output, in figures and reports alike, by its finite values."""
+    finite = finite[finite >= LEAST_POSITIVE] if output.logarithmic else finite
+    least, most = _range(finite) or ((1.0, 10.0) if output.logarithmic else (0.0, 1.0))
+    if output.look == "diverging":
+        # The bad side has the range of the good one, if there is one: values outside have one color.
+        sides = [output.center - least, most - output.center]
+        good, bad = sides if output.below else reversed(sides)
+        span = max(good if good > 0 else bad, 1e-6)
+        low, high = output.center - span, output.center + span
+    elif output.logarithmic:
+        low, high = least, min(most, _STEEP * least) if output.look == "steep" else most
+        high = max(high, 1.001 * low)
+    else:
+        low, high = least, most if most > least else least + 1.0
+    beyond: Any = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
+    return ColorScale(_name_colormap(output), low, high, output.logarithmic, beyond[least < low, most > high])
+
+
+def _finite(panels: Sequence[Panel], name: str) -> np.ndarray:
+    return np.concatenate([panel.variables[name].compressed() for panel in panels])
 
 
 def _norm(panels: Sequence[Panel], name: str) -> Any:
     output = OUTPUTS[name]
-    low, high = _range(panels, name) or (0.0, 1.0)
+    scale = choose_scale(output, _finite(panels, name))
     if output.look == "diverging":
-        # As far on the bad side as on the good one, where there is one: beyond, a color would tell no more.
-        sides = [output.center - low, high - output.center]
-        good, bad = sides if output.below else reversed(sides)
-        span = max(good if good > 0 else bad, 1e-6)
-        return TwoSlopeNorm(output.center, output.center - span, output.center + span)
-    if output.logarithmic:
-        low, high = _range(panels, name, least=1e-300) or (1.0, 10.0)
-        high = min(high, _STEEP * low) if output.look == "steep" else high
-        return LogNorm(low, max(high, 1.001 * low))
-    return Normalize(low, high if high > low else low + 1.0)
+        return TwoSlopeNorm(output.center, scale.low, scale.high)
+    return (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
 
 
-def _range(panels: Sequence[Panel], name: str, least: float = -np.inf) -> tuple[float, float] | None:
-    finite = np.concatenate([panel.variables[name].compressed() for panel in panels])
-    finite = finite[finite >= least]
+def _range(finite: np.ndarray) -> tuple[float, float] | None:
     return (float(finite.min()), float(finite.max())) if finite.size else None
 
 
 def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, label: str, *, outside: bool) -> None:
     handles: list[Any] = []
-    output, ends = OUTPUTS[name], _range(panels, name)
+    output, ends = OUTPUTS[name], _range(finite := _finite(panels, name))
     if output.look == "truth":
         for each, dash in (("stable", "-"), ("passive", "-.")):
             if each == name or each in panels[0].variables:
                 edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.8, "linestyle": dash}
                 handles.append(Patch(facecolor=SHADES[each], label=each, **edge))
     else:
-        low, high = ends or (image.norm.vmin, image.norm.vmax)
-        beyond = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
-        extend = beyond[low < image.norm.vmin, high > image.norm.vmax]
+        extend = choose_scale(output, finite).extend
         bar = axes[0].figure.colorbar(image, ax=list(axes), label=label, extend=extend)
         if output.logarithmic:
             style.use_logarithmic(bar.ax, "y", (image.norm.vmin, image.norm.vmax), _FEW_TICKS)

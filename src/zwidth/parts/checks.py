@@ -217,7 +217,8 @@ def check_number(field: str, value: Any, unit: str = "", allowed: Range | None =
         unit = PARAMETERS[field].unit
     if allowed is None:
         allowed = PARAMETERS[field].sign if field in PARAMETERS else NOT_NEGATIVE
-    return _read(field, value, lambda known: read_quantity(known, find_dimension(unit), allowed)[0])
+    counts = field == "resolution"
+    return _read(field, value, lambda known: read_quantity(known, find_dimension(unit), allowed, counts=counts)[0])
 
 
 def check_span(field: str, value: Any) -> Any:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 from zwidth.parts.checks import Part, check_number
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.xp import is_jax
 
 # That of the reference below.
@@ -52,9 +53,11 @@ class Operator(Part):
     coupling_damping: Any = 0.0
 
     def __post_init__(self) -> None:
-        if not self.rigid:
-            check_number("operator.mass", self.mass, allowed=POSITIVE)
         super().__post_init__()
+        if not self.rigid:
+            # The mass is in its SI unit now, in that of a rotary device if any other number is.
+            with use_kind(getattr(self, "rotary", is_rotary())):
+                check_number("operator.mass", self.mass, allowed=POSITIVE)
         # Which number JAX holds, nobody can ask.
         if self.rigid and (is_jax(self.coupling_damping) or self.coupling_damping):
             raise InputError(

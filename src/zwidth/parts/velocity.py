@@ -7,8 +7,7 @@ by the wrong time and the cut-off lies elsewhere: that is what the loop then doe
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -50,6 +49,13 @@ class Estimate:
             value = xp.where(at.w >= np.pi, 1.0 - back.value, 2.0 * s * s - 1j * back.value.imag) / n
             parts = parts.times(Jet(value, -back.slope / n))
         return parts
+
+    @property
+    def is_difference(self) -> bool:
+        """Whether the estimate is the difference of two successive samples times a gain."""
+        window = self.window == 1 and not self.lag and not np.size(self.zeros) and not np.size(self.poles)
+        coefficients = not self.window and self.lag == 1 and not np.size(self.poles)
+        return window or (coefficients and np.size(self.zeros) == 1 and bool(np.all(np.equal(self.zeros, 0))))
 
     @property
     def degree(self) -> int:
@@ -136,12 +142,12 @@ class LowPass(_Checked):
         coded = period if self.coded_period is None else self.coded_period
         if self.time_constant is None:
             check_cutoff(self.cutoff, coded)
-            decay = 2.0 * np.pi * self.cutoff * coded
+            decay = 2.0 * _pi(coded) * self.cutoff * coded
         else:
             decay = coded / self.time_constant
         xp = namespace(decay)
         offset = -xp.expm1(-decay)
-        poles = xp.stack([xp.asarray(offset) + 0j] * self.order)
+        poles = xp.stack([_as_complex(xp.asarray(offset))] * self.order)
         gain = offset**self.order * _ratio(period, self.coded_period)
         return Estimate(1, gain, -self.order, poles=poles)
 
@@ -169,9 +175,9 @@ class Butterworth(_Checked):
         check_cutoff(self.cutoff, coded)
         # The bilinear transform, warped so that the cut-off stays: s = (z - 1)/(z + 1), poles on a circle.
         xp = namespace(self.cutoff, coded)
-        size = xp.tan(np.pi * self.cutoff * coded)
-        angles = np.pi * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
-        analog = size * xp.asarray(np.exp(1j * angles))
+        size = xp.tan(_pi(coded) * self.cutoff * coded)
+        angles = _pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
+        analog = size * xp.asarray(_unit_vectors(angles))
         offsets = -2.0 * analog / (1.0 - analog)
         gain = xp.prod(offsets).real * 0.5**self.order * _ratio(period, self.coded_period)
         return Estimate(1, gain, zeros=np.full(self.order, 2.0 + 0j), poles=offsets)
@@ -229,8 +235,12 @@ class VelocityFilter(Part):
 
     def estimate(self, period: Any) -> Estimate:
         """The estimate for a loop of this period, normalized."""
+        gain = self.numerator[0] / self.denominator[0] * period
+        if hasattr(period, "mid"):
+            # Exact coefficients have exact zeros at z = 1, which rounded roots lose.
+            return Estimate(0, gain, 0, _ball_offsets(self.numerator), _ball_offsets(self.denominator))
         zeros, poles, lag = self._roots
-        return Estimate(0, self.numerator[0] / self.denominator[0] * period, lag, zeros, poles)
+        return Estimate(0, gain, lag, zeros, poles)
 
 
 @dataclass(frozen=True, repr=False)
@@ -273,7 +283,21 @@ ESTIMATES = {
 
 def name_estimate(velocity: Velocity) -> str:
     """What configurations call the kind of an estimate."""
-    return next(kind for kind, part in ESTIMATES.items() if type(velocity) is part)
+    for kind, part in ESTIMATES.items():
+        if type(velocity) is part:
+            return kind
+    raise InputError(
+        f"velocity: got {type(velocity).__name__}, a class that a configuration cannot name; use one of "
+        f"{', '.join(ESTIMATES)}"
+    )
+
+
+def is_plain(velocity: Velocity, period: Any) -> bool:
+    """Return whether an estimate is the difference of two samples over the loop's period and has no parameters."""
+    if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
+        return False
+    estimate = velocity.estimate(period)
+    return estimate.window == 1 and estimate.is_difference and isinstance(estimate.gain, float) and estimate.gain == 1.0
 
 
 def check_cutoff(cutoff: Any, period: Any) -> None:
@@ -291,6 +315,37 @@ def _ratio(period: Any, coded: Any) -> Any:
     return 1.0 if coded is None else period / coded
 
 
+# The estimates are computed in floats, in JAX arrays and in balls of python-flint (``flint.arb``).
+
+
+def _pi(like: Any) -> Any:
+    """Return pi in the arithmetic of a number."""
+    return like.pi() if hasattr(like, "pi") else np.pi
+
+
+def _as_complex(value: Any) -> Any:
+    """Return an array as complex numbers; balls convert themselves."""
+    return value if value.dtype == object else value + 0j
+
+
+def _unit_vectors(angles: np.ndarray) -> np.ndarray:
+    """Return ``e^(j angle)`` of each angle."""
+    if angles.dtype != object:
+        return np.exp(1j * angles)
+    import flint
+
+    return np.array([flint.acb(angle.cos(), angle.sin()) for angle in angles])
+
+
+def _ball_offsets(coefficients: tuple[Any, ...]) -> np.ndarray:
+    """Return the roots of a polynomial with exact coefficients as balls, by their offsets from 1."""
+    import flint
+
+    exact = flint.fmpq_poly([flint.arb(value).fmpq() for value in reversed(coefficients)])
+    found: Any = exact(flint.fmpq_poly([1, -1])).numer().complex_roots()
+    return np.array([flint.acb(root) for root, times in found for _ in range(times)], object)
+
+
 def _trailing(polynomial: np.ndarray) -> int:
     return polynomial.size - int(np.flatnonzero(polynomial)[-1]) - 1
 
@@ -305,23 +360,3 @@ def _offsets(polynomial: np.ndarray) -> np.ndarray:
     scale = np.abs(polynomial).sum()
     shifted = np.where(np.abs(shifted) <= 4 * polynomial.size * np.finfo(float).eps * scale, 0.0, shifted)
     return -np.polynomial.polynomial.polyroots(shifted) + 0j
-
-
-def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> float:
-    """The standard deviation of a velocity estimate whose positions are quantized, in m/s."""
-    # The positions' error is nearly white, of variance ``Q^2/12`` with Q the resolution in m (Widrow, Kollar 2008,
-    # chapter 5). Through ``F(z)`` with the impulse response f that becomes ``Q^2/12 sum f_k^2``, with ``sum f^2`` of
-    # ``2/(n T)^2`` for a difference over n, ``2 (1 - p)^2/((1 + p) T^2)`` for a low-pass of pole p, ``2 (1 - p)^3/((1 +
-    # p)^3 T^2)`` for two; of other estimates there is no closed form.
-    estimate = velocity.estimate(period)
-    power = 2.0 * (float(estimate.gain) / (estimate.window * period)) ** 2 if estimate.window else math.nan
-    if isinstance(velocity, LowPass):
-        offset = float(estimate.poles[0].real)
-        # 1 + p = 2 - (1 - p); the gain holds (1 - p) once for every low-pass.
-        power /= (2.0 - offset) if velocity.order == 1 else offset * (2.0 - offset) ** 3
-    elif not isinstance(velocity, BackwardDifference | WindowedDifference):
-        raise InputError(
-            f"velocity: got {type(velocity).__name__}, whose noise has no closed form here; use a difference, a "
-            "windowed difference or a low-pass"
-        )
-    return resolution * math.sqrt(power / 12.0)

@@ -170,6 +170,8 @@ def run(
     sweeps = [plan.study for plan in plans]
     if plans:
         check_installed()
+    elif scheduler is not None:
+        raise InputError(f"scheduler: got {scheduler!r}, but no study of the configuration is a sweep; leave it out")
     # What does not fit, or not belong there, is refused before anything is made.
     Record(folder).check_free(text, overwrite=overwrite, going_on=going_on)
     begun = {study.name for study in sweeps if store_path(folder, study).exists()}
@@ -192,7 +194,8 @@ def run(
         record.start(name=config.name, description=config.description, config_sha256=digest, planned=planned)
         record.keep_config(text, files)
         job.do(pieces)
-        about = {"name": config.name, "description": config.description, "config": _spell(config)}
+        about = {"name": config.name, "description": config.description}
+        about |= {"config": _spell(config), "config_sha256": digest}
         if plans and not job.over:
             job.sweep(plans, about, shard=shard, workers=workers, scheduler=scheduler)
     seconds = time.perf_counter() - clock

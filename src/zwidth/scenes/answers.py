@@ -14,7 +14,6 @@ from zwidth.loops.linear.rows import Island
 from zwidth.loops.rigid.verdict import STABILITY_METHODS, StabilityMethod
 from zwidth.parts.checks import read_texts
 from zwidth.parts.state_space import StateSpace
-from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import InputError, check_choice
@@ -244,7 +243,7 @@ class SceneAnswers(SceneParts):
 def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     """Whether walls with B < 0 count: by default only where B acts on the plain difference of two samples."""
     if negative_damping is None:
-        return isinstance(scene.velocity, BackwardDifference)
+        return scene.velocity.estimate(scene.timing.period).is_difference
     if not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; it is True, False or None")
     return bool(negative_damping)

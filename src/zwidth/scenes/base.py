@@ -18,7 +18,7 @@ from zwidth.parts.operator import Operator
 from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
 from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import BackwardDifference, Velocity
+from zwidth.parts.velocity import BackwardDifference, Velocity, is_plain
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.scenes.measured_loop import MeasuredLoop
@@ -92,8 +92,7 @@ class SceneParts(Part):
         """What makes it more than a rigid mass with the difference of two samples: names of its parts."""
         hand = self.operator
         grasp = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
-        plain = isinstance(self.velocity, BackwardDifference) and self.velocity.coded_period is None
-        within = {"velocity": plain, "operator": grasp}
+        within = {"velocity": is_plain(self.velocity, self.timing.period), "operator": grasp}
         device = () if isinstance(self.device, Device) else ("device",)
         return device + tuple(name for name in find_parts(self) if not within.get(name))
 

@@ -21,7 +21,8 @@ from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
 from zwidth.config.values import Axis, Fraction, Quantity, axis_of, quantity_of, read_entries
 from zwidth.figures.table import SI_COLUMNS, stack
-from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference, find_velocity_noise
+from zwidth.parts.noise import find_velocity_noise
+from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import RequiredValue
@@ -251,7 +252,7 @@ class FiltersStudy(ComputedStudy):
     samples: Annotated[Axis, axis_of("velocity.samples")] | None = None
     """Lengths of a window, in periods."""
 
-    resolution: Annotated[float, Quantity("m", POSITIVE)] | None = None
+    resolution: Annotated[float, Quantity("m", POSITIVE, counts=True)] | None = None
     """One count of the position, in m or with a unit: the noise that it makes of the velocity is computed as well."""
 
     noise_limit: Annotated[float, Quantity("m/s", POSITIVE)] | None = None

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, Perform, describe_failure
-from zwidth.words.errors import InputError
+from zwidth.words.errors import InputError, how_to_install
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -35,7 +35,11 @@ class _BlindWorkerError(InputError):
 @contextmanager
 def connected(address: str) -> Iterator[Client]:
     """A connection to a scheduler while the block runs; an `InputError` where nobody answers."""
-    from distributed import Client
+    try:
+        from distributed import Client
+    except ModuleNotFoundError as error:
+        remedy = how_to_install("distributed")
+        raise InputError(f"scheduler: needs distributed, which is not installed; install it: {remedy}") from error
 
     with _terminal_without_logs():
         try:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from zwidth.config.sweep import SweepStudy
-from zwidth.sweep.files import ELSEWHERE, differences, digest, versions
+from zwidth.sweep.files import ELSEWHERE, differences, versions
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, attempt, in_workers
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.store import SUFFIX, Store, create
@@ -75,9 +75,9 @@ def compute_sweeps(
     progress: Callable[[Progress], None],
 ) -> Sweeps:
     """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there."""
-    # The folder is held by the caller; ``about`` has name, description and config for the stores' attributes; the
-    # options are those of `zwidth.run`. A scheduler that does not answer, or whose workers do not see the folder, is an
-    # `InputError`.
+    # The folder is held by the caller; ``about`` has name, description, config and config_sha256 (of config.yaml) for
+    # the stores' attributes; the options are those of `zwidth.run`. A scheduler that does not answer, or whose workers
+    # do not see the folder, is an `InputError`.
     from zwidth.sweep.jobs import perform
 
     with ExitStack() as stack:
@@ -143,7 +143,7 @@ def _prepare_store(
             "precision": "float64",
             "versions": versions(),
             "config": about["config"],
-            "config_sha256": digest(about["config"]),
+            "config_sha256": about["config_sha256"],
             "study": plan.study.model_dump(mode="json", exclude_none=True),
             "plan": plan.as_dict(),
         }

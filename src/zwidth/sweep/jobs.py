@@ -17,7 +17,6 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.kernel_cache import mend_compilation_cache
 from zwidth.config.sweep import SweepStudy
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.scenes.scene import Scene
@@ -177,7 +176,6 @@ def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
     if 1 < count <= len(available):
         os.sched_setaffinity(0, available[number::count])
-    mend_compilation_cache()
     while True:
         try:
             job: Any = pipe.recv()

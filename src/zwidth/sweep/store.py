@@ -25,7 +25,7 @@ import numpy as np
 from zwidth.config.sweep import SweepStudy
 from zwidth.sweep.files import checksum, content, digest
 from zwidth.sweep.plan import Plan, Task, kept_plan
-from zwidth.words.errors import InputError, StoreError
+from zwidth.words.errors import InputError, StoreError, how_to_install
 from zwidth.words.files import hidden_beside, remove_quietly, write_whole
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.words.rotation import own_unit
@@ -52,10 +52,7 @@ def check_installed() -> None:
     """Raise an `InputError` that says what to install where a library that stores are made with is missing."""
     for name in ("dask", "h5netcdf", "h5py", "xarray", "zarr"):
         if find_spec(name) is None:
-            raise InputError(
-                f"sweeps are kept in stores, and {name}, which those need, is not installed; install it with "
-                "pip install 'zwidth[store]'"
-            )
+            raise InputError(f"sweep: needs {name}, which is not installed; install it: {how_to_install('store')}")
 
 
 def name_checksums(family: str) -> str:

@@ -57,11 +57,26 @@ class TracedDelayError(ZwidthError, TypeError):
     """A traced delay where the number of poles, hence an array shape, depends on its value."""
 
 
+# Names in use for quantities that have another name here.
+SYNONYMS = {"weight": "mass", "inertia": "mass", "frequency": "rate", "latency": "delay", "dead_time": "delay"}
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that adds an optional dependency to this installation."""
+    import sys
+    from pathlib import Path
+
+    project = Path(__file__).resolve().parents[3]
+    by_script = (project / "scripts" / "setup").is_file() and Path(sys.prefix) == project / ".venv"
+    return f"scripts/setup {extra}" if by_script else f"pip install 'zwidth[{extra}]'"
+
+
 def describe_choice(value: object, allowed: tuple[str, ...]) -> str:
     """Say which values are allowed and which of them looks most like the one received."""
     import difflib
 
-    nearest = difflib.get_close_matches(str(value), allowed, n=1)
+    meant = SYNONYMS.get(str(value))
+    nearest = [meant] if meant in allowed else difflib.get_close_matches(str(value), allowed, n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     return f"got {value!r}, allowed are {', '.join(repr(name) for name in allowed)}{hint}"
 

@@ -21,7 +21,10 @@ _PLAUSIBLE = {
     "delay": (0.0, 0.5),
     "cutoff": (0.05, 1e6),
     "time_constant": (1e-7, 5.0),
+    "resolution": (1e-10, 0.01),
 }
+# The step of a rotary encoder in rad: from 32 bits per turn to 6 steps per turn.
+_STEP_ANGLE = (1e-9, 1.1)
 # Kinds of quantities with another name.
 _OF_UNIT = {"N s/m": "damping", "N/m": "spring", "s": "period", "kg": "mass"}
 # The slips: the same number of another unit and how much that is, here or as another quantity; or in words.
@@ -54,10 +57,13 @@ def list_doubts(given: Mapping[str, Any], spell: Callable[[str, str], str]) -> l
                 if _is_plausible(other or kind, value * scale) and not (is_rotary() and own_unit(unit) != unit)
             ]
             remedy = f"did you mean {meant[0]}?" if meant else "check its unit"
+            if kind == "resolution" and value > 1:
+                per = "rev" if is_rotary() else "mm"
+                remedy = f"write counts as {spell(path, f'{number} counts/{per}')}"
             lines.append(f"{spell(path, '')} is {number} {own_unit(unit)}, far from any device; {remedy}")
     return lines
 
 
 def _is_plausible(kind: str, value: float) -> bool:
-    low, high = _PLAUSIBLE[kind]
+    low, high = _STEP_ANGLE if kind == "resolution" and is_rotary() else _PLAUSIBLE[kind]
     return value == 0 or low <= abs(value) <= high

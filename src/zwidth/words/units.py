@@ -1,30 +1,38 @@
-"""Quantities with a unit, as ``10 kN/m``; a number alone is in the SI base unit of its field."""
+"""Quantities with a unit, as ``10 kN/m``; a number alone is in the SI base unit of its field.
+
+The units of a dimension that messages list are in tables; any other product or quotient of the same dimension, as
+``N/um`` or ``ozf in``, is read by `zwidth.words.unit_symbols`.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any, NoReturn
 
 from zwidth.words.errors import UnusableValueError
-from zwidth.words.formatting import describe, short, suggestion
+from zwidth.words.formatting import describe, resembling, short
 from zwidth.words.quantities import ANY, SI_RANGE, Range
 from zwidth.words.rotation import ROTARY, is_rotary, own_unit
+from zwidth.words.unit_symbols import Exponents, measure_unit, normalize_symbols
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
-_QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.{0,20})", re.DOTALL)
+_QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.{0,30})", re.DOTALL)
 
 # One way only to match a run of digits: a second one costs quadratic time on a long run that fails in the end.
 _NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
 
+# The digits at the start of a quantity, with separators of thousands and a decimal sign.
+_DIGITS = re.compile(r"\s*[-+]?[0-9][0-9.,'’_\u00a0\u2009\u202f ]*[0-9](?![0-9])")
+_GROUPED = re.compile(r"[1-9][0-9]{0,2}(?:(?P<mark>[.,'’_\u00a0\u2009\u202f ])[0-9]{3})(?:(?P=mark)[0-9]{3})*")
 
-# A comma in a number; and where it may part thousands.
-_COMMA, _THOUSANDS = re.compile(r"[0-9],[0-9]"), re.compile(r"\s*[-+]?[1-9][0-9]{0,2}(,[0-9]{3})+(?![0-9,])")
 
-
-class Dimension(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Dimension:
     """The units of one kind of quantity, the base unit first, each with its power of ten over that.
 
     Units that are no power of ten stand apart, with their factors.
@@ -32,7 +40,7 @@ class Dimension(NamedTuple):
 
     powers: dict[str, int]
     example: str
-    factors: dict[str, float] = {}  # noqa: RUF012  (nobody writes into it)
+    factors: dict[str, float] = field(default_factory=dict)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -42,13 +50,22 @@ class Dimension(NamedTuple):
     def base(self) -> str:
         return next(iter(self.powers))
 
+    @cached_property
+    def exponents(self) -> Exponents | None:
+        """Exponents of kg, m, s and rad; None of a ratio."""
+        size = measure_unit(self.base)
+        return None if size is None else size.exponents
+
     def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
-        """A number of a unit in the base unit; None for another dimension's unit."""
+        """Return a number of a unit in the base unit; None if the unit is of another dimension."""
         own = next((name for name in self.units if _canonical(name) == _canonical(unit)), None)
         if own in self.factors:
             return float(f"{mantissa}e{exponent}") * self.factors[own]
-        # Shifting the decimal exponent rounds once: 0.3 ms is exactly the float64 of 0.0003.
-        return None if own is None else float(f"{mantissa}e{exponent + self.powers[own]}")
+        if own is not None:
+            # Shifting the decimal exponent rounds once: 0.3 ms is exactly the float64 of 0.0003.
+            return float(f"{mantissa}e{exponent + self.powers[own]}")
+        size = measure_unit(unit, self.exponents) if self.exponents and unit else None
+        return None if size is None else float(f"{mantissa}e{exponent + size.power}") * size.factor
 
 
 MASS = Dimension({"kg": 0, "g": -3, "mg": -6}, "0.1 kg")
@@ -94,6 +111,8 @@ _OF_UNIT = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
 _OTHER_KIND = {one: other for pair in ROTARY.items() for one, other in (pair, pair[::-1])}
 
 PERIOD_WORDS = ("periods", "period")
+COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
+"""Units of a position that its encoder's resolution translates."""
 
 
 def find_dimension(unit: str) -> Dimension:
@@ -107,11 +126,18 @@ def find_other(dimension: Dimension) -> Dimension | None:
 
 
 def tell_kind(value: Any) -> bool | None:
-    """Whether a text is a number with a unit of a rotary device; None where it tells no kind."""
-    match = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
-    unit = "" if match is None else _canonical(match[3])
-    # Whoever writes an unknown unit per angle means no linear one.
-    return _KIND_OF_UNIT.get(unit, True if unit.endswith(("/rad", "/deg")) else None)
+    """Return whether a text is a number with a unit of a rotary device; None if the text has no such unit."""
+    if not isinstance(value, str):
+        return None
+    match = _QUANTITY.fullmatch(_drop_separators(value, strict=False))
+    unit = "" if match is None else match[3].strip()
+    if _read_counts("1", unit) is not None or unit.lower() in COUNTS:
+        return True
+    size = measure_unit(unit) if unit else None
+    if size is None:
+        return None
+    # An unknown unit per angle is of no linear device.
+    return _KIND_OF_EXPONENTS.get(size.exponents, True if size.exponents[3] else None)
 
 
 def spell_exactly(value: float, unit: str) -> str:
@@ -154,42 +180,95 @@ def to_float(value: Any) -> float:
 
 def _canonical(unit: str) -> str:
     """One spelling of a unit for the many of them: ``N*s/m``, ``N·s / m`` and ``Ns/m`` are ``N s/m``."""
-    # Two characters look like the micro sign; this makes them one.
-    unit = unicodedata.normalize("NFKC", unit)
+    unit = normalize_symbols(unit)
     unit = re.sub(r"\s*/\s*", "/", unit)
     unit = re.sub(r"([kmµu]?g)[\s*·⋅.]*([cm]?m)\^?2$", r"\1 \2^2", unit)
     unit = re.sub(r"N[\s*·⋅.]*m[\s*·⋅.]*(?=s/)", "N m ", unit)
     return re.sub(r"N[\s*·⋅.]*(?=[scm])", "N ", unit)
 
 
-_KIND_OF_UNIT = {
-    _canonical(unit): kind == 1
-    for pair in ROTARY.items()
-    for kind, base in enumerate(pair)
-    if base in _OF_UNIT
-    for unit in _OF_UNIT[base].units
+_KIND_OF_EXPONENTS = {
+    _OF_UNIT[base].exponents: kind == 1 for pair in ROTARY.items() for kind, base in enumerate(pair) if base in _OF_UNIT
 }
 
 
-def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, str]:
-    """The number in the base unit and that unit, or the number and "periods"."""
+def _drop_separators(text: str, *, strict: bool = True) -> str:
+    """Return a quantity with a decimal point and no separators of thousands; `UnusableValueError` if ambiguous.
+
+    "1.000,5 N/m" and "1,000.5 N/m" are 1000.5 N/m, "1,5 N/m" is 1.5 N/m; "1,000 N/m" may be either. A point alone is a
+    decimal point always.
+    """
+    text = normalize_symbols(text.strip())
+    match = _DIGITS.match(text)
+    digits = match[0].strip() if match else ""
+    number, rest = digits.lstrip("+-"), text[match.end() :] if match else text
+    marks = re.sub("[0-9]", "", number)
+    if not marks or marks == ".":
+        return text
+    sign = digits[: len(digits) - len(number)]
+    decimal = next((mark for mark in ",." if number.count(mark) == 1 and number.rindex(mark) > _last(number, mark)), "")
+    whole, _, fraction = number.rpartition(decimal) if decimal else (number, "", "")
+    grouped = _GROUPED.fullmatch(whole) is not None
+    plain_digits = re.sub("[^0-9]", "", whole)
+    if decimal == "," and marks == "," and _GROUPED.fullmatch(number):
+        if not strict:
+            return text
+        ways = " or ".join(repr(f"{sign}{way}{rest}") for way in (plain_digits + fraction, f"{whole}.{fraction}"))
+        raise UnusableValueError(
+            f"got {describe(text)}", "its comma may be decimal or separate thousands", f"write {ways}"
+        )
+    if whole.isdigit() or grouped or (_GROUPED.fullmatch(number) and not decimal):
+        return f"{sign}{plain_digits}{'.' if decimal else ''}{fraction}{rest}"
+    if not strict:
+        return text
+    raise UnusableValueError(
+        f"got {describe(text)}", "its digits are not in groups of three", "write 1000.5 as '1000.5'"
+    )
+
+
+def _last(number: str, mark: str) -> int:
+    """Return the place of the last separator other than a mark, -1 without any."""
+    return max((k for k, sign in enumerate(number) if not sign.isdigit() and sign != mark), default=-1)
+
+
+def _read_counts(mantissa: str, unit: str) -> tuple[float, Dimension] | None:
+    """Return one count of an encoder in rad or m, and its dimension; None for another unit.
+
+    "2000 counts/rev" and "14 bit" are steps of an angle, "50 counts/mm" is a step of a length.
+    """
+    number = float(mantissa)
+    if unit.lower() in ("bit", "bits", "-bit") and 1 <= number <= 64 and number.is_integer():
+        return 2.0 * math.pi / 2.0**number, ANGLE
+    if unit.lower() == "cpr":
+        unit = "counts/rev"
+    name, per, base = (part.strip() for part in unit.partition("/"))
+    if name.lower() not in COUNTS or not per or not number > 0:
+        return None
+    for dimension in (ANGLE, LENGTH):
+        size = dimension.in_base("1", 0, base)
+        if size is not None:
+            return size / number, dimension
+    return None
+
+
+def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> tuple[float, str]:
+    """Return the number in the base unit and that unit, or the number and "periods"."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
     units = (*dimension.units, *PERIOD_WORDS) if periods else dimension.units
     text, names, got = value if isinstance(value, str) else "", ", ".join(units), f"got {describe(value)}"
-    if _COMMA.search(text):
-        ways = [text.strip().replace(",", sign) for sign in ("", ".")]
-        meant = " or ".join(map(repr, ways if _THOUSANDS.match(text) else ways[1:]))
-        raise UnusableValueError(got, "a number has no comma", f"write {meant}")
     allowed = f"it must be a number in {dimension.base} or a number with one of the units {names}"
     remedy = f"write a number and a unit, as in {dimension.example!r}"
     if dimension is RATIO:
         allowed, remedy = "it must be a number without a unit", f"write a number, as {dimension.example}"
+    text = _drop_separators(text)
+    if looks_like_number(text) and not looks_like_number(str(value)):
+        raise UnusableValueError(got, "a number without a unit has no separators", f"write {text}")
     if looks_like_number(text):
         raise UnusableValueError(
             f"got the text {describe(value)}", allowed, f"drop the quotes (it is then in {dimension.base})"
         )
-    match = _QUANTITY.fullmatch(text.strip())
+    match = _QUANTITY.fullmatch(text)
     if match is None:
         raise UnusableValueError(got, allowed, remedy)
     mantissa, exponent, unit = match.groups()
@@ -198,25 +277,68 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
     amount = dimension.in_base(mantissa, int(exponent or 0), unit)
     if amount is not None:
         return amount, dimension.base
+    if dimension in (LENGTH, ANGLE):
+        number = f"{mantissa}e{exponent or 0}"
+        step = _read_counts(number, f"{unit}/rev" if counts and unit.lower() in COUNTS else unit)
+        if step is not None:
+            if step[1] is not dimension:
+                _refuse_kind(got, dimension, "write the step of the encoder as a length, or as '50 counts/mm'")
+            return step[0], dimension.base
     if dimension is RATIO:
         raise UnusableValueError(got, allowed, remedy)
     other = find_other(dimension)
     if other is not None and other.in_base(mantissa, 0, unit) is not None:
-        this, that = ("rotary", "linear") if is_rotary() else ("linear", "rotary")
-        raise UnusableValueError(
-            f"{got}, a unit of a {that} device where the device is {this}",
-            f"the units allowed are {names}",
+        that = "linear" if is_rotary() else "rotary"
+        _refuse_kind(
+            got,
+            dimension,
             f"write one of these, or every quantity of the device in {that} units, as {other.example!r} here",
         )
-    known = (*units, *(other.units if other else ()))
-    raise UnusableValueError(got, f"the units allowed are {names}", suggestion(unit, known, remedy))
+    meant = _find_same_letters(unit, (*units, *(other.units if other else ())))
+    raise UnusableValueError(got, f"the units allowed are {names}", meant or remedy)
+
+
+def _refuse_kind(got: str, dimension: Dimension, remedy: str) -> NoReturn:
+    """Raise `UnusableValueError` for a unit of a rotary device in a linear one, or the reverse."""
+    this, that = ("rotary", "linear") if is_rotary() else ("linear", "rotary")
+    names = ", ".join(dimension.units)
+    raise UnusableValueError(
+        f"{got}, a unit of a {that} device where the device is {this}", f"the units allowed are {names}", remedy
+    )
+
+
+def _find_same_letters(unit: str, known: Sequence[str]) -> str:
+    """Return the question for the known unit that a misspelled unit stands for, "" if the magnitude could differ.
+
+    Only the case of letters, except the prefixes m and M, and the spelling of symbols of three letters or more differ.
+    """
+
+    def fold(name: str) -> str:
+        return "".join(sign if sign in "mM" else sign.lower() for sign in _canonical(name).replace(" ", ""))
+
+    def split(name: str) -> list[str]:
+        return re.split(r"([ /])", _canonical(name))
+
+    def misspells(name: str) -> bool:
+        pairs = list(zip(split(unit), split(name), strict=False))
+        if len(split(unit)) != len(split(name)):
+            return False
+        others = [(one, other) for one, other in pairs if one != other]
+        return all(len(other) > 2 and one[:1] == other[0] and resembling(one, [other]) for one, other in others)
+
+    same = [name for name in known if fold(name) == fold(unit)]
+    same = same or ([] if measure_unit(unit) else [name for name in known if misspells(name)])
+    return f"did you mean {same[0]!r}?" if same else ""
 
 
 def read_quantity(
-    value: Any, dimension: Dimension, allowed: Range = ANY, *, periods: bool = False
+    value: Any, dimension: Dimension, allowed: Range = ANY, *, periods: bool = False, counts: bool = False
 ) -> tuple[float, str]:
-    """A quantity that the model is computed for, in its base unit or, where allowed, in "periods"; and which."""
-    amount, unit = _parse(value, dimension, periods=periods)
+    """Return a quantity in its base unit or, if allowed, in "periods"; and that unit.
+
+    With ``counts`` a number of counts, as "2000 counts", is the step of an encoder with so many counts per revolution.
+    """
+    amount, unit = _parse(value, dimension, periods=periods, counts=counts)
     check_range(amount, allowed, unit)
     least, most = SI_RANGE
     if amount and not least <= abs(amount) <= most:
@@ -225,8 +347,6 @@ def read_quantity(
     return amount, unit
 
 
-COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
-"""Units of a position that its encoder's resolution translates."""
 # Of logs and responses; and their units besides.
 _KNOWN = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
 _FURTHER = ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s", "krad/s", "dB", "m/N", "mm/N", "um/N", "µm/N")

@@ -156,6 +156,14 @@ def test_rate_and_period_are_one_thing():
         (["--mass", "1", "--period", "4000"], "--period is 4000 s, .* did you mean --rate '4000 Hz'?"),
         (["--mass", "1", "--period", "1"], "--period is 1 s, .* did you mean --period '1 ms'?"),
         (["--mass", "1", "--rate", "1"], "--rate is 1 Hz, .* did you mean --rate '1 kHz'?"),
+        (
+            ["--mass", "1", *RATE, "--resolution", "5"],
+            "--resolution is 5 m, .* write counts as --resolution '5 counts/mm'",
+        ),
+        (
+            ["--mass", "60 g cm^2", *RATE, "--resolution", "2000"],
+            "--resolution is 2000 rad, .* write counts as --resolution '2000 counts/rev'",
+        ),
         (["--mass", "1", *RATE, "--delay", "20"], "--delay is 20 s, .* did you mean --delay '20 ms'?"),
         (["--mass", "1", *RATE, "--delay", "1"], "--delay is 1 s, .* did you mean --delay '1 ms'?"),
         (

@@ -292,10 +292,10 @@ def test_any_mutation_ends_in_a_plan_or_in_exit_code_2(seed, tmp_path, capsys):
     if config is not None:
         # What is wrong with no field may still be too large for the machine.
         largest = "|".join(re.escape(study.name) for study in config.studies)
-        named = rf"zwidth: (out: .* of studies\[({largest})\]\.axes \(|workers: )"
+        named = rf"Error: (out: .* of studies\[({largest})\]\.axes \(|workers: )"
         assert all(re.match(named, line) for line in lines), lines
     else:
-        assert lines == [f"zwidth: {fault}" for fault in faults]
+        assert lines == [f"Error: {fault}" for fault in faults]
     for line in lines:
         assert "; " in line, line
         assert not any(word in line for word in ("Error", "Traceback", "Exception")), line

@@ -5,14 +5,19 @@ import pytest
 from scipy import signal
 
 import zwidth
-from zwidth.parts.velocity import find_velocity_noise
-from zwidth.words.errors import InputError
+from zwidth.parts.noise import find_velocity_noise
+from zwidth.parts.velocity import Estimate
 
 PERIOD, COUNT = 1e-3, 20e-6
 
 
 def coefficients(velocity, period=PERIOD):
     """F(z) of the estimates, written out here from their definitions."""
+    if isinstance(velocity, zwidth.VelocityFilter):
+        return np.array(velocity.numerator), np.array(velocity.denominator)
+    if isinstance(velocity, zwidth.Butterworth):
+        top, bottom = signal.butter(velocity.order, 2 * velocity.cutoff * period)
+        return np.convolve(top, [1 / period, -1 / period]), bottom
     if isinstance(velocity, zwidth.WindowedDifference):
         top = np.zeros(velocity.samples + 1)
         top[[0, -1]] = 1.0, -1.0
@@ -27,6 +32,8 @@ def coefficients(velocity, period=PERIOD):
 ESTIMATES = [
     *(zwidth.WindowedDifference(n) for n in (1, 5, 40)),
     *(zwidth.LowPass(cutoff=cutoff, order=order) for cutoff in (3, 30, 300) for order in (1, 2)),
+    *(zwidth.Butterworth(cutoff, order) for cutoff in (30, 300) for order in (1, 2, 4)),
+    zwidth.VelocityFilter([800.0, -700.0, -100.0], [1.0, -0.5, 0.2]),
 ]
 
 
@@ -59,6 +66,12 @@ def test_counts_of_a_moving_device_make_this_noise(velocity):
     assert find_velocity_noise(velocity, PERIOD, COUNT) == pytest.approx(np.std(error), rel=0.01)
 
 
-def test_other_estimates_are_refused():
-    with pytest.raises(InputError, match="got Butterworth, whose noise has no closed form"):
-        find_velocity_noise(zwidth.Butterworth(30), PERIOD, COUNT)
+def test_a_subclass_has_the_noise_of_its_transfer_function():
+    """The class alone must not select the formula."""
+
+    class Halved(zwidth.LowPass):
+        def estimate(self, period):
+            return Estimate(window=4, gain=0.5)
+
+    whole = find_velocity_noise(zwidth.WindowedDifference(4), PERIOD, COUNT)
+    assert find_velocity_noise(Halved(cutoff=30), PERIOD, COUNT) == pytest.approx(0.5 * whole, rel=1e-14)

@@ -106,14 +106,25 @@ def test_questions_read_texts_with_units(name):
     np.testing.assert_array_equal(ask(*texts), ask(*numbers))
 
 
+def test_a_rotary_hand_with_a_coupling_is_given_in_units():
+    hand = zwidth.Operator(mass="2000 g cm^2", coupling_stiffness="2 N m/rad", coupling_damping="10 mN m s/rad")
+    assert (hand.mass, hand.coupling_stiffness, hand.coupling_damping) == (2e-4, 2.0, 0.01)
+    device = zwidth.Device("60 g cm^2", "0.02 mN m s/rad")
+    told = zwidth.Scene(device, zwidth.Timing("1 ms"), operator=hand)
+    plain = zwidth.Scene(device, zwidth.Timing(1e-3), operator=zwidth.Operator(2e-4, 0, 0, 2.0, 0.01))
+    assert told.max_stiffness().stiffness == plain.max_stiffness().stiffness
+    with pytest.raises(zwidth.InputError, match=r"operator.mass: got 0 kg m\^2; it must be greater than 0"):
+        zwidth.Operator(mass="0 g cm^2", coupling_stiffness="2 N m/rad")
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: zwidth.Device(mass="70 gramm"), "mass: got '70 gramm'; the units allowed are kg, g, mg"),
         (lambda: SCENE.is_stable("10 kN", 40), "stiffness: got '10 kN'; the units allowed are N/m"),
-        (lambda: SCENE.is_stable("10,000 N/m", 40), "a number has no comma; write '10000 N/m' or '10.000 N/m'"),
-        (lambda: zwidth.Device(mass="10,000"), "mass: got '10,000'; a number has no comma; write '10000' or '10.000'"),
-        (lambda: zwidth.Device(mass="0,1 kg"), "a number has no comma; write '0.1 kg'$"),
+        (lambda: SCENE.is_stable("10,000 N/m", 40), "separate thousands; write '10000 N/m' or '10.000 N/m'"),
+        (lambda: zwidth.Device(mass="10,000"), "mass: got '10,000'; .* write '10000' or '10.000'"),
+        (lambda: zwidth.Device(mass="0,1"), "a number without a unit has no separators; write 0.1$"),
         (lambda: zwidth.Timing("1 ms", rate="1 kHz"), "timing: both are given; give either the period"),
         (lambda: zwidth.Device(mass="0.07"), r"mass: got the text '0.07'; .*drop the quotes \(it is then in kg\)"),
         (lambda: zwidth.Device(mass="-70 g"), "mass: got -0.07 kg; it must be greater than 0 kg"),

@@ -45,7 +45,6 @@ QUESTIONS = {
     "normalize_walls": lambda scene, *wall: scene.normalize_walls(*wall),
     "simulate": lambda scene, *wall: scene.simulate(*wall, start_position=1e-4, periods=50).position,
     "zwidth.simulate": lambda scene, *wall: zwidth.simulate([scene], *wall, start_position=1e-4, periods=50).position,
-    "worst_motion": lambda scene, *wall: zwidth.worst_motion(scene, *wall).energy,
     "to_control": lambda scene, *wall: zwidth.to_control(scene, *wall).A,
     "plot.step": draw("step"),
     "plot.nyquist": draw("nyquist"),

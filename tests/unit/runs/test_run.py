@@ -1,5 +1,6 @@
 """The one run: folders, events, failures, the record, and going on with what is there."""
 
+import hashlib
 import json
 import shutil
 import time
@@ -246,3 +247,18 @@ def test_a_study_that_takes_long_tells_how_far_it_is(tmp_path):
     study = {"kind": "filters", "name": "f", "device": device, "damping": [1, 10], "samples": [2, 3]}
     assert run({"version": 1, "name": "n", "studies": [study]}, out=tmp_path / "out", progress=events.append).ok
     assert [event.parts for event in events] == [None, *((done, 6) for done in range(6)), None]
+
+
+def test_record_and_store_name_the_same_configuration(both, tmp_path):
+    folder = run(both, out=tmp_path / "out").folder
+    digest = hashlib.sha256((folder / "config.yaml").read_bytes()).hexdigest()
+    assert record_of(folder)["config_sha256"] == digest
+    (store,) = folder.glob("*.zarr")
+    with zwidth.open_dataset(store) as data:
+        assert data.attrs["config_sha256"] == digest
+
+
+def test_a_scheduler_without_a_sweep_is_refused(config, tmp_path):
+    with pytest.raises(InputError, match="scheduler: got 'foo', but no study of the configuration is a sweep"):
+        run(config, out=tmp_path / "out", scheduler="foo")
+    assert not (tmp_path / "out").exists()

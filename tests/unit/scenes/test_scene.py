@@ -142,7 +142,7 @@ def test_a_scene_without_a_wall_has_none():
     assert (scene.alpha, scene.beta, scene.delta, scene.d) == (0, 0, 0, 0)
 
 
-ASKED: tuple[Any, ...] = zwidth.assess, zwidth.limits_of, zwidth.worst_motion, zwidth.plot.region
+ASKED: tuple[Any, ...] = zwidth.assess, zwidth.limits_of, zwidth.plot.region
 SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
 
 

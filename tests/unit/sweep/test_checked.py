@@ -168,7 +168,7 @@ def test_on_the_command_line_a_damage_is_one_line(store, words, tmp_path, monkey
     file.unlink()
     assert main_of(words[0], store.parent, *words[1:]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == f"zwidth: {store.parent / 'map.zarr'}{str(file)[len(str(store)) :]}: missing; " + (
+    assert line == f"Error: {store.parent / 'map.zarr'}{str(file)[len(str(store)) :]}: missing; " + (
         "'zwidth run CONFIG --resume' makes it again"
     )
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

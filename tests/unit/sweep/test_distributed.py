@@ -87,7 +87,7 @@ def test_a_chunk_that_always_kills_its_worker_is_named_and_the_exit_code_is_1(
     assert main_of("run", path, "--out", tmp_path / "out", "--scheduler", cluster) == 1
     out, err = capsys.readouterr()
     assert "7 of 8 chunks done" in out
-    assert "zwidth: chunk map/wall/2 (" in err
+    assert "Error: chunk map/wall/2 (" in err
     assert err.count(" failed: ") == 1
     assert ") failed: KilledWorker: its worker died every time it was tried" in err
     assert "Traceback" not in err
@@ -144,7 +144,7 @@ def test_a_scheduler_that_dies_or_falls_silent_ends_the_run_in_one_line(
     ours = [line for line in err.splitlines() if not line.startswith(("map ", "[1/1] map "))]
     go_on = f"go on with: zwidth run {path} --out {out} --resume --scheduler {address}"
     assert ours == [
-        f"zwidth: scheduler: {address} does not answer any more, or has started again; what is done is kept, {go_on}"
+        f"Error: scheduler: {address} does not answer any more, or has started again; what is done is kept, {go_on}"
     ]
     told = int(out_text.split(" of 8 chunks done")[0])
     # What it was at may have been finished since.

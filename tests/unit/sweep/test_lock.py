@@ -141,7 +141,7 @@ def test_the_command_line_says_it_in_one_line_and_ends_with_exit_code_2(holder, 
     for words in (["--resume"], ["--overwrite"], ["--shard", "1/2"]):
         assert main_of("run", path, "--out", out, *words) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith(f"zwidth: out: {out}: another run computes in this folder (process {process.pid} on ")
+        assert line.startswith(f"Error: out: {out}: another run computes in this folder (process {process.pid} on ")
     # Who only reads has nothing to wait for.
     assert main_of("verify", out) == 0
     assert main_of("export", out, "--csv", tmp_path / "table.csv") == 0

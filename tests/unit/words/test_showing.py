@@ -38,7 +38,6 @@ RESULTS: dict[str, Callable[[], Any]] = {
     "labels": lambda: zwidth.decide_stability(np.linspace(0.1, 0.3, 5), 0.4, 0.1, 1),
     "label": lambda: zwidth.decide_stability(np.linspace(0.1, 0.3, 50), 0.4, 0.1, 1),
     "robust": lambda: zwidth.robust_wall(mass=zwidth.Interval(0.09, 0.11), damping=10, period=1e-3),
-    "worst": lambda: zwidth.worst_motion(SCENE),
     "tolerances": lambda: zwidth.simulate_tolerances(SCENE, {"mass": 0.1}, samples=100),
     "response": lambda: zwidth.step_response(0.1, 0.4, 0.1, 1, periods=500),
 }

@@ -1,16 +1,21 @@
 """Quantities: every spelling of a unit, exact conversion, and spans in periods."""
 
 import math
+import re
 
 import pytest
 
 from zwidth.parts.checks import Span
 from zwidth.words.errors import UnusableValueError
+from zwidth.words.rotation import use_kind
 from zwidth.words.units import (
     ANGLE,
     ANGULAR_DAMPING,
     ANGULAR_STIFFNESS,
     DAMPING,
+    FORCE,
+    INERTIA,
+    LENGTH,
     MASS,
     RATE,
     STIFFNESS,
@@ -29,6 +34,17 @@ from zwidth.words.units import (
         (MASS, "100g", 0.1),
         (MASS, "  2.5e2   g ", 0.25),
         (MASS, 0.1, 0.1),
+        (MASS, "0,1 kg", 0.1),
+        (MASS, "−0,1 kg", -0.1),
+        (STIFFNESS, "1.000,5 N/m", 1000.5),
+        (STIFFNESS, "1,000.5 N/m", 1000.5),
+        (STIFFNESS, "1,000,000 N/m", 1e6),
+        (STIFFNESS, "1.000.000,0 N/m", 1e6),
+        (STIFFNESS, "12'000 N/m", 12e3),
+        (STIFFNESS, "12 000 N/m", 12e3),
+        (STIFFNESS, "1.000 kN/m", 1e3),
+        (STIFFNESS, "1 N/um", 1e6),
+        (STIFFNESS, "1 N/µm", 1e6),
         (MASS, 2, 2.0),
         (DAMPING, "10 N s/m", 10.0),
         (DAMPING, "10 N*s/m", 10.0),
@@ -48,6 +64,7 @@ from zwidth.words.units import (
         (TORQUE, "5 Ncm", 0.05),
         (ANGULAR_STIFFNESS, "5 Nm/rad", 5.0),
         (ANGULAR_STIFFNESS, "1 mN m/deg", 0.18 / math.pi),
+        (ANGULAR_STIFFNESS, "1 N mm/rad", 1e-3),
         (ANGULAR_DAMPING, "5 mNms/rad", 0.005),
         (ANGULAR_DAMPING, "5 N*m*s / rad", 5.0),
         (TIME, "1 ms", 0.001),
@@ -66,12 +83,108 @@ def test_a_quantity_is_the_number_nearest_to_what_is_written(dimension, text, va
 
 
 @pytest.mark.parametrize(
+    "dimension, text, value",
+    [
+        (STIFFNESS, "2 kgf/mm", 2 * 9.80665e3),
+        (STIFFNESS, "2 kg/mm", 2 * 9.80665e3),
+        (STIFFNESS, "10 lbf/in", 10 * 4.4482216152605 / 0.0254),
+        (FORCE, "2 kgf", 19.6133),
+        (FORCE, "3 lbf", 13.3446648457815),
+        (TORQUE, "1 ozf in", 0.27801385095378125 * 0.0254),
+        (TORQUE, "1 oz-in", 0.028349523125 * 9.80665 * 0.0254),
+        (TORQUE, "1 in-oz", 0.028349523125 * 9.80665 * 0.0254),
+        (TORQUE, "2 kg cm", 0.196133),
+        (TORQUE, "2 kgf.cm", 0.196133),
+        (ANGLE, "0.18º", math.pi / 1000),
+        (ANGULAR_STIFFNESS, "1 N mm/deg", 0.18 / math.pi),
+        (ANGULAR_STIFFNESS, "30 mNm/°", 5.4 / math.pi),
+        (ANGULAR_STIFFNESS, "3.2 N m/turn", 1.6 / math.pi),
+        (ANGULAR_STIFFNESS, "3.2 N m/rev", 1.6 / math.pi),
+        (ANGULAR_DAMPING, "5 mNm/(rad/s)", 0.005),
+        (ANGULAR_DAMPING, "1 N m s/rev", 0.5 / math.pi),
+        (INERTIA, "60 gcm2", 6e-6),
+        (INERTIA, "60 g cm²", 6e-6),
+    ],
+)
+def test_units_that_no_table_lists_are_read(dimension, text, value):
+    # Several factors round several times.
+    assert read_quantity(text, dimension)[0] == pytest.approx(value, rel=4e-16, abs=0)
+
+
+def test_counts_per_revolution_or_length_are_the_step_of_an_encoder():
+    step = math.pi / 1000
+    with use_kind(True):
+        for text in ("2000 counts/rev", "2000 cpr", "2,000.0 counts/turn", "2e3 ticks/rev"):
+            assert read_quantity(text, find_dimension("m"))[0] == pytest.approx(step, rel=1e-15)
+        assert read_quantity("2000 counts", find_dimension("m"), counts=True)[0] == pytest.approx(step, rel=1e-15)
+        assert read_quantity("14 bit", find_dimension("m"))[0] == 2 * math.pi / 2**14
+        # Elsewhere counts are no angle: how many make a turn is open.
+        with pytest.raises(UnusableValueError, match="units allowed are rad"):
+            read_quantity("20 counts", find_dimension("m"))
+    assert read_quantity("50 counts/mm", LENGTH)[0] == pytest.approx(2e-5, rel=1e-15)
+    with pytest.raises(UnusableValueError, match=r"unit of a rotary device where .*50 counts/mm"):
+        read_quantity("2000 counts", LENGTH, counts=True)
+
+
+@pytest.mark.parametrize(
+    ("dimension", "text"),
+    [
+        (STIFFNESS, "1 pN/m"),
+        (STIFFNESS, "1 GN/m"),
+        (STIFFNESS, "2 N m"),
+        (STIFFNESS, "10 kN"),
+        (ANGULAR_STIFFNESS, "2 N m"),
+        (ANGULAR_STIFFNESS, "2 N m s/rad"),
+        (DAMPING, "10 N/m"),
+        (DAMPING, "3 MN s/um s"),
+        (MASS, "70 gr"),
+        (LENGTH, "2000 counts"),
+        (RATE, "1 ms"),
+        (TIME, "1 Mhz"),
+    ],
+)
+def test_no_suggestion_changes_the_magnitude(dimension, text):
+    with pytest.raises(UnusableValueError, match="units allowed are") as caught:
+        read_quantity(text, dimension)
+    assert "did you mean" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("dimension", "text", "meant"),
+    [
+        (MASS, "0.1 KG", "kg"),
+        (RATE, "1 khz", "kHz"),
+        (STIFFNESS, "1 KN/m", "kN/m"),
+        (DAMPING, "1 ns/m", "N s/m"),
+        (ANGULAR_DAMPING, "1 mN m s/rd", "mN m s/rad"),
+    ],
+)
+def test_a_suggestion_has_the_same_magnitude(dimension, text, meant):
+    with pytest.raises(UnusableValueError, match=f"did you mean '{meant}'"):
+        read_quantity(text, dimension)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1,000 N/m", "may be decimal or separate thousands; write '1000 N/m' or '1.000 N/m'"),
+        ("1,00,0.5 N/m", "not in groups of three"),
+        ("1,5", "has no separators; write 1.5"),
+    ],
+)
+def test_separators_that_may_mean_two_numbers_are_refused(text, words):
+    with pytest.raises(UnusableValueError, match=re.escape(words)):
+        read_quantity(text, STIFFNESS)
+
+
+@pytest.mark.parametrize(
     "dimension, value",
     [
         (MASS, "0.1"),
         (MASS, "kg"),
         (MASS, "0.1 kg kg"),
-        (MASS, "0,1 kg"),
+        (MASS, "1,000 kg"),
+        (MASS, "1,00,000 kg"),
         (MASS, "٣ kg"),
         (MASS, "1e99999999 kg"),
         (MASS, "1e999 kg"),

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from fractions import Fraction
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +19,8 @@ from zwidth.arrays.balls import BITS, available
 from zwidth.parts.chain import AnyChain, chain_of
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.system import System
-from zwidth.parts.velocity import Butterworth, Estimate, LowPass, VelocityFilter, WindowedDifference
-from zwidth.words.errors import InputError
+from zwidth.parts.velocity import Estimate
+from zwidth.words.errors import InputError, how_to_install
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ _NOTHING = Estimate(0, 0.0)
 def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels and statuses of walls of one shape, in SI units."""
     if not available():
-        raise InputError("method: 'certified' needs python-flint for this scene; pip install 'zwidth[certified]'")
+        raise InputError(f"method: 'certified' needs python-flint for this scene: {how_to_install('certified')}")
     polynomials = cache(lambda bits: _polynomials(scene))
     stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)
     for place in np.ndindex(stiffness.shape):
@@ -89,14 +88,14 @@ def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_
     period = exact.timing.period
     chain = chain_of(exact, (scene.d, int(scene.d)), _NOTHING)
     answer, device = _device(chain)
-    top, bottom = _estimate(exact.velocity, period)
+    estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
+    top, bottom = _estimate_polynomials(estimate)
     unit = period * period / exact.mass
     whole = chain.whole + (1 if chain.d > chain.whole else 0)
     waiting = flint.arb_poly([0] * whole + device.coeffs())
-    # F(1) is exactly 0 where a sum of exact fractions is; all other estimates are differences.
-    own = isinstance(scene.velocity, VelocityFilter)
-    rest = chain.free and (not own or sum(map(Fraction, scene.velocity.numerator)) == 0)
-    return waiting * bottom, answer * bottom * unit, answer * top * unit, rest
+    # F(1) = 0 exactly of a difference, and of a zero at z = 1 without rounding error.
+    rest = chain.free and (estimate.window > 0 or any(offset == 0 for offset in np.asarray(estimate.zeros).tolist()))
+    return waiting * bottom, answer * bottom * unit, answer * top * (unit / period), rest
 
 
 def _exact(part: Any) -> Any:
@@ -173,31 +172,32 @@ def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
     return flint.arb_poly([0, 1]) * numerator(late) + numerator(full - late), device
 
 
-def _estimate(velocity: Any, period: flint.arb) -> tuple[flint.arb_poly, flint.arb_poly]:
-    """Numerator and denominator of F in SI units."""
+def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
+    """Return the velocity estimate in balls; in floats, taken as exact, if its code computes in floats only."""
+    try:
+        return exact.velocity.estimate(exact.timing.period)
+    except (ArithmeticError, AttributeError, TypeError, ValueError):
+        # A class of a user may call functions of ``math``.
+        return velocity.estimate(period)
+
+
+def _estimate_polynomials(estimate: Estimate) -> tuple[flint.arb_poly, flint.arb_poly]:
+    """Return numerator and denominator of F for T = 1."""
     import flint
 
-    pi, z = flint.arb.pi(), flint.arb_poly([0, 1])
-    if isinstance(velocity, VelocityFilter):
-        top, bottom = (flint.arb_poly(list(part[::-1])) for part in (velocity.numerator, velocity.denominator))
-        return top, bottom
-    coded = period if velocity.coded_period is None else velocity.coded_period
-    if isinstance(velocity, WindowedDifference):
-        n = velocity.samples
-        return (z**n - 1) * (1 / (n * coded)), z**n
-    top, bottom = (z - 1) * (1 / coded), z
-    if isinstance(velocity, LowPass):
-        tau = velocity.time_constant
-        p = (-2 * pi * velocity.cutoff * coded if tau is None else -coded / tau).exp()
-        top, bottom = top * z ** (velocity.order - 1), (z - p) ** velocity.order
-        return top * (1 - p) ** velocity.order, bottom
-    if isinstance(velocity, Butterworth):
-        size = (pi * velocity.cutoff * coded).tan()
-        n, above, below = velocity.order, z - 1, (z + 1) * size
-        for k in range(n // 2):
-            cosine = (pi * (2 * k + 1) / (2 * n)).sin()
-            bottom = bottom * (above * above + above * below * (2 * cosine) + below * below)
-        if n % 2:
-            bottom = bottom * (above + below)
-        top = top * below**n
-    return top, bottom
+    z, turns = flint.arb_poly([0, 1]), estimate.window + estimate.lag
+    top, bottom = (_expand(roots) for roots in (estimate.zeros, estimate.poles))
+    top = top * estimate.gain * z ** max(-turns, 0)
+    if estimate.window:
+        top = top * (z**estimate.window - 1) * (1 / flint.arb(estimate.window))
+    return top, bottom * z ** max(turns, 0)
+
+
+def _expand(offsets: Any) -> flint.arb_poly:
+    """Return the real polynomial of roots given by their offsets from 1, in conjugate pairs."""
+    import flint
+
+    found = flint.acb_poly([1])
+    for offset in np.asarray(offsets).tolist():
+        found = found * flint.acb_poly([flint.acb(offset) - 1, 1])
+    return flint.arb_poly([coefficient.real for coefficient in found.coeffs()])

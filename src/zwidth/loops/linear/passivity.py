@@ -161,19 +161,19 @@ def _enclose_difference(low: np.ndarray, high: np.ndarray, offset: complex) -> t
     return np.abs(circle(middle).before + offset) + 0.5 * (high - low), one, one
 
 
-def find_need(condition: PassivityCondition, alpha: float, beta: float) -> tuple[float, float]:
-    """The damping that the worst frequency asks for, to a relative 1e-13, proved, and its angle; NaN of no numbers."""
+def find_needed_damping(condition: PassivityCondition, alpha: float, beta: float) -> float:
+    """Return the largest damping required at any frequency, certified to a relative 1e-13; NaN if not finite."""
     if not (np.isfinite(alpha) and np.isfinite(beta)):
-        return np.nan, np.nan
+        return np.nan
     stiff = max(alpha + beta * condition.spring, 0.0)
     w = np.concatenate([[0.0], np.geomspace(1e-6, 1e-2, 24), np.linspace(1e-2, np.pi, _NODES)[1:]])
     values = condition.needed(stiff, beta, w)
     # Intervals: both ends of each, and what they need.
     ends, needs = np.stack([w[:-1], w[1:]]), np.stack([values[:-1], values[1:]])
-    best, most = (float(values.max()), float(w[values.argmax()])), values
+    best, most = float(values.max()), values
     for _ in range(_ROUNDS):
         most = needs.max(0) + condition.curvature(stiff, beta, *ends) * np.diff(ends, axis=0)[0] ** 2 / 8.0
-        open_ = most > best[0] + _PROVED * (abs(best[0]) + 1e-300)
+        open_ = most > best + _PROVED * (abs(best) + 1e-300)
         if not open_.any():
             return best
         if open_.sum() > _MOST:
@@ -182,17 +182,17 @@ def find_need(condition: PassivityCondition, alpha: float, beta: float) -> tuple
         (low, high), needs = ends[:, open_], needs[:, open_]
         places = low + (high - low) * _SHARES
         inner = condition.needed(stiff, beta, places.ravel())
-        best = max(best, (float(inner.max()), float(places.flat[inner.argmax()])))
+        best = max(best, float(inner.max()))
         places = np.concatenate([[low], places, [high]])
         values = np.concatenate([needs[:1], inner.reshape(_PARTS - 1, -1), needs[1:]])
         ends, needs = (np.stack([part[:-1].ravel(), part[1:].ravel()]) for part in (places, values))
-    return float(most.max()), best[1]
+    return float(most.max())
 
 
 def passivity_margins(condition: PassivityCondition, alpha: np.ndarray, beta: np.ndarray, delta: float) -> np.ndarray:
     """By how much delta exceeds what walls of one shape need; at most their stiffness where that is negative."""
     pairs = zip(alpha.ravel().tolist(), beta.ravel().tolist(), strict=True)
-    needed = [find_need(condition, *wall)[0] for wall in pairs]
+    needed = [find_needed_damping(condition, *wall) for wall in pairs]
     margin = delta - np.array(needed).reshape(alpha.shape)
     stiff = alpha + beta * condition.spring
     return np.where(stiff < 0, np.minimum(margin, stiff), margin)

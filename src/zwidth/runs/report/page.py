@@ -14,11 +14,13 @@ from string import Template
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import matplotlib
 import numpy as np
+from matplotlib.colors import to_hex
 
 from zwidth.config.study import KINDS
 from zwidth.figures.grid import choose_axes, in_order
-from zwidth.figures.plane import Edges
+from zwidth.figures.plane import ColorScale, Edges, choose_scale
 from zwidth.figures.style import pick_evenly, save, style_sheet
 from zwidth.runs.draw import figures_of, make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
@@ -38,6 +40,7 @@ _GRAY = "not finite, or not known"
 _LINES = " Lines: exact edges of the stable walls, dashed of the passive ones."
 # Of each axis of a slice, of each other axis, and numbers a map in all: half a megabyte.
 _ALONG, _OTHERS, _MOST = 120, 9, 120_000
+_COLORS = 21  # of a map; odd, so that the center of a diverging colormap is one of them
 
 
 def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | None = None) -> Path:
@@ -182,10 +185,17 @@ def _draw_curves(data: xarray.Dataset, study: str) -> Iterator[str]:
                 yield _show_figure(file, study)
 
 
+_AGREEMENT = {True: "agrees", False: "differs", None: "cited"}
+
+
+def _computed(row: dict[str, Any]) -> str:
+    return escape(row["note"]) if row["computed"] is None else f"{row['computed']:.10g}"
+
+
 def _published(content: dict[str, Any]) -> str:
     rows = [
         f"<td>{escape(row['quantity'])}</td><td>{escape(row['where'])}</td><td>{escape(str(row['printed']))}</td>"
-        f'<td class="number">{row["computed"]:.10g}</td><td>{"agrees" if row["agrees"] else "differs"}</td>'
+        f'<td class="number">{_computed(row)}</td><td>{_AGREEMENT[row["agrees"]]}</td>'
         for row in content["published"]
     ]
     head = "".join(f'<th scope="col">{word}</th>' for word in ("quantity", "where", "printed", "computed", ""))
@@ -224,16 +234,16 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
     thin = thin.transpose(*others, y, x).load()
     with np.errstate(over="ignore"):
         numbers, sizes = thin.values.astype(np.float32), [thin.sizes[dim] for dim in others]
-    finite = numbers[np.isfinite(numbers)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    steep = output.logarithmic and low > 0
+    scale = choose_scale(output, numbers[np.isfinite(numbers)].astype(float))
     content = {
         "name": name,
         "unit": _unit(thin),
         "truth": output.dtype == "bool",
-        "scale": "log" if steep else "linear",
-        "low": low,
-        "high": min(high, 1e4 * low) if steep else high,
+        "scale": "log" if scale.logarithmic else "linear",
+        "low": scale.low,
+        "high": scale.high,
+        "extend": scale.extend,
+        "colors": _list_colors(scale.colormap),
         "x": _axis(thin, x),
         "y": _axis(thin, y),
         "others": [_axis(thin, dim) for dim in others],
@@ -247,21 +257,28 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
         "</label>"
         for dim in others
     )
-    ends = (
-        f"not {name}, {name}"
-        if output.dtype == "bool"
-        else f"{' to '.join(tell_apart(low, content['high']))} {_unit(thin)}".rstrip()
-    )
+    colors = f"Dark: not {name}; bright: {name}" if output.dtype == "bool" else _explain_colors(scale, _unit(thin))
     thinned = "" if thin.size == values.size else f" Shown are {thin.size:,} of {values.size:,} values."
     # As JSON that ends no script element.
     embedded = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
     return (
         f'<div class="slices"><h3>{escape(name)}</h3><p class="soft">{escape(words)}. '
-        f"Dark to bright: {ends}; gray: {_GRAY}.{_LINES if any(content['edges']) else ''}{thinned} "
+        f"{colors}; gray: {'0, ' if scale.logarithmic else ''}{_GRAY}."
+        f"{_LINES if any(content['edges']) else ''}{thinned} "
         "Point, or focus the map and use the arrow keys, to read a value.</p>"
         f'{sliders}<canvas tabindex="0" role="img" aria-label="{escape(words)}"></canvas><output aria-live="polite">'
         f'</output><script type="application/json">{embedded}</script></div>'
     )
+
+
+def _list_colors(colormap: str) -> list[str]:
+    """Return evenly spaced colors of a colormap, between which the page interpolates."""
+    return [to_hex(color)[1:] for color in matplotlib.colormaps[colormap](np.linspace(0.0, 1.0, _COLORS))]
+
+
+def _explain_colors(scale: ColorScale, unit: str) -> str:
+    ends = {"neither": "", "min": "; below: arrow", "max": "; above: arrow", "both": "; outside: arrows"}
+    return f"Color bar: {' to '.join(tell_apart(scale.low, scale.high))} {unit}".rstrip() + ends[scale.extend]
 
 
 def _trace(part: xarray.DataArray, x: str, edges: Edges) -> dict[str, list[str]]:

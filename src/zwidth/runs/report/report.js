@@ -1,14 +1,7 @@
 "use strict";
 // Slices of stored maps: every block holds its numbers; nothing is fetched.
 (() => {
-  const VIRIDIS = ["440154", "482878", "3e4a89", "31688e", "26828e", "1f9e89", "35b779", "6dcd59", "b4de2c", "fde725"]
-    .map((hex) => [0, 2, 4].map((k) => parseInt(hex.slice(k, k + 2), 16)));
   const spell = (value, digits = 6) => typeof value === "string" ? value : Number(value.toPrecision(digits)).toString();
-
-  function color(share) {
-    const place = Math.min(Math.max(share, 0), 1) * (VIRIDIS.length - 1), k = Math.min(Math.floor(place), VIRIDIS.length - 2);
-    return VIRIDIS[k].map((low, i) => Math.round(low + (place - k) * (VIRIDIS[k + 1][i] - low)));
-  }
 
   function show(block) {
     const data = JSON.parse(block.querySelector("script").textContent);
@@ -22,6 +15,11 @@
     const painter = small.getContext("2d"), pen = canvas.getContext("2d");
     const at = { column: columns >> 1, row: rows >> 1 };
     const box = { left: 70, top: 12, right: 78, bottom: 44 };
+    const colors = data.colors.map((hex) => [0, 2, 4].map((k) => parseInt(hex.slice(k, k + 2), 16)));
+    function color(share) {
+      const place = Math.min(Math.max(share, 0), 1) * (colors.length - 1), k = Math.min(Math.floor(place), colors.length - 2);
+      return colors[k].map((low, i) => Math.round(low + (place - k) * (colors[k + 1][i] - low)));
+    }
     const logarithmic = data.scale === "log";
     const share = (value) => logarithmic ? Math.log(value / data.low) / Math.log(data.high / data.low)
       : (value - data.low) / (data.high - data.low || 1);
@@ -33,7 +31,8 @@
       const image = painter.createImageData(columns, rows), start = offset();
       for (let row = 0; row < rows; row++) for (let column = 0; column < columns; column++) {
         const value = values[start + row * columns + column], k = 4 * ((rows - 1 - row) * columns + column);
-        const rgb = Number.isFinite(value) ? color(share(value)) : [138, 138, 138];
+        // 0 has no place on a logarithmic scale.
+        const rgb = Number.isFinite(value) && !(logarithmic && value <= 0) ? color(share(value)) : [138, 138, 138];
         image.data.set([...rgb, 255], k);
       }
       painter.putImageData(image, 0, 0);
@@ -99,6 +98,11 @@
       // The colors, and what they stand for at both ends and in the middle.
       const bar = left + across + 12;
       for (let k = 0; k < up; k++) { pen.fillStyle = `rgb(${color(data.truth ? +(k < up / 2) : 1 - k / up)})`; pen.fillRect(bar, top + k, 12, 1.5); }
+      // An arrow at an end: values beyond it have its color.
+      for (const [side, level, peak] of [["min", top + up, top + up + 10], ["max", top, top - 10]]) if ([side, "both"].includes(data.extend)) {
+        pen.fillStyle = `rgb(${color(side === "max" ? 1 : 0)})`;
+        pen.beginPath(); pen.moveTo(bar, level); pen.lineTo(bar + 12, level); pen.lineTo(bar + 6, peak); pen.closePath(); pen.fill();
+      }
       pen.fillStyle = style.color;
       const valueAt = (share) => logarithmic ? data.low * (data.high / data.low) ** share : data.low + share * (data.high - data.low);
       // So few digits as leave each where it is between the ends.

@@ -1,8 +1,11 @@
-"""Passivity of scenes: the condition by a fine grid of frequencies, passive walls are stable, and what is refused."""
+"""Passivity of scenes: the condition on a fine frequency grid and by energies in time, and rejected scenes."""
 
 import numpy as np
 import pytest
+import scipy.linalg
+import scipy.signal
 from independent_scenes import random_scene, random_velocity, velocity_polynomials
+from tolerances import LEAST_DAMPING
 
 import zwidth
 from zwidth.words.errors import InputError
@@ -43,6 +46,48 @@ def test_no_frequency_needs_more():
         # The subtraction and the grid's own rounding at low frequencies.
         assert grid <= needed * (1 + 1e-6) + 1e-9 * unit
         assert grid >= needed * (1 - 1e-4) - 1e-9 * unit
+
+
+def delayed(values, count):
+    return np.concatenate([np.zeros_like(values[:count]), values])[: len(values)]
+
+
+def least_damping(scene, wall, periods):
+    """Return the damping below which some trajectory of that many periods extracts energy, in N s/m."""
+    f, period, n = scene.d - scene.whole_delay, scene.timing.period, periods
+    # One column per free position: the samples, then the positions at which delayed forces arrive between samples.
+    unit = np.eye(n * (2 if f else 1))
+    x = np.concatenate([np.zeros((1, unit.shape[1])), unit[:n]])
+    top, bottom = velocity_polynomials(scene)
+    top = np.concatenate([np.zeros(len(bottom) - len(top)), top])
+    force = delayed(wall[0] * x + wall[1] * scipy.signal.lfilter(top, bottom, x, axis=0), scene.whole_delay)
+    steps, forces, durations = [np.diff(x, axis=0)], [force[:-1]], [period]
+    if f:
+        between = unit[n:]
+        steps, forces = [between - x[:-1], x[1:] - between], [delayed(force, 1)[:-1], force[:-1]]
+        durations = [f * period, (1 - f) * period]
+    work = np.concatenate(forces).T @ np.concatenate(steps)
+    square = np.sum([step.T @ step / duration for step, duration in zip(steps, durations, strict=True)], axis=0)
+    return -scipy.linalg.eigh(work + work.T, 2 * square, eigvals_only=True, subset_by_index=[0, 0])[0]
+
+
+@pytest.mark.parametrize("kind", ["rigid", "filter", "hand", "coupled hand", "motor"])
+def test_trajectories_need_at_most_what_the_condition_requires_and_approach_it(kind):
+    rng = np.random.default_rng(2)
+    for _ in range(6):
+        scene = random_scene(kind, rng)
+        period = scene.timing.period
+        delay = rng.choice([0, 1, 2, 3, 0.3, 0.5, 1.6, 2.95])
+        device = zwidth.Device(scene.device.mass, 10 ** rng.uniform(-1, 1.5), scene.device.coupling)
+        scene = scene.replace(device=device, timing=zwidth.Timing(period, delay * period))
+        angle = rng.uniform(-0.5, 0.5) * np.pi
+        wall = np.cos(angle) * device.damping / period, np.sin(angle) * device.damping
+        needed = device.damping - float(scene.passivity_margin(*wall))
+        found = [least_damping(scene, wall, periods) for periods in (40, 80, 160)]
+        assert found == sorted(found)
+        assert found[-1] <= needed * (1 + LEAST_DAMPING.float64)
+        # The difference falls as 1/periods^2.
+        assert needed - found[-1] < 0.6 * (needed - found[0])
 
 
 @pytest.mark.parametrize("kind", ["filter", "hand", "coupled hand", "motor"])

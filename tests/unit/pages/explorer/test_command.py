@@ -22,7 +22,7 @@ def test_without_bokeh_there_is_one_message(monkeypatch):
     monkeypatch.setitem(sys.modules, "bokeh", None)
     done = CliRunner().invoke(cli, ["explore", "--no-browser"])
     assert isinstance(done.exception, InputError)
-    assert "zwidth[explore]" in str(done.exception)
+    assert str(done.exception).endswith(("pip install 'zwidth[explore]'", "scripts/setup explore"))
 
 
 def test_a_port_in_use_is_said():

@@ -206,3 +206,29 @@ def test_a_study_that_failed_is_told_and_has_no_section(tmp_path, monkeypatch):
     assert "<strong>top is not here</strong>, for it failed: ValueError: &lt;no luck&gt;; " in page
     assert 'id="top"' not in page
     assert 'id="walls"' in page
+
+
+def test_a_map_has_the_colors_of_its_figure(tmp_path):
+    """The scale of alpha_max has its whole range, that of a decay time ends at 100 times its least, with an arrow."""
+    wide = {"delta": [1e-6, 1.0, 1e5], "d": [0.0, 4.0, 20.0]}
+    walls = {"alpha": {"log": {"start": 1e-5, "stop": 0.3, "num": 40}}, "beta": [0.1, 0.2, 0.4], "delta": 0.1, "d": 1}
+    outputs = ("settling_time", "delay_margin", "spectral_radius")
+    studies = [study("tops", wide, ("alpha_max",)), study("walls", walls, outputs)]
+    zwidth.run({"version": 1, "name": "example", "studies": studies}, out=tmp_path)
+    page = zwidth.write_report(tmp_path).read_text(encoding="utf-8")
+    blocks = {block["name"]: block for block in map(json.loads, re.findall(r"<script type=.*?>(\{.*?)</script>", page))}
+    for store, names in (("tops", ("alpha_max",)), ("walls", outputs)):
+        with zwidth.open_dataset(tmp_path / f"{store}.zarr") as data:
+            for name in names:
+                (ax,) = zwidth.figures.draw_plane(data, name)
+                image, bar = ax.collections[0], ax.figure.axes[-1]
+                assert blocks[name]["low"] == pytest.approx(image.norm.vmin, rel=1e-6)
+                assert blocks[name]["high"] == pytest.approx(image.norm.vmax, rel=1e-6)
+                shown = image.cmap(np.linspace(0, 1, len(blocks[name]["colors"])))
+                drawn = [[int(hex_[k : k + 2], 16) for k in (0, 2, 4)] for hex_ in blocks[name]["colors"]]
+                np.testing.assert_allclose(drawn, 255 * shown[:, :3], atol=0.51)
+                assert bar.get_label() == "<colorbar>"
+                assert blocks[name]["extend"] == bar._colorbar.extend
+    assert blocks["alpha_max"]["high"] > 1e4 * blocks["alpha_max"]["low"]
+    assert blocks["settling_time"]["extend"] == "max"
+    assert "above: arrow" in page

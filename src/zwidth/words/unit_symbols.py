@@ -1,0 +1,152 @@
+"""Units as people write them: products and quotients of symbols, as a size in SI units and exponents.
+
+``N m/deg``, ``mNm/°``, ``N*m*s / rad``, ``kgf/cm`` and ``ozf in`` are such expressions. A prefix that is a power of ten
+stays apart from other factors, because shifting a decimal exponent rounds once: 0.3 ms is the float64 of 0.0003.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import NamedTuple
+
+Exponents = tuple[int, int, int, int]
+"""Exponents of kg, m, s and rad."""
+
+
+class UnitSize(NamedTuple):
+    """One of a unit in SI units: ``factor * 10**power``, with its exponents."""
+
+    power: int
+    factor: float
+    exponents: Exponents
+
+    @property
+    def value(self) -> float:
+        return float(f"1e{self.power}") * self.factor
+
+
+_PREFIXES = {"": 0, "n": -9, "u": -6, "μ": -6, "m": -3, "c": -2, "d": -1, "k": 3, "M": 6}
+_MASS, _LENGTH, _TIME, _ANGLE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
+_FORCE, _PER_TIME = (1, 1, -2, 0), (0, 0, -1, 0)
+# Symbol: power of ten, further factor, exponents, admissible prefixes.
+_SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
+    "m": (0, 1.0, _LENGTH, "nuμmck"),
+    "g": (-3, 1.0, _MASS, "uμmk"),
+    "s": (0, 1.0, _TIME, "nuμm"),
+    "N": (0, 1.0, _FORCE, "nuμmckM"),
+    "Hz": (0, 1.0, _PER_TIME, "mkM"),
+    "rad": (0, 1.0, _ANGLE, "uμmk"),
+    "sec": (0, 1.0, _TIME, "nuμm"),
+    "in": (0, 0.0254, _LENGTH, ""),
+    "ft": (0, 0.3048, _LENGTH, ""),
+    "lb": (0, 0.45359237, _MASS, ""),
+    "oz": (0, 0.028349523125, _MASS, ""),
+    # Force units use standard gravity, 9.80665 m/s^2.
+    "gf": (-3, 9.80665, _FORCE, "k"),
+    "kp": (0, 9.80665, _FORCE, ""),
+    "lbf": (0, 4.4482216152605, _FORCE, ""),
+    "ozf": (0, 0.27801385095378125, _FORCE, ""),
+    **dict.fromkeys(("seconds", "second"), (0, 1.0, _TIME, "")),
+    **dict.fromkeys(("deg", "°", "degree", "degrees"), (0, math.pi / 180, _ANGLE, "")),
+    **dict.fromkeys(("rev", "turn", "turns", "revolution", "revolutions"), (0, 2 * math.pi, _ANGLE, "")),
+}
+_READINGS = {
+    prefix + symbol: UnitSize(power + _PREFIXES[prefix], factor, exponents)
+    for symbol, (power, factor, exponents, prefixes) in _SYMBOLS.items()
+    for prefix in ("", *prefixes)
+}
+_LONGEST = max(map(len, _READINGS))
+# Mass units that stand for forces in products, as in "oz in" or "kg cm": their own exponents fit no torque.
+_GRAVITY = 9.80665
+_WEIGHT = re.compile(r"(?<![A-Za-z])(kg|g|lb|oz)(?![A-Za-z])|^(kg|g)(?=[cm]?m)")
+_POWER = re.compile(r"(.*?)(?:\^|\*\*)?(-?[1-4])?", re.DOTALL)
+_DIVIDED_RATE = re.compile(r"/\(([^()/]+)/([^()/]+)\)")
+
+
+def normalize_symbols(text: str) -> str:
+    """Return a unit with one spelling of the micro sign, the degree sign, the minus sign and of superscripts."""
+    text = text.replace("º", "°").replace("˚", "°").replace("−", "-")
+    return unicodedata.normalize("NFKC", text)
+
+
+@lru_cache(maxsize=1024)
+def measure_unit(text: str, exponents: Exponents | None = None) -> UnitSize | None:
+    """Return the size of a unit of these exponents, or of any; None if it has none or more than one size.
+
+    Symbols that stand close together may be read in two ways, "ms" as milliseconds or as metre seconds: the exponents
+    decide. Without exponents the reading with the fewest symbols counts.
+    """
+    sizes = [size for size in _read(normalize_symbols(text)) if exponents in (None, size.exponents)]
+    if exponents is None:
+        return sizes[0] if sizes else None
+    distinct = {round(math.log10(size.value), 9) for size in sizes}
+    if len(distinct) == 1:
+        return sizes[0]
+    return _read_weights(text, exponents) if not sizes else None
+
+
+def _read_weights(text: str, exponents: Exponents) -> UnitSize | None:
+    """Return the size with kg, g, lb and oz taken as forces, as in "oz in" or "kg/mm"; None if that does not fit."""
+    text = normalize_symbols(text)
+    mass = _WEIGHT.search(text)
+    # A mass is not taken for a force by itself: "2 kg" may be a mass by mistake.
+    if mass is None or exponents[1] == 1:
+        return None
+    found = [size for size in _read(f"{text[: mass.start()]}N {text[mass.end() :]}") if size.exponents == exponents]
+    if not found:
+        return None
+    weight = _READINGS[mass[0]]
+    return found[0]._replace(power=found[0].power + weight.power, factor=found[0].factor * weight.factor * _GRAVITY)
+
+
+def _read(text: str) -> list[UnitSize]:
+    """Return every size that a unit may have, fewest symbols first."""
+    text = re.sub(r"\s*/\s*", "/", text.strip())
+    # "N m/(rad/s)" is "N m s/rad".
+    if inverse := _DIVIDED_RATE.search(text):
+        text = f"{text[: inverse.start()]} {inverse[2]}/{inverse[1]}{text[inverse.end() :]}"
+    found = [UnitSize(0, 1.0, (0, 0, 0, 0))]
+    for k, part in enumerate(text.split("/")):
+        atoms = [atom for atom in re.split(r"[\s*·⋅.]+|-(?=[A-Za-z])", re.sub(r"\*\*", "^", part)) if atom]
+        if k == 0 and atoms == ["1"]:
+            continue
+        if not atoms:
+            return []
+        sign = -1 if k else 1
+        for atom in atoms:
+            found = [_join(size, other, sign) for size in found for other in _read_run(atom)][:64]
+    return found
+
+
+def _read_run(atom: str) -> Iterator[UnitSize]:
+    """Yield the sizes of symbols that stand close together, as "mNm"; an exponent belongs to the last one."""
+    match = _POWER.fullmatch(atom)
+    letters, power = (match[1], int(match[2] or 1)) if match else (atom, 1)
+    # Longest symbols first, so that the fewest symbols come first.
+    for length in range(min(len(letters), _LONGEST), 0, -1):
+        first = _READINGS.get(letters[:length])
+        rest = letters[length:]
+        # A metre directly before a newton is a milli.
+        if first is None or (letters[:length] == "m" and rest.startswith("N")):
+            continue
+        if not rest:
+            yield _raise_to(first, power)
+            continue
+        for size in _read_run(atom[length:]):
+            yield _join(first, size, 1)
+
+
+def _raise_to(size: UnitSize, power: int) -> UnitSize:
+    kg, m, s, rad = size.exponents
+    return UnitSize(size.power * power, size.factor**power, (kg * power, m * power, s * power, rad * power))
+
+
+def _join(first: UnitSize, second: UnitSize, sign: int) -> UnitSize:
+    """Return the product of two units, or their quotient where the sign is -1."""
+    (a, b, c, d), (e, f, g, h) = first.exponents, second.exponents
+    exponents = (a + sign * e, b + sign * f, c + sign * g, d + sign * h)
+    return UnitSize(first.power + sign * second.power, first.factor * second.factor**sign, exponents)
