@@ -356,6 +356,7 @@ def _make_velocity(given: dict[str, Any]) -> Any:
 
 
 figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
+beyond_safe_option = click.option("--beyond-safe", is_flag=True, help="Ignore the safe limit of a fitted scene.")
 verbose_option = click.option("--verbose", is_flag=True, help="Print everything that is known.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 

@@ -162,9 +162,8 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
 DeviceForm = Annotated[SystemSection | ResponseSection, WrapValidator(lambda raw, _: _read_form(raw))]
 
 
-PHYSICAL_KEYS = frozenset(
-    {"device", "rotary", "mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES}
-)
+PHYSICAL_KEYS = frozenset({"device", "rotary", "mass", "damping", "period", "rate", "delay", *PART_NAMES})
+PHYSICAL_KEYS |= {"stiffness", "virtual_damping", "safe_limit"}
 NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
 
 
