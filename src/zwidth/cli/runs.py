@@ -28,13 +28,6 @@ if TYPE_CHECKING:
 _SECONDS_BETWEEN_LINES = 10.0
 
 
-def _read_shard(text: str) -> tuple[int, int]:
-    first, _, second = text.partition("/")
-    if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second) <= 10**6):
-        raise ValueError
-    return int(first), int(second)
-
-
 def _read_size(text: str) -> int:
     found = re.fullmatch(r"(.*?)\s*(B|KiB|MiB|GiB|)", text.strip())
     assert found is not None, "any text is a number and perhaps a unit"
@@ -60,7 +53,6 @@ def _read_figure_size(text: str) -> tuple[float, float | None]:
     return width, rest[0] if rest else None
 
 
-_SHARD = Parsed("i/n", _read_shard, "write i/n with 1 <= i <= n, as in 3/8")
 _SIZE = Parsed("size", _read_size, "write a size from 128 MiB to 1024 GiB, as in '512 MiB'")
 _SLICE = Parsed("name=value", _read_slice, "write NAME=VALUE, as in delta=0.1")
 _FIGURE_SIZE = Parsed(
@@ -75,7 +67,6 @@ _FIGURE_SIZE = Parsed(
 @click.option("--resume", is_flag=True, help="Go on with a run that was stopped; repair what is damaged.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes for sweeps.  [default: this one]")
 @click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
-@click.option("--shard", type=_SHARD, help="Compute every n-th chunk of sweeps only, as one of n jobs.")
 @click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size of the studies' figures in inches, as 7x4.5, or width, as 85mm.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
@@ -144,12 +135,12 @@ def _print_plan(config: Config, *, out: Path | None, memory: int, workers: int |
     check_resources([step for step in steps if isinstance(step, Plan)], folder, workers or 1)
 
 
-def _spell_resume_command(path: Path, *, out: Path | None, shard: tuple[int, int] | None, **given: Any) -> str:
+def _spell_resume_command(path: Path, *, out: Path | None, **given: Any) -> str:
     """The command that goes on with a run, as a shell takes it."""
     words = ["zwidth", "run", path, *(["--out", out] if out else []), "--resume"]
     size = given["size"] and "x".join(f"{25.4 * side:.12g}" for side in given["size"] if side) + "mm"
-    for name, value in {**given, "shard": shard and f"{shard[0]}/{shard[1]}", "size": size}.items():
-        words += [f"--{name}", value] if value and name in ("shard", "workers", "scheduler", "size") else []
+    for name, value in {**given, "size": size}.items():
+        words += [f"--{name}", value] if value and name in ("workers", "scheduler", "size") else []
     return shlex.join(map(str, words))
 
 

@@ -183,7 +183,7 @@ def _fit(
         shown = {"response": respond_as_fitted(best, scene, banks), "hidden": weigh_resonances(best, scene, banks)}
         shown |= {"lag": bound_lag(best, lags, scene, reach_of(freedom))}
     return DeviceFit(
-        scene=scene,
+        nominal=scene,
         covariance=covariance,
         errors_of_log={"offset": offset[1], "friction": friction[1]},
         offset=offset[0],

@@ -86,7 +86,9 @@ def test_a_transfer_function_is_pushed():
 def test_a_scene_file(tmp_path):
     file = tmp_path / "knob.yaml"
     scene = "{mass: 60 g cm^2, damping: 0.02 mN m s/rad, period: 1 ms, stiffness: 0.1 N m/rad, virtual_damping: 1e-3}"
-    file.write_text(f"version: 1\nname: knob\nscene: {scene}\nstudies: [{{kind: simulate, name: s}}]\n", encoding="utf-8")
+    file.write_text(
+        f"version: 1\nname: knob\nscene: {scene}\nstudies: [{{kind: simulate, name: s}}]\n", encoding="utf-8"
+    )
     printed = run("simulate", str(file), "--hit", "1 rad/s", "--duration", "0.2 s")
     assert "hit at 1.00 rad/s" in printed
     assert run("diagnose", str(file)).startswith("AT REST ")

@@ -227,7 +227,7 @@ def compute_details(
     length = 1.0 if normalized else 1e3
     verdict = assess(scene)
     own = normalized_lines(verdict) if normalized else None
-    text = "\n".join(own) if own else write_check(scene, verdict, [])
+    text = "\n".join(own) if own else write_check(scene, verdict, None)
     word = word_of(verdict)
     captions = {"poles_words": caption_poles(scene.poles(), word), **caption_curves(verdict, normalized)}
     time, position = step_motion(scene, length_of(scene, verdict))
