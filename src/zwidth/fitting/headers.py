@@ -130,6 +130,9 @@ def _rank(name: str, head: str, title: str) -> int | None:
     excluded = {"position": (*_COMMANDED, *_DERIVED), "force": (*_MEASURED, *_DERIVED), "time": ()}[name]
     if set(words) & set(excluded):
         return None
+    core = [word for word in words if word not in (*_COMMANDED, *_MEASURED)]
+    if len(core) == 1 < len(words) and core[0] in _NAMES[name]:
+        return 1
     if any(
         word in _WORDS[name] or (name != "time" and word.endswith(_ENDINGS) and _ends(name, word)) for word in words
     ):
@@ -138,7 +141,7 @@ def _rank(name: str, head: str, title: str) -> int | None:
     bare = head.strip()
     if name == "position" and bare.lower() in COUNTS:
         return _UNIT_ONLY
-    if len(bare) > 1 and any(each.in_base("1", 0, bare) is not None for each in DIMENSIONS[name]):
+    if (len(bare) > 1 or bare == "N") and any(each.in_base("1", 0, bare) is not None for each in DIMENSIONS[name]):
         return _UNIT_ONLY
     return None
 
