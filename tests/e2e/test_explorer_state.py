@@ -197,7 +197,7 @@ def test_a_rotary_device_is_moved_and_told_in_its_units(page, browser):
     settle(page)
     enter(page, "mass", "4500")
     enter(page, "stiffness", "20")
-    settle(page, "document.getElementById('verdict').textContent.includes('what limits it')")
+    settle(page, "document.getElementById('verdict').textContent.includes('To gain K_max')")
     verdict = page.inner_text("#verdict")
     assert "4500 g cm^2" in verdict
     for text in (verdict, page.input_value("#yaml"), page.input_value("#python"), "; ".join(axes_of(page))):
