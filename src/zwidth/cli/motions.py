@@ -11,15 +11,14 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
+from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
-    OF_SCENE,
     Command,
     figure_option,
     json_option,
     quantity_type,
     save_figure,
     scene_options,
-    show_example,
     warn_implausible,
 )
 from zwidth.pages import words
