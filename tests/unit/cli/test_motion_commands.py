@@ -29,10 +29,9 @@ def parse(*arguments):
 
 def test_the_knob_of_2000_counts():
     printed = run("diagnose", *KNOB, "--resolution", "2000 counts", "--friction", "0.1 mN m")
-    cause, remedies = printed.splitlines()
+    cause, _, remedies = " ".join(printed.split()).partition("to stop it ")
     assert cause.startswith("LIMIT CYCLE ")
     assert "caused by the encoder's steps of 3.14 mrad; the linear loop is stable" in cause
-    assert remedies.startswith("to stop it ")
     assert "counts per turn" in remedies
     assert "friction of at least" in remedies
     found = parse("diagnose", *KNOB, "--resolution", "0.0005 rev", "--friction", "0.1 mN m")
@@ -86,7 +85,9 @@ def test_a_transfer_function_is_pushed():
 def test_a_scene_file(tmp_path):
     file = tmp_path / "knob.yaml"
     scene = "{mass: 60 g cm^2, damping: 0.02 mN m s/rad, period: 1 ms, stiffness: 0.1 N m/rad, virtual_damping: 1e-3}"
-    file.write_text(f"version: 1\nname: knob\nscene: {scene}\nstudies: [{{kind: simulate, name: s}}]\n", encoding="utf-8")
+    file.write_text(
+        f"version: 1\nname: knob\nscene: {scene}\nstudies: [{{kind: simulate, name: s}}]\n", encoding="utf-8"
+    )
     printed = run("simulate", str(file), "--hit", "1 rad/s", "--duration", "0.2 s")
     assert "hit at 1.00 rad/s" in printed
     assert run("diagnose", str(file)).startswith("AT REST ")
