@@ -15,6 +15,7 @@ from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     SHARE,
     Parsed,
+    beyond_safe_option,
     figure_option,
     find_silent,
     json_option,
@@ -320,6 +321,7 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option("--phase-margin", type=_DEGREES, help="At least so many degrees.  [default: 30]")
 @click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
 @hardware_options
+@beyond_safe_option
 @figure_option
 @click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
 @verbose_option

@@ -26,7 +26,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.files import write_whole
 from zwidth.words.formatting import PREFIXES
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.rotation import own_unit
+from zwidth.words.rotation import is_rotary, own_unit
 
 # Okabe and Ito's palette, told apart with any color vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -43,8 +43,8 @@ STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED, (0, (11.0, 2.5)), (0, (6.0, 1.8, 1
 # What tells curves apart whose line styles have a meaning of their own.
 MARKERS = ("o", "s", "^", "v", "P", "X", "*")
 
-ALPHA_LABEL, BETA_LABEL, DELTA_LABEL = (PARAMETERS[name].axis_label for name in ("alpha", "beta", "delta"))
-ALPHA_MAX_LABEL = r"maximum stable stiffness  $\alpha_{\max} = K_{\max}T^2\!/m$"
+# Units as texts write them, where datasets follow UDUNITS.
+_WRITTEN = {"1": "", "degree": "degrees", "g cm^2": "g cm$^2$"}
 
 # Of a whole number there is nothing between its values.
 POINTS: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 3.5}
@@ -54,6 +54,7 @@ AnyAxes: TypeAlias = Axes | Sequence[Axes] | np.ndarray
 WIDTH = 7.0  # inches: both columns of a journal page
 DECADES = 3000.0  # from so many times its least value on, an axis of stiffnesses has powers of ten only
 PNG_DPI = 180
+LIGHTEST = 0.6  # of viridis, for curves and their names: contrast 3:1 to white
 # Values closer together than this have but one or two of 1, 2 and 5 among them.
 _FEW = 5.0
 # How far an axis goes on either side of a single value.
@@ -117,6 +118,18 @@ def panels(given: AnyAxes | None, count: int, width: float, height: float, colum
         # Of its column, in the last row or not; panels that share an axis would leave it bare.
         lowest.tick_params(labelbottom=True)
     return axes.ravel()[:count]
+
+
+def label_quantity(name: str) -> str:
+    """Return the label of an axis of a normalized quantity, for the kind of device in question."""
+    if name != "alpha_max":
+        return PARAMETERS[name].axis_label
+    return rf"maximum stable stiffness  $\alpha_{{\max}} = K_{{\max}}T^2\!/{'J' if is_rotary() else 'm'}$"
+
+
+def write_unit(unit: str) -> str:
+    """Return a unit as labels and legends write it; "" for 1."""
+    return _WRITTEN.get(unit, unit)
 
 
 def letter(axes: np.ndarray) -> None:
@@ -274,7 +287,7 @@ def save(
 
 def ordered_colors(count: int) -> list[Any]:
     """Colors for values in ascending order: the larger the value, the darker."""
-    shades = np.linspace(0.76, 0.0, count) if count > 1 else np.array([0.25])
+    shades = np.linspace(LIGHTEST, 0.0, count) if count > 1 else np.array([0.25])
     return [matplotlib.colormaps["viridis"](shade) for shade in shades]
 
 

@@ -15,6 +15,7 @@ import click
 
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.paths import find_parts
+from zwidth.parts.wall import NoWall
 from zwidth.words.formatting import plain, short, to_json, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
@@ -150,7 +151,17 @@ def scene_notes(scene: Scene) -> list[str]:
     from zwidth.scenes.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
-    return [*undecided, *coded_period_notes(scene), *describe_islands(scene)]
+    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *_compare_with_limit(scene)]
+
+
+def _compare_with_limit(scene: Scene) -> list[str]:
+    """Return the notes on the safe limit of a scene that has a wall: is the wall within, and the warnings."""
+    limit, wall = scene.safe_limit, scene.wall
+    if limit is None or isinstance(wall, NoWall):
+        return []
+    if limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
+        return list(limit.warnings)
+    return [f"this wall exceeds the safe limit: the true device may be unstable. {limit.describe()}", *limit.warnings]
 
 
 @in_own_units
