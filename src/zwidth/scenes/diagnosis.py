@@ -338,7 +338,7 @@ class _Experiment(NamedTuple):
         if np.any(motion.outcome == MotionKind.INVALID):
             raise InputError("coulomb: friction stops and starts the device too often within a period; lower it")
         # The tail of a motion that decays as the linear loop does narrows by exp(-decay/8).
-        return _pick_widest(motion, max(SUSTAINED, math.exp(-self.decay / 16.0)))
+        return _pick_widest(motion, max(SUSTAINED, math.exp(-max(self.decay, 0.0) / 16.0)))
 
 
 def _pick_widest(motion: Any, least_trend: float) -> _Widest:
