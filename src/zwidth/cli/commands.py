@@ -75,6 +75,8 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
     if as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
+        if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
+            result["damper_range"] = scene.damper_range().tolist()
     if resolution is not None:
         warn_implausible({"resolution": resolution})
     if friction is not None or resolution is not None:

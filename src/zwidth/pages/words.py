@@ -113,7 +113,12 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
     wall, word = scene.wall, word_of(verdict)
     color = {"stable": "green", "UNSTABLE": "red"}.get(word, "yellow")
     told = click.style(word, fg=color, bold=True)
-    told += " (a pole at z = 1: without stiffness nothing pulls back)" if word == "marginal" else ""
+    # Of a response no pole is known.
+    dampings, free = verdict.stable_damping, wall.stiffness == 0 and not isnan(verdict.frequency)
+    if free:
+        dampings = tuple(map(tuple, scene.damper_range().tolist()))
+    if word == "marginal":
+        told += f" ({_explain_marginal(free, dampings)})"
     best, normalized = "none: no stiffness is stable at any damping", []
     # Of a device that is given as a whole no mass is known, and of a response no pole.
     by_mass, by_poles = isinstance(scene.device, Device), not isnan(verdict.frequency)
@@ -140,12 +145,20 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
         "",
         row("verdict", told),
         row("to the boundary in K", _distance(wall.stiffness, verdict.stable_stiffness, "N/m", "K", "B", surely)),
-        row("to the boundary in B", _distance(wall.virtual_damping, verdict.stable_damping, "N s/m", "B", "K", surely)),
+        row("to the boundary in B", _distance(wall.virtual_damping, dampings, "N s/m", "B", "K", surely)),
         row("passive", passivity_words(scene, verdict)),
         row("stiffest stable wall", best),
         *pole_lines(verdict),
         *margin_lines(wall.stiffness, verdict),
     ]
+
+
+def _explain_marginal(free: bool, dampings: Intervals) -> str:
+    """Return the reason for a marginal wall: the free position of a pure damper, or a plant without damping."""
+    if not free:
+        return "poles on the unit circle: the response neither decays nor grows"
+    ranges = " and ".join(" to ".join(tell_apart(*ends, "N s/m")) for ends in dampings)
+    return f"only for the free position, a pole at z = 1: a pure damper, B from {ranges}"
 
 
 def _distance(value: float, intervals: Intervals, unit: str, name: str, other: str, surely: str) -> str:
