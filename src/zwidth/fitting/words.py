@@ -71,7 +71,7 @@ def summarize_fit(fit: DeviceFit) -> list[tuple[str, str]]:
         rows.append(("next", _describe_next(fit)))
     elif found.status == Status.OK and found.is_held_back and fit.motions:
         rigid = _assume_rigid(fit)
-        gain = "" if rigid is None else f" (up to {spell('stiffness', rigid.stiffness)}, if none is there)"
+        gain = "" if rigid is None else f" (up to {spell('stiffness', rigid.stiffness)} if nothing is hidden)"
         rows.append(("next", f"for a stiffer wall{gain} {advise_record(fit)}"))
     return rows
 
