@@ -221,7 +221,7 @@ class DeviceEstimate:
             radius = radius + np.sqrt(0.5 * (square + across) * reach)
         if not np.all(np.isfinite(radius)):
             return None
-        device = MeasuredDevice(known.frequency, known.response, radius)
+        device = MeasuredDevice(known.frequency, known.response, radius, known.rotary)
         return Scene(device, Timing(self.period), velocity=self.velocity)
 
 

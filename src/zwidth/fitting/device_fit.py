@@ -105,6 +105,7 @@ class DeviceFit(DeviceEstimate):
         residuals: measured less fitted, of buzzing walls an array (n, 2) in units of the noise of K and f, of a log in
             m, NaN where samples are left out.
         doubts: what is odd about the records or about the estimate, a sentence each; then there is no safe wall.
+        notes: how a log was read and what was repaired in it, a sentence each.
         status: of `zwidth.Status`: UNDECIDED where another device fits as well, or where a log shows more than the
             model has.
         rivals: those devices, a `zwidth.RivalDevice` each.
@@ -143,6 +144,7 @@ class DeviceFit(DeviceEstimate):
     lag: HiddenLag | None = None
     hidden: HiddenResonances | None = None
     errors_of_log: dict[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def errors(self) -> dict[str, float]:
@@ -318,7 +320,7 @@ class DeviceFit(DeviceEstimate):
             "intervals": self.intervals,
             "covariance": self.covariance.tolist(),
             "noise": self.noise,
-            **{name: getattr(self, name) for name in ("offset", "friction", "resolution", "period", "doubts")},
+            **{name: getattr(self, name) for name in ("offset", "friction", "resolution", "period", "doubts", "notes")},
             "status": int(self.status),
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),

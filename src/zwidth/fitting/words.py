@@ -67,6 +67,7 @@ def summarize_fit(fit: DeviceFit) -> list[tuple[str, str]]:
         rows += [("CAUTION", caution) for caution in found.cautions]
     trouble = [f"{Status(fit.status).name}: {name_trouble(fit)}"] if fit.status != Status.OK else []
     rows += [("WARNING", text) for text in (*trouble, *fit.doubts)] or [("warnings", "none")]
+    rows += [("note", note) for note in fit.notes]
     if fit.next is not None:
         rows.append(("next", _describe_next(fit)))
     elif found.status == Status.OK and found.is_held_back and fit.motions:
@@ -245,6 +246,7 @@ def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> l
     origin = "as given" if period_given or not fit.motions else "from the times of the log"
     lines = [
         f"# Fitted to {source}: {_between(fit, 'stiffness_max')} for K_max.",
+        *(f"# Note: {note}" for note in fit.notes),
         *("version: 1", "name: fitted_device", "scene:"),
         *(f"  {_write_part(fit, key)}" for key in fit.numbers[:3]),
         f"  period: {round_period(fit)!r} s # {origin}",

@@ -53,23 +53,24 @@ def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
 def check_lines(
     scene: Scene,
     verdict: Assessment,
-    limits: Iterable[Limit],
+    limits: Iterable[Limit] | None,
     *,
     silent: frozenset[str] = frozenset(),
     verbose: bool = False,
 ) -> list[str]:
-    """Return the answer of `zwidth check` without its notes."""
+    """Return the answer of `zwidth check` without its notes; None for the limits leaves out what takes a second."""
     wall, word = scene.wall, word_of(verdict).upper()
     K, B = spell_stiffness(wall.stiffness), with_unit(wall.virtual_damping, "N s/m")
-    lines = [line(word, f"K = {K}, B = {B} on a device of {spell_device(scene, silent)}")]
+    wall_words, device_words = f"K = {K}, B = {B}", spell_device(scene, silent)
     if isinstance(scene.device, Device):
-        numbers = (f"{name} {plain(getattr(verdict, name))}" for name in ("alpha", "beta", "delta", "d"))
-        lines.append(line("", f"({', '.join(numbers)})"))
+        wall_words += f" (alpha {plain(verdict.alpha)}, beta {plain(verdict.beta)})"
+        device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
+    lines = [line(word, wall_words), line("device", device_words)]
     lines += part_lines(scene)
     if word == "MARGINAL":
         lines.append(line("", "a pole at z = 1: without stiffness no force pulls back"))
     lines.append("")
-    if word == "UNSTABLE":
+    if word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no change of a single parameter is known"]
         lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
     lines += margin_lines(verdict)
@@ -78,10 +79,10 @@ def check_lines(
         lines.append(line("room", _spell_room(verdict)))
     lines.append(line("passive", spell_passivity(scene, verdict)))
     lines += _list_maximum(scene, verdict, verbose)
-    return lines + gain_lines("To gain K_max:", limits, verbose)
+    return lines + gain_lines("To gain K_max:", limits or (), verbose)
 
 
-def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit]) -> str:
+def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | None) -> str:
     """Return the answer of `zwidth check` with its notes as one text, without color."""
     lines = [*check_lines(scene, verdict, limits), *(line("note", note) for note in scene_notes(scene))]
     return "\n".join(fold(lines))

@@ -22,6 +22,7 @@ from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.assessment import Assessment
+    from zwidth.scenes.diagnosis import Diagnosis
     from zwidth.scenes.scene import Scene
 
 WIDTH = 100  # columns of printed answers, at most
@@ -161,6 +162,16 @@ def _compare_with_limit(scene: Scene) -> list[str]:
     if limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
         return list(limit.warnings)
     return [f"this wall exceeds the safe limit: the true device may be unstable. {limit.describe()}", *limit.warnings]
+
+
+@in_own_units
+def diagnosis_lines(found: Diagnosis) -> list[str]:
+    """Return the result of a simulation with encoder, friction and motor, and the remedies if it oscillates."""
+    advice = found.advise()
+    return [
+        line("simulated", f"{found.word}: {found.explain()}"),
+        *([line("", f"to stop it: {advice}")] if advice else []),
+    ]
 
 
 def note_lines(notes: list[str]) -> list[str]:

@@ -361,27 +361,6 @@ def _double_rate(scene: SceneOptima) -> SceneOptima:
     return scene.replace(**changes)
 
 
-class FrictionRule(NamedTuple):
-    """Stiffnesses up to which viscous damping, and Coulomb friction, pay for sampling and for quantization."""
-
-    by_damping: float | None  # 2 b/T; None where there is no damping
-    by_friction: float | None  # 2 f_c/Q; None where friction or resolution is not given
-    stiffness: float | None  # the lower of the two, which is the rule; None where one is missing or it does not hold
-    holds: bool  # whether the rule is known of the scene: a rigid device without delay
-
-
-def friction_rule(scene: SceneOptima, friction: float | None = None, resolution: float | None = None) -> FrictionRule:
-    """Up to which K in N/m a wall without virtual damping and delay is passive: ``K <= min(2 b/T, 2 f_c/Q)``."""
-    # Viscous damping b pays for sampling, Coulomb friction f_c in N for quantization in steps of Q in m. A sufficient
-    # condition for a spring alone, on a rigid device (Abbott, Okamura 2005, IEEE Trans. Robotics 21(5), 952-964). As
-    # passivity it is for any hand, with the device's own damping; no velocity is estimated for a spring.
-    by_damping = 2.0 * scene.device.damping / scene.timing.period if scene.device.damping else None
-    by_friction = None if friction is None or resolution is None else 2.0 * friction / resolution
-    holds = not scene.timing.delay and not set(scene.parts_beyond) - {"velocity"}
-    known = [end for end in (by_damping, by_friction) if end is not None]
-    return FrictionRule(by_damping, by_friction, min(known) if holds and len(known) == 2 else None, holds)
-
-
 def passive_edge(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
     """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping."""
     # The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.

@@ -19,8 +19,6 @@ from zwidth.loops.linear.curve import curve_at, zeros_of
 from zwidth.loops.linear.rows import Island, bound_intervals, reaches_down
 from zwidth.words.showing import shown
 
-# What of |q| and |beta F| may be left of their difference where a curve has one damping.
-_ONE_DAMPING = 1e-12
 # Rows across the whole of the plane, and how far beyond the edge that nodes show the first and the last one are.
 _ACROSS, _BEYOND = 65, 0.05
 # Rows beside a damping at which columns meet, as shares of the way between the rows that enclosed it.
@@ -76,12 +74,10 @@ class Border:
         w = np.union1d(self.boundary.w, self.boundary.tops)
         return np.stack([w, *curve_at(self.boundary.loop, w)[:2]])
 
-    @cached_property
+    @property
     def _upright(self) -> float:
-        """The one damping of all pole pairs, of a loop of two poles whose product depends on it alone; else NaN."""
-        here, damping = curve_at(self.boundary.loop, self.boundary.w), self.boundary.limits[0.0][1]
-        away = np.abs((here.beta - damping) * here.fall)
-        return damping if np.all(away <= _ONE_DAMPING * here.size) else np.nan
+        """The one damping of all pole pairs, if two lines bound the stable walls next to it; else NaN."""
+        return self.boundary.lossless if len(self.boundary.lines) == 2 else np.nan
 
     def _first_rows(self) -> np.ndarray:
         """Rows on both sides of where nodes of the curve cease to be on the edge, and across the set."""

@@ -24,6 +24,8 @@ from zwidth.loops.linear.curve import (
     circle_zeros,
     curve_at,
     cut_arcs,
+    find_lossless,
+    level_arc,
     lines_at,
     nodes_of,
     zeros_of,
@@ -39,6 +41,7 @@ _SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
 _PROBE = 1e-6
 # A pole that leaves a zero on the circle along it, to such a share, goes where that way bends to.
 _ALONG = 1e-9
+_SAME_ROW = 1e-12  # relative difference of two dampings below which they are equal but for rounding errors
 # Pairs of rows and arcs that are looked at in one go: what they need stays in caches.
 _BLOCK = 1 << 17
 
@@ -62,6 +65,7 @@ class Boundary:
     lines: tuple[CrossingLine, ...]
     infinite: np.ndarray  # angles at which the curve runs to infinity
     limits: dict[float, tuple[float, float]]  # alpha and beta where it has no point of its own, NaN where it has no end
+    lossless: float  # the damping of all pole pairs on the circle, if it is the same at every angle; else NaN
 
     @classmethod
     def trace(cls, loop: LoopRoots) -> Boundary:
@@ -78,7 +82,14 @@ class Boundary:
         lines += lines_at(loop, (0.0, np.pi))
         limits = dict.fromkeys([0.0, np.pi, *poles.tolist()], (np.nan, np.nan))
         limits |= {line.w: (line.q - line.meeting * line.f, line.meeting) for line in lines}
-        return cls(loop, w, tuple(cut_arcs(loop, w, here, turns, limits)), tuple(lines), poles, limits)
+        lossless = find_lossless(loop, w, here, limits[0.0][1])
+        arcs = [level_arc(w, here, lossless)] if np.isfinite(lossless) else cut_arcs(loop, w, here, turns, limits)
+        return cls(loop, w, tuple(arcs), tuple(lines), poles, limits, lossless)
+
+    def are_lossless(self, beta: np.ndarray) -> np.ndarray:
+        """Return whether every pole of walls with these dampings has its reciprocal as another pole: none is stable."""
+        with np.errstate(invalid="ignore"):
+            return np.abs(beta - self.lossless) <= _SAME_ROW * np.abs(self.lossless)
 
     def crossings(self, beta: np.ndarray) -> Crossings:
         """Where the rows of these dampings, shape (rows,), cross the boundary."""
@@ -219,7 +230,7 @@ class Boundary:
 
     def _missed(self, beta: np.ndarray) -> np.ndarray:
         """By how many poles the crossings of each row fail to lead to the count far above."""
-        return self.base - self.top + self._sum_leaving(beta)
+        return self.count_below(beta) - self.count_above(beta) + self._sum_leaving(beta)
 
     def _sum_leaving(self, beta: np.ndarray, most: float = np.inf) -> np.ndarray:
         """Poles that leave at all crossings of each row, where each counts for no more than ``most``."""
@@ -230,7 +241,7 @@ class Boundary:
     def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
         """How many poles of each wall lie outside the circle; -1 where the row's crossings contradict each other."""
         passed, sound = self._passed(alpha, beta)
-        return np.where(sound, self.base + passed, -1)
+        return np.where(sound, self.count_below(beta) + passed, -1)
 
     def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> tuple[np.ndarray, np.ndarray]:
         """Poles that have left below each wall, without those of one column of the crossings; and if that is sound."""
@@ -260,26 +271,41 @@ class Boundary:
         here = curve_at(self.loop, w)
         held = np.isfinite(here.alpha) & np.isfinite(here.beta)
         # Of a long delay's rows most hold no stable wall wherever: not enough poles enter on them.
-        held[held] = self.base + self._sum_leaving(self.settle(here.beta[held])[0], 0.0) <= 0
+        rows = self.settle(here.beta[held])[0]
+        held[held] = self.count_below(rows) + self._sum_leaving(rows, 0.0) <= 0
         own, block = self.arc_at(w), max(1, _BLOCK // max(1, len(self.arcs)))
         for part in np.array_split(np.flatnonzero(held), 1 + held.sum() // block):
             passed, sound = self._passed(here.alpha[part], here.beta[part], own[part])
             # By the arc: next to z = -1 the slope at one angle may be rounding.
-            held[part] = sound & (self.base + passed == np.where(self._steps.leaving[own[part]] > 0, 0, 2))
+            below = self.count_below(here.beta[part])
+            held[part] = sound & (below + passed == np.where(self._steps.leaving[own[part]] > 0, 0, 2))
         return held
 
-    @cached_property
-    def base(self) -> int:
-        """Poles outside far below every crossing (docs/theory/scenes.md, V14)."""
-        return self._far_outside(-1.0)
+    def count_below(self, beta: np.ndarray) -> np.ndarray | int:
+        """Return the number of poles outside far below every crossing of rows (docs/theory/scenes.md, V14)."""
+        return self._count_far(-1.0, beta)
+
+    def count_above(self, beta: np.ndarray) -> np.ndarray | int:
+        """Return the same far above: the crossings of every row must lead from `count_below` to it."""
+        return self._count_far(1.0, beta)
+
+    def _count_far(self, side: float, beta: np.ndarray) -> np.ndarray | int:
+        less, more = self._far_counts[side]
+        # One number for the whole plane, unless the curve is a row of its own.
+        return less if less == more else np.where(beta > self.lossless, more, less)
 
     @cached_property
-    def top(self) -> int:
-        """Poles outside far above every crossing: every row's crossings must lead from ``base`` to it."""
-        return self._far_outside(1.0)
+    def _far_counts(self) -> dict[float, tuple[int, int]]:
+        """Poles outside far below (-1) and far above (1), for dampings below and above that of a lossless loop."""
+        return {side: (self._far_outside(side, -1.0), self._far_outside(side, 1.0)) for side in (-1.0, 1.0)}
 
-    def _far_outside(self, side: float) -> int:
-        """Where the wall's spring is all there is, the poles are at the device's zeros, the others at infinity."""
+    def _far_outside(self, side: float, more: float) -> int:
+        """Return the count where the wall's spring dominates: poles at the device's zeros, the others at infinity.
+
+        Args:
+            side: the sign of alpha.
+            more: the sign of the damping in addition to that of a lossless loop.
+        """
         loop = self.loop
         depth, on = depths(loop.zeros), are_on_circle(loop.zeros)
         leaving = 0
@@ -289,6 +315,10 @@ class Boundary:
             rest = replace(loop, zeros=loop.zeros[loop.zeros != zero]).response(at)
             power = -side / (rest.value * (1j * at.z) ** times)
             x = power ** (1.0 / times) * np.exp(2j * np.pi * np.arange(times) / times)
+            if np.isfinite(self.lossless):
+                # The spring moves the pole along the circle, and damping off it: x (1 - beta F/alpha).
+                leaving += int(np.sum(side * more * loop.estimate.jet(at).value.imag * x.real > 0))
+                continue
             bend = -(rest.slope / rest.value + 0.5j * times) * x * x / times
             leaving += int(np.sum(np.where(np.abs(x.imag) > _ALONG * np.abs(x), x.imag, bend.imag) < 0))
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving

@@ -60,10 +60,12 @@ def _some_intervals(boundary: Boundary, beta: np.ndarray) -> tuple[np.ndarray, .
     ends = np.pad(np.where(np.isnan(alpha), np.inf, alpha), sides, constant_values=(-np.inf, np.inf))
     met = np.pad(order, sides, constant_values=-1)
     w = np.pad(np.take_along_axis(found.w, order, 1), sides, constant_values=np.nan)
-    outside = boundary.base + np.concatenate([np.zeros((beta.size, 1)), np.cumsum(leaving, 1)], 1)
+    below = np.broadcast_to(boundary.count_below(beta), beta.shape)[:, None]
+    outside = below + np.concatenate([np.zeros((beta.size, 1)), np.cumsum(leaving, 1)], 1)
     # Closer than any alpha in range two crossings are one: the rounding of 0 on an undamped device's own row.
     wide = ends[:, 1:] > ends[:, :-1] + WALL_RANGE[0]
-    stable = (np.round(outside) == 0) & wide & (np.isfinite(beta) & found.sound)[:, None]
+    sound = np.isfinite(beta) & found.sound & ~boundary.are_lossless(beta)
+    stable = (np.round(outside) == 0) & wide & sound[:, None]
     # Neighbors that touch, where one pole leaves as another enters, stay apart: their common end is on the boundary.
     row, gap = np.nonzero(stable)
     return row, *(part[row, gap] for both in (ends, w, met) for part in (both[:, :-1], both[:, 1:]))
@@ -108,7 +110,7 @@ def _count_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
         left = np.flatnonzero(outside < 0)
         if left.size:
             outside[left] = (log_size(poles_less_one(boundary.loop, alpha[left], beta[left])) >= 0).sum(1)
-        stable[part] = good[part] & (outside == 0)
+        stable[part] = good[part] & (outside == 0) & ~boundary.are_lossless(beta)
     return stable.reshape(shape)
 
 
@@ -127,7 +129,9 @@ def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     above = height - alpha
     k = np.flatnonzero(np.isfinite(above[1:] + above[:-1]) & ((above[1:] > 0) != (above[:-1] > 0)))
     on_curve = zeros_between(lambda at: curve_at(boundary.loop, at).alpha - alpha, w, above, k)
-    met = np.unique(np.concatenate([curve_at(boundary.loop, on_curve).beta, on_lines]))
+    lossless = np.isfinite(boundary.lossless)
+    on_curve = np.array([boundary.lossless]) if lossless else curve_at(boundary.loop, on_curve).beta
+    met = np.unique(np.concatenate([on_curve, on_lines]))
     met = met[np.isfinite(met)]
     if not np.isfinite(alpha) or not met.size:
         return np.zeros((0, 2))
@@ -142,6 +146,8 @@ def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     room = np.minimum(met[k] - between[k], between[k + 1] - met[k])
     beside = np.minimum(_BESIDE * np.abs(met[k]), 0.5 * room)
     wrong = (label(met[k] - beside) != stable[k]) | (label(met[k] + beside) != stable[k + 1])
+    # On a lossless row itself no wall is stable.
+    wrong &= met[k] != boundary.lossless
     k, low, high = k[wrong], between[:-1][k[wrong]], between[1:][k[wrong]]
     # Twice: the last digit of a long way is not that of an end near 0.
     for _ in range(2 if k.size else 0):

@@ -107,7 +107,7 @@ def test_every_row_s_crossings_lead_from_the_count_below_to_the_one_above(name):
     found = boundary.crossings(rows)
     assert found.sound.all()
     crossed = np.where(np.isfinite(found.alpha), found.leaving, 0.0).sum(1)
-    np.testing.assert_array_equal(boundary.base + crossed, boundary.top)
+    np.testing.assert_array_equal(boundary.count_below(rows) + crossed, boundary.count_above(rows))
 
 
 @pytest.mark.parametrize("before", [1e-5, 1e-7, 1e-8, 1e-9, 1e-11, 1e-13])
