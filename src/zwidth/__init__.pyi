@@ -47,6 +47,7 @@ from .parts.linear_device import LinearDevice as LinearDevice
 from .parts.measured import MeasuredDevice as MeasuredDevice
 from .parts.mode import Mode as Mode
 from .parts.operator import Operator as Operator
+from .parts.safe_limit import SafeLimit as SafeLimit
 from .parts.timing import Timing as Timing
 from .parts.velocity import FOAW as FOAW
 from .parts.velocity import BackwardDifference as BackwardDifference

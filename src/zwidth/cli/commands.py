@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from zwidth import __version__
+from zwidth.cli.hardware import diagnose_wall, hardware_options
+from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
-    OF_SCENE,
     SHARE,
     Parsed,
+    beyond_safe_option,
     figure_option,
     find_silent,
     json_option,
@@ -22,7 +23,6 @@ from zwidth.cli.options import (
     read_factor,
     save_figure,
     scene_options,
-    show_example,
     verbose_option,
 )
 from zwidth.pages import words
@@ -32,7 +32,7 @@ from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
 from zwidth.words.errors import InputError, ZwidthError, check_choice, how_to_install
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
-from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
+from zwidth.words.quantities import SIZES, Range
 from zwidth.words.status import Status
 
 EXIT_FAILED, EXIT_INPUT = 1, 2
@@ -56,18 +56,14 @@ def cli() -> None:
 
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
-@click.option("--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N.")
-@click.option(
-    "--resolution",
-    type=quantity_type("m", POSITIVE, counts=True),
-    help="One step Q of the position sensor, in m; or '2000 counts'.",
-)
+@hardware_options
 @verbose_option
 @json_option
-def check(scene: Any, friction: float | None, resolution: float | None, verbose: bool, as_json: bool) -> None:
+def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) -> None:
     """Judge one wall: stable, passive, its margins; for an unstable wall, the changes that make it stable.
 
-    It needs --stiffness, --mass (or --device) and --rate (or --period); damping and delay are 0 if not given.
+    With --resolution, --friction or --max-force also simulate the wall, to find limit cycles and saturation. It needs
+    --stiffness, --mass (or --device) and --rate (or --period); damping and delay are 0 if not given.
     SCENE.yaml (or the folder of a run) supplies what no option gives; options override it.
     """
     from zwidth.pages.verdict import check_lines
@@ -80,9 +76,14 @@ def check(scene: Any, friction: float | None, resolution: float | None, verbose:
     if as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
         unstable = verdict.stable is False and not verdict.marginal
+        if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
+            result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
         lines = check_lines(scene, verdict, limits, silent=find_silent(), verbose=verbose)
+    if (diagnosis := diagnose_wall(scene, hardware)) is not None:
+        result["diagnosis"] = diagnosis.as_dict()
+        lines += ["", *words.diagnosis_lines(diagnosis)]
     words.tell(result, lines + words.note_lines(notes), as_json, words.LABEL)
 
 
@@ -113,7 +114,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
         raise click.UsageError("give either --delta and --d, or --mass and --rate (with --damping and --delay)")
     given = scene
     scene = Scene(Device(1.0, delta), Timing(1.0, d)) if scene is None else scene
-    scene = replace(scene, timing=replace(scene.timing, delay_model=delay_model))
+    scene = scene.replace(delay_model=delay_model)
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
@@ -321,14 +322,25 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option("--gain-margin", type=_FACTOR, help="At least this factor on K and B together.  [default: 2]")
 @click.option("--phase-margin", type=_DEGREES, help="At least so many degrees.  [default: 30]")
 @click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
+@hardware_options
+@beyond_safe_option
 @figure_option
 @click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
 @verbose_option
 @json_option
-def recommend(scene: Any, figure: Path | None, code: Any, verbose: bool, as_json: bool, **wanted: Any) -> None:
+def recommend(
+    scene: Any,
+    figure: Path | None,
+    code: Any,
+    hardware: dict[str, Any],
+    verbose: bool,
+    as_json: bool,
+    **wanted: Any,
+) -> None:
     """Recommend the wall to set: the stiffest one with the required margins.
 
-    The defaults hold if no requirement is given; any requirement replaces all of them. A hand (--operator-...) is part
+    The defaults hold if no requirement is given; any requirement replaces all of them. With --resolution, --friction or
+    --max-force also simulate the wall, to find limit cycles and saturation. A hand (--operator-...) is part
     of the device: the wall is then checked without it as well. It needs --mass (or --device) and --rate (or
     --period); damping and delay are 0 if not given. SCENE.yaml (or the folder of a run) supplies what no option gives;
     options override it.
@@ -347,6 +359,10 @@ def recommend(scene: Any, figure: Path | None, code: Any, verbose: bool, as_json
         click.echo(found.code(code), nl=False)
         return
     notes = [*words.coded_period_notes(scene), *found.notes]
-    lines = () if as_json else recommend_lines(found, silent=find_silent(), verbose=verbose)
-    result = found.as_dict() | {"notes": notes} if as_json else None
+    diagnosis = diagnose_wall(found.scene, hardware) if found.status == Status.OK else None
+    told = [] if diagnosis is None else words.diagnosis_lines(diagnosis)
+    lines = () if as_json else recommend_lines(found, silent=find_silent(), hardware=told, verbose=verbose)
+    result = found.as_dict() | {"notes": notes} if as_json else {}
+    if as_json and diagnosis is not None:
+        result["diagnosis"] = diagnosis.as_dict()
     words.tell(result, [*lines, *words.note_lines(notes), *wrote], as_json, words.LABEL)

@@ -10,8 +10,8 @@ import click
 import numpy as np
 
 from zwidth.cli.commands import EXIT_FAILED, cli
+from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
-    OF_SCENE,
     Parsed,
     find_silent,
     flag_of,
@@ -19,7 +19,6 @@ from zwidth.cli.options import (
     read_pairs,
     read_share,
     scene_options,
-    show_example,
 )
 from zwidth.pages.verdict import spell_device
 from zwidth.pages.words import LABEL, line, part_lines, tell

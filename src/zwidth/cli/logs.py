@@ -9,27 +9,31 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
+from zwidth.cli.help import show_example
 from zwidth.cli.options import (
     SHARE,
     Parsed,
     figure_option,
+    get_told,
     json_option,
     log_options,
     period_options,
     quantity_type,
     read_logs,
     save_figure,
-    show_example,
     velocity_options,
+    verbose_option,
+    warn_implausible,
 )
-from zwidth.pages.words import row, tell
+from zwidth.pages.words import LABEL, line, print_folded, print_json, row, tell
+from zwidth.parts.checks import find_kind
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import name_wall, round_safely, with_unit
 from zwidth.words.quantities import POSITIVE
-from zwidth.words.rotation import use_kind
+from zwidth.words.rotation import own_unit, use_kind
 from zwidth.words.status import Status
 from zwidth.words.units import tell_kind
 
@@ -73,7 +77,9 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
 @figure_option
-@click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run`.")
+@click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
+@click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run` and the other commands.")
+@verbose_option
 @json_option
 def fit(
     logs: tuple[Path, ...],
@@ -82,22 +88,24 @@ def fit(
     noise: float | None,
     velocity: Any,
     figure: Path | None,
+    code: Any,
     as_yaml: bool,
+    verbose: bool,
     as_json: bool,
     **of_logs: Any,
 ) -> None:
-    """Find a device's mass, damping and delay.
+    """Find a device's mass, damping and delay, and the wall to set.
 
     With --buzz: from walls at which it began to buzz as K was raised, at two dampings or more, and the frequencies
     heard. With LOG.csv: from its free motion under a force that a computer commanded, friction included; several logs
     are of one device and have the same columns. Units stand in headers, as 'encoder [counts]', or behind a colon.
     """
-    from zwidth.fitting.words import describe_fit, list_units, write_scene
+    from zwidth.fitting.words import detail_fit, list_units, summarize_fit, write_scene
 
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
-    if as_json and as_yaml:
-        raise click.UsageError("give one of --json and --yaml")
+    if sum(map(bool, (as_json, as_yaml, code))) > 1:
+        raise click.UsageError("give one of --json, --yaml and --code: each has all of the output")
     points = ()
     if walls:
         for name, value in of_logs.items():
@@ -130,11 +138,20 @@ def fit(
 
         evidence: dict[str, Any] = gather_evidence(found, source, points)
         wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
-    if as_yaml:
-        click.echo("\n".join(write_scene(found, source)))
+    if code:
+        click.echo(found.recommended.code(code), nl=False)
         return
-    lines = () if as_json else describe_fit(found, source)
-    tell({**found.as_dict(), "units": list_units(found)}, [*(row(*each) for each in lines), *wrote], as_json)
+    if as_yaml:
+        click.echo("\n".join(write_scene(found, source, period_given=period is not None)))
+        return
+    if as_json:
+        print_json({**found.as_dict(), "units": list_units(found)})
+        return
+    details = [("", ""), *detail_fit(found, source)] if verbose else []
+    lines = [line(*each).rstrip() for each in (*summarize_fit(found), *details)]
+    more = "the rest: --verbose; a scene for the other commands: --yaml"
+    more += "; a program for the loop: --code c" if found.recommended.status == Status.OK else ""
+    print_folded([*lines, *wrote, line("more", more)], LABEL)
 
 
 _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
@@ -143,20 +160,40 @@ _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
 @cli.command(**show_example("excite --rate '1 kHz' --force '2 N' --resolution '10 um'"))
 @period_options
 @click.option("--force", type=quantity_type("N", POSITIVE), required=True, help="The largest force to command, in N.")
-@click.option("--resolution", type=quantity_type("m", POSITIVE), required=True, help="One count of the encoder, in m.")
+@click.option(
+    "--resolution",
+    type=quantity_type("m", POSITIVE, counts=True),
+    required=True,
+    help="One count of the encoder, in m; or '2000 counts'.",
+)
 @click.option("--duration", type=_TIME, default="60 s", show_default=True, help="How long it plays, in s.")
 @click.option("--response", type=_FILE, help="The response of a first record, to design the second.")
 @click.option("--out", type=_FILE, default=Path("play.csv"), show_default=True, help="The file to play.")
 @velocity_options
 @json_option
 def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> None:
-    """Design the force to play before `zwidth respond`."""
+    """Design the force to play before `zwidth respond`; of a rotary device the torque, by the units given."""
     if options["period"] is None:
         raise click.UsageError("give --period or --rate")
     from zwidth.fitting.excite import excite as design
 
-    made = design(response=None if response is None else MeasuredDevice.read(response), **options)
-    made.save(out)
+    warn_implausible({"resolution": options["resolution"]})
+    known = None if response is None else MeasuredDevice.read(response)
+    # Units of options say the kind of device; the numbers are plain by now.
+    told = find_kind(get_told())
+    if known is not None and told not in (None, known.rotary):
+        raise click.UsageError(
+            "--response is of another kind of device, linear or rotary, than --force and --resolution"
+        )
+    rotary = known.rotary if known is not None else bool(told)
+    with use_kind(rotary):
+        made = design(response=known, rotary=rotary, **options)
+        made.save(out)
+        _tell_excitation(made, out, as_json)
+
+
+def _tell_excitation(made: Any, out: Path, as_json: bool) -> None:
+    """Print what a record is and what it will show."""
     low, high = (with_unit(end, "Hz") for end in made.frequency[[0, -1]])
     lines = [
         row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), 'N')}"),
@@ -196,10 +233,20 @@ def respond(
     other. What --save keeps, and any table of an analyzer, is a device of the other commands: `zwidth ridge --device
     FILE.csv` answers of it.
     """
-    from zwidth.fitting.respond import find_nominal_limit, respond_to_logs
-    from zwidth.scenes.scene import Scene
+    from zwidth.fitting.respond import respond_to_logs
 
     found = respond_to_logs(read_logs(logs, period, **of_logs), period, cycle)
+    with use_kind(found.device.rotary):
+        _tell_response(found, logs, velocity, save, figure, as_json)
+
+
+def _tell_response(
+    found: Any, logs: tuple[Path, ...], velocity: Any, save: Path | None, figure: Path | None, as_json: bool
+) -> None:
+    """Print a response and the wall that is safe by it, keep it and draw it."""
+    from zwidth.fitting.respond import find_nominal_limit
+    from zwidth.scenes.scene import Scene
+
     device, period, doubts = found.device, found.period, found.doubts
     kind = "stretches of a force that repeats" if found.cycle else "pieces"
     source = f"{' and '.join(log.name for log in logs)}, {found.records} {kind}"
@@ -217,6 +264,7 @@ def respond(
     lines.append(row("safe wall", words))
     lines += [row("a stiffer one" if k == 0 else "", text) for k, text in enumerate(said)]
     lines += [row("doubt", text) for text in doubts]
+    lines += [row("note", text) for text in found.notes]
     if save is not None:
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
         lines.append(row("wrote", str(save)))
@@ -224,6 +272,7 @@ def respond(
         lines.append(save_figure(_draw(scene, safe if safe.status == Status.OK else None), figure))
     told = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
     told |= {"safe_wall": _plain(safe) if given else None, "undecided": said, "doubts": list(doubts)}
+    told |= {"notes": list(found.notes), "rotary": device.rotary}
     tell(told, lines, as_json)
 
 
@@ -235,7 +284,8 @@ def spell_safe_wall(scene: Any, wall: Any) -> str:
         if scene.is_stable(stiffness, damping):
             return name_wall(stiffness, damping)
         stiffness *= 1.0 - 1e-4
-    return f"K = {float(wall.stiffness)!r} N/m, B = {float(wall.virtual_damping)!r} N s/m"
+    units = own_unit("N/m"), own_unit("N s/m")
+    return f"K = {float(wall.stiffness)!r} {units[0]}, B = {float(wall.virtual_damping)!r} {units[1]}"
 
 
 def _compliance(deviation: Any) -> str:

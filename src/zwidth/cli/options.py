@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
+from zwidth.cli.help import OF_SCENE as OF_SCENE
+from zwidth.cli.help import show_example as show_example
 from zwidth.pages.words import row
 from zwidth.parts.checks import Span, find_kind, read_span
 from zwidth.parts.device import Device
@@ -47,14 +49,6 @@ _BARE = {"mass", "damping"}
 _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
-OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
-
-
-def show_example(command: str, *more: str) -> dict[str, str]:
-    """What a command is declared with so that its help ends with an example, on lines of their own."""
-    return {"epilog": "\b\nExample:\n" + " \\\n    ".join((f"  zwidth {command}", *more))}
-
-
 class Parsed(click.ParamType):
     """What a function reads of an option's text, or raises a `ValueError` for: then ``remedy`` says what to write."""
 
@@ -69,6 +63,11 @@ class Parsed(click.ParamType):
             return self.read(value)
         except ValueError as error:
             self.fail(f"got {value!r}; {self.remedy}" if self.remedy else str(error), param, ctx)
+
+
+def get_told() -> dict[str, Any]:
+    """Return the texts of options of the running command whose units are those of one kind of device."""
+    return click.get_current_context().meta.get(_TOLD, {})
 
 
 def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, counts: bool = False) -> Parsed:
@@ -359,6 +358,7 @@ def _make_velocity(given: dict[str, Any]) -> Any:
 
 
 figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
+beyond_safe_option = click.option("--beyond-safe", is_flag=True, help="Ignore the safe limit of a fitted scene.")
 verbose_option = click.option("--verbose", is_flag=True, help="Print everything that is known.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 ROUNDED = 1e-12  # a smaller share of the dampings is their rounding error
 NOTEWORTHY = 1.005  # gains below this are left to --verbose
 LONG = 20  # characters of a heading that has a line of its own
+MARGINAL_DAMPER = "a pure damper: marginal only because no stiffness returns the free position (a pole at z = 1)"
+MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
@@ -53,43 +55,47 @@ def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
 def check_lines(
     scene: Scene,
     verdict: Assessment,
-    limits: Iterable[Limit],
+    limits: Iterable[Limit] | None,
     *,
     silent: frozenset[str] = frozenset(),
     verbose: bool = False,
 ) -> list[str]:
-    """Return the answer of `zwidth check` without its notes."""
+    """Return the answer of `zwidth check` without its notes; None for the limits leaves out what takes a second."""
     wall, word = scene.wall, word_of(verdict).upper()
     K, B = spell_stiffness(wall.stiffness), with_unit(wall.virtual_damping, "N s/m")
-    lines = [line(word, f"K = {K}, B = {B} on a device of {spell_device(scene, silent)}")]
+    wall_words, device_words = f"K = {K}, B = {B}", spell_device(scene, silent)
     if isinstance(scene.device, Device):
-        numbers = (f"{name} {plain(getattr(verdict, name))}" for name in ("alpha", "beta", "delta", "d"))
-        lines.append(line("", f"({', '.join(numbers)})"))
+        wall_words += f" (alpha {plain(verdict.alpha)}, beta {plain(verdict.beta)})"
+        device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
+    lines = [line(word, wall_words), line("device", device_words)]
     lines += part_lines(scene)
+    # A measured response has no poles.
+    damper = wall.stiffness == 0 and not isnan(verdict.frequency)
+    dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
-        lines.append(line("", "a pole at z = 1: without stiffness no force pulls back"))
+        lines.append(line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
     lines.append("")
-    if word == "UNSTABLE":
+    if word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no change of a single parameter is known"]
         lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
     lines += margin_lines(verdict)
     lines += decay_lines(verdict)
     if word != "UNSTABLE" or verbose:
-        lines.append(line("room", _spell_room(verdict)))
+        lines.append(line("room", _spell_room(verdict, dampings)))
     lines.append(line("passive", spell_passivity(scene, verdict)))
     lines += _list_maximum(scene, verdict, verbose)
-    return lines + gain_lines("To gain K_max:", limits, verbose)
+    return lines + gain_lines("To gain K_max:", limits or (), verbose)
 
 
-def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit]) -> str:
+def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | None) -> str:
     """Return the answer of `zwidth check` with its notes as one text, without color."""
     lines = [*check_lines(scene, verdict, limits), *(line("note", note) for note in scene_notes(scene))]
     return "\n".join(fold(lines))
 
 
-def _spell_room(verdict: Assessment) -> str:
+def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
     """Return the stable intervals of K and of B next to the wall."""
-    rooms = (("K", verdict.stable_stiffness, "N/m", "B"), ("B", verdict.stable_damping, "N s/m", "K"))
+    rooms = (("K", verdict.stable_stiffness, "N/m", "B"), ("B", dampings, "N s/m", "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
 
 
@@ -196,7 +202,11 @@ def recommend_lines(
         return [line("NO WALL", found.reason), device, *part_lines(scene)]
     margins = [line("margins", found.spell_margins())]
     if verbose:
-        margins = [*margin_lines(verdict), *decay_lines(verdict), line("room", _spell_room(verdict))]
+        margins = [
+            *margin_lines(verdict),
+            *decay_lines(verdict),
+            line("room", _spell_room(verdict, verdict.stable_damping)),
+        ]
     lines = [
         line("SET", f"{found.spell_wall()}; {found.spell_limit()}"),
         device,

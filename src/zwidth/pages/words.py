@@ -15,12 +15,14 @@ import click
 
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.paths import find_parts
+from zwidth.parts.wall import NoWall
 from zwidth.words.formatting import plain, short, to_json, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.assessment import Assessment
+    from zwidth.scenes.diagnosis import Diagnosis
     from zwidth.scenes.scene import Scene
 
 WIDTH = 100  # columns of printed answers, at most
@@ -149,7 +151,27 @@ def scene_notes(scene: Scene) -> list[str]:
     from zwidth.scenes.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
-    return [*undecided, *coded_period_notes(scene), *describe_islands(scene)]
+    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *_compare_with_limit(scene)]
+
+
+def _compare_with_limit(scene: Scene) -> list[str]:
+    """Return the notes on the safe limit of a scene that has a wall: is the wall within, and the warnings."""
+    limit, wall = scene.safe_limit, scene.wall
+    if limit is None or isinstance(wall, NoWall):
+        return []
+    if limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
+        return list(limit.warnings)
+    return [f"this wall exceeds the safe limit: the true device may be unstable. {limit.describe()}", *limit.warnings]
+
+
+@in_own_units
+def diagnosis_lines(found: Diagnosis) -> list[str]:
+    """Return the result of a simulation with encoder, friction and motor, and the remedies if it oscillates."""
+    advice = found.advise()
+    return [
+        line("simulated", f"{found.word}: {found.explain()}"),
+        *([line("", f"to stop it: {advice}")] if advice else []),
+    ]
 
 
 def note_lines(notes: list[str]) -> list[str]:

@@ -12,6 +12,7 @@ import numpy as np
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.checks import Span
 from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
+from zwidth.scenes.answers import allows_negative
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
@@ -53,7 +54,7 @@ class Assessment:
     delta: float  # the damping to ground of that mass in the same units
     d: float  # the delay in periods
     stable: bool | None  # every pole lies strictly inside the unit circle; None: a measured response leaves it open
-    marginal: bool  # not stable for one pole at z = 1 alone: without stiffness nothing pulls back
+    marginal: bool  # poles on the circle, none outside: one at z = 1 (K = 0), or all of a sampled plant without damping
     spectral_radius: float  # the largest pole magnitude, 1 to rounding where the decay is very slow
     decay_rate: float  # of the slowest motion, in 1/s, with relative accuracy; negative for a growing one
     stable_stiffness: Intervals  # every stable interval of K at this B, in N/m
@@ -292,8 +293,12 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
 
 @in_own_units
 def describe_islands(scene: SceneOptima) -> list[str]:
-    """A line for each island: stable walls that K_max does not count."""
+    """Return a line for each island, and one if the device is unstable by itself."""
     lines = []
+    least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
+    if least is not None:
+        softest = with_unit(round_safely(least * scene.units.stiffness, "above"), "N/m")
+        lines.append(f"the device is unstable by itself: no wall softer than K = {softest} is stable")
     for island in scene.islands():
         units = {"K": (island.stiffness, "N/m"), "B": (island.virtual_damping, "N s/m")}
         ends = (f"{name} from {' to '.join(tell_apart(*ends, u))}" for name, (ends, u) in units.items())
@@ -359,27 +364,6 @@ def _double_rate(scene: SceneOptima) -> SceneOptima:
     if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:
         changes["velocity.coded_period"] = scene.velocity.coded_period / 2
     return scene.replace(**changes)
-
-
-class FrictionRule(NamedTuple):
-    """Stiffnesses up to which viscous damping, and Coulomb friction, pay for sampling and for quantization."""
-
-    by_damping: float | None  # 2 b/T; None where there is no damping
-    by_friction: float | None  # 2 f_c/Q; None where friction or resolution is not given
-    stiffness: float | None  # the lower of the two, which is the rule; None where one is missing or it does not hold
-    holds: bool  # whether the rule is known of the scene: a rigid device without delay
-
-
-def friction_rule(scene: SceneOptima, friction: float | None = None, resolution: float | None = None) -> FrictionRule:
-    """Up to which K in N/m a wall without virtual damping and delay is passive: ``K <= min(2 b/T, 2 f_c/Q)``."""
-    # Viscous damping b pays for sampling, Coulomb friction f_c in N for quantization in steps of Q in m. A sufficient
-    # condition for a spring alone, on a rigid device (Abbott, Okamura 2005, IEEE Trans. Robotics 21(5), 952-964). As
-    # passivity it is for any hand, with the device's own damping; no velocity is estimated for a spring.
-    by_damping = 2.0 * scene.device.damping / scene.timing.period if scene.device.damping else None
-    by_friction = None if friction is None or resolution is None else 2.0 * friction / resolution
-    holds = not scene.timing.delay and not set(scene.parts_beyond) - {"velocity"}
-    known = [end for end in (by_damping, by_friction) if end is not None]
-    return FrictionRule(by_damping, by_friction, min(known) if holds and len(known) == 2 else None, holds)
 
 
 def passive_edge(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from typing import Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
@@ -17,12 +17,14 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.operator import Operator
 from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
+from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity, is_plain
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import WALL
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
@@ -39,6 +41,7 @@ _KINDS = {
     "wall": (VirtualWall, "zwidth.VirtualWall(stiffness=10e3)"),
     "velocity": (Velocity, "zwidth.LowPass(cutoff=100)"),
     "operator": (Operator | None, "zwidth.Operator(mass=0.5)"),
+    "safe_limit": (SafeLimit | None, "zwidth.SafeLimit(stiffness=500, virtual_damping=2)"),
 }
 
 
@@ -59,6 +62,7 @@ class SceneParts(Part):
     wall: VirtualWall = field(default_factory=NoWall)
     velocity: Velocity = field(default_factory=BackwardDifference)
     operator: Operator | None = None
+    safe_limit: SafeLimit | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.wall, Velocity):
@@ -67,7 +71,7 @@ class SceneParts(Part):
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {example}")
-        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity")}
+        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit")}
         check_kind(bool(self.device.rotary), named)
         if self.operator is not None and not isinstance(self.device, Device):
             raise InputError(
@@ -222,7 +226,15 @@ class SceneParts(Part):
                 f"{', '.join(changes)}: the device would become a {kind} one, and other numbers of the scene mean "
                 "another unit; make a new scene, of a new zwidth.Device"
             )
-        return made
+        changed = sorted(changes.keys() - {"wall", "safe_limit", *WALL})
+        if self.safe_limit is None or not changed or "safe_limit" in changes:
+            return made
+        return replace(
+            made,
+            safe_limit=self.safe_limit.warn(
+                f"{' and '.join(changed)} changed after the safe limit was measured; measure again"
+            ),
+        )
 
 
 def of_scene(

@@ -12,6 +12,7 @@ import numpy as np
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
+from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.assessment import (
     Assessment,
@@ -51,8 +52,8 @@ class Recommendation:
         scene: the device with this wall as its own, for `zwidth.assess`, `zwidth.simulate` and pictures.
         stiffest: the stiffest stable wall of the device.
         wanted: what was asked of the wall.
-        limited_by: which of that allows no stiffer wall: "stiffness_fraction", "gain_margin", "phase_margin" or
-            "passive"; "" where there is no wall.
+        limited_by: which of that allows no stiffer wall: "stiffness_fraction", "gain_margin", "phase_margin",
+            "passive" or "safe_limit", the limit of the scene; "" where there is no wall.
         status: code of `zwidth.Status`; where it is not OK there is no wall to set.
         reason: why there is none.
         notes: what else to know, in sentences.
@@ -103,9 +104,10 @@ class Recommendation:
     def steps(self) -> list[Limit]:
         """The improvements of `zwidth.limits_of` that allow a stiffer wall under the same requirements, the best first.
 
-        Their stiffness is that of the wall recommended for the improved device, right to some 0.2 %.
+        Their stiffness is that of the wall recommended for the improved device, right to some 0.2 %. Within a safe
+        limit that allows no better wall, only a new measurement allows a stiffer one: the list is empty.
         """
-        if self.status != Status.OK:
+        if self.status != Status.OK or self.is_held_back:
             return []
         found = compute_gains(self.scene.replace(wall=NoWall()), self.stiffness, self._choose_again)
         return [step for step in found if step.gain > 1.0]
@@ -171,9 +173,20 @@ class Recommendation:
         """Return the share of K_max and the requirement that allows no stiffer wall, in words."""
         largest = float(self.stiffest.stiffness)
         share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {spell_stiffness(largest)}"
-        if self.limited_by == "stiffness_fraction":
-            return share
-        return f"{share}; limited by {self.wanted.spell(self.limited_by)}"
+        return share if self.limited_by == "stiffness_fraction" else f"{share}; {self.spell_requirement()}"
+
+    def spell_requirement(self) -> str:
+        """Return the requirement that allows no stiffer wall, in words."""
+        within = " within the safe limit" if self.limited_by != "safe_limit" and self.is_held_back else ""
+        return f"limited by {self.wanted.spell(self.limited_by)}{within}"
+
+    @property
+    def is_held_back(self) -> bool:
+        """True if the safe limit allows no better wall: the stiffness is at the limit, or the virtual damping."""
+        limit = None if self.wanted.beyond_safe else self.scene.safe_limit
+        ends = None if limit is None else limit.dampings(self.stiffness)
+        at_end = ends is not None and any(math.isclose(self.virtual_damping, end, rel_tol=1e-3) for end in ends)
+        return at_end or self.limited_by == "safe_limit"
 
     def spell_margins(self) -> str:
         """Return the margins of the wall in words, rounded to the safe side."""
@@ -234,6 +247,14 @@ class Recommendation:
         return to_json(found)
 
 
+def _describe_limit(limit: SafeLimit | None, ignored: bool) -> list[str]:
+    """Return the notes on a safe limit: the limit with its reason, and its warnings."""
+    if limit is None or (limit.forbids_all and not ignored):
+        # A limit that forbids all walls is the reason of the recommendation.
+        return []
+    return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe()}", *limit.warnings]
+
+
 class SceneAdvice(SceneOptima):
     """The question of `zwidth.Scene` what to set."""
 
@@ -244,6 +265,7 @@ class SceneAdvice(SceneOptima):
         gain_margin: float | None = None,
         phase_margin: float | None = None,
         passive: bool = False,
+        beyond_safe: bool = False,
     ) -> Recommendation:
         """The stiffest wall that keeps some distance from trouble: the one to set on this device.
 
@@ -252,6 +274,8 @@ class SceneAdvice(SceneOptima):
             gain_margin: at least this factor on stiffness and damping together, > 1.
             phase_margin: at least so many degrees, > 0.
             passive: require a passive wall.
+            beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its stiffness is
+                at most ``stiffness_fraction`` (or 0.75) of the limit's.
 
         Without any requirement these are the defaults: at most 0.75 of K_max, a gain margin of 2 and a phase margin of
         30 degrees. Any requirement replaces all of them.
@@ -277,13 +301,14 @@ class SceneAdvice(SceneOptima):
             'phase_margin'
         """
         check_held(self)
-        wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive)
+        wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe)
         if wanted.passive and (obstacle := find_obstacle(**vars(self.device))):
             raise InputError(f"passive: got True {obstacle}")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)
         found = choose_wall(bare, wanted, top)
         notes += [found.note] if found.note else []
+        notes += _describe_limit(self.safe_limit, beyond_safe)
         if found.status == Status.OK:
             stiffness = check_number("stiffness", found.stiffness)
             wall = VirtualWall(stiffness, check_number("virtual_damping", found.damping))

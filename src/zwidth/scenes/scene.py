@@ -27,6 +27,8 @@ class Scene(SceneAdvice):
             left out.
         velocity: how the velocity is estimated; the backward difference by default.
         operator: the hand, None where nobody holds the device.
+        safe_limit: the stiffest wall that measurements of the device support; `recommend` stays within it. A fit sets
+            it. It has no effect on verdicts and on the maximum stiffness.
 
     Numerics:
         Parameters and walls may be values that JAX traces. A rigid scene with the backward difference then computes

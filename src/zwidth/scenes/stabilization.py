@@ -80,7 +80,7 @@ def stabilize(scene: SceneOptima) -> list[StableRange]:
     found = []
     if row:
         low, high = nearest_interval(tuple(row), K)
-        found.append(StableRange("stiffness", low if low > 0 else -math.inf, high))
+        found.append(StableRange("stiffness", low if low > 0 or low >= K else -math.inf, high))
     if column:
         found.append(StableRange("virtual_damping", *nearest_interval(tuple(column), B)))
     values = {**scene.parameters(), "rate": 1.0 / scene.timing.period}

@@ -18,7 +18,7 @@ from zwidth.pages.words import list_slopes, pole_words, row, spell_radius, word_
 from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin
 from zwidth.scenes.scene import Scene
-from zwidth.simulation.result import MotionKind
+from zwidth.simulation.ending import describe_ending
 from zwidth.words.formatting import plain, round_safely, tell_apart
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -133,11 +133,7 @@ def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     # device; the normalized one at as many units.
     start = -_APPROACH * _IMPACT * scene.timing.period / max(1.0, 2.0 * _APPROACH * float(scene.delta))
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
-    kind = MotionKind(int(hit.outcome))
-    end = "" if kind in (MotionKind.UNCLEAR, MotionKind.INVALID) else f", {kind.name.lower()} at the end"
-    count = int(hit.bounces)
-    words = f"(leaves it {count} {'time' if count == 1 else 'times'}{end})"
-    return hit.time, hit.position, hit.wall_force, words
+    return hit.time, hit.position, hit.wall_force, f"({describe_ending(hit)})"
 
 
 def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
@@ -169,6 +165,8 @@ def caption_poles(poles: np.ndarray, word: str) -> str:
     outside, count = int((np.abs(poles) > 1.0).sum()), poles.size
     if word == "stable":
         return f"Stable: all {count} lie inside the circle."
+    if word == "marginal" and np.abs(poles - 1.0).min(initial=np.inf) > 1e-9:
+        return f"Marginal: of {count}, none lies outside the circle, and some lie on it."
     if word == "marginal":
         return f"Marginal: of {count}, one stands on the circle, at z = 1; without stiffness nothing pulls back."
     return f"Unstable: {outside} of {count} outside of the circle." if outside else "Not stable: one on the circle."
@@ -231,7 +229,7 @@ def compute_details(
     length = 1.0 if normalized else 1e3
     verdict = assess(scene)
     own = normalized_lines(verdict) if normalized else None
-    text = "\n".join(own) if own else write_check(scene, verdict, [])
+    text = "\n".join(own) if own else write_check(scene, verdict, None)
     word = word_of(verdict)
     captions = {"poles_words": caption_poles(scene.poles(), word), **caption_curves(verdict, normalized)}
     time, position = step_motion(scene, length_of(scene, verdict))
