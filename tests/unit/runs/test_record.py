@@ -2,7 +2,6 @@
 
 import json
 import os
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -119,7 +118,7 @@ def test_another_configurations_files_are_not_taken_for_a_lost_runs(finished, co
     assert tree(finished) == before
 
 
-@pytest.mark.parametrize("kind", ["link", "dangling", "hard link", "linked folder"])
+@pytest.mark.parametrize("kind", ["link", "dangling", "linked folder"])
 def test_a_lock_writes_into_no_file_elsewhere(config, tmp_path, kind):
     victim = tmp_path / "victim"
     victim.mkdir()
@@ -133,9 +132,8 @@ def test_a_lock_writes_into_no_file_elsewhere(config, tmp_path, kind):
         make = {
             "link": lambda: (locks / "run").symlink_to(victim / "run"),
             "dangling": lambda: (locks / "run").symlink_to(victim / "none"),
-            "hard link": lambda: (locks / "run").hardlink_to(victim / "run"),
         }
         make[kind]()
-    with nullcontext() if kind == "hard link" else pytest.raises((InputError, OSError)):
+    with pytest.raises((InputError, OSError)):
         run(config, out=tmp_path / "out")
     assert tree(victim) == {"run": b"dear"}
