@@ -55,6 +55,8 @@ def test_a_sweep_has_its_units_as_people_write_them(tmp_path):
     titles = [ax.get_title("left") for ax in panels]
     assert titles[0].endswith(r"$t_d = 0.7\,\mathrm{periods}$")
     assert titles[1].endswith(r"$t_d = 1\,\mathrm{period}$")
+    report = zwidth.write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert " degrees; gray" in report
     with zwidth.open_dataset(tmp_path / "run" / "m.zarr") as data:
         (ax,) = draw_curves(data, "stiffness_max")
     assert ax.get_xlabel() == "inertia  $J$  in g cm$^2$"
