@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +59,7 @@ def cli() -> None:
 @hardware_options
 @verbose_option
 @json_option
-def check(scene: Any, verbose: bool, as_json: bool, **hardware: float | None) -> None:
+def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) -> None:
     """Judge one wall: stable, passive, its margins; for an unstable wall, the changes that make it stable.
 
     With --resolution, --friction or --max-force also simulate the wall, to find limit cycles and saturation. It needs
@@ -113,7 +112,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
         raise click.UsageError("give either --delta and --d, or --mass and --rate (with --damping and --delay)")
     given = scene
     scene = Scene(Device(1.0, delta), Timing(1.0, d)) if scene is None else scene
-    scene = replace(scene, timing=replace(scene.timing, delay_model=delay_model))
+    scene = scene.replace(delay_model=delay_model)
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
@@ -331,9 +330,7 @@ def recommend(
     scene: Any,
     figure: Path | None,
     code: Any,
-    friction: float | None,
-    resolution: float | None,
-    max_force: float | None,
+    hardware: dict[str, Any],
     verbose: bool,
     as_json: bool,
     **wanted: Any,
@@ -360,7 +357,6 @@ def recommend(
         click.echo(found.code(code), nl=False)
         return
     notes = [*words.coded_period_notes(scene), *found.notes]
-    hardware = {"friction": friction, "resolution": resolution, "max_force": max_force}
     diagnosis = diagnose_wall(found.scene, hardware) if found.status == Status.OK else None
     told = [] if diagnosis is None else words.diagnosis_lines(diagnosis)
     lines = () if as_json else recommend_lines(found, silent=find_silent(), hardware=told, verbose=verbose)

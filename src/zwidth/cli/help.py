@@ -16,7 +16,7 @@ GROUPS = {
     "Timing": ("--period", "--rate", "--delay"),
     OWN: (),
     "Velocity estimate": ("--velocity-",),
-    "Encoder, friction and motor": ("--friction", "--resolution", "--max-force"),
+    "Encoder, friction and motor": ("--resolution", "--friction", "--static-friction", "--max-force", "--max-rate"),
     "Hand": ("--operator-",),
     "Further parts of the device": ("--coupling-", "--actuator-", "--modes-"),
     "Output": ("--figure", "--code", "--verbose", "--json", "--help"),

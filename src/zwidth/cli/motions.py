@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import click
 
 from zwidth.cli.commands import cli
+from zwidth.cli.hardware import hardware_options
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
-    Command,
     figure_option,
     json_option,
     quantity_type,
     save_figure,
     scene_options,
-    warn_implausible,
 )
 from zwidth.pages import words
 from zwidth.pages.words import row
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import with_unit
-from zwidth.words.quantities import ANY, NOT_NEGATIVE, POSITIVE
+from zwidth.words.quantities import ANY, POSITIVE
 
 TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS, MOST_PERIODS = 300, 20_000
@@ -36,30 +33,6 @@ APPROACH = 2.0  # periods before contact at which a hit begins
 
 _WALL = "--stiffness '10 kN/m' --virtual-damping '40 N s/m'"
 _LIMITS = "--resolution '20 um' --friction '50 mN'"
-_HARDWARE = (
-    ("--resolution", "resolution", "m", POSITIVE, "Step of the encoder, in m; or '2000 counts' of a revolution."),
-    ("--friction", "coulomb", "N", NOT_NEGATIVE, "Coulomb friction of the device, in N."),
-    ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N; --friction if left out."),
-    ("--max-force", "max_force", "N", POSITIVE, "Largest force of the motor, in N."),
-    ("--max-rate", "max_rate", "N/s", POSITIVE, "Largest rate of the commanded force, in N/s."),
-)
-
-
-def hardware_options(command: Command) -> Command:
-    """Add the options of encoder, friction and motor; the command receives those given as ``hardware``."""
-
-    @wraps(command)
-    def with_hardware(**given: Any) -> Any:
-        hardware = {name: value for _, name, *_ in _HARDWARE if (value := given.pop(name)) is not None}
-        if "resolution" in hardware:
-            warn_implausible({"resolution": hardware["resolution"]})
-        return command(hardware=hardware, **given)
-
-    decorated: Callable[..., Any] = with_hardware
-    for flag, name, unit, allowed, text in reversed(_HARDWARE):
-        kind = quantity_type(unit, allowed, counts=name == "resolution")
-        decorated = click.option(flag, name, type=kind, help=text)(decorated)
-    return decorated
 
 
 @cli.command(**show_example("diagnose", _WALL, OF_SCENE, _LIMITS))

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
+from zwidth.cli.help import OF_SCENE as OF_SCENE
+from zwidth.cli.help import show_example as show_example
 from zwidth.pages.words import row
 from zwidth.parts.checks import Span, find_kind, read_span
 from zwidth.parts.device import Device

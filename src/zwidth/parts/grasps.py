@@ -14,12 +14,12 @@ from zwidth.parts.operator import Operator
 
 HAND = Operator(**Operator.usual["rigid"])
 SPRINGS = {"soft": 1e3, "firm": 10e3}  # N/m
-DAMPERS = (1.0, 5.0, 20.0)  # N s/m
+DAMPERS = {"light": 1.0, "medium": 5.0, "strong": 20.0}  # N s/m
 RADIUS = 0.05  # m, from the axis of a rotary device to the hand
 
 REFERENCE_GRASPS: dict[str, Operator] = {
-    f"{name}, {damper:g} N s/m": replace(HAND, coupling_stiffness=SPRINGS[name], coupling_damping=damper)
-    for name, damper in product(SPRINGS, DAMPERS)
+    f"{spring}, {damper} damping": replace(HAND, coupling_stiffness=SPRINGS[spring], coupling_damping=DAMPERS[damper])
+    for spring, damper in product(SPRINGS, DAMPERS)
 }
 
 

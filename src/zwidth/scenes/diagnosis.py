@@ -180,8 +180,8 @@ def diagnose(
     """Find out why a device oscillates on a wall, and which change stops it.
 
     The linear loop is judged by `zwidth.Scene.is_stable`. Then the wall is simulated with encoder, friction and motor
-    from several initial displacements, without an external force and with the worst constant one, half a step of the
-    encoder times K. An oscillation that ends without the encoder, or without the limits of the motor, is attributed to
+    from several initial displacements, with and without the worst constant external force, half a step of the encoder
+    times K. An oscillation that ends without the encoder, or without the limits of the motor, is attributed to
     it. Each remedy is simulated in the same way, with the value returned and with values further from the present one.
 
     Args:
@@ -338,7 +338,7 @@ class _Experiment(NamedTuple):
         if np.any(motion.outcome == MotionKind.INVALID):
             raise InputError("coulomb: friction stops and starts the device too often within a period; lower it")
         # The tail of a motion that decays as the linear loop does narrows by exp(-decay/8).
-        return _pick_widest(motion, max(SUSTAINED, math.exp(-self.decay / 16.0)))
+        return _pick_widest(motion, max(SUSTAINED, math.exp(-max(self.decay, 0.0) / 16.0)))
 
 
 def _pick_widest(motion: Any, least_trend: float) -> _Widest:
