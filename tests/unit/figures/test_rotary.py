@@ -29,7 +29,7 @@ FILTERS = {"kind": "filters", "damping": ["0 N m s/rad", "0.02 mN m s/rad"], "cu
 
 
 def test_dampings_and_stiffnesses_in_legends_have_prefixes():
-    assert texts(draw(**FILTERS, samples=[2, 5]))[:2] == ["$b =$ 0 N m s/rad", "$b =$ 20.0 µN m s/rad"]
+    assert texts(draw(**FILTERS, samples=[2, 5]))[:2] == ["$b$ = 0 N m s/rad", "$b$ = 20.0 µN m s/rad"]
     noisy = draw("_noise", **FILTERS, samples=[2, 5], resolution="0.18 deg", noise_limit="20 deg/s")
     assert texts(noisy)[1].endswith(" mN m/rad")
 
