@@ -84,7 +84,8 @@ def simulate(
         force: a law in place of the wall's spring and damper: a function of the measured position (m), the estimated
             velocity (m/s) and the time of the sample (s; without jitter), arrays of one value a simulation, written
             with `jax.numpy`, that returns the force on the device in N. It is compiled once: it must not keep values
-            between calls, and needs ``jnp.where`` in place of ``if``. It is sampled, held and delayed as the wall's is. Nothing can be proved of a law, so the outcome is UNCLEAR or DIVERGED.
+            between calls, and needs ``jnp.where`` in place of ``if``. It is sampled, held and delayed as the wall's
+            is. Nothing can be proved of a law, so the outcome is UNCLEAR or DIVERGED.
         periods: how many sampling periods, >= 1.
         substeps: instants recorded in each period, >= 1.
         start_position: in m; of all bodies, or by their names in `Motion`, as ``{"position": 0, "hand_position":
@@ -194,7 +195,7 @@ def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
     import jax
 
     name = getattr(force, "__name__", repr(force))
-    programs = []
+    programs, found = [], None
     with compute_concretely(), jax.numpy_rank_promotion("allow"):
         try:
             hash(force)
