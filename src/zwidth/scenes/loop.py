@@ -221,7 +221,7 @@ class LinearLoop:
         found, status = self.ridge(negative)
         if found is None:
             nan = np.float64(math.nan)
-            return RidgePoint(nan, nan, nan, np.int32(RidgeKind.SMOOTH), np.int32(status))
+            return RidgePoint(nan, nan, nan, np.int32(RidgeKind.NONE), np.int32(status))
         alpha, beta, omega = map(np.float64, (found.alpha, found.beta, found.omega))
         return RidgePoint(alpha, beta, omega, np.int32(found.kind), np.int32(status))
 
@@ -335,7 +335,8 @@ class RigidLoop(LinearLoop):
         if negative or not (is_traced(below) or below):
             return found
         row = boundary_point(delta, d, beta=0.0 * delta, delay=model)
-        end = RidgePoint(row.alpha, 0.0 * row.alpha, row.omega, int(RidgeKind.NO_DAMPING), row.status)
+        kind = xp.where(row.status == Status.OK, int(RidgeKind.NO_DAMPING), int(RidgeKind.NONE))
+        end = RidgePoint(row.alpha, 0.0 * row.alpha, row.omega, kind, row.status)
         return RidgePoint(*(xp.where(below, there, here) for there, here in zip(end, found, strict=True)))
 
     def sensitivities(self, negative: bool) -> SceneSensitivities:

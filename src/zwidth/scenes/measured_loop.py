@@ -157,7 +157,7 @@ class MeasuredLoop(LinearLoop):
         best = int(np.argmax(top))
         nan, kind = np.float64(np.nan), np.int32(RidgeKind.SMOOTH)
         if not top[best] > 0:
-            return RidgePoint(nan, nan, nan, kind, np.int32(Status.UNDECIDED))
+            return RidgePoint(nan, nan, nan, np.int32(RidgeKind.NONE), np.int32(Status.UNDECIDED))
         low, middle, high = (float(beta[k]) for k in (max(best - 1, 0), best, min(best + 1, beta.size - 1)))
         low, middle, high, cost = (
             np.array([end]) for end in (low if negative else max(low, 0.0), middle, high, -top[best])
