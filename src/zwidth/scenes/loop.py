@@ -47,7 +47,6 @@ from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array, DelayModel
 from zwidth.words.xp import is_jax, is_traced, namespace, nan_beyond
 
-
 # Logarithm of the largest pole magnitude of a lossless loop below which all poles are on the circle but for rounding:
 # 1e-16^(1/2), as of two poles that meet there.
 _ON_CIRCLE = 1e-7

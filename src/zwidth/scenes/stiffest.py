@@ -198,9 +198,10 @@ class SceneOptima(SceneAnswers):
         may lean, so that no softer wall is stable at the very damping of the stiffest: `recommend` says what to set.
 
         Args:
-            negative_damping: whether walls with B < 0 count. By default they do with the backward difference; behind a
-                filter a negative B is a lead compensator and no damper, and B >= 0 is meant. What is a piece does not
-                depend on it: a path may lead through B < 0.
+            negative_damping: whether walls with B < 0 count. By default they do for a `Device` with the backward
+                difference. With a filter a negative B is a lead compensator; with a `LinearDevice` or `MeasuredDevice`
+                it would cancel damping inside the model, which is unsafe: B >= 0 there unless True is given. What is a
+                piece does not depend on it: a path may lead through B < 0.
 
         Returns:
             ``stiffness`` in N/m; ``virtual_damping`` in N s/m; ``frequency`` in Hz of the pole pair on the unit circle,
