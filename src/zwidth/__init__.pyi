@@ -42,10 +42,12 @@ from .parts import devices as devices
 from .parts.actuator import Actuator as Actuator
 from .parts.device import Coupling as Coupling
 from .parts.device import Device as Device
+from .parts.grasps import REFERENCE_GRASPS as REFERENCE_GRASPS
 from .parts.linear_device import LinearDevice as LinearDevice
 from .parts.measured import MeasuredDevice as MeasuredDevice
 from .parts.mode import Mode as Mode
 from .parts.operator import Operator as Operator
+from .parts.safe_limit import SafeLimit as SafeLimit
 from .parts.timing import Timing as Timing
 from .parts.velocity import FOAW as FOAW
 from .parts.velocity import BackwardDifference as BackwardDifference
@@ -62,6 +64,10 @@ from .scenes.assessment import Limit as Limit
 from .scenes.assessment import assess as assess
 from .scenes.assessment import assess_many as assess_many
 from .scenes.assessment import limits_of as limits_of
+from .scenes.diagnosis import Diagnosis as Diagnosis
+from .scenes.diagnosis import Hardware as Hardware
+from .scenes.diagnosis import Remedy as Remedy
+from .scenes.diagnosis import diagnose as diagnose
 from .scenes.recommendation import Recommendation as Recommendation
 from .scenes.robust import Interval as Interval
 from .scenes.robust import RobustStiffness as RobustStiffness

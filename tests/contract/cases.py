@@ -162,6 +162,7 @@ CASES = [
 OTHERS = {
     "assess": "one scene: tests/unit/studies/test_published.py, tests/properties/test_consistency.py",
     "assess_many": "scenes by name: tests/unit/scenes/test_assessment.py",
+    "diagnose": "one scene and wall: tests/unit/scenes/test_diagnosis.py",
     "excite": "one signal: tests/unit/fitting/test_respond.py",
     "fit_buzz": "one device: tests/unit/fitting/test_buzz.py",
     "fit_log": "one device: tests/unit/fitting/test_log.py",

@@ -200,7 +200,7 @@ def test_a_contact_is_simulated_on_demand(page):
 def test_a_refused_value_is_said_and_the_page_goes_on(page):
     page.fill("#mass", "-5")
     page.press("#mass", "Enter")
-    wait(page, "document.getElementById('error').textContent.startsWith('mass: got -0.005')")
+    wait(page, "document.getElementById('error').textContent.startsWith('mass m: got -5 g')")
     page.fill("#mass", "200")
     page.press("#mass", "Enter")
     settle(page)

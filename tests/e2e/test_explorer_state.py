@@ -108,7 +108,7 @@ def test_an_address_that_is_no_scene_is_said(page, address):
     settle(page, "document.getElementById('error').textContent === ''")
 
 
-@pytest.mark.parametrize("entry, says", [("-5", "mass: got -0.005 kg"), ("", "no number")])
+@pytest.mark.parametrize("entry, says", [("-5", "mass m: got -5 g; it must be greater than 0 g"), ("", "no number")])
 def test_the_badge_is_stale_while_an_entry_is_wrong(page, entry, says):
     badge = page.inner_text("#word")
     page.fill("#mass", entry)
@@ -118,8 +118,13 @@ def test_the_badge_is_stale_while_an_entry_is_wrong(page, entry, says):
     wait_for(lambda: says in page.inner_text("#error"), lambda: page.inner_text("header"))
     assert page.get_attribute("#mass", "aria-invalid") == "true"
     assert (page.input_value("#mass"), page.inner_text("#word"), page.is_visible("#stale")) == (entry, badge, True)
+    page.click("[data-save=png]")
+    assert page.inner_text("#copied") == "not saved: an entry is not valid; correct it, or press Escape in its field"
     page.press("#mass", "Escape")
     settle(page, "document.getElementById('mass').value === '100'")
+    with page.expect_download() as saved:
+        page.click("[data-save=png]")
+    assert saved.value.suggested_filename == "zwidth-plane.png"
     assert (page.is_visible("#stale"), page.inner_text("#error")) == (False, "")
     assert page.get_attribute("#mass", "aria-invalid") is None
 
@@ -187,12 +192,12 @@ def test_a_rotary_device_is_moved_and_told_in_its_units(page, browser):
     labels = labels_of(page)
     assert {"inertia J in g cm^2", "physical damping b in mN m s/rad", "stiffness K in N m/rad"} <= set(labels)
     assert not LINEAR_UNITS.search("; ".join(labels))
-    assert {"stiffness K in N m/rad", "damping B in N m s/rad", "position in mrad/(N m)"} <= set(axes_of(page))
+    assert {"stiffness K in N m/rad", "damping B in N m s/rad", "angle in mrad/(N m)"} <= set(axes_of(page))
     page.select_option("#operator", "none")
     settle(page)
     enter(page, "mass", "4500")
     enter(page, "stiffness", "20")
-    settle(page, "document.getElementById('verdict').textContent.includes('what limits it')")
+    settle(page, "document.getElementById('verdict').textContent.includes('To gain K_max')")
     verdict = page.inner_text("#verdict")
     assert "4500 g cm^2" in verdict
     for text in (verdict, page.input_value("#yaml"), page.input_value("#python"), "; ".join(axes_of(page))):

@@ -88,7 +88,7 @@ def test_a_folder_in_which_a_run_computes_is_refused_until_it_is_killed(config, 
     os.killpg(process.pid, signal.SIGSTOP)
     assert process.poll() is None
     before = flags(tmp_path)
-    for words in (["--resume"], ["--overwrite"], ["--shard", "1/2"]):
+    for words in (["--resume"], ["--overwrite"]):
         assert main_of("run", config, "--out", tmp_path, *words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"Error: out: {tmp_path}: another run computes in this folder (process {process.pid} ")
@@ -181,8 +181,9 @@ def test_stopped_before_its_first_chunk_a_run_says_the_same(config, tmp_path, mo
     def stopped(store, tasks):
         raise KeyboardInterrupt
 
-    assert main_of("run", config, "--out", tmp_path, "--shard", "1/40") == 0
-    capsys.readouterr()
+    process = start("run", config, "--out", tmp_path)
+    wait_for_chunks(process, tmp_path, 1)
+    kill_group(process)
     monkeypatch.setattr("zwidth.sweep.engine.repair", stopped)
     assert main_of("run", config, "--out", tmp_path, "--resume") == 130
     says = f"zwidth: stopped; what is done is kept, go on with: zwidth run {config} --out {tmp_path} --resume\n"

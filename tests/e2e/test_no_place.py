@@ -226,19 +226,3 @@ def test_the_plan_of_a_configuration_without_sweeps(tmp_path, capsys):
     assert main_of("run", "--dry-run", config, "--out", tmp_path / "out") == 0
     assert "study r\n  2 points" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
-
-
-def states(out):
-    entries = json.loads((out / "run.json").read_text(encoding="utf-8"))["studies"]
-    return {entry["name"]: entry["state"] for entry in entries}
-
-
-def test_other_studies_go_beside_sweeps_that_were_faster(tmp_path, capsys):
-    ridge = {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0}
-    config, out = written(tmp_path / "both.yaml", ridge, study()), tmp_path / "out"
-    assert main_of("run", config, "--out", out, "--shard", "2/2") == 0
-    assert states(out) == {"map": "open"}
-    assert main_of("run", config, "--out", out, "--shard", "1/2") == 0
-    assert states(out) == {"map": "done", "r": "done"}
-    assert (out / "r.csv").is_file()
-    assert main_of("verify", out) == 0

@@ -138,8 +138,8 @@ import importlib, logging, os, pkgutil, warnings
 # What these do to each other's settings when they are imported is no doing of ours.
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    import click, equinox, jax, jaxopt, lineax, matplotlib.pyplot, numpy, optimistix
-    import pydantic, rich.progress, scipy.linalg, scipy.optimize, yaml
+    import click, jax, jaxopt, lineax, matplotlib.pyplot, numpy, optimistix
+    import pydantic, scipy.linalg, scipy.optimize, yaml
     for name in ("bokeh.server.server", "dask", "distributed", "flint", "xarray", "zarr"):
         try:
             importlib.import_module(name)

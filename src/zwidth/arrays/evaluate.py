@@ -80,6 +80,8 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
             raise TypeError(array.dtype)
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError) as error:
+        if isinstance(value, list | tuple) and is_traced(*value):
+            raise InputError(f"{name}: got a list of values that JAX traces; join them by jax.numpy.stack") from None
         raise InputError(
             f"{name}: got {value!r}, a real number or a rectangular array of real numbers is needed"
         ) from error
@@ -123,20 +125,31 @@ def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
     return tree_map(lambda leaf: np.asarray(leaf)[()], result)
 
 
-def broadcast_traced(values: Iterable[ArrayLike]) -> list[Any]:
-    """The arguments inside a transformation: one shape, the ambient precision."""
+def broadcast_traced(arguments: Mapping[str, ArrayLike]) -> list[Any]:
+    """Convert arguments inside a transformation to arrays of one shape in the ambient precision.
+
+    A traced argument does not change the types that the others may have: they are converted and checked as in a direct
+    call.
+    """
     import jax.numpy as jnp
 
     dtype = jnp.result_type(float)
     if dtype == np.float32:
         _warn_of_float32()
-    # Each operation on a concrete value outside of `jit` is a program to compile: what is right is left as it is.
-    arrays = [
-        value if getattr(value, "dtype", None) == dtype else (jnp if is_jax(value) else np).asarray(value, dtype)
-        for value in values
-    ]
-    shape = np.broadcast_shapes(*map(np.shape, arrays))
+    arrays = [_as_ambient(name, value, dtype) for name, value in arguments.items()]
+    shape = join_shapes((name, np.shape(array)) for name, array in zip(arguments, arrays, strict=True))
     return [array if np.shape(array) == shape else jnp.broadcast_to(array, shape) for array in arrays]
+
+
+def _as_ambient(name: str, value: ArrayLike, dtype: Any) -> Any:
+    """Convert one argument to the ambient precision, NumPy's values by NumPy."""
+    if not is_jax(value):
+        with np.errstate(over="ignore"):
+            return as_float64(name, value).astype(dtype, copy=False)
+    if value.dtype.kind == "c":
+        raise InputError(f"{name}: got complex numbers; real numbers are needed")
+    # Outside of jit each operation of JAX on a concrete value compiles a program: convert only if necessary.
+    return value if value.dtype == dtype else value.astype(dtype)
 
 
 _warned = threading.Event()
@@ -206,7 +219,7 @@ def evaluate(
                 found = kernel(*numbers, *static)
             return found if isinstance(found, np.generic) else tree_map(_plain, found)
     if is_traced(*values):
-        return compile_traced(kernel, static, slopes)(*broadcast_traced(values))
+        return compile_traced(kernel, static, slopes)(*broadcast_traced(arguments))
     arrays = broadcast(arguments)
     shape = arrays[0].shape
     flat = evaluate_columns(kernel, [array.reshape(-1) for array in arrays], *static, weight=weight, route=route)

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from zwidth import __version__
+from zwidth.cli.hardware import diagnose_wall, hardware_options
+from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
-    OF_SCENE,
     SHARE,
     Parsed,
+    beyond_safe_option,
     figure_option,
+    find_silent,
     json_option,
     quantity_type,
     read_factor,
     save_figure,
     scene_options,
-    show_example,
-    warn_implausible,
+    verbose_option,
 )
 from zwidth.pages import words
 from zwidth.pages.words import row
@@ -31,7 +32,7 @@ from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
 from zwidth.words.errors import InputError, ZwidthError, check_choice, how_to_install
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
-from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SIZES, Range
+from zwidth.words.quantities import SIZES, Range
 from zwidth.words.status import Status
 
 EXIT_FAILED, EXIT_INPUT = 1, 2
@@ -55,35 +56,35 @@ def cli() -> None:
 
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
-@click.option("--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N.")
-@click.option(
-    "--resolution",
-    type=quantity_type("m", POSITIVE, counts=True),
-    help="One step Q of the position sensor, in m; or '2000 counts'.",
-)
+@hardware_options
+@verbose_option
 @json_option
-def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
-    """Judge one wall: stable, passive, how far from the boundary.
+def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) -> None:
+    """Judge one wall: stable, passive, its margins; for an unstable wall, the changes that make it stable.
 
-    It needs --stiffness, --mass (or --device) and --rate (or --period); damping and delay are 0 where left out.
+    With --resolution, --friction or --max-force also simulate the wall, to find limit cycles and saturation. It needs
+    --stiffness, --mass (or --device) and --rate (or --period); damping and delay are 0 if not given.
     SCENE.yaml (or the folder of a run) supplies what no option gives; options override it.
     """
-    from zwidth.scenes.assessment import assess, friction_rule, limits_of
+    from zwidth.pages.verdict import check_lines
+    from zwidth.scenes.assessment import assess, limits_of
+    from zwidth.scenes.stabilization import stabilize
 
     verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
     result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
-    lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
+    lines: list[str] = []
     if as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
         if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
             result["damper_range"] = scene.damper_range().tolist()
-    if resolution is not None:
-        warn_implausible({"resolution": resolution})
-    if friction is not None or resolution is not None:
-        rule = friction_rule(scene, friction, resolution)
-        result["friction_rule"] = rule._asdict()
-        lines += words.friction_lines(rule)
-    words.tell(result, lines + words.note_lines(notes), as_json)
+        unstable = verdict.stable is False and not verdict.marginal
+        result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
+    else:
+        lines = check_lines(scene, verdict, limits, silent=find_silent(), verbose=verbose)
+    if (diagnosis := diagnose_wall(scene, hardware)) is not None:
+        result["diagnosis"] = diagnosis.as_dict()
+        lines += ["", *words.diagnosis_lines(diagnosis)]
+    words.tell(result, lines + words.note_lines(notes), as_json, words.LABEL)
 
 
 @cli.command(**show_example("ridge", OF_SCENE))
@@ -101,23 +102,28 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
 def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as_json: bool) -> None:
     """Print the stiffest stable wall of a device.
 
+    Only B >= 0 counts with a velocity filter, a linear system or a measured response: there a negative B may cancel
+    damping that exists in the model alone. Scene.max_stiffness(negative_damping=True) in Python includes B < 0.
+
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
     would change is printed as well. `zwidth recommend` says which softer wall to set. SCENE.yaml (or the folder of a
     run) supplies what no option gives; options override it.
     """
+    from zwidth.pages.verdict import spell_device
     from zwidth.scenes.assessment import name_kind
     from zwidth.scenes.scene import Scene
+    from zwidth.scenes.stiffest import explain_missing
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --rate (with --damping and --delay)")
     given = scene
     scene = Scene(Device(1.0, delta), Timing(1.0, d)) if scene is None else scene
-    scene = replace(scene, timing=replace(scene.timing, delay_model=delay_model))
+    scene = scene.replace(delay_model=delay_model)
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
         what = "no wall with K > 0 is stable on this device" if none else "K_max of this device was not found"
-        raise click.UsageError(f"{what}: {Status(int(wall.status)).message}")
+        raise click.UsageError(f"{what}: {explain_missing(scene, wall.status)}")
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
     if isinstance(scene.device, Device):
@@ -125,11 +131,14 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
         omega = wall.frequency * (2.0 * math.pi * scene.timing.period)
         numbers = {"delta": scene.delta, "d": scene.d, "alpha_max": alpha, "beta": beta, "omega": omega}
         result = {name: float(number) for name, number in numbers.items()}
-        lines = [
-            row("normalized", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"),
-            row("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
-            row("beta", f"{result['beta']:.12g}"),
-        ]
+        optimum = f"alpha_max {result['alpha_max']:.12g}, beta {result['beta']:.12g}"
+        lines = [words.line("", f"({optimum}, delta {plain(result['delta'])}, d {plain(result['d'])})")]
+        if given is None:
+            lines = [
+                words.line("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
+                words.line("beta", f"{result['beta']:.12g}"),
+                words.line("device", f"delta {plain(result['delta'])}, d {plain(result['d'])}"),
+            ]
     result["kind"] = kind
     if given is not None:
         slopes, notes = words.list_slopes(scene), words.scene_notes(scene) + _say_stiffer(scene)
@@ -140,17 +149,19 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
         }
+        at = f"B = {with_unit(named['virtual_damping'], 'N s/m')}, {with_unit(named['frequency'], 'Hz')}"
+        top = f"{spell_stiffness(named['stiffness_max'])} at {at} ({kind.replace('_', ' ')} optimum)"
         lines = [
-            *words.scene_lines(scene),
+            words.line("K_max", top),
             *lines,
-            row("K_max", spell_stiffness(named["stiffness_max"])),
-            row("B", with_unit(named["virtual_damping"], "N s/m")),
-            row("frequency", with_unit(named["frequency"], "Hz")),
-            row("what to set", "at wanted margins: zwidth recommend, with the same options"),
+            words.line("device", spell_device(scene, find_silent())),
+            *words.part_lines(scene),
+            words.line("next", "zwidth recommend, with the same options, for the wall to set"),
+            "",
             *(slope.line() for slope in slopes),
             *words.note_lines(notes),
         ]
-    words.tell(result, lines, as_json)
+    words.tell(result, lines, as_json, words.LABEL)
 
 
 def _say_stiffer(scene: Any) -> list[str]:
@@ -311,20 +322,35 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 
 @cli.command(**show_example("recommend --phase-margin 30", OF_SCENE))
 @scene_options(wall=False)
-@click.option("--stiffness-fraction", type=SHARE, help="At most this share of K_max; 75% if nothing is asked for.")
-@click.option("--gain-margin", type=_FACTOR, help="At least this factor on K and B together.")
-@click.option("--phase-margin", type=_DEGREES, help="At least so many degrees.")
+@click.option("--stiffness-fraction", type=SHARE, help="At most this share of K_max.  [default: 75%]")
+@click.option("--gain-margin", type=_FACTOR, help="At least this factor on K and B together.  [default: 2]")
+@click.option("--phase-margin", type=_DEGREES, help="At least so many degrees.  [default: 30]")
 @click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
+@hardware_options
+@beyond_safe_option
 @figure_option
 @click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
+@verbose_option
 @json_option
-def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wanted: Any) -> None:
-    """Say which wall to set: the stiffest one with wanted margins.
+def recommend(
+    scene: Any,
+    figure: Path | None,
+    code: Any,
+    hardware: dict[str, Any],
+    verbose: bool,
+    as_json: bool,
+    **wanted: Any,
+) -> None:
+    """Recommend the wall to set: the stiffest one with the required margins.
 
-    Then what else is known of that wall, and what would allow a stiffer one. It needs --mass (or --device) and --rate
-    (or --period); damping and delay are 0 where left out. SCENE.yaml (or the folder of a run) supplies what no option
-    gives; options override it.
+    The defaults hold if no requirement is given; any requirement replaces all of them. With --resolution, --friction or
+    --max-force also simulate the wall, to find limit cycles and saturation. A hand (--operator-...) is part
+    of the device: the wall is then checked without it as well. It needs --mass (or --device) and --rate (or
+    --period); damping and delay are 0 if not given. SCENE.yaml (or the folder of a run) supplies what no option gives;
+    options override it.
     """
+    from zwidth.pages.verdict import recommend_lines
+
     if code and as_json:
         raise click.UsageError("give --code or --json: each has all of the output")
     found = scene.recommend(**wanted)
@@ -337,8 +363,10 @@ def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wante
         click.echo(found.code(code), nl=False)
         return
     notes = [*words.coded_period_notes(scene), *found.notes]
-    lines = [*words.scene_lines(scene), *(row("" if k else "set", text) for k, text in enumerate(found.lines()))]
-    if found.verdict is not None:
-        lines += words.pole_lines(found.verdict)
-    lines += [row("" if k else "what buys stiffness", step.spell()) for k, step in enumerate(found.steps)]
-    words.tell(found.as_dict() | {"notes": notes}, [*lines, *wrote, *words.note_lines(notes)], as_json)
+    diagnosis = diagnose_wall(found.scene, hardware) if found.status == Status.OK else None
+    told = [] if diagnosis is None else words.diagnosis_lines(diagnosis)
+    lines = () if as_json else recommend_lines(found, silent=find_silent(), hardware=told, verbose=verbose)
+    result = found.as_dict() | {"notes": notes} if as_json else {}
+    if as_json and diagnosis is not None:
+        result["diagnosis"] = diagnosis.as_dict()
+    words.tell(result, [*lines, *words.note_lines(notes), *wrote], as_json, words.LABEL)

@@ -2,30 +2,43 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
 import click
+import numpy as np
 
-from zwidth.cli.commands import cli
+from zwidth.cli.commands import EXIT_FAILED, cli
+from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
-    OF_SCENE,
     Parsed,
+    find_silent,
     flag_of,
     json_option,
     read_pairs,
     read_share,
     scene_options,
-    show_example,
 )
-from zwidth.pages.words import row, tell
-from zwidth.words.formatting import count_digits, name_wall, plain, round_safely, spell_enough, with_unit
+from zwidth.pages.verdict import spell_device
+from zwidth.pages.words import LABEL, line, part_lines, tell
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import (
+    count_digits,
+    name_wall,
+    plain,
+    round_safely,
+    spell_enough,
+    spell_stiffness,
+    with_unit,
+)
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
 
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
+_TRIED = 41  # values of a parameter among which the best reachable is found
 _BOX = ("mass", "damping", "period", "delay")
 
 
@@ -74,6 +87,8 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
         raise click.UsageError("give --find or --tolerance, or both")
     shares, uniform = tolerances, drawn["distribution"] == "uniform"
     provable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
+    # A box of periods and delays in s does not hold a delay in periods.
+    provable = provable and not ("period" in shares and scene.timing.in_periods)
     parts = {
         "required": _require(scene, find) if find is not None else None,
         "tolerances": _tolerate(scene, shares, **drawn) if shares else None,
@@ -81,7 +96,10 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
     }
     told = {name: part for name, part in parts.items() if part is not None}
     lines = [line for _, said in told.values() for line in said]
-    tell({name: found for name, (found, _) in told.items()}, lines, as_json)
+    result = {name: found for name, (found, _) in told.items()}
+    tell(result, lines, as_json, LABEL)
+    if result.get("required", {}).get("status", "OK") != "OK":
+        raise SystemExit(EXIT_FAILED)
 
 
 def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
@@ -99,24 +117,45 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     within = None if present else {"damping": (1e-6, 1e4), "delay": (1e-3 * period, 500 * period)}[path]
     wanted = float(scene.wall.stiffness)
     needed = scene.required(path, wanted, within=within)
+    if path == "delay" and needed.status == Status.UNREACHABLE and within is None:
+        # A stiffness that needs hardly any delay lies below the range.
+        needed = scene.required(path, wanted, within=(1e-4 * present, needed.range[1]))
     result = {"parameter": path, "value": needed.value, "unit": own_unit(unit), "enough": needed.enough}
     result["status"] = Status(needed.status).name
     result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
     if path in ("period", "rate"):
         result["rate"] = needed.value if path == "rate" else 1.0 / needed.value
     low, high = (with_unit(end, unit) for end in needed.range)
-    if needed.status not in (Status.OK, Status.UNREACHABLE):
-        text = f"not found from {low} to {high}: {Status(needed.status).message}"
-    elif needed.enough in ("nowhere", "everywhere"):
-        text = f"K_max = {with_unit(wanted, 'N/m')} is reached {needed.enough} from {low} to {high}"
+    goal = f"for K_max = {spell_stiffness(wanted)}"
+    kept = f" (the delay stays {scene.timing.kept_delay})" if path in ("period", "rate") and scene.timing.delay else ""
+    if needed.status == Status.UNREACHABLE:
+        best = _find_best(scene, path, needed.range)
+        result["best"] = best
+        reached = f"the largest is {spell_stiffness(best['stiffness'])} at {with_unit(best['value'], unit)}"
+        text = f"none {goal} from {low} to {high}{kept}; {reached}" if best["stiffness"] else f"none {goal}"
+    elif needed.status != Status.OK:
+        text = f"not found from {low} to {high}{kept}: {Status(needed.status).message}"
+    elif needed.enough == "everywhere":
+        text = f"any from {low} to {high} {goal}{kept}"
     else:
         values = [crossing.value for crossing in needed.crossings]
-        text = spell_enough(needed.value, needed.enough, values, unit)
-        # One or two of them are told.
+        text = f"{spell_enough(needed.value, needed.enough, values, unit)}"
+        # One or two of them are printed.
         others = len(values) - 1 - (" to " in text)
-        text += " (the same delay in seconds)" if path in ("period", "rate") else ""
+        text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
-    return result, [row(f"{path} needed", text)]
+    return result, [line(path, text), line("device", spell_device(scene, find_silent())), *part_lines(scene)]
+
+
+def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, float]:
+    """Return the value of a parameter with the largest K_max in a range, and that K_max; 0 if none was found."""
+    known = {}
+    for value in [*([0.0] if path == "delay" else []), *np.geomspace(*ends, _TRIED).tolist()]:
+        with suppress(InputError):
+            top = scene.replace(**{path: value}).max_stiffness()
+            known[value] = float(top.stiffness) if top.status == Status.OK else 0.0
+    value = max(known, key=lambda value: known[value], default=0.0)
+    return {"value": value, "stiffness": known.get(value, 0.0)}
 
 
 def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
@@ -124,13 +163,14 @@ def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
     wanted, best = float(scene.wall.stiffness), scene.best_damping()
     result = {"parameter": "virtual_damping", "value": best.virtual_damping, "unit": own_unit("N s/m")}
     result |= {"spectral_radius": best.spectral_radius, "modulus_margin": best.modulus_margin}
-    text = f"no B is stable at K = {with_unit(wanted, 'N/m')}"
+    result["status"] = Status(best.status).name
+    text = f"none: no B is stable at K = {with_unit(wanted, 'N/m')}"
     if best.status == Status.OK:
         B, radius = best.virtual_damping, plain(best.spectral_radius)
         digits = count_digits(lambda digits: scene.is_stable(wanted, float(f"{B:.{digits}g}")))
         text = f"{with_unit(B, 'N s/m', digits)} settles fastest: spectral radius {radius}"
         text += f", modulus margin {plain(best.modulus_margin)}"
-    return result, [row("virtual damping", text)]
+    return result, [line("B", text), line("device", spell_device(scene, find_silent())), *part_lines(scene)]
 
 
 def _tolerate(
@@ -152,12 +192,12 @@ def _tolerate(
     share = f"{stable} % of {found.samples} devices drawn"
     known = f"{low} to {high} % of all, with 95 % confidence"
     lines = [
-        row("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping)),
-        row("stable", f"{share} ({known})"),
-        row(f"borne by {percent}", f"K up to {borne} at this B"),
+        line("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping)),
+        line("stable", f"{share} ({known})"),
+        line(percent, f"of them are stable for K up to {borne} at this B"),
     ]
     if found.stiffness_max == found.stiffness_max:
-        lines.append(row("", f"K up to {most}, each device with a B of its own"))
+        lines.append(line("", f"or up to {most}, each device with its best B"))
     return result, lines
 
 
@@ -182,5 +222,5 @@ def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[s
     # Of a damping that is proved softer walls are proved too.
     stiffness, most = (with_unit(round_safely(result[name], "below"), "N/m") for name in ("stiffness", "stiffness_max"))
     damping = with_unit(result["virtual_damping"], "N s/m", DIGITS)
-    text = f"K = {stiffness} at B = {damping}; {most}, each with a B of its own"
-    return result, [row("proved for every one", text)]
+    text = f"every device is stable with K = {stiffness} at B = {damping}; {most}, each with its best B"
+    return result, [line("proved", text)]

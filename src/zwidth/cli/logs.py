@@ -9,27 +9,30 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
+from zwidth.cli.help import show_example
 from zwidth.cli.options import (
     SHARE,
     Parsed,
     figure_option,
+    get_told,
     json_option,
     log_options,
     period_options,
     quantity_type,
     read_logs,
     save_figure,
-    show_example,
     velocity_options,
+    warn_implausible,
 )
 from zwidth.pages.words import row, tell
+from zwidth.parts.checks import find_kind
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import name_wall, round_safely, with_unit
 from zwidth.words.quantities import POSITIVE
-from zwidth.words.rotation import use_kind
+from zwidth.words.rotation import own_unit, use_kind
 from zwidth.words.status import Status
 from zwidth.words.units import tell_kind
 
@@ -143,20 +146,40 @@ _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
 @cli.command(**show_example("excite --rate '1 kHz' --force '2 N' --resolution '10 um'"))
 @period_options
 @click.option("--force", type=quantity_type("N", POSITIVE), required=True, help="The largest force to command, in N.")
-@click.option("--resolution", type=quantity_type("m", POSITIVE), required=True, help="One count of the encoder, in m.")
+@click.option(
+    "--resolution",
+    type=quantity_type("m", POSITIVE, counts=True),
+    required=True,
+    help="One count of the encoder, in m; or '2000 counts'.",
+)
 @click.option("--duration", type=_TIME, default="60 s", show_default=True, help="How long it plays, in s.")
 @click.option("--response", type=_FILE, help="The response of a first record, to design the second.")
 @click.option("--out", type=_FILE, default=Path("play.csv"), show_default=True, help="The file to play.")
 @velocity_options
 @json_option
 def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> None:
-    """Design the force to play before `zwidth respond`."""
+    """Design the force to play before `zwidth respond`; of a rotary device the torque, by the units given."""
     if options["period"] is None:
         raise click.UsageError("give --period or --rate")
     from zwidth.fitting.excite import excite as design
 
-    made = design(response=None if response is None else MeasuredDevice.read(response), **options)
-    made.save(out)
+    warn_implausible({"resolution": options["resolution"]})
+    known = None if response is None else MeasuredDevice.read(response)
+    # Units of options say the kind of device; the numbers are plain by now.
+    told = find_kind(get_told())
+    if known is not None and told not in (None, known.rotary):
+        raise click.UsageError(
+            "--response is of another kind of device, linear or rotary, than --force and --resolution"
+        )
+    rotary = known.rotary if known is not None else bool(told)
+    with use_kind(rotary):
+        made = design(response=known, rotary=rotary, **options)
+        made.save(out)
+        _tell_excitation(made, out, as_json)
+
+
+def _tell_excitation(made: Any, out: Path, as_json: bool) -> None:
+    """Print what a record is and what it will show."""
     low, high = (with_unit(end, "Hz") for end in made.frequency[[0, -1]])
     lines = [
         row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), 'N')}"),
@@ -196,10 +219,20 @@ def respond(
     other. What --save keeps, and any table of an analyzer, is a device of the other commands: `zwidth ridge --device
     FILE.csv` answers of it.
     """
-    from zwidth.fitting.respond import find_nominal_limit, respond_to_logs
-    from zwidth.scenes.scene import Scene
+    from zwidth.fitting.respond import respond_to_logs
 
     found = respond_to_logs(read_logs(logs, period, **of_logs), period, cycle)
+    with use_kind(found.device.rotary):
+        _tell_response(found, logs, velocity, save, figure, as_json)
+
+
+def _tell_response(
+    found: Any, logs: tuple[Path, ...], velocity: Any, save: Path | None, figure: Path | None, as_json: bool
+) -> None:
+    """Print a response and the wall that is safe by it, keep it and draw it."""
+    from zwidth.fitting.respond import find_nominal_limit
+    from zwidth.scenes.scene import Scene
+
     device, period, doubts = found.device, found.period, found.doubts
     kind = "stretches of a force that repeats" if found.cycle else "pieces"
     source = f"{' and '.join(log.name for log in logs)}, {found.records} {kind}"
@@ -217,6 +250,7 @@ def respond(
     lines.append(row("safe wall", words))
     lines += [row("a stiffer one" if k == 0 else "", text) for k, text in enumerate(said)]
     lines += [row("doubt", text) for text in doubts]
+    lines += [row("note", text) for text in found.notes]
     if save is not None:
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
         lines.append(row("wrote", str(save)))
@@ -224,6 +258,7 @@ def respond(
         lines.append(save_figure(_draw(scene, safe if safe.status == Status.OK else None), figure))
     told = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
     told |= {"safe_wall": _plain(safe) if given else None, "undecided": said, "doubts": list(doubts)}
+    told |= {"notes": list(found.notes), "rotary": device.rotary}
     tell(told, lines, as_json)
 
 
@@ -235,7 +270,8 @@ def spell_safe_wall(scene: Any, wall: Any) -> str:
         if scene.is_stable(stiffness, damping):
             return name_wall(stiffness, damping)
         stiffness *= 1.0 - 1e-4
-    return f"K = {float(wall.stiffness)!r} N/m, B = {float(wall.virtual_damping)!r} N s/m"
+    units = own_unit("N/m"), own_unit("N s/m")
+    return f"K = {float(wall.stiffness)!r} {units[0]}, B = {float(wall.virtual_damping)!r} {units[1]}"
 
 
 def _compliance(deviation: Any) -> str:

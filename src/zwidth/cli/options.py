@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
+from zwidth.cli.help import OF_SCENE as OF_SCENE
+from zwidth.cli.help import show_example as show_example
 from zwidth.pages.words import row
 from zwidth.parts.checks import Span, find_kind, read_span
 from zwidth.parts.device import Device
@@ -26,6 +28,7 @@ from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.units import find_dimension, read_quantity, tell_kind
 
 if TYPE_CHECKING:
+    from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
 
 # In bytes.
@@ -46,14 +49,6 @@ _BARE = {"mass", "damping"}
 _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
-OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
-
-
-def show_example(command: str, *more: str) -> dict[str, str]:
-    """What a command is declared with so that its help ends with an example, on lines of their own."""
-    return {"epilog": "\b\nExample:\n" + " \\\n    ".join((f"  zwidth {command}", *more))}
-
-
 class Parsed(click.ParamType):
     """What a function reads of an option's text, or raises a `ValueError` for: then ``remedy`` says what to write."""
 
@@ -68,6 +63,11 @@ class Parsed(click.ParamType):
             return self.read(value)
         except ValueError as error:
             self.fail(f"got {value!r}; {self.remedy}" if self.remedy else str(error), param, ctx)
+
+
+def get_told() -> dict[str, Any]:
+    """Return the texts of options of the running command whose units are those of one kind of device."""
+    return click.get_current_context().meta.get(_TOLD, {})
 
 
 def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, counts: bool = False) -> Parsed:
@@ -124,9 +124,9 @@ def flag_of(path: str) -> str:
 def _add_option(command: Command, path: str) -> Command:
     if path == "device":
         words = (
-            "A device with published mass and damping, linear or rotary, as `zwidth devices` lists them; or in place "
-            "of mass, damping and all parts a transfer function 'NUM / DEN', coefficients in s as '1 / 0.1 10 0', or "
-            "FILE.csv (.npz, .mat), a measured response."
+            "A published device of `zwidth devices`, with its period and delay: other options supply or replace its "
+            "parameters. Or, in place of mass, damping and all parts, a transfer function 'NUM / DEN', coefficients in "
+            "s as '1 / 0.1 10 0', or FILE.csv (.npz, .mat), a measured response."
         )
         return click.option("--device", metavar="NAME", help=words)(command)
     if path in CHOICES:
@@ -247,6 +247,7 @@ def _change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     changes = {path: value for path, value in given.items() if "." not in path}
     device = changes.get("device")
     if isinstance(device, KnownDevice):
+        _check_published(device, given)
         changes["device"] = device.to_device(**{name: changes.pop(name) for name in _BARE & changes.keys()})
     if own := _own(given, "velocity"):
         same = "kind" not in own and own.keys() <= {item.name for item in fields(scene.velocity)}
@@ -283,8 +284,13 @@ def _make_scene(given: dict[str, Any], instead: str) -> Scene:
     from zwidth.scenes.scene import Scene
 
     device = given.pop("device", None)
-    known = {"--mass or --device": device or "mass" in given, "--rate or --period": {"period", "rate"} & given.keys()}
-    if missing := [flags for flags, there in known.items() if not there]:
+    published = device if isinstance(device, KnownDevice) else None
+    timed = {"period", "rate"} & given.keys() or (published and published.period)
+    known = {"--mass or --device": device or "mass" in given, "--rate or --period": timed}
+    missing = [flags for flags, there in known.items() if not there]
+    if published:
+        _check_published(published, given, missing)
+    if missing:
         raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
 
     def some(*names: str) -> dict[str, Any]:
@@ -295,16 +301,25 @@ def _make_scene(given: dict[str, Any], instead: str) -> Scene:
     }
     modes = [_make_part(name, Mode, own) for name in _MODES if (own := _own(given, name))]
     parts |= {"modes": modes} if modes else {}
+    timing = Timing
     if device is None:
         device = Device(**some("mass", "damping"), rotary=is_rotary())
     elif isinstance(device, KnownDevice):
-        device = device.to_device(**some("mass", "damping"))
+        timing, device = device.to_timing, device.to_device(**some("mass", "damping"))
     else:
         for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _HELD):
             raise click.UsageError(f"--device is given as a whole and holds {flag_of(path)}: give one of the two")
     wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
     velocity = _make_velocity(_own(given, "velocity"))
-    return Scene(device, Timing(**some("period", "rate", "delay")), wall, velocity).replace(**parts)
+    return Scene(device, timing(**some("period", "rate", "delay")), wall, velocity).replace(**parts)
+
+
+def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
+    """Raise an error that lists the options that must supply what is not published of a device."""
+    remedies = {"mass": "--mass", "damping": "--damping (0 if unknown)"}
+    flags = [*(remedies[name] for name in device.list_missing(given)), *more]
+    if flags:
+        raise click.UsageError(f"--device {device.name}: give also {', '.join(flags)}: not published for this device")
 
 
 def _list_needed(kind: Any) -> list[str]:
@@ -343,7 +358,17 @@ def _make_velocity(given: dict[str, Any]) -> Any:
 
 
 figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
+beyond_safe_option = click.option("--beyond-safe", is_flag=True, help="Ignore the safe limit of a fitted scene.")
+verbose_option = click.option("--verbose", is_flag=True, help="Print everything that is known.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+
+
+def find_silent() -> frozenset[str]:
+    """Return the names among damping and delay that are 0 because neither an option nor a file gives a value."""
+    given = click.get_current_context().params
+    if given.get("scene_file") is not None:
+        return frozenset()
+    return frozenset(name for name in ("damping", "delay") if given.get(name) is None)
 
 
 def log_options(command: Command) -> Command:

@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,13 +26,6 @@ if TYPE_CHECKING:
     from zwidth.sweep.engine import Progress
 
 _SECONDS_BETWEEN_LINES = 10.0
-
-
-def _read_shard(text: str) -> tuple[int, int]:
-    first, _, second = text.partition("/")
-    if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second) <= 10**6):
-        raise ValueError
-    return int(first), int(second)
 
 
 def _read_size(text: str) -> int:
@@ -60,9 +53,9 @@ def _read_figure_size(text: str) -> tuple[float, float | None]:
     return width, rest[0] if rest else None
 
 
-_SHARD = Parsed("i/n", _read_shard, "write i/n with 1 <= i <= n, as in 3/8")
 _SIZE = Parsed("size", _read_size, "write a size from 128 MiB to 1024 GiB, as in '512 MiB'")
 _SLICE = Parsed("name=value", _read_slice, "write NAME=VALUE, as in delta=0.1")
+_DPI = click.IntRange(10, 2400)
 _FIGURE_SIZE = Parsed(
     "WxH", _read_figure_size, "write width x height from 1 to 100 inches, as in 7x4.5, or a width, as in 85mm"
 )
@@ -75,11 +68,11 @@ _FIGURE_SIZE = Parsed(
 @click.option("--resume", is_flag=True, help="Go on with a run that was stopped; repair what is damaged.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes for sweeps.  [default: this one]")
 @click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
-@click.option("--shard", type=_SHARD, help="Compute every n-th chunk of sweeps only, as one of n jobs.")
 @click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size of the studies' figures in inches, as 7x4.5, or width, as 85mm.")
+@click.option("--dpi", type=_DPI, help="Dots per inch of the studies' figures.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
-def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **options: Any) -> None:
+def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi: int | None, **options: Any) -> None:
     """Run the studies of a CONFIG file.
 
     Data, figures and a record of the run go into one folder, the results of each sweep into a store DIR/STUDY.zarr.
@@ -95,10 +88,10 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **op
     if dry_run:
         _print_plan(config, **options)
         return
-    command = _spell_resume_command(path, size=size, **options)
+    command = _spell_resume_command(path, size=size, dpi=dpi, **options)
     with _interrupt_on_sigterm() as stopped_by:
         try:
-            with reporter() as progress, style_sheet(size=size):
+            with reporter() as progress, style_sheet(size=size, dpi=dpi):
                 # The options are those of `zwidth.run`, by their names.
                 result = run_studies(path, progress=progress, **options)
         except KeyboardInterrupt:
@@ -144,12 +137,12 @@ def _print_plan(config: Config, *, out: Path | None, memory: int, workers: int |
     check_resources([step for step in steps if isinstance(step, Plan)], folder, workers or 1)
 
 
-def _spell_resume_command(path: Path, *, out: Path | None, shard: tuple[int, int] | None, **given: Any) -> str:
+def _spell_resume_command(path: Path, *, out: Path | None, **given: Any) -> str:
     """The command that goes on with a run, as a shell takes it."""
     words = ["zwidth", "run", path, *(["--out", out] if out else []), "--resume"]
     size = given["size"] and "x".join(f"{25.4 * side:.12g}" for side in given["size"] if side) + "mm"
-    for name, value in {**given, "shard": shard and f"{shard[0]}/{shard[1]}", "size": size}.items():
-        words += [f"--{name}", value] if value and name in ("shard", "workers", "scheduler", "size") else []
+    for name, value in {**given, "size": size}.items():
+        words += [f"--{name}", value] if value and name in ("workers", "scheduler", "size", "dpi") else []
     return shlex.join(map(str, words))
 
 
@@ -236,7 +229,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 )
 @click.option("--format", "formats", multiple=True, type=click.Choice(("png", "svg", "pdf")), default=("png", "svg"),
               help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
-@click.option("--dpi", type=click.IntRange(10, 2400), help="Dots an inch.")
+@click.option("--dpi", type=_DPI, help="Dots per inch.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size in inches, as 7x4.5, or width, as 85mm.")
 @click.option(
     "--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib, as one with 'svg.fonttype: none'."
@@ -262,7 +255,7 @@ def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, *
 
 
 @cli.command()
-@click.option("--quick", is_flag=True, help="Few delays and small maps: less than a minute instead of some.")
+@click.option("--quick", is_flag=True, help="Few delays and small maps: one to three minutes on two cores.")
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
@@ -292,25 +285,16 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
 
 @contextmanager
 def reporter() -> Iterator[Callable[[StudyEvent], None]]:
-    """A callback for `zwidth.run` that tells on stderr how far it is: a bar on a terminal, else a line in a while."""
-    from rich.console import Console
-    from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    console, told = Console(stderr=True), time.monotonic()
-    words = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[state]}")
-    columns = SpinnerColumn(), *words, TimeElapsedColumn()
-    with Bar(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
-        shown = bar.add_task("starting", total=None, state="")
-
-        def say(line: str) -> None:
-            if bar.disable:
-                click.echo(line, err=True)
-            else:
-                console.print(line, markup=False, highlight=False)
+    """Yield a callback for `zwidth.run` that reports progress on stderr: a bar on a terminal, else occasional lines."""
+    printed, template = time.monotonic(), "%(label)s  [%(bar)s]  %(info)s"
+    options: dict[str, Any] = {"show_eta": False, "item_show_func": lambda state: state, "bar_template": template}
+    shown: Any = nullcontext()
+    if sys.stderr.isatty():
+        shown = click.progressbar(length=1, label="starting", file=sys.stderr, width=0, **options)
+    with shown as bar:
 
         def show(event: StudyEvent) -> None:
-            nonlocal told
+            nonlocal printed
             done, total, state, line, due = event.index - (event.result is None), event.total, "", "", False
             if event.progress is not None:
                 done, total, state = event.progress.points, event.progress.total_points, _state(event.progress)
@@ -319,12 +303,18 @@ def reporter() -> Iterator[Callable[[StudyEvent], None]]:
             elif event.parts is not None:
                 done, total = event.parts
                 line = f"{done}/{total} done"
-            bar.update(shown, description=f"{event.name} ({event.kind})", completed=done, total=total, state=state)
-            if line and bar.disable and (due or time.monotonic() - told >= _SECONDS_BETWEEN_LINES):
-                told = time.monotonic()
-                say(f"{event.name:<20} {line}")
-            for text in _lines(event):
-                say(text)
+            lines = list(_lines(event))
+            if bar is not None:
+                # Lines replace the bar, which is drawn again below them.
+                lines = [f"\r\033[K{text}" for text in lines]
+                bar.label, bar.pos, bar.length, bar.current_item = f"{event.name} ({event.kind})", done, total, state
+            elif line and (due or time.monotonic() - printed >= _SECONDS_BETWEEN_LINES):
+                printed = time.monotonic()
+                lines = [f"{event.name:<20} {line}", *lines]
+            for text in lines:
+                click.echo(text, err=True)
+            if bar is not None:
+                bar.render_progress()
 
         yield show
 

@@ -121,20 +121,23 @@ class ResponseSection(PartSection, what="a response"):
     deviation: _Numbers | None = None
     """The radius in which the true response lies, in m/N."""
 
+    rotary: bool = False
+    """Whether the response is of an angle to a torque, in rad/(N m)."""
+
     @classmethod
     def read(cls, file: str) -> ResponseSection:
         """The columns of a table, so that a run keeps the numbers and not the name."""
         known = MeasuredDevice.read(find_file(file))
         columns = {"frequency": known.frequency, "real": known.response.real, "imag": known.response.imag}
         columns |= {} if known.deviation is None else {"deviation": known.deviation}
-        return cls(**{name: column.tolist() for name, column in columns.items()})
+        return cls(**{name: column.tolist() for name, column in columns.items()}, rotary=known.rotary)
 
     @cached_property
     def known(self) -> MeasuredDevice:
         real, imag = (_to_array(part) for part in (self.real, self.imag))
         if real.shape != imag.shape:
             raise InputError(f"imag: got {imag.size} numbers beside {real.size} of real; give one a frequency")
-        return MeasuredDevice(self.frequency, real + 1j * imag, self.deviation)
+        return MeasuredDevice(self.frequency, real + 1j * imag, self.deviation, self.rotary)
 
 
 def _read_form(raw: Any) -> SystemSection | ResponseSection:
@@ -159,9 +162,8 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
 DeviceForm = Annotated[SystemSection | ResponseSection, WrapValidator(lambda raw, _: _read_form(raw))]
 
 
-PHYSICAL_KEYS = frozenset(
-    {"device", "rotary", "mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES}
-)
+PHYSICAL_KEYS = frozenset({"device", "rotary", "mass", "damping", "period", "rate", "delay", *PART_NAMES})
+PHYSICAL_KEYS |= {"stiffness", "virtual_damping", "safe_limit"}
 NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
 
 

@@ -26,10 +26,11 @@ from zwidth.config.values import Quantity, read_entries
 from zwidth.parts.checks import find_range
 from zwidth.parts.mode import Mode
 from zwidth.parts.paths import PARTS
+from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.velocity import ESTIMATES, FOAW
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe
-from zwidth.words.quantities import CHOICES, FIELDS
+from zwidth.words.quantities import CHOICES, FIELDS, NOT_NEGATIVE
 
 PART_NAMES = ("velocity", *PARTS, "modes")
 
@@ -145,6 +146,24 @@ _SECTIONS: Any = {
     name: make_section(part, name, f"{'an' if name[0] in 'aeiou' else 'a'} {name}") for name, part in PARTS.items()
 }
 ModeSection: Any = make_section(Mode, "mode", "a mode")
+
+
+class SafeLimitSection(PartSection, what="a safe limit"):
+    """The stiffest wall that measurements of the device support."""
+
+    part = SafeLimit
+
+    stiffness: Annotated[float, Quantity("N/m", NOT_NEGATIVE)]
+    """Stiffness of that wall, in N/m or with a unit; 0 if no wall is supported."""
+
+    virtual_damping: Annotated[float, Quantity("N s/m")] = 0.0
+    """Virtual damping of that wall, in N s/m or with a unit."""
+
+    reason: str = ""
+    """The cause of the limit."""
+
+    warnings: list[str] = Field(default=[])
+    """What is wrong with the measurement."""
 
 
 def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Strict]:

@@ -9,6 +9,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,7 +21,7 @@ from yaml.reader import Reader
 from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
-from zwidth.config.device_table import files_relative_to
+from zwidth.config.device_table import files_relative_to, find_file
 from zwidth.config.fields import (
     ConfigFileError,
     Fault,
@@ -33,6 +34,8 @@ from zwidth.config.fields import (
     problems_of,
 )
 from zwidth.parts.devices import DEVICES
+from zwidth.parts.measured import SUFFIXES, MeasuredDevice
+from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe
 from zwidth.words.rotation import use_kind
 from zwidth.words.units import tell_kind
@@ -84,6 +87,11 @@ def tells_rotary(data: Any, key: str = "") -> bool:
     if isinstance(data, list):
         return any(tells_rotary(each, key) for each in data)
     if key == "device" and isinstance(data, str):
+        if data.endswith(SUFFIXES):
+            # A table that cannot be read is refused where its section is checked.
+            with suppress(InputError):
+                return MeasuredDevice.read(find_file(data)).rotary
+            return False
         return any(known.rotary for known in DEVICES if known.name == data)
     return data is True if key == "rotary" else key not in _TEXTS and tell_kind(data) is True
 

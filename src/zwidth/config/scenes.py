@@ -12,7 +12,14 @@ from pydantic import ConfigDict, WrapValidator
 
 from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
 from zwidth.config.fields import LocatedProblem, listing, problem
-from zwidth.config.parts import SimulatedVelocityField, build_parts, list_parts, locate_refusal, make_parts_base
+from zwidth.config.parts import (
+    SafeLimitSection,
+    SimulatedVelocityField,
+    build_parts,
+    list_parts,
+    locate_refusal,
+    make_parts_base,
+)
 from zwidth.config.values import NonNegative, Number, quantity_of
 from zwidth.parts.device import Device
 from zwidth.parts.paths import PARTS, replace_parameters
@@ -92,7 +99,8 @@ class _PhysicalPlant(_Parts, SampledMass):
         timing = Timing(self.period, self.delay, getattr(self, "delay_model", "held"))
         # A device that is given as a whole is one of the parts, and takes the place of this one.
         device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
-        return replace_parameters(Scene(device, timing), build_parts(self))
+        limit = getattr(self, "safe_limit", None)
+        return replace_parameters(Scene(device, timing, safe_limit=limit and limit.known), build_parts(self))
 
 
 class _NormalizedPlant(OneKind):
@@ -114,6 +122,9 @@ class PhysicalDevice(_PhysicalPlant, what="a device"):
 
     label: str | None = None
     """Name of the device in legends."""
+
+    safe_limit: SafeLimitSection | None = None
+    """The stiffest wall that measurements of the device support."""
 
 
 class SimulatedDevice(PhysicalDevice):
@@ -172,6 +183,9 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
     delay_model: DelayModel = "held"
     """How a delay that is not whole is modeled."""
 
+    safe_limit: SafeLimitSection | None = None
+    """The stiffest wall that measurements of the device support."""
+
     @cached_property
     def _scene(self) -> Scene:
         # One that is not given has no stiffness and no damping.
@@ -180,7 +194,8 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
 
     def bare(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
         """The scene without its wall, as a device of a kind; by default of one whose velocity estimate is linear."""
-        own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay", "rotary")}
+        names = "mass", "damping", "period", "delay", "rotary", "safe_limit"
+        own = {name: getattr(self, name) for name in names}
         return kind(**{name: value for name, value in own.items() if value is not None}, **list_parts(self))
 
     def limits(self) -> Iterable[LocatedProblem]:

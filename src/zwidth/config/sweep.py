@@ -142,6 +142,10 @@ class Axes(_Axes):
         return longest * (self.ends("rate")[1] if "rate" in self.given else 1.0 / self.ends("period")[0])
 
 
+_PAIRS = (("alpha", "stiffness"), ("beta", "virtual_damping"), ("delta", "damping"), ("d", "delay"))
+_COUNTERPARTS = dict(_PAIRS) | {physical: normalized for normalized, physical in _PAIRS}
+
+
 def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
     if not keys:
         return
@@ -150,7 +154,8 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
         if (key in PHYSICAL) != physical:
             kinds = "physical key, after normalized ones" if not physical else "normalized key, after physical ones"
             allowed = f"{where} are in SI units or normalized, never both"
-            remedy = f"choose from {listing(PHYSICAL if physical else NORMALIZED)}"
+            other = _COUNTERPARTS.get(key)
+            remedy = f"write {other!r}" if other and other not in keys else "remove it"
             yield (key,), problem(kinds, allowed, remedy, on_key=True)
     yield from find_second_period(keys)
 
@@ -202,7 +207,8 @@ class SweepStudy(_Parts, HeldStudy):
             return raw
         given = _list_given(axes)
         if given & set(PHYSICAL):
-            if not isinstance(scene, PhysicalScene):
+            # Mixed keys are one fault: what the scene supplies would add others.
+            if not isinstance(scene, PhysicalScene) or given & set(NORMALIZED):
                 return raw
             supplied: dict[str, Any] = {"delay": str(scene.delay)}
             supplied |= {} if given & {"period", "rate"} else {"period": scene.period}

@@ -8,6 +8,7 @@ import numpy as np
 
 from zwidth.figures import grid, style
 from zwidth.figures.plane import SMOOTH, Edges, draw_edge, panel_grid, read_panel
+from zwidth.figures.table import draws_tables
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, VARIABLES, WALL
 
@@ -20,7 +21,7 @@ _LINE = 56
 _CURVES = 9
 
 
-@style.house_style()
+@draws_tables
 def draw_curves(
     data: xarray.Dataset,
     name: str,
@@ -89,7 +90,7 @@ def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
     return (name, first) if name and first else None
 
 
-@style.house_style()
+@draws_tables
 def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, edges: Edges | None = None) -> np.ndarray:
     """Draw the boundaries of the stable walls of many devices into one panel, panels for a further parameter.
 

@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, in_order, select
-from zwidth.words.formatting import ENOUGH, count_digits_apart, header, round_safely, spell_enough
+from zwidth.words.formatting import ENOUGH, count_digits_apart, header, round_safely, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.rotation import own_unit
 
 _STIFFNESS, _NOISE = SI_COLUMNS[0], "velocity_noise_m_per_s"
 _OVER = {
@@ -55,7 +54,7 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         if kind == "low_pass" or grid.logarithmic(np.unique(values)):
             style.use_logarithmic(ax, "x", values, style.DECADES)
     panels[0].set_ylabel(words)
-    handles = [style.line(rf"$b = {damping:g}$ {own_unit('N s/m')}", color=color) for damping, color in colors.items()]
+    handles = [style.line(_name_damping(damping), color=color) for damping, color in colors.items()]
     handles.append(style.line("one-sample difference", style.DASHED, 0.9))
     style.legend(panels, handles, outside=axes is None, ncols=len(handles))
     return panels
@@ -81,8 +80,8 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
             mark = {"marker": marker, "markersize": 4.5} if marker else _dots(rows)
             look = {"linestyle": dash, "color": color, "label": f"{kind}, b = {damping:g}", **mark}
             ax.plot(rows[_NOISE] * speed, rows[_STIFFNESS] * factor, **look)
-        best = _mark_best(ax, select(table, damping_N_s_per_m=damping, best=True), color, (speed, factor), words)
-        handles.append(style.line(rf"$b = {damping:g}$ {own_unit('N s/m')}{best}", color=color))
+        best = _mark_best(ax, select(table, damping_N_s_per_m=damping, best=True), color, (speed, factor))
+        handles.append(style.line(f"{_name_damping(damping)}{best}", color=color))
     if np.isfinite(limit):
         ax.axvline(limit * speed, color=style.GRAY, linewidth=0.9, linestyle=style.DASHED, zorder=0.5, label="limit")
     style.use_logarithmic(ax, "x", speed * np.append(table[_NOISE], limit), style.DECADES)
@@ -100,7 +99,11 @@ def _scale(table: Table) -> tuple[dict[float, Any], float, str]:
     return style.color_by_value(table["damping_N_s_per_m"]), factor, words
 
 
-def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float], words: str) -> str:
+def _name_damping(damping: float) -> str:
+    return f"$b =$ {with_unit(damping, 'N s/m', 3)}"
+
+
+def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) -> str:
     """Mark the stiffest wall within the limit; returns the filter that allows it, for the legend."""
     spelled = ""
     for row in zip(*(rows[name] for name in (_NOISE, _STIFFNESS, "cutoff_Hz", "samples")), strict=True):
@@ -108,8 +111,7 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float], 
         which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
         ax.plot(noise * factors[0], stiffness * factors[1], linestyle="", label="best", **look)
-        most = round_safely(stiffness * factors[1], "below", 3)
-        spelled = f":  ${which}$,  {most:.3g} {words.rpartition('  in ')[2]}"
+        spelled = f":  ${which}$,  {with_unit(round_safely(stiffness, 'below', 3), 'N/m', 3)}"
     return spelled
 
 
@@ -152,7 +154,8 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         _mark_required(ax, curve_drawn, target * factor, value * scale if known else np.nan, colors[target])
         # As a design study writes them.
         crossings = [float(each.split()[0]) for each in str(others).split("; ") if each]
-        names.append(spell_enough(float(value), enough, crossings, parameter.unit, 3) if known else "")
+        name = spell_enough(float(value), enough, crossings, parameter.unit, 3) if known else ""
+        names.append(name.replace("g cm^2", style.write_unit("g cm^2")))
     heights = np.append(stiffness, targets)
     for name, scaled in (("x", values * scale), ("y", heights * factor)):
         style.use_logarithmic(ax, name, scaled, style.DECADES)
@@ -178,7 +181,7 @@ def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[f
         words = f"{wanted * factor:.{digits}g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
         # Not 100 % where one of many does not.
         percent = f"{round_safely(100.0 * share, 'below', 3):.3g}"
-        yield wanted * reserve, words + (f": {percent} % of devices bear it" if np.isfinite(share) else "")
+        yield wanted * reserve, words + (f": stable on {percent} % of devices" if np.isfinite(share) else "")
 
 
 def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, color: Any) -> None:

@@ -128,10 +128,12 @@ def spell(value: xarray.DataArray) -> str:
     """A single value of a parameter, with symbol and unit, and as many digits as tell it from the others."""
     if value.name == "device":
         return style.literal(value.values)
-    unit = {"1": "", "sampling periods": "periods"}.get(value.attrs["units"], value.attrs["units"])
+    number = f"{float(value):.{value.attrs.get('digits', 4)}g}"
+    unit = style.write_unit(value.attrs["units"]).removeprefix("sampling ")
+    unit = unit.removesuffix("s") if unit == "periods" and number == "1" else unit
     # Within mathematics as it is.
     unit = rf"\,\mathrm{{{unit.replace(' ', '~').replace('$', '')}}}" if unit else ""
-    return rf"${VARIABLES[str(value.name)].symbol} = {float(value):.{value.attrs.get('digits', 4)}g}{unit}$"
+    return rf"${VARIABLES[str(value.name)].own_symbol} = {number}{unit}$"
 
 
 def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
@@ -155,8 +157,8 @@ def output_label(data: xarray.Dataset, name: str) -> str:
 
 
 def _in_unit(data: xarray.Dataset, name: str) -> str:
-    unit = data[name].attrs.get("units", "1")
-    return "" if unit == "1" else f"  in {unit}"
+    unit = style.write_unit(data[name].attrs.get("units", "1"))
+    return f"  in {unit}" if unit else ""
 
 
 def logarithmic(values: np.ndarray) -> bool:

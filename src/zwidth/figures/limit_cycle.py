@@ -1,4 +1,4 @@
-"""The buzz of walls: its amplitude over a plane of two parameters, and amplitude and frequency over one."""
+"""Limit cycles of walls: amplitude over a plane of two parameters, and amplitude and frequency over one."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from matplotlib.ticker import FuncFormatter
 from zwidth.figures import grid, style
 from zwidth.figures.table import Table, curves, draws_tables, grid_in_order
 from zwidth.simulation.result import MotionKind
-from zwidth.words.formatting import count_digits_apart, header, with_unit
+from zwidth.words.formatting import count_digits_apart, header, spell_short
 from zwidth.words.quantities import FIELDS
 
 AXES = {
     header(name, FIELDS[name].unit): FIELDS[name] for name in ("stiffness", "virtual_damping", "resolution", "coulomb")
 }
-"""The parameters that a buzz may be drawn over, by their columns."""
+"""The parameters of the axes of these figures, by their columns."""
 # Up to so many points of a curve are seen one by one.
 _FEW = 12
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
@@ -33,14 +33,14 @@ _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 def draw_limit_cycles(
     arrays: Mapping[str, np.ndarray], edges: Table, bounds: tuple[float, float], axes: style.AnyAxes | None = None
 ) -> np.ndarray:
-    """Draw the amplitude of the buzz over two parameters, a panel per condition.
+    """Draw the amplitude of limit cycles over two parameters, a panel per condition.
 
-    White: silent; hatched: wider than any buzz; line: boundary of the linear theory.
+    White: at rest; hatched: wider than the upper bound; line: boundary of the linear theory.
 
     Args:
         arrays: what the npz file of a limit_cycle study holds.
         edges: columns condition, number and those of the two parameters; nothing where there is no linear boundary.
-        bounds: amplitudes between which a motion counts as a buzz, in m.
+        bounds: least and largest amplitude of a limit cycle, in m.
         axes: Axes of yours, one for each condition.
     """
     across, along = names = [name for name in AXES if name in arrays]
@@ -73,12 +73,12 @@ def draw_limit_cycles(
         grid.scale_axis(ax, "y", y)
     style.label_axes(panels, *(f"{AXES[name].axis_label}  in {scales[name][1]}" for name in names), once=axes is None)
     figure = style.figure_of(panels)
-    label = f"amplitude of the buzz  in {meter}"
+    label = f"amplitude of the limit cycle  in {meter}"
     figure.colorbar(image, ax=list(panels), label=label, shrink=0.9, format=_PLAIN)
     edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.6}
     handles: list[Any] = [
-        Patch(facecolor="white", label="silent", **edge),
-        Patch(**_BEYOND, label=f"beyond {with_unit(bounds[1], 'm', 1)}"),
+        Patch(facecolor="white", label="at rest", **edge),
+        Patch(**_BEYOND, label=f"wider than {spell_short(bounds[1], 'm')}"),
     ]
     handles += [style.line("boundary of the linear theory", width=1.2, color=style.VERMILION)] if edges else []
     style.legend(panels, handles, outside=axes is None, ncols=3)
@@ -97,15 +97,15 @@ def draw_limit_cycle_curves(
     family: str = "",
     axes: style.AnyAxes | None = None,
 ) -> np.ndarray:
-    """Draw amplitude (above) and frequency (below) of the buzz over one parameter, a column per condition.
+    """Draw amplitude (above) and frequency (below) of limit cycles over one parameter, a column per condition.
 
-    A gap: silent, or wider than any buzz, and a curve that is silent throughout is named in its panel; a vertical line:
+    A gap: at rest, or wider than the upper bound; the panel names a curve without a limit cycle. A vertical line:
     boundary of the linear theory.
 
     Args:
         arrays: what the npz file of a limit_cycle study holds.
         edges: columns condition, number and the parameter; nothing where there is no linear boundary.
-        bounds: amplitudes between which a motion counts as a buzz, in m.
+        bounds: least and largest amplitude of a limit cycle, in m.
         family: the name of the parameter that has a curve for each of its values; "" where there is none.
         axes: Axes of yours, those of the amplitudes first.
     """
@@ -136,7 +136,7 @@ def draw_limit_cycle_curves(
             for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
-                _name_silent(ax, looks, cycles[name][column] < bounds[0])
+                _name_absent(ax, looks, buzzes[column], cycles[name][column] < bounds[0], spell_short(bounds[1], "m"))
                 if amplitudes.size:
                     style.use_logarithmic(ax, "y", amplitudes)
                 ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
@@ -146,24 +146,36 @@ def draw_limit_cycle_curves(
                 ax.set_ylabel(words)
     handles = [style.line(look["label"], look["linestyle"], color=look["color"]) for look in looks]
     boundary = [style.line("boundary of the linear theory", width=1.0, color=style.VERMILION)] if edges else []
-    gap = style.line(f"gap: silent, or beyond {with_unit(bounds[1], 'm', 1)}", "")
+    gap = style.line(f"gap: at rest, or wider than {spell_short(bounds[1], 'm')}", "")
     style.legend(panels, [*(handles if family else boundary), gap], outside=axes is None, ncols=4)
     return panels
 
 
-def _name_silent(ax: Axes, looks: list[dict[str, Any]], silent: np.ndarray) -> None:
-    """Write into a panel which curves are nowhere to be seen, and why."""
-    names = [look["label"] for look, nowhere in zip(looks, np.all(silent, axis=-1).tolist(), strict=True) if nowhere]
-    if names:
+def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest: np.ndarray, widest: str) -> None:
+    """Write into a panel the curves without a limit cycle, and the reason."""
+    reasons: dict[str, list[str]] = {}
+    for look, cycle, still in zip(looks, cycles, rest, strict=True):
+        if not cycle.any():
+            wide = f"wider than {widest}"
+            reason = (
+                f"{'at rest' if still.all() else wide} everywhere"
+                if still.all() or not still.any()
+                else (f"at rest or {wide}")
+            )
+            reasons.setdefault(reason, []).append(look["label"])
+    blocks = []
+    for reason, names in reasons.items():
         lines = [", ".join(names[k : k + 2]) for k in range(0, len(names), 2)]
-        text = "silent everywhere" + (":\n" + ",\n".join(lines) if len(looks) > 1 else "")
-        ax.text(0.04, 0.5, text, transform=ax.transAxes, fontsize=7.5, color=style.GRAY, va="center")
+        blocks.append(reason + (":\n" + ",\n".join(lines) if len(looks) > 1 else ""))
+    if blocks:
+        look: dict[str, Any] = {"fontsize": 7.5, "color": style.GRAY, "va": "center"}
+        ax.text(0.04, 0.5, "\n".join(blocks), transform=ax.transAxes, **look)
 
 
 def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarray) -> list[dict[str, Any]]:
     """The look of every curve, and its label: which value it belongs to, and where no wall of it is linearly stable."""
     if not family:
-        return [{**style.look(0), "label": "buzz"}]
+        return [{**style.look(0), "label": "limit cycle"}]
     values, known = arrays[family], AXES[family]
     times, unit = style.si_unit(values, known.unit)
     colors = style.ordered_colors(values.size)

@@ -16,8 +16,11 @@ _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": 
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
 # A force is held until the next one.
 _HELD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}
-# A motion this much wider than the smallest is cut, so that the smallest is still seen.
-_CUT = 8.0
+_CUT = 8.0  # a motion that grows without bound is cut at this many times the smallest width
+_GROWTH = (
+    1.5  # ratio of the last quarter to the rest, above which a motion grows without bound; 4/3 at constant velocity
+)
+_WINDOW = 3.0  # time shown of motions that all leave the wall, in times until the last contact ends
 _MOST_PANELS = 6
 _ENERGIES = {
     "energy_J": ("energy of the bodies", style.BLACK, style.SOLID),
@@ -30,6 +33,14 @@ _ENERGIES = {
 
 def _name_force() -> str:
     return "wall torque" if is_rotary() else "wall force"
+
+
+def _name_position() -> str:
+    return r"angle  $\theta$" if is_rotary() else "position  $x$"
+
+
+def _name_velocity() -> str:
+    return r"angular velocity  $\dot\theta$" if is_rotary() else "velocity  $v$"
 
 
 @draws_tables
@@ -84,7 +95,7 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
             ax.plot(each.settling_time * clock, at * factor, color=each.look["color"], zorder=4, **_DOT)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
     ax.set_ylabel(
-        f"position  $x$  in {length} for 1 {own_unit('N')}" if physical else r"position  $x$  in $F\,T^2\!/m$"
+        f"{_name_position()}  in {length} for 1 {own_unit('N')}" if physical else r"position  $x$  in $F\,T^2\!/m$"
     )
     return clock, unit
 
@@ -106,6 +117,9 @@ def _read_responses(table: Table) -> list[Any]:
 def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the position of every motion over time and the force of the wall; thin: the bodies behind links.
 
+    Motions that all leave the wall are shown until three times the end of the last contact. A motion that grows without
+    bound is cut at eight times the width of the smallest.
+
     Args:
         table: columns of a simulate study.
         axes: an Axes of yours for the positions alone, or two.
@@ -114,7 +128,7 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     panels = style.panels(axes, 2, 6.4, 4.8, height_ratios=(1.6, 1.0), sharex=True)
     clock, second = style.si_unit([each.time_s[-1] for each in motions], "s")
     behind = [name for name in ("tip_position_m", "hand_position_m") if hasattr(motions[0], name)]
-    quantities = (("position_m", "position  $x$", behind), ("wall_force_N", _name_force(), []))
+    quantities = (("position_m", _name_position(), behind), ("wall_force_N", _name_force(), []))
     for ax, (name, words, others) in zip(panels, quantities, strict=False):
         factor, unit = _limit(ax, "y", [getattr(each, one) for each in motions for one in (name, *others)], name[-1])
         for each in motions:
@@ -152,7 +166,7 @@ def draw_phase_plane(table: Table, axes: style.AnyAxes | None = None) -> np.ndar
         ax.plot(*start, linestyle="", marker="o", markersize=4.0, color=style.BLACK, label="start", zorder=4)
     ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=2)
     _mark_wall(ax, "x", motions)
-    ax.set(xlabel=f"position  $x$  in {meter}", ylabel=f"velocity  $v$  in {speed}")
+    ax.set(xlabel=f"{_name_position()}  in {meter}", ylabel=f"{_name_velocity()}  in {speed}")
     start = style.line("start", "", color=style.BLACK, marker="o", markersize=4.0)
     _explain(panels, motions, start, outside=axes is None)
     return panels
@@ -195,6 +209,22 @@ def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
     for k, each in enumerate(motions):
         each.label = style.literal(each.label[0])
         each.look = style.look(k)
+    return _trim(motions) if time == "time_s" and "contact" in columns else motions
+
+
+def _trim(motions: list[Any]) -> list[Any]:
+    """Cut motions that all leave the wall, so that their contacts fill a third of the time axis."""
+    ends = []
+    for each in motions:
+        contact = np.asarray(each.contact) > 0
+        if not contact.any() or contact[-max(contact.size // 4, 1) :].any():
+            return motions
+        ends.append(float(each.time_s[np.flatnonzero(contact)[-1]]))
+    for each in motions:
+        size, shown = each.time_s.size, each.time_s <= _WINDOW * max(ends)
+        for name, values in vars(each).items():
+            if isinstance(values, np.ndarray) and values.shape[:1] == (size,):
+                setattr(each, name, values[shown])
     return motions
 
 
@@ -207,12 +237,19 @@ def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[f
     """Set the range of an axis, so that one that grows without end does not hide the others; returns its unit."""
     finite = [each[np.isfinite(each)] for each in values]
     largest = [float(np.abs(each).max(initial=0.0)) for each in finite]
-    most = _CUT * min((size for size in largest if size > 0), default=1.0)
+    growing = any(_grows(np.abs(each)) for each in values)
+    most = _CUT * min((size for size in largest if size > 0), default=1.0) if growing else max(largest, default=1.0)
     low = min(float(np.clip(each.min(initial=0.0), -most, 0.0)) for each in finite)
     high = max(float(np.clip(each.max(initial=0.0), 0.0, most)) for each in finite)
     factor, unit = style.si_unit((low, high), unit)
     getattr(ax, f"set_{which}lim")(*style.span(low * factor, high * factor))
     return factor, unit
+
+
+def _grows(sizes: np.ndarray) -> bool:
+    """Return whether a motion grows without bound, of its absolute values over time."""
+    early, late = np.split(sizes, [3 * sizes.size // 4])
+    return not np.all(np.isfinite(sizes)) or bool(late.max(initial=0.0) > _GROWTH * early.max(initial=0.0) > 0)
 
 
 def _mark_wall(ax: Axes, which: str, motions: list[Any]) -> None:

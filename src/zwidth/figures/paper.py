@@ -64,7 +64,7 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     ax.set_ylim(*style.span(float(values.min()), float(values.max())))
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
     style.label_ends(ax, stable, [interval.beta_upper[-1] for interval in stable], colors)
-    ax.set(title=r"$\alpha \to 0$", xlabel=style.DELTA_LABEL, ylabel=style.BETA_LABEL)
+    ax.set(title=r"$\alpha \to 0$", xlabel=style.label_quantity("delta"), ylabel=style.label_quantity("beta"))
     handles = style.delay_model_handles(stable)
     if passive:
         handles.append(style.line("passivity condition", style.DASH_DOTTED, 1.3, style.VERMILION))
@@ -120,7 +120,7 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
         style.use_logarithmic(ax, "x", columns["delta"])
     _scale_stiffness(ax, shown[0].delta, columns["alpha_max"])
     style.label_ends(ax, shown, [path.alpha_max[-1] for path in shown], colors)
-    ax.set(xlabel=style.DELTA_LABEL, ylabel=style.ALPHA_MAX_LABEL)
+    ax.set(xlabel=style.label_quantity("delta"), ylabel=style.label_quantity("alpha_max"))
     style.legend([ax], style.delay_model_handles(shown), outside=False, loc="upper left")
 
 
@@ -170,7 +170,7 @@ def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
     ax.set_xlim(*ends)
     ax.set_ylim(0.7 * min(limits), 3.0 * max(limits))
     style.label_ends(ax, paths, [path.limit for path in paths], colors)
-    ax.set(xlabel=style.DELTA_LABEL, ylabel=r"$\alpha_{\max}/\delta = K_{\max}T/b$")
+    ax.set(xlabel=style.label_quantity("delta"), ylabel=r"$\alpha_{\max}/\delta = K_{\max}T/b$")
     limit = style.line(r"its limit $g(d)$", style.DOTTED, 0.9)
     ax.legend(handles=[style.line(r"$\alpha_{\max}/\delta$"), limit], loc="upper right")
 
@@ -209,7 +209,7 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     every = np.concatenate([[*cost.alpha_max, *cost.alpha_max_passive] for cost in costs])
     _scale_stiffness(maxima, costs[0].delta, every)
     style.label_ends(maxima, costs, [cost.alpha_max[-1] for cost in costs], colors)
-    maxima.set_ylabel(style.ALPHA_LABEL)
+    maxima.set_ylabel(style.label_quantity("alpha"))
     stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")
     # Single dots are in the middle, and curves rise to the right.
     place = "upper left" if costs[0].delta.size > 1 else "center left"
@@ -219,7 +219,7 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
         style.label_ends(ax, costs, [100.0 * cost.alpha_max_passive[-1] / cost.alpha_max[-1] for cost in costs], colors)
     for ax in panels:
         grid.scale_axis(ax, "x", np.unique(table["delta"]))
-        ax.set_xlabel(style.DELTA_LABEL)
+        ax.set_xlabel(style.label_quantity("delta"))
     style.letter(panels)
     return panels
 
@@ -261,14 +261,14 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
         _draw_boundaries(panel, select(table, d=d) if apart else select(table), colors, scale)
         if apart:
             panel.set_title(f"$d = {d:g}$")
-    style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)
+    style.label_axes(panels, style.label_quantity("alpha"), style.label_quantity("beta"), once=axes is None)
     if scale is not None:
         for panel in panels:
             style.add_si_axes(panel, scale)
     handles = _legend_handles(table, colors if len(colors) <= _LEGEND_ENTRIES else {})
     if len(colors) > _LEGEND_ENTRIES:
         bar = ScalarMappable(Normalize(min(colors), max(colors)), ListedColormap(list(colors.values())))
-        panels[0].figure.colorbar(bar, ax=list(panels), label=style.DELTA_LABEL)
+        panels[0].figure.colorbar(bar, ax=list(panels), label=style.label_quantity("delta"))
     style.legend(panels, handles, outside=axes is None and len(panels) > 1, ncols=min(6, len(handles)))
     return panels
 
@@ -367,7 +367,7 @@ def draw_map(
         outlines = {} if exact is None else {"passive" if output == "passive" else "stable": exact}
         shown.append(Panel(arrays["alpha"], arrays["beta"], {output: values[:, :, column, row].T}, outlines))
         ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")
-    style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)
+    style.label_axes(panels, style.label_quantity("alpha"), style.label_quantity("beta"), once=axes is None)
     draw_panels(panels, shown, output, rf"{OUTPUTS[output].words}  ${OUTPUTS[output].symbol}$", outside=axes is None)
     if len(places) == 1 and scale is not None:
         style.add_si_axes(panels[0], scale)

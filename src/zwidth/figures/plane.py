@@ -16,7 +16,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from zwidth.figures import grid, stable_set, style
 from zwidth.figures.grid import MISSING, label_contours
 from zwidth.figures.stable_set import SHADES
-from zwidth.figures.table import Table
+from zwidth.figures.table import Table, draws_tables
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, Output
 
@@ -67,7 +67,7 @@ class Panel(NamedTuple):
     peak: tuple[float, ...] = ()  # the stiffest stable wall, where it is known and within the axes
 
 
-@style.house_style()
+@draws_tables
 def draw_plane(
     data: xarray.Dataset,
     name: str,
@@ -347,7 +347,7 @@ def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, l
     style.legend(axes, handles, outside=outside, ncols=len(handles))
 
 
-@style.house_style()
+@draws_tables
 def draw_workspace(
     table: Table,
     across: str,

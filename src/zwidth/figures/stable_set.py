@@ -89,7 +89,11 @@ def name_axes(ax: Axes, spring: str, damper: str) -> None:
     """Label the axes of stiffness and damping, normalized where they have no unit, with lines where these are zero."""
     draw_zeros(ax)
     in_si = f"stiffness  $K$  in {spring}", f"virtual damping  $B$  in {damper}"
-    style.label_axes(np.array([ax]), *(in_si if spring else (style.ALPHA_LABEL, style.BETA_LABEL)), once=False)
+    style.label_axes(
+        np.array([ax]),
+        *(in_si if spring else (style.label_quantity("alpha"), style.label_quantity("beta"))),
+        once=False,
+    )
 
 
 def agrees(outlines: Outlines, x: np.ndarray, y: np.ndarray, good: np.ndarray) -> bool:
@@ -222,7 +226,7 @@ def draw_stable_set(
         mark = {**MARKS["stiffest"], "marker": markers[label]}
         handles.append(style.line(style.literal(label), color=color, **mark))
     handles += [style.line(name, dash) for name, dash in _DASHES.items() if name in pieces and name != "outline"]
-    handles += [] if alone else [style.line("mark: stiffest wall", "")]
+    handles += [] if alone else [style.line("stiffest wall", "", **MARKS["stiffest"])]
     style.legend(panels, handles, outside=axes is None, ncols=3, loc="upper right")
     return panels
 

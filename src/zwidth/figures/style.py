@@ -26,7 +26,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.files import write_whole
 from zwidth.words.formatting import PREFIXES
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.rotation import own_unit
+from zwidth.words.rotation import is_rotary, own_unit
 
 # Okabe and Ito's palette, told apart with any color vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -43,8 +43,8 @@ STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED, (0, (11.0, 2.5)), (0, (6.0, 1.8, 1
 # What tells curves apart whose line styles have a meaning of their own.
 MARKERS = ("o", "s", "^", "v", "P", "X", "*")
 
-ALPHA_LABEL, BETA_LABEL, DELTA_LABEL = (PARAMETERS[name].axis_label for name in ("alpha", "beta", "delta"))
-ALPHA_MAX_LABEL = r"maximum stable stiffness  $\alpha_{\max} = K_{\max}T^2\!/m$"
+# Units as texts write them, where datasets follow UDUNITS.
+_WRITTEN = {"1": "", "degree": "degrees", "g cm^2": "g cm$^2$"}
 
 # Of a whole number there is nothing between its values.
 POINTS: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 3.5}
@@ -54,6 +54,7 @@ AnyAxes: TypeAlias = Axes | Sequence[Axes] | np.ndarray
 WIDTH = 7.0  # inches: both columns of a journal page
 DECADES = 3000.0  # from so many times its least value on, an axis of stiffnesses has powers of ten only
 PNG_DPI = 180
+LIGHTEST = 0.6  # of viridis, for curves and their names: contrast 3:1 to white
 # Values closer together than this have but one or two of 1, 2 and 5 among them.
 _FEW = 5.0
 # How far an axis goes on either side of a single value.
@@ -64,8 +65,8 @@ _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"
 
 _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
 Size: TypeAlias = tuple[float, float | None]
-# What a user's style sheet changes of it, and the size of new figures that a user wants.
-_wanted: ContextVar[tuple[Any, Size | None]] = ContextVar("wanted", default=((), None))
+# What a user's style sheet changes of it, and the size and the dots per inch of new figures that a user wants.
+_wanted: ContextVar[tuple[Any, Size | None, float | None]] = ContextVar("wanted", default=((), None, None))
 # Narrower, in inches, panels stand below each other: beside each other their labels would have no room.
 _ONE_COLUMN = 5.0
 
@@ -78,15 +79,15 @@ def house_style() -> Iterator[None]:
 
 
 @contextmanager
-def style_sheet(file: Path | None = None, size: Size | None = None) -> Iterator[None]:
+def style_sheet(file: Path | None = None, size: Size | None = None, dpi: float | None = None) -> Iterator[None]:
     """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given."""
-    # Of a size without a height type is as large as ever. Where there is a size already, it stays.
-    changes, known = _wanted.get()
+    # Of a size without a height type is as large as ever. A size or a resolution that is set already stays.
+    changes, known, dots = _wanted.get()
     try:
         changes = changes if file is None else dict(rc_params_from_file(file, use_default_template=False))
     except OSError as error:
         raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error
-    token = _wanted.set((changes, known or size))
+    token = _wanted.set((changes, known or size, dots or dpi))
     try:
         yield
     finally:
@@ -117,6 +118,18 @@ def panels(given: AnyAxes | None, count: int, width: float, height: float, colum
         # Of its column, in the last row or not; panels that share an axis would leave it bare.
         lowest.tick_params(labelbottom=True)
     return axes.ravel()[:count]
+
+
+def label_quantity(name: str) -> str:
+    """Return the label of an axis of a normalized quantity, for the kind of device in question."""
+    if name != "alpha_max":
+        return PARAMETERS[name].axis_label
+    return rf"maximum stable stiffness  $\alpha_{{\max}} = K_{{\max}}T^2\!/{'J' if is_rotary() else 'm'}$"
+
+
+def write_unit(unit: str) -> str:
+    """Return a unit as labels and legends write it; "" for 1."""
+    return _WRITTEN.get(unit, unit)
 
 
 def letter(axes: np.ndarray) -> None:
@@ -255,7 +268,7 @@ def save(
         drawn: the figure, or Axes of it.
         stem: the files' name without its ending.
         formats: the endings, of "png", "svg" and "pdf".
-        dpi: dots an inch, also of maps within an SVG or a PDF.
+        dpi: dots per inch, also of maps within an SVG or a PDF; for PNG 180 if left out.
     """
     figure = figure_of(drawn)
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
@@ -264,7 +277,7 @@ def save(
         for file in files:
             usual = PNG_DPI if file.suffix == ".png" else "figure"
             kind = {"format": file.suffix[1:], "metadata": _METADATA[file.suffix]}
-            figure.savefig(drawing := BytesIO(), dpi=dpi or usual, **kind)
+            figure.savefig(drawing := BytesIO(), dpi=dpi or _wanted.get()[2] or usual, **kind)
             write_whole(file, drawing.getvalue())
             # What is laid out once need not be again: it is half of the work.
             figure.set_layout_engine(None)
@@ -274,7 +287,7 @@ def save(
 
 def ordered_colors(count: int) -> list[Any]:
     """Colors for values in ascending order: the larger the value, the darker."""
-    shades = np.linspace(0.76, 0.0, count) if count > 1 else np.array([0.25])
+    shades = np.linspace(LIGHTEST, 0.0, count) if count > 1 else np.array([0.25])
     return [matplotlib.colormaps["viridis"](shade) for shade in shades]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from zwidth.figures.style import house_style
 from zwidth.words.formatting import turn_header
-from zwidth.words.rotation import is_rotary, use_kind
+from zwidth.words.rotation import ROTARY, is_rotary, use_kind
 
 # Walls in SI units, beside alpha and beta.
 SI_COLUMNS = ("stiffness_N_per_m", "virtual_damping_N_s_per_m")
@@ -38,11 +38,17 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
     def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         given: Any = [*args, *kwargs.values()]
         read: Any = [name_as_linear(each) for each in given]
-        turned = any(new is not old for new, old in zip(read, given, strict=True))
+        turned = any(new is not old for new, old in zip(read, given, strict=True)) or any(map(_turns, given))
         with house_style(), use_kind(turned or is_rotary()):
             return function(*read[: len(args)], **dict(zip(kwargs, read[len(args) :], strict=True)))  # pyright: ignore
 
     return within
+
+
+def _turns(data: Any) -> bool:
+    """Return whether a dataset of a sweep has units of rotary devices."""
+    variables = getattr(data, "variables", {})
+    return any(str(each.attrs.get("units", "")) in ROTARY.values() for each in variables.values())
 
 
 def name_as_linear(table: Any) -> Any:

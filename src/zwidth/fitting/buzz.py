@@ -22,10 +22,11 @@ from zwidth.fitting.buzzing import Onsets
 from zwidth.fitting.device_estimate import differentiate, find_stiffest, name_numbers
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FurtherExperiment, RivalDevice, doubt_period
 from zwidth.fitting.words import spell_rival
-from zwidth.parts.checks import check_number, read_texts
+from zwidth.parts.checks import check_number, find_kind, read_texts
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
+from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.status import Status
 
 # Worse by chance of 1e-4, or than this share where the noise is unknown, the points contradict each other.
@@ -67,7 +68,7 @@ def fit_buzz(
 
     Args:
         points: walls, each (K in N/m, B in N s/m, f in Hz) or a `zwidth.BuzzPoint`; K > 0, 0 < f < 1/(2 T). At least
-            two dampings.
+            two dampings. Texts with units, as "0.4 N m/rad", are read too.
         period: T in s.
         velocity: how the velocity was estimated; the backward difference by default.
         noise: relative standard deviation of K and f, one number or one for each. Left out, it is taken to be equal
@@ -105,6 +106,14 @@ def fit_buzz(
     from scipy.special import chdtri
 
     period = check_number("period", period)
+    if isinstance(points, Iterable) and not isinstance(points, str | dict):
+        points = list(points)
+        told = find_kind(
+            {f"points[{k}]": list(each) for k, each in enumerate(points) if isinstance(each, list | tuple)}
+        )
+        if told is not None and told != is_rotary():
+            with use_kind(told):
+                return fit_buzz(points, period=period, velocity=velocity, noise=noise)
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
         raise InputError(f"velocity: got {velocity!r}; give an estimate, as zwidth.LowPass(cutoff=100)")
@@ -169,7 +178,7 @@ def fit_buzz(
     further = _further(chosen, stiffest, information, slope @ by_theta, weights**2 / scale, rivals)
     stiffness, damping, _ = table[np.argmax(table[:, 1])].tolist()
     fit = DeviceFit(
-        scene=scene,
+        nominal=scene,
         covariance=covariance,
         noise=share or (float(np.sqrt(scale)), float(np.sqrt(scale))),
         residuals=best.residuals / np.sqrt(scale),

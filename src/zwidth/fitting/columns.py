@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit
+from zwidth.fitting.headers import DIMENSIONS, QUANTITIES, Column, find_columns
 from zwidth.fitting.log import fit_log
 from zwidth.words.errors import InputError, UnusableValueError
-from zwidth.words.formatting import describe, suggestion, with_unit
+from zwidth.words.formatting import describe, plain, suggestion, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.tables import NamedColumns, read_columns
 from zwidth.words.units import (
@@ -24,31 +25,23 @@ from zwidth.words.units import (
     COUNTS,
     FORCE,
     LENGTH,
-    TIME,
+    MASS,
     TORQUE,
     Dimension,
     looks_like_number,
     read_quantity,
-    split_head,
 )
 
-QUANTITIES = ("time", "position", "force")
-# What each may be in, a linear axis first, and the names that say so by themselves.
-_DIMENSIONS: dict[str, tuple[Dimension, ...]] = {"time": (TIME,), "position": (LENGTH, ANGLE), "force": (FORCE, TORQUE)}
-_NAMES = {
-    "time": ("time", "t", "clock"),
-    "position": ("position", "pos", "x", "encoder", "angle", "phi", "theta", "q"),
-    "force": ("force", "f", "torque", "tau"),
-}
-# What is read in place of a position or a force that no name says, and the unit without one.
-_INSTEAD = {
-    "position": (("velocity", "vel", "speed"), "m/s"),
-    "force": (("current", "iq", "i_q"), "A"),
-}
 _AMPERES = {"A": 1.0, "mA": 1e-3}
 _PER_AMPERE = re.compile(r"(.*?)\s*/\s*A\s*")
-# Periods that differ by more are two.
-_OTHER = 0.1
+_MANY_COUNTS = 50.0  # least range of whole numbers that are counts
+_ROUNDING = 1e-9  # relative difference of equal units
+_OTHER = 0.1  # relative difference of periods that contradict each other
+# Units of mass that scales and load cells show for a force.
+_WEIGHTS = ("kg", "g", "lb", "oz")
+# The least epoch in seconds of a time without a unit, in 2001, and its units.
+_EPOCH, _EPOCH_UNITS = 1e9, (("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3))
+_COARSEST = 1.1  # largest step of a rotary encoder in rad, 6 steps per turn; a larger number is one of counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +54,9 @@ class LoggedMotion:
         force: in N, or in N m of a rotary axis.
         resolution: step of the encoder in m or rad; None where it is not known.
         rotary: whether the axis turns.
+        notes: sentences on how the columns were read.
+
+    Cells without a number are NaN.
     """
 
     time: np.ndarray | None
@@ -68,11 +64,16 @@ class LoggedMotion:
     force: np.ndarray
     resolution: float | None
     rotary: bool
+    notes: tuple[str, ...] = ()
 
     def __eq__(self, other: object) -> bool:
-        """Whether all numbers are the same."""
+        """Return whether all numbers are the same; empty cells are."""
         return isinstance(other, LoggedMotion) and all(
-            np.array_equal(getattr(self, part.name), getattr(other, part.name)) for part in fields(self)
+            np.array_equal(*(np.nan_to_num(getattr(each, part.name)) for each in (self, other)))
+            if isinstance(getattr(self, part.name), np.ndarray) and isinstance(getattr(other, part.name), np.ndarray)
+            else getattr(self, part.name) is getattr(other, part.name)
+            or (part.name not in QUANTITIES and getattr(self, part.name) == getattr(other, part.name))
+            for part in fields(self)
         )
 
 
@@ -108,39 +109,125 @@ def read_log(
     if table.nameless and not all((columns.get(name) or "").partition(":")[0] in heads for name in wanted):
         raise InputError(
             f"{table.nameless}; add a line such as 'time [s],position [m],force [N]', or say which column is which by "
-            "its number, as 1:ms, 2:mm and 3:N for time, position and force"
+            "its number, as 1:ms, 2:mm and 3:N for time, position and force, or 1:s+2:ns for a time in two columns"
         )
-    places = {name: _find_column(file, heads, name, columns.get(name)) for name in wanted}
-    taken = [at for at, _ in places.values()]
+    places = find_columns(file, heads, columns, wanted)
+    taken = [place for column in places.values() for place in column.places]
     if len(set(taken)) < len(taken):
-        words = ", ".join(f"{name} {heads[at]!r}" for name, (at, _) in places.items())
+        words = ", ".join(f"{name} {heads[column.places[0]]!r}" for name, column in places.items())
         raise InputError(f"{file}: one column is taken twice: {words}; name another")
-    given = {name: unit for name, (_, unit) in places.items()}
+    cells = dict(zip(taken, table.numbers(taken, gaps=True), strict=True))
+    for place, column in cells.items():
+        if not np.isfinite(column).any():
+            raise InputError(f"{file}: no cell of column {heads[place]!r} holds a number; name another column")
+    whole = _counts_alone(cells[places["position"].places[0]])
+    given, notes = _name_units(heads, places, resolution, whole)
     moves = _without_rate(given["position"])
     units = {**given, "position": moves or given["position"]}
     constant = 1.0
     if given["force"] in _AMPERES:
         constant, units["force"] = _read_constant(motor_constant, given["force"])
-    read = {name: _read_unit(name, unit) for name, unit in units.items()}
+    read = {name: _read_unit(name, unit) for name, unit in units.items() if name != "time"}
     factors = {name: size for name, (size, _) in read.items()}
     dimensions = {name: dimension for name, (_, dimension) in read.items()}
     rotary, step = dimensions["force"] is TORQUE, _check_pairs(units, dimensions, resolution)
     if dimensions["position"] is None:
         if step is None:
             raise InputError(
-                "position: it is in counts; give the resolution, as 0.03 mm or 0.09 deg for a count of the encoder"
+                "position: it is in counts; give the resolution, as 0.03 mm or 0.09 deg for a count of the encoder, or "
+                "'4000 counts/rev'"
             )
         factors["position"] = step
     factors["force"] *= constant
-    columns_read = dict(zip(wanted, table.numbers(taken), strict=True))
-    numbers = {name: column * factors[name] for name, column in columns_read.items()}
+    numbers = {name: cells[places[name].places[0]] * factors[name] for name in factors}
+    time = None if period is not None else _join_times(places["time"], cells, notes)
     if period is not None:
         _compare_period(file, table, period)
     if moves is not None:
-        time = numbers.get("time", np.zeros(1))
-        apart = float(time[-1] - time[0]) / max(1, time.size - 1) if period is None else period
-        numbers["position"] = np.cumsum(numbers["position"]) * apart * (1 / 60 if given["position"] == "rpm" else 1.0)
-    return LoggedMotion(numbers.get("time"), numbers["position"], numbers["force"], step, rotary)
+        known = np.zeros(1) if time is None else time[np.isfinite(time)]
+        apart = float(known[-1] - known[0]) / max(1, known.size - 1) if period is None else period
+        speed = numbers["position"] * apart * (1 / 60 if given["position"] == "rpm" else 1.0)
+        numbers["position"] = np.where(np.isnan(speed), np.nan, np.cumsum(np.nan_to_num(speed)))
+    return LoggedMotion(time, numbers["position"], numbers["force"], step, rotary, tuple(notes))
+
+
+def _counts_alone(position: np.ndarray) -> bool:
+    """Return whether positions are whole numbers over a range that no length in m and no angle in rad has."""
+    known = position[np.isfinite(position)]
+    return bool(np.all(known == np.round(known))) and float(np.ptp(known)) >= _MANY_COUNTS
+
+
+def _name_units(
+    heads: Sequence[str], places: Mapping[str, Column], resolution: Any, whole: bool
+) -> tuple[dict[str, str], list[str]]:
+    """Return the unit of each quantity, and notes on those that neither header nor option gives.
+
+    Positions that are ``whole`` numbers are counts if they have no unit.
+    """
+    units = {name: column.units[0] for name, column in places.items()}
+    notes = []
+    if any(column.guessed for column in places.values()):
+        names = [f"{name} {' + '.join(repr(heads[k]) for k in column.places)}" for name, column in places.items()]
+        notes.append(f"columns by their names: {', '.join(names)}")
+    for name in ("position", "force"):
+        own, asked = places[name].header_unit, places[name].units[0]
+        sizes = [size for unit in (own, asked) if (size := _measure(name, unit)) is not None]
+        if own != asked and len(sizes) == 2 and abs(sizes[0] / sizes[1] - 1) > _ROUNDING:
+            notes.append(f"{name} is read in {asked}, as asked, although the header has {own}")
+    if units["force"] in _WEIGHTS:
+        weight = FORCE.in_base("1", 0, {"kg": "kgf", "g": "gf", "lb": "lbf", "oz": "ozf"}[units["force"]])
+        notes.append(
+            f"force in {units['force']} is the weight of that mass: 1 {units['force']} is {plain(weight or 0)} N"
+        )
+        units["force"] = {"kg": "kgf", "g": "gf", "lb": "lbf", "oz": "ozf"}[units["force"]]
+    if whole and not units["position"]:
+        units["position"] = COUNTS[0]
+        notes.append(f"position {heads[places['position'].places[0]]!r} has no unit and is read in counts")
+    if _turns(units, places, resolution):
+        for name, unit in (("position", "rad"), ("force", "N m")):
+            if not units[name] and places[name].turns is not False:
+                units[name] = unit
+                notes.append(f"{name} {heads[places[name].places[0]]!r} has no unit and is read in {unit}")
+    return units, notes
+
+
+def _turns(units: Mapping[str, str], places: Mapping[str, Column], resolution: Any) -> bool:
+    """Return whether units, or else names, are of a rotary axis."""
+    for name in ("force", "position"):
+        linear, angular = DIMENSIONS[name]
+        base = _without_rate(units[name]) or units[name]
+        for dimension in (linear, angular):
+            if base and dimension.in_base("1", 0, base) is not None:
+                return dimension is angular
+    if resolution is not None and read_step(resolution)[1] is not None:
+        return bool(read_step(resolution)[1])
+    return any(places[name].turns for name in ("force", "position"))
+
+
+def _measure(name: str, unit: str) -> float | None:
+    """Return the size of a unit of a quantity, linear or rotary, in SI units; None for another unit."""
+    for dimension in (*DIMENSIONS[name], MASS):
+        size = dimension.in_base("1", 0, unit) if unit else None
+        if size is not None:
+            return size * (9.80665 if dimension is MASS else 1.0)
+    return None
+
+
+def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[str]) -> np.ndarray:
+    """Return the times in s, of one column or of seconds and a part of a second in two."""
+    total: Any = 0.0
+    for place, unit in zip(column.places, column.units, strict=True):
+        values = numbers[place]
+        size = _read_unit("time", unit)[0]
+        first = float(values[np.isfinite(values)][0])
+        if not unit:
+            # Times since 1970 have a magnitude of their own.
+            name, size = next(((name, size) for name, size in _EPOCH_UNITS if first * size >= _EPOCH), ("s", 1.0))
+            if name != "s":
+                notes.append(f"time has no unit and is read in {name}, by its magnitude as a time since 1970")
+        # Whole seconds since 1970 would hide the digits of the other column.
+        total = total + (values - first if len(column.places) > 1 and size == 1.0 else values) * size
+    return total
 
 
 def _without_rate(unit: str) -> str | None:
@@ -168,12 +255,13 @@ def _read_constant(constant: str | None, unit: str) -> tuple[float, str]:
 
 def _compare_period(file: str | Path, table: NamedColumns, period: float) -> None:
     """Raise `InputError` where a column of times, in a unit that it says, is of another period than the one given."""
-    heads = [split_head(head) for head in table.heads]
-    found = [(at, unit) for at, (name, unit) in enumerate(heads) if name.lower() in _NAMES["time"] and unit]
-    if len(found) != 1:
-        return
     try:
-        time = _read_unit("time", found[0][1])[0] * table.numbers([found[0][0]])[0]
+        column = find_columns(file, table.heads, {}, ["time"])["time"]
+        if not all(column.units):
+            return
+        values = table.numbers(column.places, gaps=True)
+        time = _join_times(column, dict(zip(column.places, values, strict=True)), [])
+        time = time[np.isfinite(time)]
     except InputError:
         # The period may be given for the times' sake.
         return
@@ -185,56 +273,15 @@ def _compare_period(file: str | Path, table: NamedColumns, period: float) -> Non
         )
 
 
-def _find_column(file: str | Path, heads: Sequence[str], name: str, wanted: str | None) -> tuple[int, str]:
-    """The column's index and its unit, "" where nothing says it."""
-    if wanted is None:
-        titles = [split_head(head) for head in heads]
-        others, usual = _INSTEAD.get(name, ((), ""))
-        found = [k for k, (title, _) in enumerate(titles) if title.lower() in _NAMES[name]]
-        instead = [k for k, (title, _) in enumerate(titles) if title.lower() in others]
-        if len(found) == 1:
-            return found[0], titles[found[0]][1]
-        if not found and len(instead) == 1:
-            return instead[0], titles[instead[0]][1] or usual
-        what = f"may be any of {_listing(heads[k] for k in found)}" if found else f"is none of {_listing(heads)}"
-        measured = "frequency" in {title.lower() for title, _ in titles}
-        remedy = f"a table of a response is a device: zwidth ridge --device {file}" if measured else ""
-        raise InputError(f"{name}: by its name it {what} in {file}; {remedy or 'say which column it is'}")
-    title, unit = wanted.strip(), None
-    found = _matches(heads, title)
-    if not found:
-        title, _, unit = (part.strip() for part in wanted.rpartition(":"))
-        found = _matches(heads, title)
-    if len(found) != 1:
-        title = title or wanted.strip()
-        if found:
-            raise InputError(f"{name}: {file} has {len(found)} columns {title!r}; give each a name of its own")
-        known = [*heads, *(split_head(head)[0] for head in heads)]
-        hint = suggestion(title, known, f"it has {_listing(heads)}")
-        raise InputError(f"{name}: {file} has no column {title!r}; {hint}")
-    return found[0], split_head(heads[found[0]])[1] if unit is None else unit
-
-
-def _matches(heads: Sequence[str], title: str) -> list[int]:
-    """Columns of this header; else those of this name before the brackets."""
-    whole = [k for k, head in enumerate(heads) if head == title]
-    return whole or [k for k, head in enumerate(heads) if title and split_head(head)[0] == title]
-
-
-def _listing(heads: Any) -> str:
-    names = [repr(head) for head in heads if head]
-    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-
-
 def _read_unit(name: str, unit: str) -> tuple[float, Dimension | None]:
     """What one of a unit is in SI units, the base unit of a linear axis without one; its dimension, None of counts."""
     if name == "position" and unit.lower() in COUNTS:
         return 1.0, None
-    for dimension in _DIMENSIONS[name]:
+    for dimension in DIMENSIONS[name]:
         size = dimension.in_base("1", 0, unit) if unit else 1.0
         if size is not None:
             return size, dimension
-    known = [each for dimension in _DIMENSIONS[name] for each in dimension.units]
+    known = [each for dimension in DIMENSIONS[name] for each in dimension.units]
     known += [COUNTS[0]] if name == "position" else []
     raise InputError(
         f"{name}: got the unit {unit!r}; allowed are {', '.join(known)}; "
@@ -261,14 +308,19 @@ def _check_pairs(units: Mapping[str, str], dimensions: Mapping[str, Dimension | 
 
 
 def read_step(resolution: Any) -> tuple[float, bool | None]:
-    """The step in SI units, and whether it is an angle; None of a number alone."""
+    """Return the step in SI units, and whether it is an angle; None for a number alone."""
     number = not isinstance(resolution, str) or looks_like_number(resolution)
     value = float(resolution) if isinstance(resolution, str) and number else resolution
+    if number and isinstance(value, int | float) and value > _COARSEST:
+        raise InputError(
+            f"resolution: got {describe(resolution)}, which is more than a radian or a metre per count; give counts as "
+            f"'{describe(resolution).strip(chr(39))} counts/rev' or a step as '0.09 deg'"
+        )
     try:
         return read_quantity(value, LENGTH, POSITIVE)[0], None if number else False
     except UnusableValueError as error:
         try:
-            return read_quantity(value, ANGLE, POSITIVE)[0], True
+            return read_quantity(value, ANGLE, POSITIVE, counts=True)[0], True
         except UnusableValueError:
             what, allowed = error.parts[:2]
             raise InputError(
@@ -289,5 +341,7 @@ def join_logs(motions: Sequence[LoggedMotion], period: float | None) -> dict[str
 
 
 def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None, **options: Any) -> DeviceFit:
-    """`zwidth.fit_log` of logs that are read."""
-    return fit_log(**join_logs(motions, period), **options)
+    """Return `zwidth.fit_log` of logs that are read, with the notes on how they were read."""
+    fit = fit_log(**join_logs(motions, period), **options)
+    notes = dict.fromkeys(note for motion in motions for note in motion.notes)
+    return replace(fit, notes=(*notes, *fit.notes)) if notes else fit

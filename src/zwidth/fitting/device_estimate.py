@@ -100,7 +100,7 @@ def reach_of(freedom: int | None, upper: float = UPPER) -> float:
 class DeviceEstimate:
     """What is known of a device; the attributes are those of `zwidth.DeviceFit`."""
 
-    scene: Scene
+    nominal: Scene
     covariance: np.ndarray
     noise: float | tuple[float, float]
     freedom: int | None = None
@@ -109,13 +109,13 @@ class DeviceEstimate:
     stiffness_tried: float | None = None
 
     # Of its scene: kg, N s/m, s, the period in s, and the parts that the records ask for.
-    mass = property(attrgetter("scene.device.mass"))
-    damping = property(attrgetter("scene.device.damping"))
-    delay = property(attrgetter("scene.timing.delay"))
-    period = property(attrgetter("scene.timing.period"))
-    velocity = property(attrgetter("scene.velocity"))
-    actuator = property(attrgetter("scene.device.actuator"))
-    modes = property(attrgetter("scene.device.modes"))
+    mass = property(attrgetter("nominal.device.mass"))
+    damping = property(attrgetter("nominal.device.damping"))
+    delay = property(attrgetter("nominal.timing.delay"))
+    period = property(attrgetter("nominal.timing.period"))
+    velocity = property(attrgetter("nominal.velocity"))
+    actuator = property(attrgetter("nominal.device.actuator"))
+    modes = property(attrgetter("nominal.device.modes"))
 
     @property
     def is_structured(self) -> bool:
@@ -125,12 +125,12 @@ class DeviceEstimate:
     @property
     def numbers(self) -> tuple[str, ...]:
         """Paths of what was fitted, in the order of the covariance: mass, damping, delay, and what more there is."""
-        return name_numbers(self.scene)
+        return name_numbers(self.nominal)
 
     @cached_property
     def estimates(self) -> np.ndarray:
         """The values of ``numbers``."""
-        own = self.scene.parameters()
+        own = self.nominal.parameters()
         return np.array([own[name] for name in self.numbers])
 
     @property
@@ -145,13 +145,13 @@ class DeviceEstimate:
 
     def differ(self, ask: Callable[[Scene], Any]) -> np.ndarray:
         """By how much an answer changes along each axis of the covariance, one standard deviation far: a row each."""
-        values, middle, rows = self.estimates, ask(self.scene), []
+        values, middle, rows = self.estimates, ask(self.nominal), []
         for axis in _find_axes(self.covariance).T:
             step = _STEP * axis
             # Where damping or delay would be negative, to one side.
             sides = [side for side in (-1.0, 1.0) if np.all((values + side * step) * np.where(values < 0, -1, 1) >= 0)]
             moved = [dict(zip(self.numbers, (values + side * step).tolist(), strict=True)) for side in sides]
-            ends = [ask(self.scene.replace(**each)) for each in moved]
+            ends = [ask(self.nominal.replace(**each)) for each in moved]
             if len(sides) == 1:
                 sides, ends = [0.0, *sides], [middle, *ends]
             change = (ends[-1] - ends[0]) / (_STEP * (sides[-1] - sides[0])) if sides else np.nan * middle
@@ -221,7 +221,7 @@ class DeviceEstimate:
             radius = radius + np.sqrt(0.5 * (square + across) * reach)
         if not np.all(np.isfinite(radius)):
             return None
-        device = MeasuredDevice(known.frequency, known.response, radius)
+        device = MeasuredDevice(known.frequency, known.response, radius, known.rotary)
         return Scene(device, Timing(self.period), velocity=self.velocity)
 
 

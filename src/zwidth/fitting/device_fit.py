@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -10,7 +10,9 @@ import numpy as np
 
 from zwidth.fitting.device_estimate import RELIABILITY, UPPER, DeviceEstimate, find_stiffest
 from zwidth.fitting.hidden import HiddenLag, HiddenResonances
+from zwidth.fitting.safe_scene import limit_walls, round_scene
 from zwidth.fitting.safe_wall import SafeWall, find_safe_wall
+from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import to_json, with_unit
 from zwidth.words.showing import shown
@@ -102,6 +104,7 @@ class DeviceFit(DeviceEstimate):
         residuals: measured less fitted, of buzzing walls an array (n, 2) in units of the noise of K and f, of a log in
             m, NaN where samples are left out.
         doubts: what is odd about the records or about the estimate, a sentence each; then there is no safe wall.
+        notes: how a log was read and what was repaired in it, a sentence each.
         status: of `zwidth.Status`: UNDECIDED where another device fits as well, or where a log shows more than the
             model has.
         rivals: those devices, a `zwidth.RivalDevice` each.
@@ -111,7 +114,9 @@ class DeviceFit(DeviceEstimate):
             ``errors_of_log`` and ``errors``, NaN where the log leaves open how much is of which.
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
         motions: of a log, each with its fit, a `zwidth.FittedMotion`.
-        scene, period, velocity: the estimated device in its loop, a `zwidth.Scene`.
+        scene: the estimated device in its loop, a `zwidth.Scene` with the safe limit of its walls; parameters are
+            rounded to a thousandth of their standard errors, as `zwidth fit --yaml` writes them.
+        nominal, period, velocity: the same loop without rounding and without the limit.
         response: of a log, a `zwidth.MeasuredDevice`: the response of the estimated device, with the radius by which a
             resonance of a damping ratio of 0.005 or more may move it and not show in the log. None of buzzing walls, of
             a log without noise, and under a doubt of what the fit leaves.
@@ -138,6 +143,7 @@ class DeviceFit(DeviceEstimate):
     lag: HiddenLag | None = None
     hidden: HiddenResonances | None = None
     errors_of_log: dict[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def errors(self) -> dict[str, float]:
@@ -148,7 +154,7 @@ class DeviceFit(DeviceEstimate):
     @cached_property
     def _stiffest(self) -> tuple[float, float]:
         """K_max and its standard error; NaN where the device that bears it is another one, or may be."""
-        value, gradient = find_stiffest(self.scene)
+        value, gradient = find_stiffest(self.nominal)
         error = float(np.sqrt(gradient @ self.covariance @ gradient))
         agreed = bool(self.rivals) and all(abs(one.stiffness_max - value) <= error for one in self.rivals)
         known = self.status == Status.OK or (self.status == Status.UNDECIDED and agreed)
@@ -173,9 +179,14 @@ class DeviceFit(DeviceEstimate):
         return self.status != Status.OK or bool(self.doubts)
 
     @cached_property
+    def scene(self) -> Scene:
+        """The scene to hand over, with rounded parameters and the safe limit."""
+        return replace(round_scene(self), safe_limit=limit_walls(self))
+
+    @cached_property
     def virtual_damping(self) -> float:
         """B in N s/m of the stiffest stable wall; NaN where ``stiffness_max`` is."""
-        return float(self.scene.max_stiffness().virtual_damping) if self.stiffness_max > 0 else np.nan
+        return float(self.nominal.max_stiffness().virtual_damping) if self.stiffness_max > 0 else np.nan
 
     @cached_property
     def virtual_damping_error(self) -> float:
@@ -186,7 +197,7 @@ class DeviceFit(DeviceEstimate):
 
     def value_of(self, name: str) -> float:
         """What ``errors`` names: an attribute of the fit, or a parameter of a part by its path."""
-        return float(self.scene.parameters()[name] if "." in name else getattr(self, name))
+        return float(self.nominal.parameters()[name] if "." in name else getattr(self, name))
 
     @cached_property
     def intervals(self) -> dict[str, ErrorBar]:
@@ -303,7 +314,7 @@ class DeviceFit(DeviceEstimate):
             "intervals": self.intervals,
             "covariance": self.covariance.tolist(),
             "noise": self.noise,
-            **{name: getattr(self, name) for name in ("offset", "friction", "resolution", "period", "doubts")},
+            **{name: getattr(self, name) for name in ("offset", "friction", "resolution", "period", "doubts", "notes")},
             "status": int(self.status),
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),

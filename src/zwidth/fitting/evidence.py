@@ -64,14 +64,14 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
     """The stiffest stable wall at each damping B >= 0, and between which stiffnesses it lies with 95 %."""
     # The band is pointwise: the quantiles of devices drawn around the estimate, by a fixed seed; NaN where the records
     # leave the device open. A damping at which a device has no stable wall counts as 0.
-    outlines = fit.scene.stable_region()
+    outlines = fit.nominal.stable_region()
     if not outlines:
         raise InputError("scene: no wall of the fitted device is stable; measure again")
     end = max(float(each.virtual_damping.max()) for each in outlines)
     damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
     own = fit.estimates[None]
     low = high = np.full(damping.size, np.nan)
-    drawn = fit.draw(min(_DRAWS, fit.scene.loop.draws))
+    drawn = fit.draw(min(_DRAWS, fit.nominal.loop.draws))
     if drawn is not None:
         low, high = np.quantile(_limit_rows(fit, drawn, damping), [0.025, 0.975], axis=0)
     return {
@@ -84,14 +84,14 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """Up to which stiffness every softer wall is stable, for devices, a row each, and dampings; 0 where none is."""
-    return fit.scene.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).row_ends(damping)
+    return fit.nominal.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).row_ends(damping)
 
 
 @in_own_units
 def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str, np.ndarray]:
     """The stiffest wall, the one to set, and walls that buzzed: errors, frequencies, and distances from the fit."""
     # Distances are in units of the noise, stiffness and frequency apart.
-    top, choice, lost = fit.scene.max_stiffness(), choose_wall(fit), (np.nan,) * 4
+    top, choice, lost = fit.nominal.max_stiffness(), choose_wall(fit), (np.nan,) * 4
     rows: list[tuple[Any, ...]] = [("stiffest", float(top.stiffness), float(top.virtual_damping), *lost)]
     rows += [] if choice is None else [("set", choice.stiffness, choice.virtual_damping, *lost)]
     share = fit.noise[0] if isinstance(fit.noise, tuple) else np.nan

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 
 from zwidth.fitting.respond import SURE, find_nominal_limit
-from zwidth.parts.checks import check_number
+from zwidth.parts.checks import check_number, find_kind
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
@@ -23,6 +23,7 @@ from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.files import write_whole
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.status import Status
 
 # Stretches of other phases, and periods of each.
@@ -46,6 +47,8 @@ _FEWEST_SAMPLES = 600
 class Excitation:
     """A force to play, sample by sample, and what it will tell.
 
+    Of a rotary device forces are torques in N m, and m is rad.
+
     Attributes:
         force: in N, one number a sample.
         period: of the samples, in s.
@@ -64,11 +67,20 @@ class Excitation:
     deviation: np.ndarray
     expected: StiffestWall | None
     limit: StiffestWall | None
+    rotary: bool = False
+
+    @property
+    def in_rotary_units(self) -> bool:
+        """Whether its numbers are those of a rotary device."""
+        return self.rotary
 
     def save(self, file: str | Path) -> None:
-        """Write a CSV file with the time in s and the force in N of every sample."""
+        """Write a CSV file with the time in s and the force in N, or torque in N m, of every sample."""
         rows = [f"{k * self.period:.9g},{value:.7g}" for k, value in enumerate(self.force.tolist())]
-        write_whole(Path(file), ("\n".join(["time [s],force [N]", *rows]) + "\n").encode())
+        write_whole(
+            Path(file),
+            ("\n".join([f"time [s],{'torque [N m]' if self.rotary else 'force [N]'}", *rows]) + "\n").encode(),
+        )
 
 
 def excite(
@@ -80,6 +92,7 @@ def excite(
     response: MeasuredDevice | None = None,
     velocity: Velocity | None = None,
     seed: int = 0,
+    rotary: bool | None = None,
 ) -> Excitation:
     """Design the force to play for `zwidth.respond`.
 
@@ -92,6 +105,8 @@ def excite(
             is nearly unstable. Without it all lines from 1 Hz to nearly half the rate are equally strong.
         velocity: the velocity estimate of the walls that are meant; the backward difference by default.
         seed: of the phases.
+        rotary: whether the force is a torque in N m and the resolution an angle in rad; left out, their units or the
+            response say so, and plain numbers are of a linear device.
 
     Returns:
         Excitation: ``force`` to play at every period, ``cycle``, the lines with the ``deviation`` to expect, and with a
@@ -113,6 +128,26 @@ def excite(
         >>> print(f"{record.force.size} samples, up to {abs(record.force).max():.1f} N, cycle {record.cycle} s")
         30000 samples, up to 3.0 N, cycle 2.0 s
     """
+    told = find_kind({"force": force, "resolution": resolution, "response": response})
+    if rotary is not None and told not in (None, rotary):
+        kind = "rotary" if told else "linear"
+        raise InputError(
+            f"rotary: got {rotary}, but force, resolution or response are of a {kind} device; leave it out"
+        )
+    with use_kind(is_rotary() if rotary is None and told is None else bool(told or rotary)):
+        return _design(period, force, resolution, duration, response, velocity, seed)
+
+
+def _design(
+    period: Any,
+    force: Any,
+    resolution: Any,
+    duration: Any,
+    response: MeasuredDevice | None,
+    velocity: Velocity | None,
+    seed: int,
+) -> Excitation:
+    """Return the record of `excite`, in units of the kind of device in question."""
     period, most = check_number("period", period), check_number("force", force, "N", POSITIVE)
     step, length = check_number("resolution", resolution, "m"), check_number("duration", duration, "s", POSITIVE)
     count = int(length / period / (_STRETCHES * _PERIODS)) // 2 * 2
@@ -137,9 +172,9 @@ def excite(
     hertz, expected = lines / (count * period), None
     if scene is not None and response is not None:
         answer = _answer_at(scene, 2.0 * np.pi * lines / count)[0]
-        told = MeasuredDevice(hertz, answer, deviation)
-        expected = Scene(told, scene.timing, velocity=velocity).max_stiffness()
-    return Excitation(played, period, count * period, hertz, amplitude, deviation, expected, limit)
+        promised = MeasuredDevice(hertz, answer, deviation, is_rotary())
+        expected = Scene(promised, scene.timing, velocity=velocity).max_stiffness()
+    return Excitation(played, period, count * period, hertz, amplitude, deviation, expected, limit, is_rotary())
 
 
 def _lay_lines(count: int, period: float, spacing: np.ndarray) -> np.ndarray:

@@ -190,7 +190,7 @@ def respond_as_fitted(best: FittedModel, scene: Scene, banks: list[PoleBank]) ->
             - bank.absorbed[: best.model.parts.stop].T @ slopes.T
         )
         radius = np.maximum(radius, np.max(np.abs(moved) * bank.bound_modes()[:, None], 0))
-    return MeasuredDevice(lines / scene.timing.period, response, radius)
+    return MeasuredDevice(lines / scene.timing.period, response, radius, bool(scene.device.rotary))
 
 
 def weigh_resonances(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> HiddenResonances | None:

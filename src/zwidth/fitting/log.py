@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.fitting.causes import Cause, explain_motion, explain_residuals
 from zwidth.fitting.choosing import ALIKE, EXACT, choose_structure
 from zwidth.fitting.device_estimate import differentiate, reach_of
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, doubt_period
@@ -13,7 +14,7 @@ from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted, weigh_resonances
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
-from zwidth.fitting.recordings import find_even, find_stretches, read_logs
+from zwidth.fitting.recordings import ReadLogs, find_even, find_stretches, read_logs
 from zwidth.fitting.structure import Recordings
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity
@@ -118,7 +119,7 @@ def fit_log(
     """
     with use_kind(rotary):
         return _fit(
-            *read_logs(time, position, force, resample),
+            read_logs(time, position, force, resample, resolution),
             BackwardDifference() if velocity is None else velocity,
             max_delay,
             resolution,
@@ -126,15 +127,13 @@ def fit_log(
 
 
 def _fit(
-    logs: tuple[Recording, ...],
-    places: tuple[np.ndarray, ...],
-    period: float,
-    wavers: float,
+    read: ReadLogs,
     velocity: Velocity,
     max_delay: Any,
     resolution: Any,
 ) -> DeviceFit:
-    """The same of logs that are read, whose period has the relative standard error ``wavers``."""
+    """Return the device of logs that are read."""
+    logs, places, period, wavers, notes = read
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
     stretches = [find_even(place, skip + _FEWEST) for place in places]
@@ -184,7 +183,7 @@ def _fit(
         shown = {"response": respond_as_fitted(best, scene, banks), "hidden": weigh_resonances(best, scene, banks)}
         shown |= {"lag": bound_lag(best, lags, scene, reach_of(freedom))}
     return DeviceFit(
-        scene=scene,
+        nominal=scene,
         covariance=covariance,
         errors_of_log={"offset": offset[1], "friction": friction[1]},
         offset=offset[0],
@@ -196,12 +195,17 @@ def _fit(
         doubts=(*doubts, *doubt_period(period)),
         status=int(status),
         freedom=freedom,
+        notes=notes,
         **shown,
     )
 
 
 def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float) -> list[str]:
     """What the residuals show beyond noise, with the record to make next."""
+    cause = explain_residuals(best) if pole is not None or best.excess > ALIKE else ""
+    if cause:
+        remedy = "log the force with more digits" if "rounded" in cause else _RECORD_NEXT
+        return [f"what the fit leaves is no noise: {cause}: {remedy}"]
     if pole is not None and pole.instead:
         near = with_unit(pole.frequency / period, "Hz", 3)
         what = f"an amplifier's lag explains the log, and so does a resonance near {near}, whose K_max is another one"
@@ -251,13 +255,25 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
             "force: the position does not follow it; check that both columns are of the same axis, and that nothing "
             "holds the device"
         )
-    if theta[0] <= 0:
+    left = squares / float(rest @ rest)
+    unexplained = left > _UNEXPLAINED and best.excess > _SMOOTH
+    cause = explain_motion(model.logs, period) if theta[0] <= 0 or unexplained else Cause("")
+    if cause.words:
+        raise InputError(
+            f"force: {cause.words} as well; support the device, or play a record of zwidth.excite, for zwidth.respond "
+            "needs no model"
+        )
+    if theta[0] <= 0 and (cause.reversed or left < _UNEXPLAINED):
         raise InputError(
             f"force: the device runs away from it, as if its mass were {with_unit(period**2 / theta[0], 'kg')}; "
             "turn the sign of the force, or of the position; a velocity given as a position looks so too"
         )
-    left = squares / float(rest @ rest)
-    if left > _UNEXPLAINED and best.excess > _SMOOTH:
+    if theta[0] <= 0:
+        raise InputError(
+            f"force: it leaves {plain(100 * np.sqrt(left), 2)} % of the motion unexplained, and the fitted mass is "
+            "negative; check that both columns are of one axis, every sample is logged, and nothing else moves it"
+        )
+    if unexplained:
         raise InputError(
             f"force: it leaves {plain(100 * np.sqrt(left), 2)} % of the motion unexplained, and that is smooth, not "
             "noise: something else pushes, as a hand, a spring, a stop or gravity along the way, the motor gives less "

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64
 from zwidth.fitting.moving import Recording
+from zwidth.fitting.repair import even_coarse_times, refuse_repeated, repair_log
 from zwidth.parts.checks import check_number
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
-from zwidth.words.quantities import POSITIVE, SI_RANGE
+from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SI_RANGE
 
 # How far a sample's time may lie from an even one, as a share of the period, unasked and where a wavering clock is
 # asked for, less than what a missing sample looks like; how far periods of logs may differ beyond their errors.
@@ -23,10 +24,18 @@ _STUCK, _MANY = 25, 0.1
 _MISSING = 1.5
 
 
-def read_logs(
-    time: Any, position: Any, force: Any, resample: bool = False
-) -> tuple[tuple[Recording, ...], tuple[np.ndarray, ...], float, float]:
-    """The logs, the place of each sample in periods, their period, and its relative standard error."""
+class ReadLogs(NamedTuple):
+    """Logs that were read and repaired."""
+
+    logs: tuple[Recording, ...]
+    places: tuple[np.ndarray, ...]  # of each sample, in periods
+    period: float  # in s
+    wavers: float  # relative standard error of the period
+    notes: tuple[str, ...]  # what was repaired
+
+
+def read_logs(time: Any, position: Any, force: Any, resample: bool = False, resolution: Any = None) -> ReadLogs:
+    """Return logs with what was repaired in them; raise `InputError` where nothing can be found from them."""
     several = isinstance(position, list | tuple) and len(position) > 0 and np.ndim(position[0]) == 1
     positions, forces = (position, force) if several else ([position], [force])
     times = time if several and isinstance(time, list | tuple) else [time] * len(positions)
@@ -34,18 +43,23 @@ def read_logs(
         raise InputError(
             f"time, position, force: got {len(times)}, {len(positions)} and {len(forces)} logs; give each log all three"
         )
-    read = [_read(*parts, resample) for parts in zip(times, positions, forces, strict=True)]
-    logs, places, periods, errors = zip(*read, strict=True)
+    step = 0.0 if resolution is None else check_number("resolution", resolution, "m", NOT_NEGATIVE)
+    read = [_read(*parts, resample, step) for parts in zip(times, positions, forces, strict=True)]
+    logs, places, periods, errors, notes = zip(*read, strict=True)
+    if len(read) > 1:
+        notes = [[f"log {k}: {note}" for note in each] for k, each in enumerate(notes, start=1)]
     error = max(errors)
     if np.ptp(periods) > (_SAME + _SURE * error) * periods[0]:
         raise InputError(
             f"time: the logs have periods of {with_unit(min(periods), 's')} to {with_unit(max(periods), 's')}; fit "
             "them one by one"
         )
-    return logs, places, float(np.mean(periods)), error
+    return ReadLogs(logs, places, float(np.mean(periods)), error, tuple(note for each in notes for note in each))
 
 
-def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Recording, np.ndarray, float, float]:
+def _read(
+    time: Any, position: Any, force: Any, resample: bool, step: float
+) -> tuple[Recording, np.ndarray, float, float, list[str]]:
     x, f = as_float64("position", position), as_float64("force", force)
     clock = None if isinstance(time, str) or np.ndim(time) == 0 else as_float64("time", time)
     given = {"position": x, "force": f} | ({} if clock is None else {"time": clock})
@@ -56,40 +70,44 @@ def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Recordi
         text = ", ".join(f"{name} {array.shape}" for name, array in given.items())
         raise InputError(f"shapes differ or are no single columns: {text}; give one number a sample in each")
     for name, array in given.items():
-        bad = np.flatnonzero(~np.isfinite(array))
-        if bad.size:
-            raise InputError(f"{name}: {bad.size} samples are no numbers, the first is sample {bad[0]}; leave them out")
-        low, high = float(array.min()), float(array.max())
+        known = array[np.isfinite(array)]
+        if not known.size:
+            raise InputError(f"{name}: it holds no number; check the column")
+        low, high = float(known.min()), float(known.max())
         if max(-low, high) > SI_RANGE[1] or 0 < high - low < SI_RANGE[0]:
             least, most = SI_RANGE
             raise InputError(
                 f"{name}: got values from {plain(low)} to {plain(high)}; they must be at most {most:g} in magnitude "
                 f"and at least {least:g} apart; check the unit"
             )
+    clock, row, x, f, notes = repair_log(clock, x, f, step)
     if clock is None:
-        place, period, error = np.arange(x.size), check_number("time", time, "s", POSITIVE), 0.0
+        place, period, error = row - row[0], check_number("time", time, "s", POSITIVE), 0.0
     else:
-        place, period, error = _place(clock, resample)
+        place, period, error = _place(clock, resample, notes)
     if np.ptp(f) == 0:
         raise InputError(
             f"force: it is {plain(f[0])} N all the time; command a force that changes, as steps to and fro"
         )
     if np.ptp(x) == 0:
         raise InputError("position: it never changes; check the column, and that nothing holds the device")
-    return Recording(f, x, 0), place, period, error
+    return Recording(f, x, 0), place, period, error, notes
 
 
-def _place(clock: np.ndarray, wavering: bool) -> tuple[np.ndarray, float, float]:
-    """Samples in whole periods by a clock that wavers, their period and its relative standard error."""
+def _place(clock: np.ndarray, wavering: bool, notes: list[str]) -> tuple[np.ndarray, float, float]:
+    """Return samples in whole periods by a clock that wavers, their period and its relative standard error."""
     # The line through all times: nothing between the samples is guessed, they are taken as they are.
     steps = np.diff(clock)
-    if steps.min() <= 0:
-        k = int(np.argmin(steps))
-        raise InputError(f"time: it does not grow from sample {k} to {k + 1}; sort the samples, drop double ones")
     usual = float(np.median(steps))
+    uneven = np.ptp(steps) > _UNEVEN * usual
+    coarse = even_coarse_times(clock) if uneven and not wavering else None
+    if coarse is not None:
+        notes.append(coarse.note)
+    elif steps.min() <= 0:
+        refuse_repeated(clock)
     # By a clock that wavers it cannot be told how many samples are missing.
     passed = np.where((steps > _MISSING * usual) & (not wavering), np.round(steps / usual), 1.0)
-    place = np.concatenate([[0.0], np.cumsum(passed)])
+    place = np.concatenate([[0.0], np.cumsum(passed)]) if coarse is None else coarse.place
     count = place - place.mean()
     square = float(count @ count)
     # Times to 12 digits have a period of as many.
@@ -99,7 +117,7 @@ def _place(clock: np.ndarray, wavering: bool) -> tuple[np.ndarray, float, float]
     # Against the middle of them, for the first sample may be the late one.
     late = late - 0.5 * (late.max() + late.min())
     worst = int(np.argmax(np.abs(late)))
-    if abs(late[worst]) > (_WAVERING if wavering else _UNEVEN) * period:
+    if coarse is None and abs(late[worst]) > (_WAVERING if wavering else _UNEVEN) * period:
         if abs(late[worst]) > _WAVERING * period:
             remedy = "which sample is whose cannot be told; record at even times"
         else:

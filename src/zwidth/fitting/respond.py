@@ -25,6 +25,7 @@ from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.rotation import use_kind
 from zwidth.words.types import ArrayLike
 
 # The radius that holds for some thousand lines at once: 4.5 standard errors of real and imaginary part, each of which
@@ -42,6 +43,8 @@ _PIECES, _LONGEST, _COHERENT = 8, 1 << 13, 0.1
 _OVERLAP = 1.06
 # A motion of fewer steps of the encoder is not seen as it is.
 _STEPS = 20
+# Missing samples that are interpolated, as a share, and the longest step over them in samples.
+_FILLED, _LONGEST_GAP = 0.002, 4
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class ResponseEstimate:
         records: stretches of one periodic force that count, or pieces of a force that does not repeat.
         noise: of one sampled position in m, where the force repeats.
         doubts: sentences on what makes the response doubtful.
+        notes: how the logs were read and what was repaired in them, a sentence each.
     """
 
     device: MeasuredDevice
@@ -65,10 +69,17 @@ class ResponseEstimate:
     records: int
     noise: float
     doubts: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def respond(
-    time: ArrayLike, position: ArrayLike, force: ArrayLike, *, cycle: Any = None, resolution: Any = None
+    time: ArrayLike,
+    position: ArrayLike,
+    force: ArrayLike,
+    *,
+    cycle: Any = None,
+    resolution: Any = None,
+    rotary: bool = False,
 ) -> ResponseEstimate:
     """Find the frequency response of a device, with its deviation, from a log of commanded force and sampled position.
 
@@ -79,6 +90,8 @@ def respond(
         force: that the program commanded, in N: of that sample. `zwidth.excite` makes one.
         cycle: period of the force in s; found from the force where left out, which must repeat itself exactly for that.
         resolution: step of the encoder in m; found from the positions where left out.
+        rotary: whether the position is an angle in rad and the force a torque in N m; the response is in rad/(N m)
+            then.
 
     Returns:
         ResponseEstimate: ``device``, with a deviation of 4.5 standard errors; ``period``, ``coherence``, ``cycle``,
@@ -105,14 +118,16 @@ def respond(
         >>> f"{found.device.frequency.size} lines from {found.records} stretches"
         '409 lines from 5 stretches'
     """
-    logs, places, period, _ = read_logs(time, position, force)
-    for k, place in enumerate(places, start=1):
-        if place[-1] >= place.size:
-            missing, gap = place[-1] + 1 - place.size, int(np.argmax(np.diff(place)))
-            raise InputError(
-                f"time: log {k} lacks {missing} samples, most of them after sample {gap}; record every sample, or give "
-                "what lies before and behind a gap as two logs"
-            )
+    with use_kind(rotary):
+        found = _respond(time, position, force, cycle, resolution)
+        return replace(found, device=replace(found.device, rotary=rotary))
+
+
+def _respond(time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any, resolution: Any) -> ResponseEstimate:
+    """Return the response in units of the kind of device in question."""
+    logs, places, period, _, notes = read_logs(time, position, force, resolution=resolution)
+    notes = list(notes)
+    logs = tuple(_fill(log, place, k, notes) for k, (log, place) in enumerate(zip(logs, places, strict=True), start=1))
     step = min(find_resolution(log.position) for log in logs)
     step = step if resolution is None else check_number("resolution", resolution, "m")
     given = None if cycle is None else int(np.round(check_number("cycle", cycle, "s", POSITIVE) / period))
@@ -124,24 +139,40 @@ def respond(
         )
     count = given or _find_period(logs[0].force)
     if count is None:
-        return _average_pieces(logs, period, doubts)
+        return replace(_average_pieces(logs, period, doubts), notes=tuple(notes))
     stretches = [part for log in logs for part in _split(log, count, given is not None)]
     if not stretches:
         raise InputError(
             f"cycle: no stretch of the force repeats after {count} samples; leave the cycle out, or record two periods "
             "or more of each force"
         )
-    return _average_periods(stretches, count, period, step, doubts)
+    return replace(_average_periods(stretches, count, period, step, doubts), notes=tuple(notes))
+
+
+def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> Recording:
+    """Return a log with every sample, few missing ones interpolated; raise `InputError` for more."""
+    missing = int(place[-1]) + 1 - place.size
+    if not missing:
+        return log
+    if missing > _FILLED * place.size or np.diff(place).max() > _LONGEST_GAP:
+        gap = int(np.argmax(np.diff(place)))
+        raise InputError(
+            f"time: log {number} lacks {missing} samples, most of them after sample {gap}; record every sample, or "
+            "give what lies before and after a gap as two logs"
+        )
+    every = np.arange(place[-1] + 1)
+    # The force of a missing sample is taken for that of the sample before.
+    force = log.force[np.searchsorted(place, every, side="right") - 1]
+    from scipy.interpolate import CubicSpline
+
+    notes.append(f"interpolated {missing} missing sample{'' if missing == 1 else 's'} of log {number}")
+    return Recording(force, CubicSpline(place, log.position)(every), 0)
 
 
 def respond_to_logs(motions: Sequence[LoggedMotion], period: float | None, cycle: Any = None) -> ResponseEstimate:
     """`respond` of logs that are read."""
-    logs = join_logs(motions, period)
-    if logs.pop("rotary"):
-        raise InputError(
-            "position, force: got an angle and a torque; a response is in m/N: give position and force at the handle"
-        )
-    return respond(**logs, cycle=cycle)
+    found = respond(**join_logs(motions, period), cycle=cycle)
+    return replace(found, notes=(*dict.fromkeys(note for motion in motions for note in motion.notes), *found.notes))
 
 
 def find_nominal_limit(scene: Scene) -> StiffestWall:

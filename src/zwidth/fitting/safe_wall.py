@@ -67,7 +67,7 @@ _UNDECIDED = SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
 
 def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> SafeWall:
     """See `zwidth.DeviceFit.safe_wall`."""
-    scene, usual = fit.scene, _CONFIRMED if fit.is_structured else _FOUND
+    scene, usual = fit.nominal, _CONFIRMED if fit.is_structured else _FOUND
     count = min(_SAMPLES, usual * scene.loop.draws)
     drawn = fit.draw(count)
     if drawn is None:
@@ -168,7 +168,7 @@ class _SearchedDevices:
     """Devices with a filter or parts, by their boundaries on a grid of frequencies; only B >= 0 counts."""
 
     def __init__(self, drawn: np.ndarray, fit: DeviceEstimate) -> None:
-        period, scene = fit.period, fit.scene
+        period, scene = fit.period, fit.nominal
         with np.errstate(all="ignore"):
             rate, d = drawn[:, 0] / period, drawn[:, 2] / period
             known = device_status(drawn[:, 1] / rate, d) == Status.OK

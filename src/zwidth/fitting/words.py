@@ -125,6 +125,7 @@ def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     if wall is not None:
         rows.append(("set", f"{name_wall(*wall[:2])}: {wall.why}"))
     rows += [("doubt", doubt) for doubt in fit.doubts]
+    rows += [("note", note) for note in fit.notes]
     if not fit.is_doubted and (rigid := choose_wall(fit, rigid=True)) not in (None, wall):
         at = "" if math.isnan(safe.resonance) else f" near {with_unit(safe.resonance, 'Hz', 3)}"
         hidden = f"a resonance{at} may make stiffer walls unstable, K_max too, and not show in this log: {SEE_MORE}"
@@ -209,6 +210,7 @@ def write_scene(fit: DeviceFit, source: str) -> list[str]:
     if fit.status != Status.OK:
         lines.append(f"# {Status(fit.status).name}: do not rely on these numbers: {name_trouble(fit)}.")
     lines += [f"# Doubt: {doubt}" for doubt in fit.doubts]
+    lines += [f"# Note: {note}" for note in fit.notes]
     lines += ["version: 1", "name: fitted_device", "scene:"]
     lines += [f"  {_write_part(fit, key)}" for key in fit.numbers[:3]]
     lines.append(f"  period: {fit.period!r} s # as given")

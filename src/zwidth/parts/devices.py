@@ -7,6 +7,7 @@ A rotary device is the same mathematics as a linear one with other units: its ``
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,6 +16,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.measured import SUFFIXES, MeasuredDevice
 from zwidth.parts.operator import Operator
+from zwidth.parts.timing import Timing
 from zwidth.words.errors import InputError, describe_choice
 from zwidth.words.formatting import with_unit
 
@@ -36,7 +38,9 @@ class Published(NamedTuple):
 
     def spell(self) -> str:
         """It with its unit."""
-        return f"{self.value:g} counts" if self.unit == "counts" else with_unit(self.value, self.unit, 3)
+        if self.unit in ("counts", "periods"):
+            return f"{self.value:g} {self.unit.removesuffix('s') if self.value == 1 else self.unit}"
+        return with_unit(self.value, self.unit, 3)
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,7 @@ class KnownDevice:
         resolution: one step of the position sensor, in m or rad.
         counts: of the encoder on the motor's shaft; transmissions are not published with them.
         period: of the loop it was measured or used in, in s.
+        delay: of that loop, from a sample to its force, in s or in periods.
         force: the largest, in N.
         stiffness_limit: the largest in use, in N/m: what a library sets or notes name, no measured boundary.
         damping_limit: likewise, in N s/m.
@@ -67,6 +72,7 @@ class KnownDevice:
     resolution: Published | None = None
     counts: Published | None = None
     period: Published | None = None
+    delay: Published | None = None
     force: Published | None = None
     stiffness_limit: Published | None = None
     damping_limit: Published | None = None
@@ -108,6 +114,31 @@ class KnownDevice:
         """
         numbers = {"mass": self._chosen("mass", mass), "damping": self._chosen("damping", damping)}
         return Device(**numbers, rotary=self.rotary)
+
+    def to_timing(self, *, period: Any = None, rate: Any = None, delay: Any = None) -> Timing:
+        """Return a `zwidth.Timing` with the published period and delay; 0 if no delay is published.
+
+        Args:
+            period: yours, or ``rate``, in place of the published one or if none is published.
+            delay: yours, in place of the published one. A delay published in periods stays in periods.
+
+        Raises:
+            InputError: the period is neither published nor given.
+
+        Example:
+            >>> import zwidth
+            >>> zwidth.devices.find_device("phantom_2006").to_timing(rate="2 kHz")
+            Timing(period=0.0005, delay=0.0005)
+        """
+        if delay is None and self.delay is not None:
+            delay = f"{self.delay.value!r} periods" if self.delay.unit == "periods" else self.delay.value
+        if period is None and rate is None:
+            period = self._chosen("period", None)
+        return Timing(period=period, rate=rate, delay=0.0 if delay is None else delay)
+
+    def list_missing(self, given: Collection[str]) -> list[str]:
+        """Return which of mass and damping are neither published nor among the names given."""
+        return [name for name in ("mass", "damping") if name not in given and getattr(self, name) is None]
 
     def _chosen(self, name: str, given: Any) -> Any:
         if given is not None:

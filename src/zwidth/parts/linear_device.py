@@ -42,7 +42,7 @@ class WholeDevice:
     coupling: ClassVar[None] = None
     actuator: ClassVar[None] = None
     modes: ClassVar[tuple[()]] = ()
-    rotary: ClassVar[bool] = False
+    rotary: bool = False
     # What damping there is stands in the response.
     damping: ClassVar[float] = 0.0
 

@@ -41,6 +41,11 @@ _FREQUENCY = Dimension(RATE.powers, RATE.example, {"rad/s": 1.0 / _TURN, "1/s": 
 _COMPLIANCE = Dimension(
     {f"{length}/{force}": p - q for length, p in LENGTH.powers.items() for force, q in FORCE.powers.items()}, "1 mm/N"
 )
+_ANGULAR_COMPLIANCE = Dimension(
+    {"rad/(N m)": 0, "rad/(mN m)": 3, "mrad/(N m)": -3, "mrad/(mN m)": 0},
+    "1 rad/(N m)",
+    {"deg/(N m)": math.pi / 180, "deg/(mN m)": 1e3 * math.pi / 180},
+)
 _DECIBELS = re.compile(r"dB(?:\s*(?:\(?re\.?\s*)?(?:1\s*)?(m\s*/\s*N|mm\s*/\s*N|um\s*/\s*N|µm\s*/\s*N)\)?)?")
 
 
@@ -57,6 +62,7 @@ class MeasuredDevice(WholeDevice):
         response: complex, in m/N, one for each line.
         deviation: the radius in m/N, of each line or of all, in which the true response lies; None where it is taken as
             it stands. With one, answers hold for every response in the band.
+        rotary: whether the response is of an angle to a torque: then it and the deviation are in rad/(N m).
 
     Raises:
         InputError: lines do not grow, there are too few, a number is not finite, shapes differ.
@@ -77,6 +83,7 @@ class MeasuredDevice(WholeDevice):
     frequency: Any
     response: Any
     deviation: Any = None
+    rotary: bool = False
 
     def __post_init__(self) -> None:
         f, g = _as_line("frequency", self.frequency, float), _as_line("response", self.response, complex)
@@ -116,12 +123,13 @@ class MeasuredDevice(WholeDevice):
     def spell(self) -> str:
         """What it is, in words."""
         f, band = self.frequency, "" if self.deviation is None else ", with deviation"
+        band += " of a rotary device" if self.rotary else ""
         return f"measured response, {f.size} lines from {f[0]:g} to {f[-1]:g} Hz{band}"
 
     @property
     def _key(self) -> tuple[bytes, ...]:
         parts = (self.frequency, self.response, self.deviation)
-        return tuple(b"" if part is None else part.tobytes() for part in parts)
+        return (*(b"" if part is None else part.tobytes() for part in parts), bytes([self.rotary]))
 
     @property
     def mass(self) -> float:
@@ -136,16 +144,18 @@ class MeasuredDevice(WholeDevice):
             file: a text with commas, semicolons, tabs or blanks, a preamble or a line of units, packed or not; ``.npz``
                 or ``.mat``. With a column ``frequency [Hz]`` or ``[rad/s]``; and ``real [m/N]`` and ``imag [m/N]``, or
                 ``magnitude`` in m/N, mm/N, um/N or dB and ``phase`` in deg or rad, or complex numbers under
-                ``response``; and, where it is known, ``deviation [m/N]``.
+                ``response``; and, where it is known, ``deviation [m/N]``. With rad/(N m) or deg/(N m) in place of m/N
+                the device is rotary.
         """
         return cls(*_read_table(file))
 
     def save(self, file: str | Path, *remarks: str) -> None:
         """Write the table that `read` reads, with every digit; remarks become its first lines, behind a #."""
-        heads = ["frequency [Hz]", "real [m/N]", "imag [m/N]"]
+        unit = "rad/(N m)" if self.rotary else "m/N"
+        heads = ["frequency [Hz]", f"real [{unit}]", f"imag [{unit}]"]
         columns = [self.frequency, np.real(self.response), np.imag(self.response)]
         if self.deviation is not None:
-            heads, columns = [*heads, "deviation [m/N]"], [*columns, self.deviation]
+            heads, columns = [*heads, f"deviation [{unit}]"], [*columns, self.deviation]
         lines = [f"# {remark}" for remark in remarks] + [",".join(heads)]
         lines += [",".join(repr(float(value)) for value in line) for line in zip(*columns, strict=True)]
         write_whole(Path(file), ("\n".join(lines) + "\n").encode())
@@ -169,8 +179,12 @@ def _as_line(name: str, values: Any, kind: type) -> np.ndarray:
     return line
 
 
-def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Hz, m/N and the deviation in m/N, or None; `InputError` for columns or units that cannot be told."""
+def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, bool]:
+    """Return Hz, the response in m/N, its deviation or None, and whether both are in rad/(N m) of a rotary device.
+
+    Raises:
+        InputError: a column is missing, or a unit is unknown.
+    """
     file = Path(file)
     table = read_columns(file)
     heads = [split_head(head) for head in table.heads]
@@ -191,7 +205,7 @@ def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
     columns = dict(zip(names, table.numbers([found[name] for name in names]), strict=True))
     units = {name: heads[at][1] for name, at in found.items()}
     hertz = columns["frequency"] * _size(file, "frequency", units["frequency"], _FREQUENCY, _FREQUENCY.units)
-    scale = _compliance(file, parts[0], units[parts[0]])
+    scale, rotary = _compliance(file, parts[0], units[parts[0]])
     if parts[0] == "magnitude":
         size = columns["magnitude"]
         size = 10.0 ** (size / 20.0) if units["magnitude"].lower().startswith("db") else size
@@ -200,12 +214,15 @@ def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
         (answer,) = table.numbers([found["response"]], complex)
     else:
         answer = columns["real"] + 1j * columns["imag"]
-    if parts[0] == "real" and _compliance(file, "imag", units["imag"]) != scale:
+    if parts[0] == "real" and _compliance(file, "imag", units["imag"]) != (scale, rotary):
         raise InputError(f"{file}: real and imag have different units; write both in one")
     band = None
     if "deviation" in columns:
-        band = columns["deviation"] * _compliance(file, "deviation", units["deviation"])
-    return hertz, answer * scale, band
+        size, turns = _compliance(file, "deviation", units["deviation"])
+        if turns != rotary:
+            raise InputError(f"{file}: response and deviation have units of different axes; write both in one")
+        band = columns["deviation"] * size
+    return hertz, answer * scale, band, rotary
 
 
 def _size(file: Path, name: str, unit: str, dimension: Dimension, known: tuple[str, ...]) -> float:
@@ -217,8 +234,12 @@ def _size(file: Path, name: str, unit: str, dimension: Dimension, known: tuple[s
     return size
 
 
-def _compliance(file: Path, name: str, unit: str) -> float:
-    """What one of a unit of length over force is in m/N; of decibels the unit that they are over."""
+def _compliance(file: Path, name: str, unit: str) -> tuple[float, bool]:
+    """Return one of a unit in m/N or rad/(N m), of decibels that of their reference, and whether it is rotary."""
     decibels = _DECIBELS.fullmatch(unit) if name == "magnitude" else None
-    known = ("m/N", "mm/N", "um/N", *(("dB",) if name == "magnitude" else ()))
-    return _size(file, name, (decibels[1] if decibels else unit) or "m/N", _COMPLIANCE, known)
+    unit = (decibels[1] if decibels else unit) or "m/N"
+    angular = _ANGULAR_COMPLIANCE.in_base("1", 0, unit)
+    if angular is not None:
+        return angular, True
+    known = ("m/N", "mm/N", "um/N", "rad/(N m)", "deg/(N m)", *(("dB",) if name == "magnitude" else ()))
+    return _size(file, name, unit, _COMPLIANCE, known), False

@@ -44,6 +44,8 @@ class Parts(Protocol):
 AnyScene = TypeVar("AnyScene", bound=Parts)
 
 _BARE = ("device", "timing", "wall")
+# Whole parts without parameters of their own.
+_WHOLE = ("safe_limit",)
 # The parts that a scene need not have, in the order in which it is described; those of the device are fields of it.
 PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator}
 _OF_DEVICE = ("coupling", "actuator")
@@ -76,7 +78,10 @@ def list_parameters(scene: Parts) -> dict[str, Any]:
 def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     """A new scene with some parameters, or whole parts, changed; everything else stays as it is in SI units."""
     # Numbers are those of the new parts.
-    levels = {path: 0 if path in (*_BARE, *_NAMED) else 1 if path in (*_OF_DEVICE, "modes") else 2 for path in changes}
+    levels = {
+        path: 0 if path in (*_BARE, *_NAMED, *_WHOLE) else 1 if path in (*_OF_DEVICE, "modes") else 2
+        for path in changes
+    }
     for level in sorted(set(levels.values())):
         scene = _replace_fields(scene, {path: value for path, value in changes.items() if levels[path] == level})
     return scene
@@ -85,7 +90,7 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     parts = {name: part for _, name, part in _parts(scene)}
     owners = {prefix + item.name: (name, item.name) for prefix, name, part in _parts(scene) for item in fields(part)}
-    owners |= {name: ("", name) for name in (*_BARE, *_NAMED)}
+    owners |= {name: ("", name) for name in (*_BARE, *_NAMED, *_WHOLE)}
     changed: dict[str, dict[str, Any]] = {}
     for path, value in changes.items():
         if path not in owners:
@@ -113,6 +118,8 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 def spell_scene(scene: Any) -> dict[str, Any]:
     """The section ``scene`` of a configuration, with the keys that differ from their defaults."""
     parts: dict[str, Any] = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
+    if scene.safe_limit is not None:
+        parts["safe_limit"] = spell_part(scene.safe_limit)
     if scene.device.modes:
         parts["modes"] = [spell_part(mode) for mode in scene.device.modes]
     if isinstance(scene.device, LinearDevice):

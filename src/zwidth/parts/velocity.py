@@ -206,8 +206,9 @@ class VelocityFilter(Part):
 
     def __post_init__(self) -> None:
         for name in ("numerator", "denominator"):
-            sections = _read_sections(name, getattr(self, name))
-            object.__setattr__(self, name, sections if len(sections) > 1 else sections[0])
+            sections: tuple[Any, ...] = _read_sections(name, getattr(self, name))
+            (first, *others) = sections
+            object.__setattr__(self, name, sections if others else first)
         top, bottom = (sum(len(section) - 1 for section in part) for part in self._sections)
         if top > bottom:
             raise InputError(
@@ -236,7 +237,7 @@ class VelocityFilter(Part):
     @property
     def _sections(self) -> tuple[Any, Any]:
         """The coefficients of the sections of numerator and denominator."""
-        both = self.numerator, self.denominator
+        both: Any = self.numerator, self.denominator
         top, bottom = (part if isinstance(part[0], tuple) else (part,) for part in both)
         return top, bottom
 

@@ -26,7 +26,6 @@ from zwidth.sweep.files import (
     LOCKS,
     check_folder,
     digest,
-    held_briefly,
     is_plain_name,
     versions,
 )
@@ -43,7 +42,7 @@ _SEAL = "record_sha256"
 _MOVE = f"move it away, or {ELSEWHERE}"
 
 # Beside those that can change a result.
-_PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
+_PACKAGES = ("scipy", "matplotlib", "optimistix", "jaxopt")
 
 # As `hidden_beside` calls what is not finished.
 _HALF_MADE = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
@@ -169,16 +168,13 @@ class Record:
         self._update({}, entry)
 
     def _update(self, about: dict[str, Any], entry: dict[str, Any] | None = None) -> None:
-        """Change the file; other shards may be writing in it as well."""
-        with held_briefly(self.folder, "record"):
-            self._read()
-            content = {**self.content, **about}
-            studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
-            content["studies"] = [*studies, *([] if entry is None else [entry])]
-            self.content = content
-            write_whole(
-                self.folder / RUN_FILE, (json.dumps(content | {_SEAL: digest(content)}, indent=2) + "\n").encode()
-            )
+        """Change the content and write it to the file."""
+        content = {**self.content, **about}
+        studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
+        content["studies"] = [*studies, *([] if entry is None else [entry])]
+        self.content = content
+        sealed = json.dumps(content | {_SEAL: digest(content)}, indent=2) + "\n"
+        write_whole(self.folder / RUN_FILE, sealed.encode())
 
     def faults(self, name: str) -> list[str]:
         """The files of a study that are not what was written."""

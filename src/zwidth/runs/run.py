@@ -19,7 +19,7 @@ from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
 from zwidth.studies.outcome import LISTENER, ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
-from zwidth.sweep.files import holding, hopeless
+from zwidth.sweep.files import hopeless, lock_folder
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.words.errors import InputError
@@ -34,8 +34,8 @@ AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 class StudyResult:
     """How one study went.
 
-    Its state is "done"; "kept", where an earlier run had done it; "failed"; or "open", a sweep of which chunks are left
-    to do, by another shard or because the run was stopped.
+    Its state is "done"; "kept", where an earlier run had done it; "failed"; or "open", a sweep that was stopped before
+    its last chunk.
     """
 
     name: str
@@ -103,7 +103,6 @@ def run(
     resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
-    shard: tuple[int, int] | None = None,
     memory: int = MEMORY,
     progress: ProgressCallback | None = None,
 ) -> RunResult:
@@ -126,8 +125,6 @@ def run(
         workers: how many processes compute sweeps on this machine; this process itself where left out. They are
             spawned: a script that asks for them does its work below ``if __name__ == "__main__":``.
         scheduler: address of a dask.distributed scheduler whose workers compute sweeps, and see the same folder.
-        shard: (i, n), 1 <= i <= n: compute every n-th chunk of the sweeps only, one of n such runs in the same folder;
-            the other studies are the first one's. A shard goes on with what is there.
         memory: bytes that a chunk of a sweep may take while it is computed.
         progress: called with a `StudyEvent` when a study starts and when it ends, after every chunk of a sweep, and
             between the parts of a study that takes long.
@@ -142,7 +139,7 @@ def run(
         StoreExistsError: the folder holds a run, and neither ``resume`` nor ``overwrite`` is set; or it holds something
             else.
         StoreError: with ``resume``: a store is damaged, or the run was made from another configuration or release.
-        StoreBusyError: another run computes in the folder; shards (i, n) of one n do not exclude each other.
+        StoreBusyError: another run computes in the folder.
         ResourceError: the results do not fit on the disk, or the workers not into memory.
         InputError: options that exclude each other, a folder that cannot be written, a scheduler that does not answer.
 
@@ -158,14 +155,12 @@ def run(
         ...     zwidth.run(config, out=f"{folder}/small").ok
         True
     """
-    going_on = resume or shard is not None
-    _check_options(workers, scheduler, shard, going_on=going_on, overwrite=overwrite)
+    _check_options(workers, scheduler, resume=resume, overwrite=overwrite)
     config, text = _read_config(config)
     text, files, names = gather_inputs(text, config.folder)
     shown = Path("runs", config.name) if out is None else Path(os.fsdecode(out))
     folder, clock = Path(os.path.abspath(shown)), time.perf_counter()
     pieces = [study for study in config.studies if isinstance(study, ComputedStudy)]
-    pieces = pieces if shard is None or shard[0] == 1 else []
     plans = [make_plan(study, memory=memory) for study in config.studies if isinstance(study, SweepStudy)]
     sweeps = [plan.study for plan in plans]
     if plans:
@@ -173,21 +168,20 @@ def run(
     elif scheduler is not None:
         raise InputError(f"scheduler: got {scheduler!r}, but no study of the configuration is a sweep; leave it out")
     # What does not fit, or not belong there, is refused before anything is made.
-    Record(folder).check_free(text, overwrite=overwrite, going_on=going_on)
+    Record(folder).check_free(text, overwrite=overwrite, going_on=resume)
     begun = {study.name for study in sweeps if store_path(folder, study).exists()}
     check_resources(plans, folder, workers or 1, begun=set() if overwrite else begun)
-    with holding(folder, shard):
+    with lock_folder(folder):
         record = Record(folder)
-        record.check_free(text, overwrite=overwrite, going_on=going_on)
+        record.check_free(text, overwrite=overwrite, going_on=resume)
         inputs = _list_inputs(config, names, files)
         if overwrite:
             record.clear()
             for study in sweeps:
                 remove(folder, study)
         record.check_same({study.name: inputs[study.name] for study in (*pieces, *sweeps)})
-        check_stores(sweeps, folder, going_on=going_on)
-        if shard is None:
-            record.sweep_up()
+        check_stores(sweeps, folder, going_on=resume)
+        record.sweep_up()
         job = _Run(config, record, inputs, progress or (lambda event: None), len(pieces) + len(plans))
         digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
         planned = [study.name for study in config.studies]
@@ -197,7 +191,7 @@ def run(
         about = {"name": config.name, "description": config.description}
         about |= {"config": _spell(config), "config_sha256": digest}
         if plans and not job.over:
-            job.sweep(plans, about, shard=shard, workers=workers, scheduler=scheduler)
+            job.sweep(plans, about, workers=workers, scheduler=scheduler)
     seconds = time.perf_counter() - clock
     ends = job.hopeless, job.interrupted, job.lost, len(pieces)
     return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), *ends)
@@ -264,7 +258,7 @@ class _Run:
             stage.mkdir()
             try:
                 look = self.config.figure or FigureLook()
-                with use_kind(self.config.rotary), style_sheet(size=look.size):
+                with use_kind(self.config.rotary), style_sheet(size=look.size, dpi=look.dpi):
                     outcome = study.compute(self.config.scene, alone)
                     outcome.write(stage, study.name, look.formats)
             except Exception as caught:
@@ -314,7 +308,6 @@ class _Run:
         for study in (plan.study for plan in plans):
             sweep = sweeps.results[study.name]
             self.repaired += sweep.repaired
-            # A shard that ends last finds the others' chunks done as well.
             store = Store(sweep.store)
             state = "failed" if sweep.failed else "open" if store.missing() else "done"
             counts = store.count_statuses() if state == "done" else {}
@@ -370,14 +363,10 @@ def _describe_error(error: Exception | None) -> str:
     return f"{type(error).__name__}: {error}" if error else ""
 
 
-def _check_options(
-    workers: int | None, scheduler: str | None, shard: tuple[int, int] | None, *, going_on: bool, overwrite: bool
-) -> None:
+def _check_options(workers: int | None, scheduler: str | None, *, resume: bool, overwrite: bool) -> None:
     if workers is not None and scheduler is not None:
         raise InputError("workers, scheduler: got both; the cluster has its own workers, give one of the two")
     if workers is not None and workers < 1:
         raise InputError(f"workers: got {workers}; at least 1")
-    if shard is not None and not 1 <= shard[0] <= shard[1]:
-        raise InputError(f"shard: got {shard[0]}/{shard[1]}; give i/n with 1 <= i <= n")
-    if overwrite and going_on:
-        raise InputError("overwrite: it starts again, resume and shard go on; give one of them")
+    if overwrite and resume:
+        raise InputError("overwrite: it starts again, resume goes on; give one of the two")

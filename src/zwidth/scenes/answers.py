@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
+from zwidth.arrays.evaluate import are_numbers, as_float64, broadcast_traced, join_shapes
 from zwidth.loops.linear.held import closed_loop, delayed_device, open_loop
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.rows import Island
@@ -21,7 +21,7 @@ from zwidth.words.errors import InputError, check_choice
 from zwidth.words.results import Margins, Stability
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
-from zwidth.words.xp import is_traced
+from zwidth.words.xp import is_traced, namespace
 
 if TYPE_CHECKING:
     import control
@@ -48,11 +48,27 @@ class SceneAnswers(SceneParts):
         units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping, self.device.rotary)
         if are_numbers(*both):
             both = np.float64(both[0]), np.float64(both[1])
+        elif is_traced(*both):
+            both = broadcast_traced({"stiffness": both[0], "virtual_damping": both[1]})
         else:
             both = as_float64("stiffness", both[0]), as_float64("virtual_damping", both[1])
             join_shapes([("stiffness", both[0].shape), ("virtual_damping", both[1].shape)])
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
+
+    def _broadcast_walls(self, stiffness: Walls, virtual_damping: Walls) -> Sequence[Array]:
+        """Return alpha and beta of walls in SI units, as arrays of one shape."""
+        walls = self.normalize_walls(stiffness, virtual_damping)
+        self._check_traceable(*walls)
+        return namespace(*walls).broadcast_arrays(*walls)
+
+    def _check_traceable(self, *values: Any) -> None:
+        """Raise `InputError` if JAX traces a value and the loop has no closed form."""
+        if is_traced(*values) and not self.loop.traceable:
+            raise InputError(
+                f"{self.traced_path or 'stiffness, virtual_damping'}: got a value that JAX traces, which needs a rigid "
+                "device with the backward difference; pass numbers, outside of jit, vmap and grad"
+            )
 
     def poles(self, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
         """All poles of walls, along a new last axis and in no particular order; NaN where a wall is out of range.
@@ -60,14 +76,14 @@ class SceneAnswers(SceneParts):
         Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
         is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
         """
-        return self.loop.poles(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return self.loop.poles(*self._broadcast_walls(stiffness, virtual_damping))
 
     def spectral_radius(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
 
         From all poles; beyond 150 of them by counting poles in circles, at a cost that does not grow with the delay.
         """
-        return self.loop.radius(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return self.loop.radius(*self._broadcast_walls(stiffness, virtual_damping))
 
     def islands(self, *, negative_damping: bool | None = None) -> list[Island]:
         """The islands: pieces of the stable set that no path of stable walls leads to from soft ones.
@@ -149,7 +165,9 @@ class SceneAnswers(SceneParts):
         """
         if method != "auto":
             return self.decide_stability(stiffness, virtual_damping, method=method).stable
-        return self.loop.labels(*self.normalize_walls(stiffness, virtual_damping))
+        walls = self.normalize_walls(stiffness, virtual_damping)
+        self._check_traceable(*walls)
+        return self.loop.labels(*walls)
 
     def stable_stiffness(self, virtual_damping: ArrayLike | None = None) -> np.ndarray:
         """The stable intervals of the stiffness at a damping, several where there are several.
@@ -230,12 +248,13 @@ class SceneAnswers(SceneParts):
         """
         if obstacle := find_obstacle(**vars(self.device)):
             raise InputError(f"passivity {obstacle}")
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         return self.loop.passivity_margin(alpha, beta) * self.units.virtual_damping
 
     def is_passive(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
-        return np.asarray(self.passivity_margin(stiffness, virtual_damping)) > 0
+        margin = self.passivity_margin(stiffness, virtual_damping)
+        return (margin if is_traced(margin) else np.asarray(margin)) > 0
 
     def margins(self, stiffness: Walls = None, virtual_damping: Walls = None) -> SceneMargins:
         """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
@@ -249,7 +268,7 @@ class SceneAnswers(SceneParts):
         Walls out of range are NaN. A rigid scene answers by `zwidth.margins`. A wall takes some milliseconds, its
         delay margin some 0.1 s.
         """
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
         found = SceneMargins._make(self.loop.margins(alpha, beta))
         return found._replace(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.parts.checks import Span
 from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.scenes.answers import allows_negative
 from zwidth.scenes.base import of_scene
@@ -227,28 +228,38 @@ _STEPS = {
 
 @shown()
 class Limit(NamedTuple):
-    """One thing that limits: its name, a step that can be bought, K_max then in N/m, and by what factor it grew."""
+    """An improvement of a scene and the stiffness that it gains."""
+
+    name: str  # of the part or parameter
+    words: str  # the improvement, such as "half the delay"
+    stiffness: float  # in N/m, with the improvement: K_max, or of a recommended wall under the same requirements
+    gain: float  # stiffness over the present one
+    note: str = ""  # the quantity that stays the same, such as "the delay stays 1 ms"
+
+    def spell(self) -> str:
+        """Return the improvement and its gain in words."""
+        K = with_unit(round_safely(self.stiffness, "below"), "N/m")
+        kept = f"; {self.note}" if self.note else ""
+        return f"{self.words}: {K} (x {plain(self.gain, 3)}{kept})"
+
+
+class Improvement(NamedTuple):
+    """A scene with one thing improved."""
 
     name: str
     words: str
-    stiffness: float
-    gain: float
-
-    def spell(self) -> str:
-        """The step and what it buys."""
-        less = " (it helps as it is)" if self.gain < 1 else ""
-        K_max = with_unit(round_safely(self.stiffness, "below"), "N/m")
-        return f"{self.words}: K_max {K_max}, {plain(self.gain, 3)} times{less}"
+    scene: SceneOptima
+    note: str = ""
 
 
 @of_scene
 def limits_of(scene: SceneOptima) -> list[Limit]:
     """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 
-    Each thing that the scene has is improved by itself, by a step that somebody can buy: twice the rate (delay and
-    window the same in seconds), half the delay, a tenth more damping, a filter or an amplifier twice as fast (without a
-    filter where twice its cut-off is beyond half the rate), a window half as long, a link twice as stiff, or the
-    structure behind the modes.
+    Each thing that the scene has is improved by itself, by a step that somebody can buy: twice the rate (the window the
+    same in seconds, the delay in the unit in which it was given; a delay given in seconds also with the same periods),
+    half the delay, a tenth more damping, a filter or an amplifier twice as fast (without a filter where twice its
+    cut-off is beyond half the rate), a window half as long, a link twice as stiff, or the structure behind the modes.
 
     Args:
         scene: a scene of plain numbers.
@@ -268,12 +279,15 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
         >>> [limit.words for limit in zwidth.limits_of(scene)][:2]
         ['half the delay', 'a velocity filter twice as fast']
     """
-    now = _stiffness(scene)
+    return compute_gains(scene, _stiffness(scene), _stiffness)
+
+
+def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima], float]) -> list[Limit]:
+    """Return every improvement of a scene with its stiffness by ``measure``, the largest gain first, NaN last."""
     found = []
-    for name, words, improved in _improve(scene):
-        stiffness = _stiffness(improved)
-        found.append(Limit(name, words, stiffness, stiffness / now))
-    # NaN is larger than nothing.
+    for name, words, improved, note in list_improvements(scene):
+        stiffness = measure(improved)
+        found.append(Limit(name, words, stiffness, stiffness / now, note))
     return sorted(found, key=lambda limit: (not limit.gain >= 0, -limit.gain))
 
 
@@ -303,11 +317,16 @@ def _stiffness(scene: SceneOptima) -> float:
         return math.nan
 
 
-def _improve(scene: SceneOptima) -> Iterator[tuple[str, str, SceneOptima]]:
-    """The scene with one thing improved, for each thing it has: the part's name, the step in words, the scene."""
-    if _can_sample_faster(scene):
-        same = ", the delay the same in seconds" if scene.timing.delay else ""
-        yield "period", f"twice the rate{same}", _double_rate(scene)
+def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
+    """Yield the scene with one thing improved, for each thing it has."""
+    timing = scene.timing
+    slower = {"period": scene}
+    if timing.delay and not timing.in_periods:
+        slower["period_and_delay"] = scene.replace(delay=Span(float(scene.d), "periods"))
+    for name, present in slower.items():
+        if _can_sample_faster(present):
+            note = f"the delay stays {present.timing.kept_delay}" if timing.delay else ""
+            yield Improvement(name, "twice the rate", _double_rate(present), note)
     values = scene.parameters()
     for path, (factor, words) in _STEPS.items():
         if not (now := values.get(path)):
@@ -322,10 +341,10 @@ def _improve(scene: SceneOptima) -> Iterator[tuple[str, str, SceneOptima]]:
             except InputError:
                 # Beyond half the rate there is no filter.
                 improved, words = scene.replace(velocity=BackwardDifference()), "no velocity filter"
-        yield path.partition(".")[0], words, improved
+        yield Improvement(path.partition(".")[0], words, improved)
     if scene.device.modes:
         stiffer = tuple(replace(mode, frequency=math.sqrt(2.0) * mode.frequency) for mode in scene.device.modes)
-        yield "modes", "a structure twice as stiff", scene.replace(modes=stiffer)
+        yield Improvement("modes", "a structure twice as stiff", scene.replace(modes=stiffer))
 
 
 def _can_sample_faster(scene: SceneOptima) -> bool:
@@ -333,38 +352,18 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
     if isinstance(scene.velocity, VelocityFilter):
         return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
-    return 2 * (window + scene.d) <= scene.loop.most_periods
+    later = scene.d if scene.timing.in_periods else 2 * scene.d
+    return 2 * window + later <= scene.loop.most_periods
 
 
 def _double_rate(scene: SceneOptima) -> SceneOptima:
-    """The scene at twice the rate, filter and delay the same in seconds."""
+    """Return the scene at twice the rate, filter and window the same in seconds, the delay in its unit."""
     changes: dict[str, float] = {"period": scene.timing.period / 2}
     if isinstance(scene.velocity, WindowedDifference):
         changes["velocity.samples"] = scene.velocity.samples * 2
     if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:
         changes["velocity.coded_period"] = scene.velocity.coded_period / 2
     return scene.replace(**changes)
-
-
-class FrictionRule(NamedTuple):
-    """Stiffnesses up to which viscous damping, and Coulomb friction, pay for sampling and for quantization."""
-
-    by_damping: float | None  # 2 b/T; None where there is no damping
-    by_friction: float | None  # 2 f_c/Q; None where friction or resolution is not given
-    stiffness: float | None  # the lower of the two, which is the rule; None where one is missing or it does not hold
-    holds: bool  # whether the rule is known of the scene: a rigid device without delay
-
-
-def friction_rule(scene: SceneOptima, friction: float | None = None, resolution: float | None = None) -> FrictionRule:
-    """Up to which K in N/m a wall without virtual damping and delay is passive: ``K <= min(2 b/T, 2 f_c/Q)``."""
-    # Viscous damping b pays for sampling, Coulomb friction f_c in N for quantization in steps of Q in m. A sufficient
-    # condition for a spring alone, on a rigid device (Abbott, Okamura 2005, IEEE Trans. Robotics 21(5), 952-964). As
-    # passivity it is for any hand, with the device's own damping; no velocity is estimated for a spring.
-    by_damping = 2.0 * scene.device.damping / scene.timing.period if scene.device.damping else None
-    by_friction = None if friction is None or resolution is None else 2.0 * friction / resolution
-    holds = not scene.timing.delay and not set(scene.parts_beyond) - {"velocity"}
-    known = [end for end in (by_damping, by_friction) if end is not None]
-    return FrictionRule(by_damping, by_friction, min(known) if holds and len(known) == 2 else None, holds)
 
 
 def passive_edge(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import inspect
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from typing import Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
@@ -16,15 +17,18 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.operator import Operator
 from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
+from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity, is_plain
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import WALL
 from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
+from zwidth.words.xp import is_traced
 
 Owner = TypeVar("Owner", bound="SceneParts")
 Parameters = ParamSpec("Parameters")
@@ -37,6 +41,7 @@ _KINDS = {
     "wall": (VirtualWall, "zwidth.VirtualWall(stiffness=10e3)"),
     "velocity": (Velocity, "zwidth.LowPass(cutoff=100)"),
     "operator": (Operator | None, "zwidth.Operator(mass=0.5)"),
+    "safe_limit": (SafeLimit | None, "zwidth.SafeLimit(stiffness=500, virtual_damping=2)"),
 }
 
 
@@ -57,6 +62,7 @@ class SceneParts(Part):
     wall: VirtualWall = field(default_factory=NoWall)
     velocity: Velocity = field(default_factory=BackwardDifference)
     operator: Operator | None = None
+    safe_limit: SafeLimit | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.wall, Velocity):
@@ -65,7 +71,7 @@ class SceneParts(Part):
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {example}")
-        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity")}
+        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit")}
         check_kind(bool(self.device.rotary), named)
         if self.operator is not None and not isinstance(self.device, Device):
             raise InputError(
@@ -130,6 +136,11 @@ class SceneParts(Part):
             virtual_damping=self.wall.virtual_damping,
         )._replace(d=self.d)
 
+    @cached_property
+    def traced_path(self) -> str | None:
+        """The path of a parameter that JAX traces, or None."""
+        return next((path for path, value in list_parameters(self).items() if is_traced(value)), None)
+
     @property
     def alpha(self) -> float:
         """Normalized stiffness of the wall."""
@@ -170,8 +181,9 @@ class SceneParts(Part):
     @in_own_units
     def units(self) -> WallSI:
         """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
-        rate = self.mass / self.timing.period
-        return WallSI(rate / self.timing.period, rate)
+        # Concrete numbers of JAX may have single precision only.
+        mass, period = (value if is_traced(value) else float(value) for value in (self.mass, self.timing.period))
+        return WallSI(mass / period / period, mass / period)
 
     def parameters(self) -> dict[str, Any]:
         """Every number of every part by its dotted path.
@@ -214,7 +226,15 @@ class SceneParts(Part):
                 f"{', '.join(changes)}: the device would become a {kind} one, and other numbers of the scene mean "
                 "another unit; make a new scene, of a new zwidth.Device"
             )
-        return made
+        changed = sorted(changes.keys() - {"wall", "safe_limit", *WALL})
+        if self.safe_limit is None or not changed or "safe_limit" in changes:
+            return made
+        return replace(
+            made,
+            safe_limit=self.safe_limit.warn(
+                f"{' and '.join(changed)} changed after the safe limit was measured; measure again"
+            ),
+        )
 
 
 def of_scene(
@@ -225,14 +245,42 @@ def of_scene(
 
     @wraps(function)
     def checked(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        check_scene(scene)
+        check_scene(scene, function.__name__)
         return answer(scene, *args, **kwargs)
 
     return checked
 
 
-def check_scene(scene: object) -> None:
-    """Refuse anything but a scene."""
+def require_numbers(kind: type[SceneParts], *, but: Collection[str]) -> None:
+    """Let all public methods of a class of scenes, except those in ``but``, refuse values that JAX traces."""
+    for name in dir(kind):
+        method = inspect.getattr_static(kind, name)
+        if inspect.isfunction(method) and not name.startswith("_") and name not in but:
+            setattr(kind, name, _of_numbers(method))
+
+
+def _of_numbers(method: Callable[Concatenate[Owner, Parameters], Result]) -> Callable[..., Result]:
+    @wraps(method)
+    def checked(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        if scene.traced_path is not None or is_traced(*args, *kwargs.values()):
+            refuse_traced(method.__name__, scene, inspect.signature(method).bind(scene, *args, **kwargs).arguments)
+        return method(scene, *args, **kwargs)
+
+    return checked
+
+
+def refuse_traced(question: str, scene: SceneParts, arguments: Mapping[str, Any]) -> None:
+    """Raise `InputError` if JAX traces a parameter of the scene or an argument."""
+    traced = scene.traced_path or next((name for name, value in arguments.items() if is_traced(value)), None)
+    if traced is not None:
+        raise InputError(
+            f"{traced}: got a value that JAX traces; {question} needs numbers: call it outside of jit, vmap and grad"
+        )
+
+
+def check_scene(scene: object, question: str = "this function") -> None:
+    """Refuse anything but a scene of numbers."""
     if not isinstance(scene, SceneParts):
         example = "zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3))"
         raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed, as {example}")
+    refuse_traced(question, scene, {})

@@ -19,6 +19,7 @@ from zwidth.arrays.evaluate import as_float64, check_scalars, evaluate
 from zwidth.arrays.held_mass import classify_delays
 from zwidth.loops.linear.border import Border, Outline
 from zwidth.loops.linear.boundary import Boundary
+from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.linear.held import find_roots
 from zwidth.loops.linear.margins import linear_margins, open_loop_response
 from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
@@ -27,7 +28,7 @@ from zwidth.loops.linear.poles import spectral_radius as linear_radius
 from zwidth.loops.linear.ridge import BoundRidge, SceneSensitivities, differentiate, find_ridge, find_slope
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import Island, bound_intervals, label_walls, stable_dampings
-from zwidth.loops.rigid.boundary import boundary_point, stable_region
+from zwidth.loops.rigid.boundary import boundary, boundary_point, stable_region
 from zwidth.loops.rigid.margins import margins, margins_kernel
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.loops.rigid.outermost_poles import slowest_pole
@@ -73,6 +74,8 @@ class LinearLoop:
     # a stiffest wall takes some 10 to 50 ms.
     delay_models: ClassVar[tuple[DelayModel, ...]] = ("held",)
     draws: ClassVar[int] = 200
+    # Whether its questions about walls work inside jit, vmap and grad.
+    traceable: ClassVar[bool] = False
     # The most periods of window and delay that a search affords: its cost grows with their square.
     most_periods: ClassVar[float] = 128
 
@@ -181,6 +184,10 @@ class LinearLoop:
         """What keeps a wall undecided, a sentence each: nothing, where there is a model."""
         return []
 
+    def explain_limit(self) -> str:
+        """Return the reason for a stiffest wall that is not decided: empty, because a model decides every wall."""
+        return ""
+
     def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
         """Those above ``least`` whose walls lie in a piece of the stable set with soft walls."""
         column = np.maximum(self.column(alpha), least).tolist()
@@ -198,6 +205,11 @@ class LinearLoop:
         """Return the alpha below which no wall of a device unstable by itself is stable; None for other devices."""
         softest = self.border.find_softest(least) if self.roots.device_is_unstable else 0.0
         return softest if softest > 0 else None
+
+    def critical_walls(self, w: Array) -> tuple[Array, Array]:
+        """Return alpha and beta of the walls that put a pole pair at the angles w, in (0, pi), on the unit circle."""
+        curve = curve_at(self.roots, w)
+        return curve.alpha, curve.beta
 
     def outlines(self) -> list[Outline]:
         """Closed outlines of the stable set, the largest first."""
@@ -268,6 +280,7 @@ class RigidLoop(LinearLoop):
     delay_models = get_args(DelayModel)
     draws = 10_000
     most_periods = math.inf
+    traceable = True
 
     @cached_property
     def poles_sought(self) -> int:
@@ -308,6 +321,12 @@ class RigidLoop(LinearLoop):
 
     def islands(self, least: float) -> list[Island]:
         return []
+
+    def critical_walls(self, w: Array) -> tuple[Array, Array]:
+        device = self.scene.delta, self.scene.d
+        if not is_traced(w, *device):
+            return super().critical_walls(w)
+        return boundary(w, *device, delay=self.scene.timing.delay_model)
 
     def outlines(self) -> list[Outline]:
         return [Outline(*stable_region(float(self.scene.delta), float(self.scene.d))[:2], False, False)]

@@ -1,4 +1,4 @@
-"""The wall to set on a device: as stiff as what is wanted of it allows, and what would allow more."""
+"""The wall to set on a device: the stiffest with the required margins, its risks, and improvements of the device."""
 
 from __future__ import annotations
 
@@ -12,20 +12,22 @@ import numpy as np
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_number
+from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.assessment import (
     Assessment,
     Limit,
     assess,
     check_held,
+    compute_gains,
     describe_islands,
-    limits_of,
     name_kind,
     round_margin,
 )
+from zwidth.scenes.cautions import judge_grasps, list_cautions
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.scenes.wall_code import write_wall
-from zwidth.scenes.wall_search import Wanted, choose_wall, measure_slack
+from zwidth.scenes.wall_search import COARSE, Wanted, choose_wall, measure_slack
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import WALL
@@ -50,8 +52,8 @@ class Recommendation:
         scene: the device with this wall as its own, for `zwidth.assess`, `zwidth.simulate` and pictures.
         stiffest: the stiffest stable wall of the device.
         wanted: what was asked of the wall.
-        limited_by: which of that allows no stiffer wall: "stiffness_fraction", "gain_margin", "phase_margin" or
-            "passive"; "" where there is no wall.
+        limited_by: which of that allows no stiffer wall: "stiffness_fraction", "gain_margin", "phase_margin",
+            "passive" or "safe_limit", the limit of the scene; "" where there is no wall.
         status: code of `zwidth.Status`; where it is not OK there is no wall to set.
         reason: why there is none.
         notes: what else to know, in sentences.
@@ -100,9 +102,37 @@ class Recommendation:
 
     @cached_property
     def steps(self) -> list[Limit]:
-        """What would allow a stiffer wall, in steps that can be bought, by `zwidth.limits_of`: the best first."""
-        known = limits_of(self.scene) if self.stiffest.status == Status.OK else []
-        return [step for step in known if step.gain > 1.0]
+        """The improvements of `zwidth.limits_of` that allow a stiffer wall under the same requirements, the best first.
+
+        Their stiffness is that of the wall recommended for the improved device, right to some 0.2 %.
+        """
+        if self.status != Status.OK:
+            return []
+        found = compute_gains(self.scene.replace(wall=NoWall()), self.stiffness, self._choose_again)
+        return [step for step in found if step.gain > 1.0]
+
+    def _choose_again(self, improved: SceneOptima) -> float:
+        """Return K of the wall recommended for another device under the same requirements; NaN without one."""
+        try:
+            top = improved.max_stiffness()
+            near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
+            return choose_wall(improved, self.wanted, top, near, COARSE).stiffness
+        except InputError:
+            # At twice the rate a long delay may be more periods than the model is computed for.
+            return math.nan
+
+    @cached_property
+    def cautions(self) -> tuple[str, ...]:
+        """Thin margins of the wall and hands that destabilize it, each with its remedy, in sentences."""
+        return () if self.verdict is None else list_cautions(self)
+
+    @cached_property
+    def grasps(self) -> dict[str, bool]:
+        """Stability of the wall in each of `zwidth.REFERENCE_GRASPS`, by name; empty for a device given as a whole.
+
+        A rotary device is held at a radius of 50 mm. If the scene has an operator, "released" is the device without it.
+        """
+        return {} if self.status != Status.OK else judge_grasps(self.scene)
 
     def code(self, language: Literal["c", "python"] = "c") -> str:
         """The wall with its velocity estimate as the difference equations of a control loop.
@@ -123,28 +153,48 @@ class Recommendation:
         return write_wall(self.scene, language)
 
     def lines(self) -> tuple[str, ...]:
-        """The wall in two lines, what to set and how far that is from trouble; in one why there is none."""
+        """Return the wall, its margins and its cautions, a line each; or the reason why no wall exists."""
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        K, B, digits = self.read
-        wall = f"K = {spell_stiffness(K, digits)}, B = {with_unit(B, 'N s/m', digits)}"
-        largest = float(self.stiffest.stiffness)
-        share = 100.0 * self.stiffness / largest
-        first = f"{wall}: {share:.4g} % of the stiffest stable wall, {spell_stiffness(largest)}"
-        if self.limited_by != "stiffness_fraction":
-            first += f"; {self.wanted.spell(self.limited_by)} allows no more"
         lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
-        # A unit that both have stands once.
-        lower = lower.removesuffix(f" {upper.partition(' ')[2]}")
-        gain, phase, late = (round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay"))
-        delay = "not known" if math.isnan(late) else with_unit(late, "s")
-        apart = f"gain {plain(gain)}, phase {plain(phase)} degrees, delay {delay}"
-        rest = f"margins: {apart}; passive: {self.spell_passive()}"
-        return first, f"stable for B from {lower} to {upper}; {rest}"
+        room = f"B from {lower} to {upper} is stable at this K"
+        margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
+        cautions = (f"caution: {caution}" for caution in self.cautions)
+        return f"{self.spell_wall()}: {self.spell_limit()}", margins, *cautions
+
+    def spell_wall(self) -> str:
+        """Return the wall to set in words."""
+        K, B, digits = self.read
+        return f"K = {spell_stiffness(K, digits)}, B = {with_unit(B, 'N s/m', digits)}"
+
+    def spell_limit(self) -> str:
+        """Return the share of K_max and the requirement that allows no stiffer wall, in words."""
+        largest = float(self.stiffest.stiffness)
+        share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {spell_stiffness(largest)}"
+        if self.limited_by == "stiffness_fraction":
+            return share
+        within = " within the safe limit" if self.limited_by != "safe_limit" and self._is_clipped else ""
+        return f"{share}; limited by {self.wanted.spell(self.limited_by)}{within}"
+
+    @property
+    def _is_clipped(self) -> bool:
+        """True if the virtual damping lies at an end of the safe limit."""
+        limit = None if self.wanted.beyond_safe else self.scene.safe_limit
+        ends = None if limit is None else limit.dampings(self.stiffness)
+        return ends is not None and any(math.isclose(self.virtual_damping, end, rel_tol=1e-3) for end in ends)
+
+    def spell_margins(self) -> str:
+        """Return the margins of the wall in words, rounded to the safe side."""
+        verdict = self.verdict
+        if verdict is None:
+            return "none"
+        gain, phase, late = (round_margin(f"{name}_margin", verdict, True, 3) for name in ("gain", "phase", "delay"))
+        delay = "not known" if math.isnan(late) else with_unit(late, "s", 3)
+        return f"gain {plain(gain, 3)}, phase {plain(phase, 3)} deg, delay {delay}"
 
     def spell_passive(self) -> str:
-        """Whether the wall is passive, or why that is not known."""
+        """Return the passivity of the wall in words."""
         passive = None if self.verdict is None else self.verdict.passive
         obstacle = find_obstacle(**vars(self.scene.device)).partition(":")[0]
         return {True: "yes", False: "no", None: f"not known {obstacle}".rstrip()}[passive]
@@ -182,6 +232,8 @@ class Recommendation:
                 "settling_time": None,
             },
             "steps": [step._asdict() for step in self.steps],
+            "grasps": self.grasps,
+            "cautions": list(self.cautions),
             "reason": self.reason,
             "notes": list(self.notes),
         }
@@ -189,6 +241,13 @@ class Recommendation:
             # As it was given: the quotient may have another last digit.
             found["recommended"]["stiffness_fraction"] = self.wanted.stiffness_fraction
         return to_json(found)
+
+
+def _describe_limit(limit: SafeLimit | None, ignored: bool) -> list[str]:
+    """Return the notes on a safe limit: the limit with its reason, and its warnings."""
+    if limit is None:
+        return []
+    return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe()}", *limit.warnings]
 
 
 class SceneAdvice(SceneOptima):
@@ -201,20 +260,26 @@ class SceneAdvice(SceneOptima):
         gain_margin: float | None = None,
         phase_margin: float | None = None,
         passive: bool = False,
+        beyond_safe: bool = False,
     ) -> Recommendation:
         """The stiffest wall that keeps some distance from trouble: the one to set on this device.
 
         Args:
-            stiffness_fraction: at most this share of K_max, between 0 and 1; 0.75 where nothing is asked for.
+            stiffness_fraction: at most this share of K_max, between 0 and 1.
             gain_margin: at least this factor on stiffness and damping together, > 1.
             phase_margin: at least so many degrees, > 0.
-            passive: whether the wall must be passive.
+            passive: require a passive wall.
+            beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its stiffness is
+                at most ``stiffness_fraction`` (or 0.75) of the limit's.
+
+        Without any requirement these are the defaults: at most 0.75 of K_max, a gain margin of 2 and a phase margin of
+        30 degrees. Any requirement replaces all of them.
 
         Returns:
-            Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, what allows no more; ``verdict``,
-            what `zwidth.assess` says of the wall; ``steps``, what could be bought for a stiffer one; ``code("c")``, the
-            wall for a control loop. ``status`` is UNREACHABLE, and there is no wall, where nothing softer keeps what is
-            asked for either.
+            Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, the active requirement; ``cautions``,
+            thin margins and grasps that destabilize the wall; ``verdict``, the `zwidth.assess` of the wall; ``steps``,
+            improvements of the device that allow a stiffer wall under the same requirements; ``code("c")``, the wall
+            for a control loop. ``status`` is UNREACHABLE if no wall, however soft, satisfies the requirements.
 
         Numerics:
             A share of K_max alone is in closed form, with the damping of the stiffest wall where it is stable. Margins
@@ -227,15 +292,18 @@ class SceneAdvice(SceneOptima):
             >>> found = scene.recommend(phase_margin=30)
             >>> print(f"{found.stiffness:.0f} N/m and {found.virtual_damping:.0f} N s/m")
             8009 N/m and 33 N s/m
+            >>> scene.recommend().limited_by
+            'phase_margin'
         """
         check_held(self)
-        wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive)
+        wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe)
         if wanted.passive and (obstacle := find_obstacle(**vars(self.device))):
             raise InputError(f"passive: got True {obstacle}")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)
         found = choose_wall(bare, wanted, top)
         notes += [found.note] if found.note else []
+        notes += _describe_limit(self.safe_limit, beyond_safe)
         if found.status == Status.OK:
             stiffness = check_number("stiffness", found.stiffness)
             wall = VirtualWall(stiffness, check_number("virtual_damping", found.damping))

@@ -8,12 +8,12 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_float64
 from zwidth.loops.linear.border import Outline
-from zwidth.loops.linear.curve import curve_at
-from zwidth.scenes.base import WallSI
+from zwidth.scenes.base import WallSI, require_numbers
 from zwidth.scenes.recommendation import SceneAdvice
 from zwidth.simulation.simulate import simulate
 from zwidth.words.rotation import wrap_methods
 from zwidth.words.types import ArrayLike
+from zwidth.words.xp import is_traced, namespace
 
 
 @dataclass(frozen=True, repr=False)
@@ -27,6 +27,14 @@ class Scene(SceneAdvice):
             left out.
         velocity: how the velocity is estimated; the backward difference by default.
         operator: the hand, None where nobody holds the device.
+        safe_limit: the stiffest wall that measurements of the device support; `recommend` stays within it. A fit sets
+            it. It has no effect on verdicts and on the maximum stiffness.
+
+    Numerics:
+        Parameters and walls may be values that JAX traces. A rigid scene with the backward difference then computes
+        `boundary`, `is_passive`, `is_stable`, `margins`, `passivity_margin`, `poles` (not of a traced delay) and
+        `spectral_radius` inside ``jit``, ``vmap`` and ``grad``, every scene `max_stiffness`. All other methods raise
+        `InputError` there.
 
     Example:
         >>> import zwidth
@@ -45,12 +53,12 @@ class Scene(SceneAdvice):
         Returns:
             ``stiffness`` in N/m and ``virtual_damping`` in N s/m; NaN for other frequencies.
         """
-        w = as_float64("omega", omega) * self.timing.period
-        inside = (w > 0) & (w < np.pi)
-        curve = curve_at(self.loop.roots, np.where(inside, w, 1.0))
-        units = self.units
-        numbers = (curve.alpha * units.stiffness, curve.beta * units.virtual_damping)
-        return WallSI(*(np.where(inside, part, np.nan)[()] for part in numbers))
+        w = (omega if is_traced(omega) else as_float64("omega", omega)) * self.timing.period
+        self._check_traceable(w, *self.units)
+        inside, units = (w > 0) & (w < np.pi), self.units
+        alpha, beta = self.loop.critical_walls(namespace(w).where(inside, w, 1.0))
+        numbers = alpha * units.stiffness, beta * units.virtual_damping
+        return WallSI(*(namespace(inside, part).where(inside, part, np.nan)[()] for part in numbers))
 
     def stable_region(self) -> list[Outline]:
         """Closed outlines of the stable set, the largest first, islands and holes told apart.
@@ -69,5 +77,22 @@ class Scene(SceneAdvice):
     """A method: `zwidth.simulate` of this scene, with all its arguments."""
 
 
+# Methods that work inside jit, vmap and grad: all of a rigid scene with the backward difference, of others
+# `max_stiffness` and those that only convert units.
+TRACEABLE = (
+    "boundary",
+    "is_passive",
+    "is_stable",
+    "margins",
+    "max_stiffness",
+    "normalize_walls",
+    "parameters",
+    "passivity_margin",
+    "poles",
+    "replace",
+    "spectral_radius",
+    "to_si",
+)
+require_numbers(Scene, but=TRACEABLE)
 # Labels have no units, and walls that are texts are read in those of the device.
 wrap_methods(Scene, but=("is_stable", "normalize_walls"))

@@ -39,6 +39,14 @@ class StiffestWall(NamedTuple):
     status: Array
 
 
+def explain_missing(scene: SceneAnswers, status: Any) -> str:
+    """Return the reason for a stiffest wall without numbers."""
+    if status == Status.NO_BOUNDARY:
+        return "no stiffness is stable at any damping"
+    explained = scene.loop.explain_limit() if status == Status.UNDECIDED else ""
+    return explained or Status(int(status)).message
+
+
 def choose_damping(scene: SceneAnswers, top: StiffestWall, stiffness: float) -> float:
     """A damping with which a softer wall than the stiffest is stable, where it can be so without leaving its piece."""
     # That of the stiffest wall, if all walls of that damping between the two are stable; else the middle of the widest

@@ -10,16 +10,19 @@ has the states ``p = zeta W`` and ``q = W`` with ``zeta^2 W = w = u - a1 p - a0 
 
 from __future__ import annotations
 
+import textwrap
 from typing import NamedTuple
 
 import numpy as np
 
+from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.velocity import Estimate
 from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import check_choice
 from zwidth.words.formatting import name_wall, with_unit
 from zwidth.words.rotation import is_rotary, own_unit
 
+_COLUMNS = 100  # of a comment
 # A root is real whose imaginary part is no more of it than rounding.
 _ROUNDED = 1e-13
 
@@ -31,6 +34,18 @@ def _describe_call() -> tuple[str, str]:
         f"x is the {position}, 0 at the surface of the wall and positive inside of it; the {force} on the device is",
         f"in {own_unit('N')}, and 0 outside of the wall.",
     )
+
+
+def _describe_limit(limit: SafeLimit | None, stiffness: float, virtual_damping: float) -> list[str]:
+    """Return the lines of a program's head on the safe limit of its wall."""
+    if limit is None:
+        return []
+    texts = [f"Safe limit: {limit.describe()}", *(f"Warning: {text}" for text in limit.warnings)]
+    if not limit.allows(stiffness, virtual_damping):
+        texts.insert(0, "WARNING: this wall is beyond the safe limit; it may be unstable.")
+    # Texts of a file must not end the comment, nor escape a character.
+    plain_texts = (text.replace("*/", "* /").replace('"', "'").replace("\\", "/") for text in texts)
+    return [line for text in plain_texts for line in textwrap.wrap(text, _COLUMNS)]
 
 
 def find_sections(estimate: Estimate) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
@@ -110,7 +125,7 @@ def lay_program(scene: SceneParts) -> WallProgram:
         force.append(f"{names[0]} += w")
     K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
     estimated = f"velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}"
-    head = f"Virtual wall: {name_wall(K, B)}, {estimated}."
+    head = "\n".join([f"Virtual wall: {name_wall(K, B)}, {estimated}.", *_describe_limit(scene.safe_limit, K, B)])
     return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], f"-({K!r} * x + {B!r} * v)")
 
 
@@ -125,7 +140,11 @@ def _write_c(program: WallProgram) -> str:
     blocks = ["\n".join(f"    {line.replace('@', 'wall->')};" for line in lines) for lines in (start, force)]
     kept = "\n".join(f"    {line};" for line in (*members, *(f"double {name}" for name in program.states)))
     words = "\n   ".join(
-        [f"/* {program.head}", *_describe_call(), "Call wall_start once, then wall_force once a period. */"]
+        [
+            "/* " + program.head.replace("\n", "\n   "),
+            *_describe_call(),
+            "Call wall_start once, then wall_force once a period. */",
+        ]
     )
     opened = "void wall_start(Wall *wall, double x)\n{\n", "double wall_force(Wall *wall, double x)\n{\n"
     functions = [f"{head}{block}\n}}\n" for head, block in zip(opened, blocks, strict=True)]
@@ -138,7 +157,12 @@ def _write_python(program: WallProgram) -> str:
     begin = [f"@past = [x] * {count}", "@next = 0"] if count > 1 else ["@x = x"]
     force = [*program.force, f"return {program.law} if x > 0.0 else 0.0"]
     words = "\n    ".join(
-        [f'    """{program.head}\n', *_describe_call(), "Make one, then call force once a period.", '"""']
+        [
+            '    """' + program.head.replace("\n", "\n    ") + "\n",
+            *_describe_call(),
+            "Make one, then call force once a period.",
+            '"""',
+        ]
     )
     heads = "    def __init__(self, x=0.0):", "    def force(self, x):"
     blocks = ["\n".join(f"        {line}" for line in lines) for lines in ([*begin, *program.start], force)]

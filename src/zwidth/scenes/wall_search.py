@@ -1,6 +1,7 @@
 """Search for the stiffest wall of a scene that keeps required margins.
 
-``slack`` is the relative excess of a wall over each requirement: 0 on the limit, negative for too little, -1 for an unstable wall.
+``slack`` is the relative excess of a wall over each requirement: 0 on the limit, negative for too little, -1 for an
+unstable wall.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import false_position, find_lowest
-from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, soft_dampings
+from zwidth.parts.safe_limit import SafeLimit
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, soft_dampings
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.status import Status
@@ -20,10 +22,10 @@ from zwidth.words.units import to_float
 
 # Of a recommendation without any wish; docs/guides/my-device.md gives the reasons.
 DEFAULT_PHASE_MARGIN = 30.0  # degrees
-DEFAULT_GAIN_MARGIN = 1.6  # factor on K and B together
+DEFAULT_GAIN_MARGIN = 2.0  # factor on K and B together, 6 dB
 
 SAMPLES = 18  # dampings tried at each stiffness; passive ones of a weakly damped device are few of the stable ones
-NEAR = 2e-4  # relative accuracy of the best damping
+NEAR = 5.0  # relative accuracy of the best damping, in units of that of K
 LEAST = 1e-9  # least stiffness that is tried, relative to the largest allowed
 STEP_DOWN = 0.25  # ratio of two stiffnesses, until one has a wall with the margins
 FIRST_STEP = 0.9  # the same near a guess
@@ -45,10 +47,16 @@ class Wanted(NamedTuple):
     gain_margin: float | None = None  # at least, a factor
     phase_margin: float | None = None  # at least, in degrees
     passive: bool = False
+    beyond_safe: bool = False  # ignore the safe limit of the scene
 
     @classmethod
     def check(
-        cls, stiffness_fraction: float | None, gain_margin: float | None, phase_margin: float | None, passive: bool
+        cls,
+        stiffness_fraction: float | None,
+        gain_margin: float | None,
+        phase_margin: float | None,
+        passive: bool,
+        beyond_safe: bool = False,
     ) -> Wanted:
         """Return the requirements, the default ones if none is given; raise `InputError` for a wrong one."""
         ranges = {"stiffness_fraction": FRACTION, **RANGES}
@@ -57,11 +65,13 @@ class Wanted(NamedTuple):
             number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
             if value is not None and not (number and math.isfinite(to_float(value)) and ranges[name].holds(value)):
                 raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, as {_EXAMPLES[name]}")
-        if not isinstance(passive, bool | np.bool_):
-            raise InputError(f"passive: got {passive!r}; True or False is needed")
+        switches = {"passive": passive, "beyond_safe": beyond_safe}
+        for name, value in switches.items():
+            if not isinstance(value, bool | np.bool_):
+                raise InputError(f"{name}: got {value!r}; True or False is needed")
         if not passive and all(value is None for value in given.values()):
-            return cls(RECOMMENDED_SHARE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN)
-        return cls(**given, passive=bool(passive))
+            given = dict(zip(given, (RECOMMENDED_SHARE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN), strict=True))
+        return cls(**given, passive=bool(passive), beyond_safe=bool(beyond_safe))
 
     def spell(self, name: str) -> str:
         """Return one requirement in words."""
@@ -70,7 +80,13 @@ class Wanted(NamedTuple):
             "gain_margin": f"gain margin {self.gain_margin:g}" if self.gain_margin else "",
             "phase_margin": f"{self.phase_margin:g} deg phase margin" if self.phase_margin else "",
             "passive": "passivity",
+            "safe_limit": f"{100.0 * self.safe_share:.4g} % of the safe limit",
         }[name]
+
+    @property
+    def safe_share(self) -> float:
+        """The largest share of the stiffness of a safe limit."""
+        return self.stiffness_fraction or RECOMMENDED_SHARE
 
 
 class WallChoice(NamedTuple):
@@ -78,14 +94,14 @@ class WallChoice(NamedTuple):
 
     stiffness: float  # in N/m; NaN without a wall
     damping: float  # in N s/m
-    limit: str  # the requirement that allows no stiffer wall, a field of `Wanted`
+    limit: str  # the requirement that allows no stiffer wall, a field of `Wanted`, or "safe_limit"
     status: Status
     reason: str = ""
     note: str = ""
 
 
 def measure_slack(scene: SceneOptima, wanted: Wanted) -> Slack:
-    """Return a function of K in N/m and B in N s/m that computes the slack of each requirement but the share of K_max."""
+    """Return a function of K in N/m and B in N s/m that computes the slack of each requirement on margins."""
     own = float(scene.device.damping)
     asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
 
@@ -100,14 +116,21 @@ def measure_slack(scene: SceneOptima, wanted: Wanted) -> Slack:
             if wanted.phase_margin:
                 found["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
         if wanted.passive:
-            found["passive"] = np.asarray(scene.passivity_margin(stiffness, damping)) / (own or 1.0)
+            margin = np.asarray(scene.passivity_margin(stiffness, damping)) / (own or 1.0)
+            # A wall without any margin is not passive.
+            found["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
         return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in found.items()}
 
     return slack
 
 
 def find_stiffest(
-    scene: SceneOptima, slack: Slack, most: float, near: float | None = None, width: float = WIDTH
+    scene: SceneOptima,
+    slack: Slack,
+    most: float,
+    near: float | None = None,
+    width: float = WIDTH,
+    safe: SafeLimit | None = None,
 ) -> tuple[float, float]:
     """Return K and B of the stiffest wall with nonnegative slack; NaN if none was found.
 
@@ -117,6 +140,7 @@ def find_stiffest(
         most: largest K allowed, in N/m.
         near: a guess of K, at which the search starts; without one it starts at ``most``.
         width: relative accuracy of K.
+        safe: the limit within which the wall must lie.
     """
     unit, found = scene.units.virtual_damping, {}
 
@@ -127,7 +151,13 @@ def find_stiffest(
         def cost(beta: Any) -> np.ndarray:
             return -np.min(list(slack(stiffness, beta * unit).values()), axis=0)
 
-        dips = (find_lowest(cost, *ends, SAMPLES, NEAR) for ends in soft_dampings(scene, stiffness))
+        intervals = soft_dampings(scene, stiffness)
+        if safe is not None:
+            intervals = _clip(intervals, *(end / unit for end in safe.dampings(stiffness) or (math.inf, -math.inf)))
+        dips = [
+            find_lowest(cost, low, high, SAMPLES, NEAR * width) if low < high else (float(cost(low)), low)
+            for low, high in intervals
+        ]
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
             found[log_stiffness] = beta * unit
@@ -149,9 +179,8 @@ def find_stiffest(
     if at_low <= 0:
         return math.nan, math.nan
     if low < high and at_high <= 0:
-        false_position(
-            np.vectorize(best_slack, otypes=[float]), *map(np.float64, (low, high, at_low, at_high)), MAX_STEPS, width
-        )
+        ends = np.float64(low), np.float64(high), np.float64(at_low), np.float64(at_high)
+        false_position(np.vectorize(best_slack, otypes=[float]), *ends, MAX_STEPS, width)
     log_stiffness = max(found)
     wall = most if log_stiffness == top else math.exp(log_stiffness), found[log_stiffness]
     if wall[0] == most:
@@ -161,31 +190,46 @@ def find_stiffest(
     return short if min(map(float, slack(*short).values())) >= 0 else wall
 
 
+def _clip(intervals: list[tuple[float, float]], low: float, high: float) -> list[tuple[float, float]]:
+    """Return the parts of intervals that lie between two ends."""
+    clipped = [(max(start, low), min(end, high)) for start, end in intervals]
+    return [(start, end) for start, end in clipped if start <= end]
+
+
 def choose_wall(
     scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> WallChoice:
     """Choose the stiffest wall of a scene, whose stiffest stable wall is known, that satisfies the requirements."""
     nan = math.nan
     if top.status != Status.OK:
-        status = Status(int(top.status))
-        reason = "no stiffness is stable at any damping" if status == Status.NO_BOUNDARY else status.message
-        return WallChoice(nan, nan, "", status, reason)
-    most = (wanted.stiffness_fraction or 1.0) * float(top.stiffness)
+        return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
+    most, binding = (wanted.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
+    safe = None if wanted.beyond_safe else scene.safe_limit
+    if safe is not None:
+        if safe.forbids_all:
+            why = "; ".join(safe.warnings) or safe.reason or "the safe limit is 0"
+            return WallChoice(nan, nan, "", Status.UNREACHABLE, f"no wall is safe: {why}")
+        # The reserve is the same for both limits.
+        share = wanted.safe_share * safe.stiffness
+        most, binding = (share, "safe_limit") if share < most else (most, binding)
     usual, slack = choose_damping(scene, top, most), measure_slack(scene, wanted)
+    if safe is not None:
+        low, high = safe.dampings(most) or (usual, usual)
+        usual = min(max(usual, low), high)
     spare = slack(most, usual)
     if spare and not (wanted.stiffness_fraction and min(spare.values()) >= 0):
-        stiffness, damping = find_stiffest(scene, slack, most, near, width)
+        stiffness, damping = find_stiffest(scene, slack, most, near, width, safe)
         if math.isnan(stiffness):
             asked = " and ".join(map(wanted.spell, spare))
             undamped = wanted.passive and scene.device.damping == 0
             why = "without damping of the device no wall is passive" if undamped else "ask for less"
             return WallChoice(nan, nan, "", Status.UNREACHABLE, f"no wall keeps {asked}, however soft; {why}")
         spare = slack(stiffness, damping)
-        limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else "stiffness_fraction"
+        limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else binding
         return WallChoice(stiffness, damping, limit, Status.OK)
     if not np.all(scene.is_stable(most, usual)):
         share = most / float(top.stiffness)
         reason = f"no wall of {share:g} of K_max was found to be stable; choose another share"
         return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
-    note = OTHER_DAMPING if usual != top.virtual_damping else ""
-    return WallChoice(most, usual, "stiffness_fraction", Status.OK, note=note)
+    note = OTHER_DAMPING if usual != top.virtual_damping and binding == "stiffness_fraction" else ""
+    return WallChoice(most, usual, binding, Status.OK, note=note)

@@ -56,7 +56,7 @@ OF_WHOLE = {
     "trend": ("width of the second half of the tail over that of the first", "1"),
     "frequency": ("frequency of the motion in the tail", "Hz"),
     "penetration": ("largest position at a sample", "m"),
-    "bounces": ("times the wall was left again", "1"),
+    "bounces": ("number of times contact ends", "1"),
     "impact_velocity": ("velocity at the first sample in contact", "m/s"),
     "energy_given": ("most energy that the wall has given beyond what it took", "J"),
     "outcome": ("how the motion ends", "1"),
@@ -77,7 +77,7 @@ def _draw(motion: Motion) -> str:
     _draw,
     {
         "frequency": "the velocity does not turn twice in the tail",
-        "impact_velocity": "the wall is not entered from outside",
+        "impact_velocity": "no contact begins after the first sample",
         "trend": "nothing moves, or the tail is one period",
     },
     outcome=MotionKind,
@@ -102,8 +102,10 @@ class Motion:
         trend: the peak-to-peak position in the second half of the tail over that in the first.
         frequency: of the motion in the tail, in Hz; NaN at rest and where the velocity does not turn twice there.
         penetration: the largest position at a sample, in m, at least 0.
-        bounces: how often the wall was left again.
-        impact_velocity: at the first sample at which the wall is entered from outside, in m/s; NaN where it never is.
+        bounces: number of samples at which contact ends. A bilateral wall is always in contact; a law is in contact
+            while it commands a force that is not 0.
+        impact_velocity: velocity at the first sample at which contact begins, in m/s; NaN if none begins after the
+            first sample.
         energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
         outcome: a code of `zwidth.MotionKind`, what becomes of the motion, the hand pushing on as in the tail
             (docs/theory/simulation.md, T7). Proved: REST, no body moves more than 1e-9 of the widest motion in the

@@ -289,7 +289,7 @@ def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
             raise InputError(f"scenes: got {scene!r}; a zwidth.Scene or a list of them is needed")
         if isinstance(scene.device, MeasuredDevice):
             raise InputError("scenes: a measured response is no model to simulate; fit one to a log (zwidth.fit_log)")
-        if is_traced(scene.device.mass, scene.timing.period):
+        if scene.traced_path is not None:
             raise InputError("scenes: got one of values that JAX traces; simulate outside of jit, vmap and grad")
         which[place] = known.setdefault(id(scene), len(known))
     return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))], which

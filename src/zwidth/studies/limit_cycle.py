@@ -1,7 +1,8 @@
-"""The limit_cycle study: where a wall buzzes, and how wide, over one or two parameters and under several conditions."""
+"""The limit_cycle study: amplitude and frequency of limit cycles over one or two parameters and several conditions."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from functools import partial
 from typing import Annotated, Any, Literal, get_type_hints
@@ -22,7 +23,7 @@ from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
 from zwidth.studies.simulate import Circumstances, SimulatedStudy
-from zwidth.words.formatting import header, with_unit
+from zwidth.words.formatting import header, spell_short, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.status import Status
 
@@ -30,6 +31,11 @@ _COLUMNS = {known.name: column for column, known in AXES.items()}
 _OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
 # So many values of a list are curves, and more are a plane.
 _MOST_CURVES = 6
+WIDEST = {
+    False: 1e-3,
+    True: math.radians(20.0),
+}  # default largest amplitude of linear and of rotary devices, in m and rad
+WIDEST_STEPS = 10.0  # the same in steps of the encoder
 
 
 # All that the study sets for every condition may be set for one; what is not is None.
@@ -80,7 +86,7 @@ class CycleAxes(Strict, what="the axes of a limit_cycle study"):
 
 @register
 class LimitCycleStudy(SimulatedStudy, Circumstances):
-    """Amplitude of the buzz over one or two parameters, under one or several conditions."""
+    """Amplitude of limit cycles over one or two parameters, under one or several conditions."""
 
     method = "Simulations, exact between samples, each judged by the end of what was simulated."
     point_bytes = 8 * (1 + len(_OUTPUTS))
@@ -94,10 +100,11 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
     """What each panel has of its own, beside what the study sets for all; one panel where left out."""
 
     silence: Annotated[float, Quantity("m", POSITIVE)] = 1e-6
-    """Amplitude below which a motion counts as silent, in m or with a unit."""
+    """Amplitude below which a motion is at rest, in m or rad or with a unit."""
 
-    widest: Annotated[float, Quantity("m", POSITIVE)] = 1e-3
-    """Amplitude beyond which it counts as no buzz any more, in m or with a unit."""
+    widest: Annotated[float, Quantity("m", POSITIVE)] | None = None
+    """Largest amplitude of a limit cycle, in m or rad or with a unit; wider motions are counted and drawn apart.
+    1 mm if left out (20 deg of a rotary device), or 10 steps of the encoder if these are more."""
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
@@ -112,10 +119,13 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
                 if getattr(condition, name, None) is not None:
                     what = "given twice, here and as an axis"
                     yield ("conditions", index, name), problem(what, "each parameter once", "remove one")
-        if self.widest <= self.silence:
-            what = f"got {with_unit(self.widest, 'm')}, silence is {with_unit(self.silence, 'm')}"
-            yield ("widest",), problem(what, "a buzz lies between silence and widest", "raise it")
         scene = self.device.to_scene()
+        silence, widest = self.bound_amplitudes(scene)
+        if widest <= silence:
+            low, high = (with_unit(end, "m") for end in (silence, widest))
+            name = "silence" if self.widest is None else "widest"
+            what = f"got silence {low}, widest {high}"
+            yield (name,), problem(what, "silence is less than widest", "raise widest or lower silence")
         found = [list(each.find_clashes(scene)) for each in self.list_circumstances()]
         for index, (condition, faults) in enumerate(zip(self.conditions, found, strict=True)):
             for path, what in faults:
@@ -132,6 +142,14 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
             for own in owns
         ]
 
+    def bound_amplitudes(self, scene: Scene) -> tuple[float, float]:
+        """Return the least and the largest amplitude of a limit cycle, in SI units."""
+        if self.widest is not None:
+            return self.silence, self.widest
+        steps = [self.resolution, *(each.resolution or 0.0 for each in self.conditions)]
+        steps += self.axes.resolution.values().tolist() if self.axes.resolution is not None else []
+        return self.silence, max(WIDEST[bool(scene.device.rotary)], WIDEST_STEPS * max(steps))
+
     @property
     def sizes(self) -> dict[str, int]:
         return {"conditions": len(self.conditions)} | {name: axis.size for name, axis in self.axes.varied.items()}
@@ -140,6 +158,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         axes, varied = self.axes.lay_out(), self.axes.varied
         labels = [each.label for each in self.conditions]
         found: dict[str, list[np.ndarray]] = {name: [] for name in (*_OUTPUTS, "linearly_stable")}
+        bounds = self.bound_amplitudes(self.device.to_scene())
         edges, notes = [], []
         for label, given in zip(labels, self.list_circumstances(), strict=True):
             placed = given.place(self.device.to_scene())
@@ -152,19 +171,20 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
                 stable[...] = placed.is_stable(axes["stiffness"], axes["virtual_damping"])
                 edges += trace_edges(placed, label, varied, axes)
             found["linearly_stable"].append(stable)
-            notes.append(f"{label}: {describe_outcomes(motion, stable, self.silence, self.widest)}")
+            notes.append(f"{label}: {describe_outcomes(motion, stable, bounds)}")
         units = {name: unit for name, (_, unit) in OF_WHOLE.items()}
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
         arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
-        table, bounds = stack(edges), (self.silence, self.widest)
+        table = stack(edges)
         # A curve for each value of a short list, or a single one; else a plane.
         short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MOST_CURVES]
         draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
         if short or len(varied) == 1:
             family = _COLUMNS[short[0]] if len(varied) > 1 else ""
             draw = partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
-        low, high = (with_unit(bound, "m", 3) for bound in bounds)
-        notes.append(f"buzzing: an amplitude from {low} to {high} in the last quarter of {self.duration}")
+        low, high = (spell_short(bound, "m") for bound in bounds)
+        rest = f"at rest: an amplitude below {low} in the last quarter of {self.duration}"
+        notes.append(f"{rest}; limit cycle: from {low} to {high}")
         return Outcome(
             arrays=arrays,
             figures={"": draw},
@@ -193,12 +213,12 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
     ]
 
 
-def describe_outcomes(motion: Any, stable: np.ndarray, silence: float, widest: float) -> str:
-    """How many of the linearly stable and unstable walls are silent, buzz, or go beyond."""
-    beyond = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > widest)
-    silent = ~beyond & (motion.amplitude < silence)
+def describe_outcomes(motion: Any, stable: np.ndarray, bounds: tuple[float, float]) -> str:
+    """Return how many of the linearly stable and unstable walls are at rest, in a limit cycle, or wider than it."""
+    wide = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > bounds[1])
+    rest = ~wide & (motion.amplitude < bounds[0])
     known = motion.status == Status.OK
-    ends = {"silent": silent, "buzzing": ~silent & ~beyond, "beyond": beyond}
+    ends = {"at rest": rest, "in a limit cycle": ~rest & ~wide, f"wider than {spell_short(bounds[1], 'm')}": wide}
     words = []
     for name, kind in {"linearly stable ": 1, "linearly unstable ": 0, "": -1}.items():
         those = known & (stable == kind)
@@ -206,4 +226,4 @@ def describe_outcomes(motion: Any, stable: np.ndarray, silence: float, widest: f
             counts = ", ".join(f"{np.count_nonzero(end[those]):,} {word}" for word, end in ends.items())
             words.append(f"of {np.count_nonzero(those):,} {name}walls {counts}")
     lost = int(np.count_nonzero(~known))
-    return "; ".join(words) + (f"; {lost} not followed to the end" if lost else "")
+    return "; ".join(words) + (f"; {lost} not simulated to the end" if lost else "")

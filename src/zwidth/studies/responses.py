@@ -182,7 +182,8 @@ class RecommendStudy(ResponseStudy):
     """Device in SI units."""
 
     stiffness_fraction: Fraction | None = None
-    """Stiffness of the recommended wall as a share of the maximum, at most; 0.75 where nothing else is asked for."""
+    """Stiffness of the recommended wall as a share of the maximum, at most. Without any requirement the defaults apply:
+    0.75 of the maximum, a gain margin of 2 and a phase margin of 30 degrees."""
 
     gain_margin: Annotated[float, Quantity(allowed=RANGES["gain_margin"])] | None = None
     """The factor on stiffness and damping together that the wall must bear, at least."""
@@ -193,13 +194,16 @@ class RecommendStudy(ResponseStudy):
     passive: bool = False
     """Whether the wall must be passive."""
 
+    beyond_safe: bool = False
+    """Ignore the safe limit of the device, which a fit sets."""
+
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         return ((self.device, None),)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         stem, label = "recommendation" if alone else f"{self.name}_recommendation", self.device.label or self.name
         bare = self.device.to_scene()
-        wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive")
+        wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive", "beyond_safe")
         found = bare.recommend(**{name: getattr(self, name) for name in wanted})
         told, notes, response = found.as_dict(), list(found.notes), None
         if not bare.parts_beyond and found.verdict is not None:
@@ -245,7 +249,8 @@ def _describe(found: Recommendation, told: dict[str, Any]) -> str:
         "Device: {}, sampled every {}, force delayed by {}.".format(scene.device.spell(), *times),
         *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
         *("", *(f"- {text}" for text in said), ""),
-        *(("What would raise the maximum:", "") if found.steps else ()),
+        *(text for note in found.notes for text in (f"Note: {note}", "")),
+        *(("To gain stiffness under the same requirements:", "") if found.steps else ()),
         *(f"- {step.spell()}" for step in found.steps),
     ]
     return "\n".join(lines).rstrip() + "\n"

@@ -19,11 +19,12 @@ from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
-from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
+from zwidth.simulation.ending import describe_ending
+from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion
 from zwidth.simulation.simulate import Contact
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import header, name_wall, with_unit
+from zwidth.words.formatting import header, name_wall
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, Range
 
 LONGEST = 1_000_000
@@ -31,13 +32,6 @@ LONGEST = 1_000_000
 
 # What the program makes of a sample stays until the next one.
 _OF_SAMPLES = ("measured", "estimated_velocity", "command", "contact")
-_WORDS = {
-    MotionKind.REST: "at rest",
-    MotionKind.DECAYING: "decaying",
-    MotionKind.GROWING: "growing",
-    MotionKind.DIVERGED: "growing without end",
-    MotionKind.INVALID: "not followed to its end",
-}
 
 
 class Circumstances(Strict):
@@ -168,7 +162,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
         for k, (label, *wall) in enumerate(walls):
             named = {"label": label, **dict(zip(SI_COLUMNS, wall, strict=True))}
             parts.append({**named, **tabulate_motion(motion, k, self.substeps)})
-            words = describe_end(motion, k)
+            words = describe_ending(motion, k)
             judged = {} if linear is None else {"linearly_stable": bool(linear[k])}
             whole = {header(name, unit): getattr(motion, name)[k] for name, (_, unit) in OF_WHOLE.items()}
             rows.append({**named, **judged, **whole, "outcome": words})
@@ -194,28 +188,3 @@ def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarr
             own = np.repeat(values[k], substeps) if name in _OF_SAMPLES else values[k]
             columns[header(name, unit)] = own.astype(int) if own.dtype == bool else own
     return columns
-
-
-def describe_end(motion: Motion, k: int) -> str:
-    """How a recorded motion of several ends, in words."""
-    end = MotionKind(int(motion.outcome[k]))
-    if end in (MotionKind.REST, MotionKind.DIVERGED, MotionKind.INVALID):
-        return _WORDS[end]
-    velocity, contact = motion.velocity[k], motion.contact[k]
-    tail = max(contact.size // 4, 1)
-    if not contact[-tail:].any() and end is not MotionKind.RESTLESS:
-        return "gone from the wall"
-    amplitude, frequency = float(motion.amplitude[k]), float(motion.frequency[k])
-    if end in (MotionKind.UNCLEAR, MotionKind.RESTLESS):
-        hits = np.flatnonzero(contact[1:] & ~contact[:-1]) + 1
-        if hits.size > 1:
-            speeds = velocity.reshape(contact.size, -1)[hits, 0]
-            first, last = (with_unit(float(speed), "m/s", 3) for speed in speeds[[0, -1]])
-            change = "growing" if speeds[-1] > speeds[0] else "decaying"
-            return f"bounces {change}, the first of {hits.size} impacts at {first} and the last at {last}"
-    if end is MotionKind.UNCLEAR:
-        return "too few swings at the end to tell how it goes on"
-    if end not in (MotionKind.STEADY, MotionKind.RESTLESS):
-        return _WORDS[end]
-    rate = f" at {with_unit(frequency, 'Hz', 3)}" if np.isfinite(frequency) else ""
-    return f"buzzing{rate}, amplitude {with_unit(amplitude, 'm', 3)}"

@@ -69,7 +69,6 @@ def compute_sweeps(
     folder: Path,
     about: Mapping[str, Any],
     *,
-    shard: tuple[int, int] | None,
     workers: int | None,
     scheduler: str | None,
     progress: Callable[[Progress], None],
@@ -89,8 +88,8 @@ def compute_sweeps(
             client = stack.enter_context(connected(scheduler))
         sweeps, stores, jobs = Sweeps({}), {}, []
         for plan in plans:
-            store, repaired = _prepare_store(plan, folder, about, shard)
-            tasks = _pick_share(store.plan, shard)
+            store, repaired = _prepare_store(plan, folder, about)
+            tasks = list(store.plan.tasks())
             missing = [Job(str(store.path), task) for task in tasks if not store.is_done(task)]
             skipped, total = len(tasks) - len(missing), len(tasks)
             sweeps.results[plan.study.name] = SweepResult(store.path, 0, skipped, total, repaired)
@@ -113,11 +112,6 @@ def compute_sweeps(
         return sweeps
 
 
-def _pick_share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
-    tasks = list(plan.tasks())
-    return tasks if shard is None else tasks[shard[0] - 1 :: shard[1]]
-
-
 def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool) -> None:
     """Refuse stores that exist, unless the run goes on with them, and those that `check_same` refuses."""
     for study in studies:
@@ -129,9 +123,7 @@ def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool)
         check_same(Store(path), study)
 
 
-def _prepare_store(
-    plan: Plan, folder: Path, about: Mapping[str, Any], shard: tuple[int, int] | None
-) -> tuple[Store, tuple[str, ...]]:
+def _prepare_store(plan: Plan, folder: Path, about: Mapping[str, Any]) -> tuple[Store, tuple[str, ...]]:
     """The store of a sweep, made or found, and what was repaired in it."""
     path = store_path(folder, plan.study)
     if not path.exists():
@@ -147,16 +139,12 @@ def _prepare_store(
             "study": plan.study.model_dump(mode="json", exclude_none=True),
             "plan": plan.as_dict(),
         }
-        store = create(path, attributes)
-        # Where other runs share the folder, one of them may have been faster.
-        check_same(store, plan.study)
-        return store, ()
+        return create(path, attributes), ()
     store = Store(path)
-    if shard is None:
-        # Unfinished files of a run that was killed.
-        for left in path.rglob("*.partial"):
-            left.unlink(missing_ok=True)
-    return store, tuple(f"{plan.study.name}/{what}" for what in repair(store, _pick_share(store.plan, shard)))
+    # Unfinished files of a run that was killed.
+    for left in path.rglob("*.partial"):
+        left.unlink(missing_ok=True)
+    return store, tuple(f"{plan.study.name}/{what}" for what in repair(store, store.plan.tasks()))
 
 
 def _follow(

@@ -1,25 +1,17 @@
-"""Files and folders of results: whole or absent whatever kills a program, knowing their making, and held by one run.
+"""Files and folders of results: checks, checksums, versions, and the lock of the one run that writes a folder.
 
-The locks are the system's own (flock), on files in ``DIR/.locks``: the kernel takes them back when their holder ends,
-however it ends, so that a killed run never stands in the way of the next. A library for file locks would keep shared
-locks in a database, or fall back on files that stay behind. NFS carries these locks to the other machines (from Linux
-2.6.12 on); on a file system that knows none, runs go on without one, as the files of a store stay whole even then.
-
-``run`` is held alone by a run without shards, and shared by all shards; each shard holds ``shard-i`` beside it. The
-files stay when a run ends: to remove one could give two runs a lock each, on the old file and on a new one.
+The lock is the system's own, on ``DIR/.locks/run``: it ends with its process, even a killed one, so that the file that
+stays behind blocks no later run. NFS extends it to other machines.
 """
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import os
 import platform
 import socket
-import stat
-import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -41,10 +33,9 @@ LOCKS = ".locks"
 ELSEWHERE = "choose another folder with --out DIR"
 """What helps in every case."""
 
-# As long as a killed program may take to vanish, and a shard to write down who it is.
-_PATIENCE = 1.0
-_PAUSE = 0.02
-_UNKNOWN_TO_FILE_SYSTEM = frozenset({errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EBADF})
+PATIENCE = 1.0  # s; a killed program needs some time to end
+# Reported by file systems without locks.
+_NO_LOCKS = frozenset({errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK})
 
 
 def hopeless(error: BaseException | None) -> bool:
@@ -119,110 +110,37 @@ def differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, 
 
 
 @contextmanager
-def holding(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None]:
-    """Hold a folder of results, made where it is missing, within the block; a shard (i, n) shares it with others."""
-    # A `StoreBusyError` says which other run holds it.
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Lock a folder of results, created if missing, for this run; raise `StoreBusyError` if another run holds it."""
+    # Loading it takes longer than many commands that import this module.
+    from filelock import FileLock, Timeout
+
     check_folder(folder)
-    with _opened(folder / LOCKS / "run") as run:
-        if shard is None:
-            if not _lock(run, fcntl.LOCK_EX):
-                raise _busy(folder, "another run computes in this folder")
-            _write_holder(run, _this_process())
-            yield
-            return
-        number, count = shard
-        # The first shard to come says how many there are to be.
-        if _lock(run, fcntl.LOCK_EX, patience=0.0):
-            _write_holder(run, f"{count} shards")
-        # From alone to shared the kernel may let another in between: what is written counts only from here on.
-        if not _lock(run, fcntl.LOCK_SH):
-            raise _busy(folder, "another run computes in this folder")
-        said = _read_holder(run)
-        if said.endswith(" shards") and said != f"{count} shards":
-            raise _busy(folder, f"{said} compute in this folder, not {count}")
-        with _opened(folder / LOCKS / f"shard-{number}") as own:
-            if not _lock(own, fcntl.LOCK_EX):
-                raise _busy(folder, f"shard {number} computes in this folder already")
-            _write_holder(own, f"shard {number}/{count}, {_this_process()}")
-            yield
-
-
-@contextmanager
-def held_briefly(folder: Path, name: str) -> Iterator[None]:
-    """Hold a lock of that name in a folder for as long as it takes to write a small file."""
-    with _opened(folder / LOCKS / name) as file:
-        # Where another holds it for so long, it hangs: the file is written whole in any case.
-        _lock(file, fcntl.LOCK_EX, patience=10.0)
-        yield
-
-
-def _busy(folder: Path, what: str) -> StoreBusyError:
-    """Why a folder cannot be had, who has it, and what to do."""
-    holders = []
-    for path in sorted((folder / LOCKS).glob("*")):
-        with suppress(OSError, InputError), _opened(path) as file:
-            held = not _lock(file, fcntl.LOCK_SH, patience=0.0)
-            holders += [_read_holder(file)] if held and "process" in _read_holder(file) else []
-    more = f", and {len(holders) - 1} more" if len(holders) > 1 else ""
-    who = f" ({holders[0]}{more})" if holders else ""
-    return StoreBusyError(f"out: {folder}: {what}{who}; wait until it ends, stop that process, or {ELSEWHERE}")
-
-
-def _this_process() -> str:
-    since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")
-    return f"process {os.getpid()} on {socket.gethostname()}, since {since} UTC"
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[int]:
-    """A file to lock, made where it is missing; closed, and so freed, when the block ends."""
+    place = folder / LOCKS
+    if place.is_symlink():
+        raise InputError(f"out: {place} is a link; remove it, or {ELSEWHERE}")
+    place.mkdir(parents=True, exist_ok=True)
+    holder = place / "holder"
+    # Writable by all, because other users of the folder lock it too. No fallback to files in place of flock: they
+    # would block later runs after a kill.
+    lock = FileLock(place / "run", timeout=PATIENCE, mode=0o666, fallback_to_soft=False)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
-    except PermissionError:
-        # Another user's: to lock it, local file systems want no more than this.
-        file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        lock.acquire()
+    except Timeout:
+        who = content(holder).decode(errors="replace")
+        what = f"another run computes in this folder{who and f' ({who})'}"
+        raise StoreBusyError(f"out: {folder}: {what}; wait until it ends, stop that process, or {ELSEWHERE}") from None
     except OSError as error:
-        if error.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.EEXIST, errno.ENOTDIR):
+        # Without locks nothing keeps two runs apart, but every file of a store is still complete or absent.
+        if error.errno not in _NO_LOCKS:
             raise
-        raise _foreign(path) from error
     try:
-        found = os.fstat(file)
-        if path.parent.is_symlink() or not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
-            raise _foreign(path)
-        yield file
+        since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")
+        who = f"process {os.getpid()} on {socket.gethostname()}, since {since} UTC"
+        # For messages only: a full disk must not end a run here. Removed first, because it may be a link.
+        with suppress(OSError):
+            holder.unlink(missing_ok=True)
+            holder.write_text(who, encoding="utf-8")
+        yield
     finally:
-        os.close(file)
-
-
-def _foreign(path: Path) -> InputError:
-    place = path.parent if path.parent.is_symlink() else path
-    return InputError(f"out: {place} is a link or no file of a run's own; remove it, or choose another folder")
-
-
-def _lock(file: int, how: int, patience: float | None = None) -> bool:
-    """Take or change the lock; False where another holds it all the time."""
-    deadline = time.monotonic() + (_PATIENCE if patience is None else patience)
-    while True:
-        try:
-            fcntl.flock(file, how | fcntl.LOCK_NB)
-            return True
-        except OSError as error:
-            if error.errno in _UNKNOWN_TO_FILE_SYSTEM:
-                return True
-            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-                raise
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(_PAUSE)
-
-
-def _write_holder(file: int, text: str) -> None:
-    # It is for messages alone: neither a full disk nor a file of another user's may end a run here.
-    with suppress(OSError):
-        os.ftruncate(file, 0)
-        os.pwrite(file, text.encode(), 0)
-
-
-def _read_holder(file: int) -> str:
-    return os.pread(file, 200, 0).decode(errors="replace")
+        lock.release()

@@ -205,13 +205,9 @@ class Store:
 
 
 def create(path: Path, attributes: dict[str, Any]) -> Store:
-    """Make an empty store, at once and whole, or take one that another process has made in the meantime."""
+    """Make an empty store that appears complete."""
     with _build_beside(path, attributes) as fresh:
-        try:
-            os.rename(fresh, path)
-        except OSError:
-            if not path.exists():
-                raise
+        os.rename(fresh, path)
     return Store(path)
 
 

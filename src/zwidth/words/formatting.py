@@ -54,6 +54,12 @@ def spell_periods(count: float) -> str:
     return f"{short(float(f'{count:.6g}'))} period{'' if count == 1 else 's'}"
 
 
+def spell_short(value: float, unit: str, digits: int = 3) -> str:
+    """Return a quantity with its unit, without trailing zeros: ``1 mm``, ``349 mrad``."""
+    number, space, name = with_unit(value, unit, digits).partition(" ")
+    return f"{float(number):g}{space}{name}" if math.isfinite(value) else number
+
+
 def name_wall(stiffness: Any, virtual_damping: Any) -> str:
     """A wall by its numbers, K rounded down: it holds as it is read."""
     K = with_unit(round_safely(float(stiffness), "below"), "N/m")

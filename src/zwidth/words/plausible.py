@@ -56,6 +56,8 @@ def list_doubts(given: Mapping[str, Any], spell: Callable[[str, str], str]) -> l
                 for other, smaller, scale, text in _SLIPS.get(kind, ())
                 if _is_plausible(other or kind, value * scale) and not (is_rotary() and own_unit(unit) != unit)
             ]
+            if kind == "delay" and meant:
+                meant[0] += f" or {spell(path, f'{number} periods')}"
             remedy = f"did you mean {meant[0]}?" if meant else "check its unit"
             if kind == "resolution" and value > 1:
                 per = "rev" if is_rotary() else "mm"

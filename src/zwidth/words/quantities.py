@@ -7,10 +7,12 @@ what a store says of it, and what a figure writes beside it.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypeAlias
 
+from zwidth.words.rotation import is_rotary
 from zwidth.words.status import Status
 
 
@@ -93,10 +95,21 @@ class Parameter:
         return self.short_name or self.long_name
 
     @property
+    def own_words(self) -> str:
+        """The name for the kind of device in question: a rotary one has an inertia."""
+        return self.words.replace("mass", "inertia") if is_rotary() else self.words
+
+    @property
+    def own_symbol(self) -> str:
+        """The symbol for the kind of device in question, in mathtext."""
+        return re.sub(r"^m(?=_|$)", "J", self.symbol) if is_rotary() else self.symbol
+
+    @property
     def axis_label(self) -> str:
-        """The same with its symbol, as an axis of a figure has it."""
+        """The label of an axis: name, symbol and definition for the kind of device in question."""
         definition = f" = {self.definition}" if self.definition else ""
-        return f"{self.words}  ${self.symbol}{definition}$"
+        definition = definition.replace("/m", "/J") if is_rotary() else definition
+        return f"{self.own_words}  ${self.own_symbol}{definition}$"
 
     @property
     def sentence(self) -> str:

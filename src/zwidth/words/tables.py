@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.words.clocks import CLOCK, is_time, read_clock, read_duration, to_seconds
 from zwidth.words.errors import InputError
 from zwidth.words.units import is_unit, looks_like_number, split_head
 
@@ -31,12 +32,12 @@ _DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
 _FRACTION = re.compile(r"[-+]?[0-9]*([.,])[0-9]+(?:[eE][-+]?[0-9]+)?")
 # Lines that may stand above the numbers.
 _PREAMBLE = 500
+_LABVIEW = "***End_of_Header***"
 _REMARK = re.compile(r"\s*[#%]+\s*")
 _SEPARATOR = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 _BLANKS = re.compile(r"\s+(?![\[(])")
-# 2024-05-01T12:00:00.001, also with a blank or a time zone; or the time of a day alone.
-_CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?(\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?)(Z|[+-]\d\d:?\d\d)?")
-_DAY, _AT_ONCE = "1970-01-01T", 20_000
+# Cells without a number, in lower case.
+_MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-")
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class NamedColumns:
     """Columns of a file, whose numbers are read when they are asked for."""
 
     heads: list[str]  # their names, perhaps with units
-    numbers: Callable[..., list[np.ndarray]]  # of columns at some places, finite and of a kind: float or complex
+    # Columns at some places, of a kind: float or complex. All finite, or NaN for cells without a number if gaps=True.
+    numbers: Callable[..., list[np.ndarray]]
     nameless: str = ""  # says so where the names are 1, 2, ...
 
 
@@ -169,7 +171,7 @@ def _table_arrays(file: Path, arrays: dict[str, Any]) -> NamedColumns:
         raise InputError(f"{file}: got {shapes[:200]}; give a column of numbers for each quantity")
     heads, values = list(flat), list(flat.values())
 
-    def numbers(places: Sequence[int], kind: type = float) -> list[np.ndarray]:
+    def numbers(places: Sequence[int], kind: type = float, gaps: bool = False) -> list[np.ndarray]:
         sizes = {heads[at]: values[at].size for at in places}
         if len(set(sizes.values())) > 1:
             text = ", ".join(f"{name!r} {size}" for name, size in sizes.items())
@@ -179,9 +181,9 @@ def _table_arrays(file: Path, arrays: dict[str, Any]) -> NamedColumns:
             clock = values[at].dtype.kind == "M"
             if values[at].dtype.kind == "c" and kind is float:
                 raise InputError(f"{file}: got complex numbers in {heads[at]!r}; real ones are needed")
-            column = _seconds(values[at]) if clock else values[at].astype(kind)
+            column = to_seconds(values[at]) if clock else values[at].astype(kind)
             bad = np.flatnonzero(~np.isfinite(column))
-            if bad.size:
+            if bad.size and not gaps:
                 raise InputError(
                     f"{file}: got {column[bad[0]]} in {heads[at]!r} at sample {bad[0]}; a number is needed"
                 )
@@ -223,9 +225,9 @@ def _table_text(file: Path, lines: list[str]) -> NamedColumns:
     if not any(line.strip() for line in lines[layout.begin :]):
         raise InputError(f"{file}: it has names of columns and no samples; record some")
 
-    def numbers(places: Sequence[int], kind: type = float) -> list[np.ndarray]:
+    def numbers(places: Sequence[int], kind: type = float, gaps: bool = False) -> list[np.ndarray]:
         found = _read_quickly(lines, layout, len(heads), places) if kind is float else None
-        return _read_each(file, lines, layout, heads, places, kind) if found is None else found
+        return _read_each(file, lines, layout, heads, places, kind, gaps) if found is None else found
 
     nameless = f"{file}:{top + 1}: got numbers where the names of the columns are expected"
     return NamedColumns(heads, numbers, nameless if names is None else "")
@@ -245,7 +247,15 @@ def holds_data(line: str) -> bool:
 
 
 def _count_numbers(cells: list[str]) -> int:
-    return sum(_read_number(with_point(cell), complex) is not None or cell.lower() == "nan" for cell in cells)
+    return sum(
+        _read_number(read_duration(with_point(cell)), complex) is not None or cell.lower() == "nan" for cell in cells
+    )
+
+
+def _holds_sample(row: list[str]) -> bool:
+    """Return whether a row has two numbers or more, or one and empty cells, as of a sparse table."""
+    numbers = _count_numbers(row)
+    return numbers >= 2 or (numbers == 1 and len(row) > 2 and sum(map(bool, row)) == 1)
 
 
 def _read_number(text: str, kind: type) -> Any:
@@ -261,11 +271,14 @@ def _read_number(text: str, kind: type) -> Any:
 
 def _lay_out(lines: list[str]) -> _Layout:
     """Find the first lines of numbers, by the separator that leaves the least text in them, and what is above."""
-    held = [k for k, line in enumerate(lines[:_PREAMBLE]) if line.strip()]
+    # LabVIEW has two headers, whose lines hold numbers as well.
+    headers = [k for k, line in enumerate(lines[:_PREAMBLE]) if line.startswith(_LABVIEW)]
+    first = headers[-1] + 1 if headers else 0
+    held = [k for k in range(first, min(len(lines), _PREAMBLE)) if lines[k].strip()]
     best: tuple[float, int, str] | None = None
     for separator in "\t;, ":
         rows = [_split(lines[k], separator) for k in held]
-        full = [_count_numbers(row) >= 2 and not _REMARK.match(lines[k]) for k, row in zip(held, rows, strict=True)]
+        full = [_holds_sample(row) and not _REMARK.match(lines[k]) for k, row in zip(held, rows, strict=True)]
         for at, (k, row) in enumerate(zip(held, rows, strict=True)):
             above = at > 0 and not full[at - 1] and len(rows[at - 1]) == len(row)
             if full[at] and (above or at + 1 == len(held) or full[at + 1]):
@@ -279,7 +292,13 @@ def _lay_out(lines: list[str]) -> _Layout:
     _, begin, separator = best
     width = len(_trim(_split(lines[begin], separator)))
     above = [k for k in reversed(held) if k < begin]
+    # LabVIEW names a column of remarks, which is empty in the samples.
+    if above and (heads := _split(lines[above[0]], separator))[-1:] == ["Comment"] and len(heads) == width + 1:
+        return _Layout(above[0], None, begin, separator)
+    cells = len(_split(lines[begin], separator))
     named = [k for k in above if len(_trim(_split(lines[k], separator))) == width]
+    # Of a sample with empty cells at its end the names are as many as its cells.
+    named = named or [k for k in above if len(_split(lines[k], separator)) == cells]
     if not named:
         plain = [k for k in above if holds_data(lines[k])]
         return _Layout(plain[0] if plain else None, None, begin, separator)
@@ -314,7 +333,7 @@ def _read_quickly(lines: list[str], layout: _Layout, count: int, places: Sequenc
         for at in places:
             rows: Iterable[str] = islice(lines, begin, None)
             if at in clocks:
-                found[at] = _read_clock(np.loadtxt(rows, usecols=at, dtype="U40", **options))
+                found[at] = read_clock(np.loadtxt(rows, usecols=at, dtype="U40", **options))
                 continue
             rows = rows if separator == "," else (line.replace(",", ".") for line in rows)
             found[at] = np.loadtxt(rows, usecols=at, dtype=float, **options)
@@ -324,9 +343,15 @@ def _read_quickly(lines: list[str], layout: _Layout, count: int, places: Sequenc
 
 
 def _read_each(
-    file: Path, lines: list[str], layout: _Layout, heads: list[str], places: Sequence[int], kind: type
+    file: Path,
+    lines: list[str],
+    layout: _Layout,
+    heads: list[str],
+    places: Sequence[int],
+    kind: type,
+    gaps: bool,
 ) -> list[np.ndarray]:
-    """Columns cell by cell; raise `InputError` for the first cell that holds no number."""
+    """Read columns cell by cell; raise `InputError` for the first cell that holds no number, unless it is empty."""
     separator, found = layout.separator, [[] for _ in places]
     if separator == " ":
         rows = ((k + 1, lines[k].split()) for k in range(layout.begin, len(lines)) if lines[k].strip())
@@ -339,42 +364,21 @@ def _read_each(
             raise InputError(f"{file}:{number}: got {len(cells)} cells for {len(heads)} columns{hint}")
         for column, at in zip(found, places, strict=True):
             got = cells[at] if at < len(cells) else ""
-            value = _read_number(got if separator == "," else signs.read(number, got), kind)
-            if not _is_time(got) if at in clocks else value is None:
+            if gaps and at not in clocks and got.lower() in _MISSING:
+                column.append(np.nan)
+                continue
+            value = _read_number(read_duration(got if separator == "," else signs.read(number, got)), kind)
+            if not is_time(got) if at in clocks else value is None:
                 wanted = "a time such as 2024-05-01T12:00:00.001" if at in clocks else "a number"
                 raise InputError(
                     f"{file}:{number}: got {repr(got) if got else 'nothing'} under {heads[at]!r}; {wanted} is needed"
                 )
             column.append(got if at in clocks else value)
     columns = zip(places, map(np.array, found), strict=True)
-    return [_read_clock(column) if at in clocks else column for at, column in columns]
+    return [read_clock(column) if at in clocks else column for at, column in columns]
 
 
 def _find_clocks(lines: list[str], layout: _Layout, places: Sequence[int]) -> list[int]:
     """Columns whose first cell is a time of the calendar."""
     first = _split(lines[layout.begin], layout.separator)
-    return [at for at in places if at < len(first) and _CLOCK.fullmatch(first[at])]
-
-
-def _is_time(text: str) -> bool:
-    with suppress(ValueError):
-        return _read_clock(np.array([text])).size == 1
-    return False
-
-
-def _read_clock(texts: np.ndarray) -> np.ndarray:
-    """Seconds since the first of times that a calendar or a clock gives; raise `ValueError` where one does not."""
-    days, zones = [], set()
-    # Not all at one time, for texts take much memory.
-    for part in np.array_split(texts, 1 + texts.size // _AT_ONCE):
-        found = [match for text in part.tolist() if (match := _CLOCK.fullmatch(text.strip()))]
-        zones |= {match[3] for match in found}
-        if len(found) < part.size or len(zones) > 1:
-            raise ValueError("no time, or another zone")
-        days.append(np.array([(match[1] or _DAY) + match[2].replace(",", ".") for match in found], "datetime64[ns]"))
-    return _seconds(np.concatenate(days))
-
-
-def _seconds(times: np.ndarray) -> np.ndarray:
-    """Of `numpy.datetime64`, since the first; NaN of no time."""
-    return (times - times[0]) / np.timedelta64(1, "s") if times.size else times.astype(float)
+    return [at for at in places if at < len(first) and CLOCK.fullmatch(first[at])]

@@ -109,6 +109,7 @@ def _read(text: str) -> list[UnitSize]:
     # "N m/(rad/s)" is "N m s/rad".
     if inverse := _DIVIDED_RATE.search(text):
         text = f"{text[: inverse.start()]} {inverse[2]}/{inverse[1]}{text[inverse.end() :]}"
+    text = re.sub(r"/\(([^()/]+)\)", r"/\1", text)
     found = [UnitSize(0, 1.0, (0, 0, 0, 0))]
     for k, part in enumerate(text.split("/")):
         atoms = [atom for atom in re.split(r"[\s*·⋅.]+|-(?=[A-Za-z])", re.sub(r"\*\*", "^", part)) if atom]

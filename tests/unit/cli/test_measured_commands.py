@@ -129,13 +129,13 @@ def test_a_response_is_a_device_of_every_command_that_judges(first):
     assert (ridge["stiffness_max"], ridge["virtual_damping"]) == tuple(known.values())
     assert "alpha_max" not in ridge, "no mass is known"
     lines = said_of(call("check", *device, "--stiffness", "5 kN/m", "--virtual-damping", "12 N s/m"))
-    assert lines["verdict"].strip() == "stable"
+    assert "STABLE" in lines
     assert "not known with a measured response" in lines["passive"]
-    assert not {"normalized", "slowest pole"} & lines.keys()
+    assert not {"decay", "growth"} & lines.keys()
     # A little stiffer than what is stable for every response in the band.
     wall = ["--stiffness", 1.03 * known["stiffness"], "--virtual-damping", known["virtual_damping"]]
     lines = said_of(call("check", *device, *wall))
-    assert lines["verdict"].strip() == "undecided"
+    assert "UNDECIDED" in lines
     assert "measure anew from" in lines["note"]
     assert json.loads(call("check", *device, *wall, "--json"))["stable"] is None
     found = json.loads(call("recommend", *device, "--gain-margin", "1.3", "--json"))["recommended"]
@@ -151,8 +151,8 @@ def test_a_transfer_function_is_a_device():
     found, known = (json.loads(call("check", *device, *wall, "--json")) for device in (system, mass))
     same = ["stiffness_limit", "virtual_damping_lower", "stiffness_max", "spectral_radius", "time_constant"]
     assert [found[name] for name in same] == pytest.approx([known[name] for name in same], rel=1e-9)
-    assert said_of(call("check", *system, *wall))["device"].strip() == (
-        "continuous linear system of order 2, 0 finite zeros"
+    assert "device continuous linear system of order 2, 0 finite zeros, at 1.000 kHz" in " ".join(
+        call("check", *system, *wall).split()
     )
 
 

@@ -1,5 +1,10 @@
 """`zwidth run` says what was found, not only where it was written."""
 
+import os
+import pty
+import subprocess
+import sys
+
 import pytest
 from click.testing import CliRunner
 
@@ -84,3 +89,30 @@ def test_a_scene_that_no_device_has_is_doubted_before_anything_is_computed(tmp_p
     (of_a_turn,) = doubts_of("{rotary: true, mass: 50, rate: 1 kHz}")
     assert of_a_turn == "mass is 50 kg m^2, far from any device; check its unit"
     assert doubts_of("{mass: 0.1, damping: 10, period: 1e-3, delay: 2 periods, stiffness: 5 kN/m}") == []
+
+
+def test_a_terminal_shows_a_bar_and_keeps_the_lines(tmp_path):
+    study = "studies: [{kind: sweep, name: map, axes: {alpha: [0.1, 0.9], beta: 0.1, delta: 0.1, d: 1}}]\n"
+    (tmp_path / "small.yaml").write_text(HEAD + study, encoding="utf-8")
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "zwidth", "run", "small.yaml"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs, cwd=tmp_path)
+    os.close(theirs)
+    shown = b""
+    # Linux reports the end of a terminal as an error.
+    while piece := read_or_nothing(ours):
+        shown += piece
+    os.close(ours)
+    assert process.wait() == 0
+    assert b"map (sweep)  [" in shown
+    assert b"  100%  " in shown
+    assert b"\r\x1b[K[1/1] map                  sweep " in shown
+    # The cursor is visible again.
+    assert shown.rstrip().endswith(b"\x1b[?25h")
+
+
+def read_or_nothing(terminal):
+    try:
+        return os.read(terminal, 1 << 16)
+    except OSError:
+        return b""

@@ -15,6 +15,7 @@ LINES = [row("margins", "gain 12.19, phase 16.73 degrees at 17.7 Hz"), row("", "
     "width, says",
     [
         (None, LINES),
+        (200, LINES),
         (
             60,
             [

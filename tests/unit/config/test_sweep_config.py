@@ -178,3 +178,19 @@ def test_every_shipped_configuration_names_its_schema(path):
     marker = "# yaml-language-server: $schema="
     assert first.startswith(marker)
     assert (path.parent / first.removeprefix(marker)).resolve() == ROOT / "src" / "zwidth" / "config" / "schema.json"
+
+
+@pytest.mark.parametrize(
+    ("axes", "key", "remedy"),
+    [
+        ("alpha: [0.1, 0.2], stiffness: [1 kN/m, 2 kN/m]", "stiffness", "remove it"),
+        ("stiffness: [1 kN/m, 2 kN/m], alpha: [0.1, 0.2]", "alpha", "remove it"),
+        ("delta: [0.1, 0.2], stiffness: [1 kN/m, 2 kN/m]", "stiffness", "write 'alpha'"),
+    ],
+)
+def test_mixed_axes_beside_a_scene_are_one_fault_at_their_key(load, axes, key, remedy):
+    with pytest.raises(ConfigFileError) as refused:
+        load(SCENE + sweep(axes))
+    (line,) = str(refused.value).splitlines()
+    assert f"studies[0].axes.{key}: " in line
+    assert line.endswith(f"are in SI units or normalized, never both; {remedy}")

@@ -232,7 +232,34 @@ def test_a_rotary_device_is_drawn_in_its_units():
     assert second.get_xlabel().endswith("in g cm$^2$")
     np.testing.assert_allclose(second.lines[0].get_xdata(), [10, 20])
     assert third.get_ylabel().endswith("rad for 1 N m")
-    assert fourth.get_ylabel().endswith("in mrad")
+    assert fourth.get_ylabel() == r"angle  $\theta$  in mrad"
+    assert third.get_ylabel().startswith(r"angle  $\theta$  in ")
+
+
+def test_a_short_contact_fills_a_third_of_the_axis():
+    """A hit of some 20 ms in a simulation of 1 s, and a faster one that leaves further: neither is cut."""
+    hits = RIGID.simulate(
+        [1e3, 10e3], [5.0, 20.0], start_position=-1e-3, start_velocity=0.2, contact="unilateral", periods=1000
+    )
+    assert hits.contact is not None
+    last = max(np.flatnonzero(contact)[-1] for contact in hits.contact) * RIGID.timing.period
+    ax = plot.motion(hits, plt.figure().subplots(), labels=["soft", "stiff"])
+    shown = ax.get_xlim()[1] / 1e3
+    assert 0.01 < last < 0.1
+    assert shown == pytest.approx(3 * last, abs=1e-3)
+    low, high = ax.get_ylim()
+    for values in (np.asarray(each.get_ydata()) for each in ax.lines):
+        assert low <= values.min()
+        assert values.max() <= high
+    # What stays in contact is shown to the end.
+    pressed = RIGID.simulate(1e3, 5.0, start_position=1e-4, push=1.0, contact="unilateral", periods=1000)
+    assert plot.motion(pressed, plt.figure().subplots()).get_xlim()[1] == pytest.approx(999.0)
+
+
+def test_a_motion_that_grows_without_bound_is_cut():
+    found = RIGID.simulate([5e3, 40e3], 20.0, start_position=1e-3, periods=200)
+    ax = plot.motion(found, plt.figure().subplots(), labels=["stable", "unstable"])
+    assert max(abs(end) for end in ax.get_ylim()) <= 1.1 * 8.0
 
 
 def test_tables_of_rotary_devices_are_drawn_in_their_units(tmp_path, unpainted):

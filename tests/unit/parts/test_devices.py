@@ -38,7 +38,14 @@ def test_every_number_has_a_source_and_a_unit_of_its_motion():
     rotary = {"mass": "kg m^2", "damping": "N m s/rad", "friction": "N m", "resolution": "rad"}
     linear = {"mass": "kg", "damping": "N s/m", "friction": "N", "resolution": "m"}
     for device in DEVICES:
-        units = {"period": "s", "counts": "counts", "force": "N", "stiffness_limit": "N/m", "damping_limit": "N s/m"}
+        units = {
+            "period": "s",
+            "delay": "periods",
+            "counts": "counts",
+            "force": "N",
+            "stiffness_limit": "N/m",
+            "damping_limit": "N s/m",
+        }
         units |= rotary if device.motion == "rotary" else linear
         assert device.numbers
         for name, number in device.numbers.items():
@@ -83,3 +90,32 @@ def test_the_shipped_table_holds_published_numbers_only():
     assert all(row["source"] for row in rows)
     masses = {0.3, 0.5} | {d.mass.value for d in DEVICES if d.mass is not None and d.motion == "linear"}
     assert {float(row["mass [g]"]) / 1e3 for row in rows} <= masses
+
+
+@pytest.mark.parametrize("device", DEVICES, ids=lambda device: device.name)
+def test_the_command_line_names_what_is_not_published(device):
+    """The options that a message names are enough, for each published device."""
+    options = {"mass": "20 g", "damping": "0.5", "period": "1 ms"}
+    if device.rotary:
+        options |= {"mass": "20 g m^2"}
+    missing = [name for name in options if getattr(device, name) is None]
+    runner, command = CliRunner(), ["ridge", "--device", device.name, "--json"]
+    done = runner.invoke(cli, command)
+    assert done.exit_code == (2 if missing else 0)
+    for name in options:
+        named = f"--{name}" in done.stderr
+        assert named == (name in missing), done.stderr
+    done = runner.invoke(cli, [*command, *(word for name in missing for word in (f"--{name}", options[name]))])
+    assert done.exit_code == 0, done.output
+
+
+def test_a_published_delay_in_periods_stays_in_periods():
+    known = find_device("phantom_2006")
+    for options, period in (([], 1e-3), (["--rate", "4 kHz"], 0.25e-3)):
+        command = ["ridge", "--device", "phantom_2006", "--damping", "10", "--json", *options]
+        found = json.loads(CliRunner().invoke(cli, command).stdout)
+        scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period, delay=period))
+        assert found["stiffness_max"] == pytest.approx(float(scene.max_stiffness().stiffness), rel=1e-9)
+    assert known.to_timing(delay="2 ms") == zwidth.Timing(1e-3, 2e-3)
+    with pytest.raises(zwidth.InputError, match="period: none is published for 'touch'"):
+        find_device("touch").to_timing()

@@ -89,7 +89,7 @@ def test_panels_of_inertias_have_their_unit(tmp_path):
     axes = draw_plane(open_dataset(tmp_path / "turned.zarr"), "margin")
     axes[0].figure.draw_without_rendering()
     for title, inertia in zip(titles(axes), (2000, 4500), strict=True):
-        assert rf"$m = {inertia}\,\mathrm{{g~cm^2}}$" in title
+        assert rf"$J = {inertia}\,\mathrm{{g~cm^2}}$" in title
 
 
 def test_a_plane_holds_the_values_of_the_store(plane):
@@ -189,7 +189,7 @@ def test_curves_have_units_one_can_read(folder):
     for index, line in enumerate(axes[1].lines):
         np.testing.assert_allclose(line.get_xdata(), [1, 2, 4])
         np.testing.assert_allclose(line.get_ydata(), kept.stiffness_max.isel(device=1, delay=index).values / 1000)
-    names = [r"$t_d = 0\,\mathrm{periods}$", r"$t_d = 1\,\mathrm{periods}$"]
+    names = [r"$t_d = 0\,\mathrm{periods}$", r"$t_d = 1\,\mathrm{period}$"]
     assert [line.get_label() for line in axes[0].lines] == names
     assert [text.get_text() for text in figure.legends[0].get_texts()] == names
 

@@ -32,6 +32,7 @@ def test_a_filter_and_a_compliance():
         "period": scene.replace(period=0.5e-3),
         "damping": scene.replace(damping=11.0),
     }
+    better["period_and_delay"] = scene.replace(timing=Timing(0.5e-3, "1 periods"))
     assert {limit.name for limit in found} == set(better)
     gains = [limit.gain for limit in found]
     assert gains == sorted(gains, reverse=True)
@@ -43,8 +44,8 @@ def test_a_filter_and_a_compliance():
 def test_what_cannot_be_computed_comes_last(monkeypatch):
     scene = RIGID.replace(velocity=LowPass(cutoff=100.0), coupling=Coupling(0.05, 2e4, 1.0))
     names = [limit.name for limit in limits_of(scene)]
-    known = assessment._stiffness
-    monkeypatch.setattr(assessment, "_stiffness", lambda of: np.nan if of.timing.delay == 0.5e-3 else known(of))
+    known, half = assessment._stiffness, Timing(1e-3, 0.5e-3)
+    monkeypatch.setattr(assessment, "_stiffness", lambda of: np.nan if of.timing == half else known(of))
     names.remove("delay")
     assert [limit.name for limit in limits_of(scene)] == [*names, "delay"]
 
@@ -66,7 +67,7 @@ def test_a_filter_that_cannot_be_twice_as_fast_is_left_out(velocity):
 def test_a_window_keeps_its_length_in_seconds():
     scene = RIGID.replace(velocity=WindowedDifference(15, coded_period=2e-3))
     found = {limit.name: limit for limit in limits_of(scene)}
-    assert found["period"].words == "twice the rate, the delay the same in seconds"
+    assert (found["period"].words, found["period"].note) == ("twice the rate", "the delay stays 1.000 ms")
     same = scene.replace(period=0.5e-3, velocity=WindowedDifference(30, coded_period=1e-3))
     assert found["period"].stiffness == pytest.approx(same.max_stiffness().stiffness, rel=1e-12)
     half = scene.replace(velocity=WindowedDifference(8, coded_period=2e-3))

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.scenes.recommendation import Wanted
+from zwidth.scenes.cautions import find_thin
+from zwidth.scenes.wall_search import Wanted
 from zwidth.words.status import Status
 
 TIMING = zwidth.Timing(1e-3, 1e-3)
 RIGID = zwidth.Scene(zwidth.Device(0.1, 10.0), TIMING)
 FILTERED = RIGID.replace(velocity=zwidth.LowPass(cutoff=100.0))
 ISLANDS = RIGID.replace(velocity=zwidth.WindowedDifference(24))
+KNOB = zwidth.Scene(zwidth.Device("60 g cm^2", "0.02 mN m s/rad"), zwidth.Timing(rate="1 kHz", delay="0.7 periods"))
 TIP = zwidth.Scene(zwidth.Device(0.1, 10.0, zwidth.Coupling(0.05, 20e3, 1.0, "tip")), TIMING)
 
 
@@ -76,7 +78,7 @@ def test_a_gain_margin_alone_is_that_share_of_the_stiffest_wall():
 
 
 def test_a_share_alone_has_the_damping_of_the_stiffest_wall():
-    found, top = RIGID.recommend(), RIGID.max_stiffness()
+    found, top = RIGID.recommend(stiffness_fraction=0.75), RIGID.max_stiffness()
     assert (found.stiffness, found.virtual_damping) == (0.75 * top.stiffness, top.virtual_damping)
     assert found.wanted == Wanted(0.75)
     assert found.limited_by == "stiffness_fraction"
@@ -134,7 +136,7 @@ def test_what_no_wall_has_is_said_and_leaves_no_wall():
     assert found.status == Status.UNREACHABLE
     assert np.isnan(found.stiffness)
     assert found.verdict is None
-    reason = "none was found that keeps passivity, however soft; without damping of the device no wall is passive"
+    reason = "no wall keeps passivity, however soft; without damping of the device no wall is passive"
     assert (found.reason, found.lines()) == (reason, (f"no wall: {reason}",))
     known = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert known["recommended"]["stiffness"] is None
@@ -160,9 +162,10 @@ def test_a_wall_next_to_a_corner_is_stable_as_it_is_printed(share):
     assert found.as_dict()["recommended"]["digits"] > 4
 
 
-def test_steps_are_those_of_limits_that_help():
-    found = ISLANDS.recommend()
-    assert found.steps == [limit for limit in zwidth.limits_of(ISLANDS) if limit.gain > 1]
+def test_steps_of_a_share_are_those_of_limits_that_help():
+    found = ISLANDS.recommend(stiffness_fraction=0.5)
+    steps = [(step.name, pytest.approx(step.gain, rel=1e-6)) for step in found.steps]
+    assert steps == [(limit.name, limit.gain) for limit in zwidth.limits_of(ISLANDS) if limit.gain > 1]
     assert "island of stable walls" in found.notes[0]
     assert not any("64" in step.words for step in found.steps)
 
@@ -190,3 +193,92 @@ def test_scenes_without_an_answer_say_why():
         RIGID.replace(delay_model="fractional_power").recommend()
     with pytest.raises(zwidth.InputError, match="FOAW has no linear form"):
         RIGID.replace(velocity=zwidth.FOAW(1e-6)).recommend()
+
+
+@pytest.mark.parametrize(
+    ("scene", "wanted"),
+    [(RIGID, {}), (RIGID, {"passive": True}), (FILTERED, {}), (KNOB, {"phase_margin": 40})],
+    ids=["default", "passive", "filter", "knob"],
+)
+def test_steps_are_those_of_the_wall_recommended_again(scene, wanted):
+    """Each improvement typed as a user would, and the same question asked again."""
+    found = scene.recommend(**wanted)
+    changed = {
+        "delay": {"delay": scene.timing.delay / 2},
+        "damping": {"damping": 1.1 * scene.device.damping},
+        "period": {"rate": 2 / scene.timing.period},
+        "velocity": {"velocity": zwidth.LowPass(cutoff=200.0)},
+    }
+    assert found.steps
+    for step in found.steps:
+        if step.name in changed:
+            again = scene.replace(**changed[step.name]).recommend(**wanted)
+            assert step.gain == pytest.approx(again.stiffness / found.stiffness, rel=5e-3)
+            assert step.stiffness == pytest.approx(again.stiffness, rel=5e-3)
+    gains = {step.name: step.gain for step in found.steps}
+    if scene.timing.in_periods:
+        assert "period_and_delay" not in gains
+    elif not wanted.get("passive"):
+        kept = scene.replace(timing=zwidth.Timing(rate=2e3, delay="1 periods")).recommend(**wanted)
+        assert gains["period_and_delay"] == pytest.approx(kept.stiffness / found.stiffness, rel=5e-3)
+
+
+def test_steps_of_a_passive_wall_of_the_readme_device():
+    """K_max gains 1.72 by half the delay and 1.03 by a tenth more damping; the passive wall 1.42 and 1.10."""
+    gains = {step.name: step.gain for step in RIGID.recommend(passive=True).steps}
+    assert gains["delay"] == pytest.approx(1.42, abs=0.01)
+    assert gains["damping"] == pytest.approx(1.10, abs=0.005)
+    assert gains["period"] == pytest.approx(1.29, abs=0.01)
+
+
+def test_the_default_asks_for_margins():
+    for scene in (RIGID, FILTERED, KNOB):
+        found = scene.recommend()
+        assert found.wanted == Wanted(0.75, 2.0, 30.0)
+        margins = scene.margins(found.stiffness, found.virtual_damping)
+        assert margins.phase_margin >= 30
+        assert margins.gain_margin >= 2
+        assert found.stiffness <= 0.75 * found.stiffest.stiffness
+        assert found.cautions == ()
+    # Any wish replaces the defaults.
+    assert RIGID.recommend(phase_margin=20).wanted == Wanted(None, None, 20)
+
+
+def test_a_wall_on_the_brink_carries_a_caution_with_a_remedy_that_holds():
+    thin = [{"passive": True}, {"stiffness_fraction": 0.95}, {"phase_margin": 5}]
+    for scene, wishes in ((RIGID, thin), (FILTERED, thin[1:2]), (KNOB, thin[:1])):
+        for wanted in wishes:
+            found = scene.recommend(**wanted)
+            assert found.cautions, wanted
+            asked, cost = re.search(r"ask for (.*?) \((?:costs|gains) (\S+) %", found.cautions[0]).groups()
+            more = dict(wanted)
+            for name, value in re.findall(r"--(\S+) ([\d.]+)", asked):
+                more[name.replace("-", "_")] = float(value)
+            if "without" in asked:
+                del more["passive"]
+            again = scene.recommend(**more)
+            assert not find_thin(again.verdict, scene.timing.period)
+            assert abs(1 - again.stiffness / found.stiffness) == pytest.approx(float(cost) / 100, abs=0.006)
+
+
+def test_grasps_that_destabilize_a_wall_are_named_with_a_wall_that_none_destabilizes():
+    """The grasp of 10 kN/m and 1 N s/m destabilizes three quarters of K_max of this device."""
+    scene = zwidth.Scene(zwidth.Device(0.1, 1), zwidth.Timing(rate="1 kHz", delay="1 periods"))
+    found = scene.recommend(stiffness_fraction=0.75)
+    hand = {"mass": 0.554, "damping": 6.45, "stiffness": 135, "coupling_stiffness": "10 kN/m", "coupling_damping": 1}
+    held = scene.replace(operator=zwidth.Operator(**hand))
+    assert not held.is_stable(found.stiffness, found.virtual_damping)
+    assert [name for name, stable in found.grasps.items() if not stable] == ["firm, light damping"]
+    K, B = re.search(
+        r"in the hand \(firm, light damping\); K = (.*?), B = (.*?) is stable in all", found.cautions[1]
+    ).groups()
+    assert all(scene.replace(operator=grasp).is_stable(K, B) for grasp in zwidth.REFERENCE_GRASPS.values())
+    assert all(scene.recommend().grasps.values())
+
+
+def test_a_wall_that_only_the_hand_of_the_scene_stabilizes():
+    hand = zwidth.Operator(0.554, 6.45, 135)
+    found = RIGID.replace(operator=hand).recommend()
+    assert found.stiffness > RIGID.max_stiffness().stiffness
+    assert found.grasps["released"] is False
+    assert "released" in found.cautions[0]

@@ -150,3 +150,18 @@ def test_a_recorded_hand_moves_the_end_of_its_spring():
     # A force held at its mean is wrong by the square of the period.
     assert errors[1] < 1e-4
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
+
+
+def test_contact_of_a_law_means_force():
+    """A force of 5 N where the position is at most 0, as in ros_falcon: contact begins and ends."""
+    scene = zwidth.Scene(zwidth.Device(0.1, 0.5), zwidth.Timing(1e-3, 1e-3))
+    found = zwidth.simulate(
+        scene, force=lambda x, v, t: jnp.where(x <= 0, 5.0, 0.0), start_position=0.01, start_velocity=-0.1, push=-1.0
+    )
+    assert found.position is not None
+    np.testing.assert_array_equal(found.contact, found.measured <= 0)
+    ends = np.count_nonzero(found.contact[:-1] & ~found.contact[1:])
+    assert found.bounces == ends > 0
+    first = np.argmax(found.contact)
+    assert first > 0
+    assert found.impact_velocity == pytest.approx(found.velocity[first])

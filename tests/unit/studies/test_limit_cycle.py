@@ -8,6 +8,7 @@ import zwidth
 from zwidth import figures
 from zwidth.config.fields import problems_of
 from zwidth.studies.limit_cycle import LimitCycleStudy
+from zwidth.words.rotation import use_kind
 
 DEVICE = {"mass": 0.1, "damping": 0.1, "period": 1e-3, "delay": "1 periods"}
 SCENE = zwidth.Scene(zwidth.Device(0.1, 0.1), zwidth.Timing(period=1e-3, delay=1e-3))
@@ -59,7 +60,9 @@ def test_the_words_count_what_the_arrays_hold(plane):
         silent, beyond = amplitude < 1e-6, (amplitude > 1e-3) | (arrays["outcome"][k] == zwidth.MotionKind.DIVERGED)
         for those, name in ((stable, "stable"), (~stable, "unstable")):
             counts = [np.count_nonzero(end[those]) for end in (silent, ~silent & ~beyond, beyond)]
-            told = ", ".join(f"{a:,} {b}" for a, b in zip(counts, ("silent", "buzzing", "beyond"), strict=True))
+            told = ", ".join(
+                f"{a:,} {b}" for a, b in zip(counts, ("at rest", "in a limit cycle", "wider than 1 mm"), strict=True)
+            )
             assert f"of {those.sum():,} linearly {name} walls {told}" in note
     # The encoder makes stable walls buzz that are silent without.
     stable = arrays["linearly_stable"][0] == 1
@@ -104,10 +107,10 @@ def test_a_curve_without_a_point_is_named_and_explained():
     }  # fmt: skip
     known = {name: np.asarray(values) for name, values in arrays.items()}
     upper, lower = figures.draw_limit_cycle_curves(known, {}, (1e-7, 1e-3), "stiffness_N_per_m")
-    assert [text.get_text() for text in upper.texts] == ["silent everywhere:\n$K = 5$ kN/m"]
+    assert [text.get_text() for text in upper.texts] == ["at rest everywhere:\n$K = 5$ kN/m"]
     assert not lower.texts
     (legend,) = upper.figure.legends
-    assert [text.get_text() for text in legend.get_texts()][-1] == "gap: silent, or beyond 1 mm"
+    assert [text.get_text() for text in legend.get_texts()][-1] == "gap: at rest, or wider than 1 mm"
 
 
 def test_where_every_wall_is_silent_the_figure_says_so():
@@ -117,7 +120,45 @@ def test_where_every_wall_is_silent_the_figure_says_so():
     (draw,) = silent.figures.values()
     upper, _ = draw()
     upper.figure.draw_without_rendering()
-    assert upper.texts[0].get_text() == "silent everywhere"
+    assert upper.texts[0].get_text() == "at rest everywhere"
+
+
+KNOB = {"mass": 6e-6, "damping": 2e-5, "period": 1e-3, "delay": "0.7 periods", "rotary": True}
+
+
+def knob_of(**keys):
+    keys = {"device": KNOB, "resolution": "0.0005 rev", "start_position": "1 deg", "duration": "600 periods"} | keys
+    return study_of({"stiffness": ["0.1 N m/rad", "0.3 N m/rad"], "virtual_damping": "1 mN m s/rad"}, **keys)
+
+
+def test_the_bounds_of_a_rotary_device_are_angles():
+    """2,000 counts are steps of 3.14 mrad: a limit cycle within a step is one, and is drawn."""
+    with use_kind(True):
+        study = knob_of()
+        assert study.bound_amplitudes(study.device.to_scene()) == (1e-6, pytest.approx(np.radians(20)))
+        outcome = study.compute(None, True)
+        (draw,) = outcome.figures.values()
+        upper, _ = draw()
+    assert "2 in a limit cycle, 0 wider than 349 mrad" in outcome.notes[0]
+    assert outcome.notes[-1].endswith("limit cycle: from 1 µrad to 349 mrad")
+    amplitude = outcome.arrays["amplitude_m"]
+    assert ((amplitude > 1e-4) & (amplitude < 1e-2)).all()
+    (legend,) = upper.figure.legends
+    assert [text.get_text() for text in legend.get_texts()][-1] == "gap: at rest, or wider than 349 mrad"
+
+
+def test_the_bounds_follow_a_coarse_encoder():
+    study = study_of(conditions=[{"label": "a"}, {"label": "b", "resolution": "1 mm"}])
+    assert study.bound_amplitudes(SCENE) == (1e-6, pytest.approx(1e-2))
+
+
+def test_a_figure_without_limit_cycles_gives_the_reason():
+    with use_kind(True):
+        outcome = knob_of(widest="0.1 mrad").compute(None, True)
+        (draw,) = outcome.figures.values()
+        upper, _ = draw()
+    assert "2 wider than 100 µrad" in outcome.notes[0]
+    assert upper.texts[0].get_text() == "wider than 100 µrad everywhere"
 
 
 def test_a_limited_motor_swings_as_the_describing_function_says(curves):
@@ -173,7 +214,7 @@ def test_an_adaptive_window_has_no_linear_boundary():
         ({"conditions": []}, "one of the conditions at least is needed"),
         ({"conditions": [{"resolution": "20 um"}]}, "label"),
         ({"axes": {**PLANE, "coulomb": 0.1}, "conditions": [{"label": "a", "coulomb": 0.2}]}, "here and as an axis"),
-        ({"silence": "2 mm"}, "a buzz lies between silence and widest"),
+        ({"silence": "2 mm"}, "silence is less than widest"),
         ({"conditions": [{"label": "a", "coulomb": 0.2, "static": 0.1}]}, "below coulomb, 0.2 N"),
     ],
 )

@@ -208,7 +208,7 @@ def test_a_recommendation_is_a_share_of_the_stiffest_wall():
     assert best["stiffness"] == pytest.approx(0.6e5 * float(ridge.alpha), rel=1e-12)
     assert best["virtual_damping"] == pytest.approx(1e2 * float(ridge.beta), rel=1e-12)
     assert best["stable"] is True
-    assert ": 60 % of the stiffest stable wall, " in outcome.documents["recommendation.md"]
+    assert ": 60 % of K_max = " in outcome.documents["recommendation.md"]
 
 
 @pytest.mark.parametrize("mass", np.linspace(0.05, 0.5, 6).tolist())

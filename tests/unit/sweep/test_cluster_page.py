@@ -12,8 +12,8 @@ PAGE = Path(__file__).parents[3] / "docs" / "cluster.md"
 STUB = f"#!{sys.executable}\nimport json, sys\nprint(json.dumps(sys.argv[1:]))\n"
 
 
-def words_of(task, tmp_path):
-    """What the script gives to the program in one task of the array."""
+def words_of(tmp_path):
+    """Return the arguments that the script passes to the program."""
     (script,) = re.findall(r"```bash\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     program = tmp_path / "zwidth"
     program.write_text(STUB, encoding="utf-8")
@@ -22,19 +22,12 @@ def words_of(task, tmp_path):
         **os.environ,
         "PATH": f"{tmp_path}:{os.environ['PATH']}",
         "SCRATCH": "/scratch/of somebody",
-        "SLURM_ARRAY_TASK_ID": str(task),
-        # As where this task alone is submitted again.
-        "SLURM_ARRAY_TASK_COUNT": "1",
+        "SLURM_CPUS_PER_TASK": "16",
     }
     done = subprocess.run(["bash", "-eu", "-c", script], env=environment, capture_output=True, text=True, check=True)
-    return script, json.loads(done.stdout)
+    return json.loads(done.stdout)
 
 
-def test_each_task_of_the_array_is_a_shard_also_when_it_is_submitted_alone(tmp_path):
-    for task in (1, 7, 16):
-        script, words = words_of(task, tmp_path)
-        (shards,) = re.findall(r"--array=1-(\d+)$", script, re.MULTILINE)
-        assert words == [
-            *("run", "configs/dense.yaml", "--out", "/scratch/of somebody/dense"),
-            *("--resume", "--shard", f"{task}/{shards}"),
-        ]
+def test_the_job_uses_the_processors_that_it_was_given(tmp_path):
+    expected = ["run", "configs/dense.yaml", "--out", "/scratch/of somebody/dense", "--resume", "--workers", "16"]
+    assert words_of(tmp_path) == expected

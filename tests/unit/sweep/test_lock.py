@@ -1,14 +1,12 @@
-"""Who computes in a folder: one run, or the shards of one run; a killed one never stands in the way."""
+"""The lock of a folder of results: one run at a time, and a killed run blocks no other."""
 
 import errno
-import fcntl
 import os
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-import threading
 
 import pytest
 import yaml
@@ -17,7 +15,7 @@ from sweeping import assert_same, config_of, main_of, run_sweeps, study, values_
 import zwidth
 from zwidth.sweep import files
 from zwidth.sweep.dataset import verify
-from zwidth.sweep.files import held_briefly, holding
+from zwidth.sweep.files import lock_folder
 from zwidth.sweep.jobs import perform
 from zwidth.sweep.store import Store
 from zwidth.words.errors import InputError, StoreBusyError
@@ -26,9 +24,8 @@ from zwidth.words.errors import InputError, StoreBusyError
 HOLD = """
 import sys, time
 from pathlib import Path
-from zwidth.sweep.files import holding
-shard = tuple(map(int, sys.argv[2:])) or None
-with holding(Path(sys.argv[1]), shard):
+from zwidth.sweep.files import lock_folder
+with lock_folder(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
 """
@@ -36,7 +33,7 @@ with holding(Path(sys.argv[1]), shard):
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch):
-    monkeypatch.setattr(files, "_PATIENCE", 0.1)
+    monkeypatch.setattr(files, "PATIENCE", 0.1)
 
 
 @pytest.fixture
@@ -44,9 +41,8 @@ def holder():
     """Starts processes that hold a folder; whatever becomes of the test, they end with it."""
     started = []
 
-    def start(folder, *shard):
-        words = [sys.executable, "-c", HOLD, str(folder), *map(str, shard)]
-        process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    def start(folder):
+        process = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE, text=True)
         started.append(process)
         assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
@@ -76,59 +72,22 @@ def test_a_second_run_is_refused_and_told_who_holds_the_folder(holder, tmp_path)
 
 def test_a_killed_holder_does_not_block_a_run(holder, tmp_path):
     kill(holder(tmp_path))
-    # Its files are still there.
-    assert f" on {socket.gethostname()}, since " in (tmp_path / ".locks" / "run").read_text(encoding="utf-8")
+    # Its files stay behind.
+    assert f" on {socket.gethostname()}, since " in (tmp_path / ".locks" / "holder").read_text(encoding="utf-8")
     assert run_sweeps(config_of(), tmp_path, resume=True).ok
 
 
 def test_the_folder_is_free_again_after_a_run_and_after_one_that_failed(tmp_path):
     assert run_sweeps(config_of(), tmp_path).ok
-    with pytest.raises(ZeroDivisionError), holding(tmp_path):
+    with pytest.raises(ZeroDivisionError), lock_folder(tmp_path):
         raise ZeroDivisionError
     assert run_sweeps(config_of(), tmp_path, resume=True).ok
 
 
 def test_two_runs_of_one_process_exclude_each_other(tmp_path):
-    with holding(tmp_path), pytest.raises(StoreBusyError, match=f"process {os.getpid()} on"), holding(tmp_path):
+    busy = pytest.raises(StoreBusyError, match=f"process {os.getpid()} on")
+    with lock_folder(tmp_path), busy, lock_folder(tmp_path):
         pass
-
-
-def test_shards_share_a_folder(holder, tmp_path):
-    first, third = holder(tmp_path, 1, 3), holder(tmp_path, 3, 3)
-    assert run_sweeps(config_of(), tmp_path, shard=(2, 3)).ok
-    with pytest.raises(StoreBusyError) as caught:
-        run_sweeps(config_of(), tmp_path, resume=True)
-    assert f"(shard 1/3, process {first.pid} on " in str(caught.value)
-    assert "UTC, and 1 more); wait until it ends, stop that process, or" in str(caught.value)
-    kill(first)
-    kill(third)
-    assert run_sweeps(config_of(), tmp_path, resume=True).ok
-    assert verify(tmp_path)[0].ok
-
-
-def test_one_shard_runs_only_once_at_a_time(holder, tmp_path):
-    process = holder(tmp_path, 2, 3)
-    with pytest.raises(
-        StoreBusyError, match=rf"shard 2 computes in this folder already \(shard 2/3, process {process.pid} "
-    ):
-        run_sweeps(config_of(), tmp_path, shard=(2, 3))
-    kill(process)
-    assert run_sweeps(config_of(), tmp_path, shard=(2, 3)).ok
-
-
-def test_shards_of_another_number_are_refused_while_the_first_run(holder, tmp_path):
-    process = holder(tmp_path, 2, 3)
-    says = rf"3 shards compute in this folder, not 4 \(shard 2/3, process {process.pid} .*; wait until it ends, stop"
-    with pytest.raises(StoreBusyError, match=says):
-        run_sweeps(config_of(), tmp_path, shard=(1, 4))
-    kill(process)
-    assert run_sweeps(config_of(), tmp_path, shard=(1, 4)).ok
-
-
-def test_a_run_keeps_shards_out(holder, tmp_path):
-    process = holder(tmp_path)
-    with pytest.raises(StoreBusyError, match=rf"another run computes in this folder \(process {process.pid} "):
-        run_sweeps(config_of(), tmp_path, shard=(1, 2))
 
 
 def test_the_command_line_says_it_in_one_line_and_ends_with_exit_code_2(holder, tmp_path, capsys):
@@ -138,7 +97,7 @@ def test_the_command_line_says_it_in_one_line_and_ends_with_exit_code_2(holder, 
     before = values_of(out)
     process = holder(out)
     capsys.readouterr()
-    for words in (["--resume"], ["--overwrite"], ["--shard", "1/2"]):
+    for words in (["--resume"], ["--overwrite"]):
         assert main_of("run", path, "--out", out, *words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"Error: out: {out}: another run computes in this folder (process {process.pid} on ")
@@ -196,36 +155,41 @@ def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch, numbe
     def refused(file, how):
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(fcntl, "flock", refused)
-    with holding(tmp_path), holding(tmp_path, (1, 2)):
+    monkeypatch.setattr("fcntl.flock", refused)
+    with lock_folder(tmp_path), lock_folder(tmp_path):
         pass
 
 
-def test_a_damaged_file_of_a_lock_costs_only_the_name_of_its_holder(holder, tmp_path):
+def test_a_missing_name_of_the_holder_costs_only_the_name(holder, tmp_path):
     holder(tmp_path)
-    for content in (b"", b"\xff{", b"[1]", b'{"who": 1}'):
-        (tmp_path / ".locks" / "run").write_bytes(content)
-        with pytest.raises(StoreBusyError, match="another run computes in this folder; wait until"), holding(tmp_path):
-            pass
-
-
-def test_who_writes_the_record_waits_for_the_other(tmp_path):
-    order = []
-
-    def other():
-        with held_briefly(tmp_path, "record"):
-            order.append("other")
-
-    with held_briefly(tmp_path, "record"):
-        thread = threading.Thread(target=other)
-        thread.start()
-        thread.join(0.2)
-        order.append("first")
-    thread.join()
-    assert order == ["first", "other"]
+    (tmp_path / ".locks" / "holder").unlink()
+    with pytest.raises(StoreBusyError, match="another run computes in this folder; wait until"), lock_folder(tmp_path):
+        pass
 
 
 def test_a_file_in_the_place_of_the_folder(tmp_path):
     (tmp_path / "out").touch()
-    with pytest.raises(InputError, match="is a file"), holding(tmp_path / "out"):
+    with pytest.raises(InputError, match="is a file"), lock_folder(tmp_path / "out"):
         pass
+
+
+# Counts in a file, without any other protection against the other processes.
+COUNT = """
+import sys, time
+from pathlib import Path
+from zwidth.sweep import files
+files.PATIENCE = 60.0
+folder, number = Path(sys.argv[1]), Path(sys.argv[1]) / "number"
+for _ in range(10):
+    with files.lock_folder(folder):
+        before = int(number.read_text())
+        time.sleep(0.01)
+        number.write_text(str(before + 1))
+"""
+
+
+def test_processes_that_compete_hold_the_folder_one_at_a_time(tmp_path):
+    (tmp_path / "number").write_text("0", encoding="utf-8")
+    processes = [subprocess.Popen([sys.executable, "-c", COUNT, str(tmp_path)]) for _ in range(4)]
+    assert [process.wait() for process in processes] == [0] * 4
+    assert (tmp_path / "number").read_text(encoding="utf-8") == "40"

@@ -137,22 +137,6 @@ def test_no_output_depends_on_workers_and_chunks(everything, tmp_path, monkeypat
     assert_same(everything, tmp_path)
 
 
-def test_no_output_depends_on_shards_and_chunks(everything, tmp_path, monkeypatch):
-    cut(monkeypatch, 13, 3)
-    results = [run_sweeps(config_of_everything(), tmp_path, shard=(number, 3)) for number in (3, 1, 2)]
-    assert all(result.ok and result.computed > 5 for result in results)
-    assert_same(everything, tmp_path)
-
-
-def test_shards_complete_each_other(finished, tmp_path):
-    config, folder = finished
-    results = [run_sweeps(config, tmp_path, shard=(number, 3)) for number in (1, 2, 3)]
-    assert all(result.ok and result.computed > 0 for result in results)
-    assert sum(result.computed for result in results) == len(flags(tmp_path))
-    assert all(one.ok for one in verify(tmp_path))
-    assert_same(folder, tmp_path)
-
-
 def test_a_chunk_that_fails_is_named_and_the_rest_completes(finished, tmp_path):
     config, folder = finished
     result = run_sweeps(config, tmp_path, perform=failing_on_2)
@@ -328,7 +312,7 @@ def test_what_a_killed_run_leaves_behind_is_removed(finished, tmp_path):
 
 
 def test_options_that_exclude_each_other(tmp_path):
-    for options in ({"workers": 1, "scheduler": "tcp://x"}, {"workers": 0}, {"shard": (3, 2)}, {"shard": (0, 2)}):
+    for options in ({"workers": 1, "scheduler": "tcp://x"}, {"workers": 0}):
         with pytest.raises(InputError):
             run_sweeps(config_of(), tmp_path, **options)
     assert list(tmp_path.iterdir()) == []

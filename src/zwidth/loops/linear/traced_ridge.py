@@ -64,7 +64,7 @@ def trace_stiffest(scene: Any, negative: bool) -> RidgePoint:
         # Only the wall is traced, on which nothing depends.
         paths = ("mass",)
     structure = structure_of(scene, paths, negative)
-    return compiled_ridge(structure, *broadcast_traced(values[path] for path in paths))
+    return compiled_ridge(structure, *broadcast_traced({path: values[path] for path in paths}))
 
 
 @partial(jax.jit, static_argnums=0)

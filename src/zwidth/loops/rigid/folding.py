@@ -67,7 +67,7 @@ def map_by_degree(
                 "d: got a traced value, but the number of poles depends on it; pass d as a plain number, "
                 "for example through jit's static_argnums or a closure"
             )
-        delays, arrays = as_float64("d", values[-1]), broadcast_traced(values)
+        delays, arrays = as_float64("d", values[-1]), broadcast_traced(arguments)
         import jax.numpy as xp
     else:
         arrays, xp = broadcast(arguments), np

@@ -71,7 +71,8 @@ def _make_slider(parameter: Parameter, rotary: bool = False) -> Slider:
         # Walls are set on a chart that is in SI units.
         unit, per_si = (ROTARY[parameter.unit], 1.0) if parameter.name in _WALL else _TURNED[parameter.unit]
         low, high = low * _SMALLER[parameter.unit], high * _SMALLER[parameter.unit]
-        words, symbol = words.replace("mass", "inertia"), "J" if parameter.name == "mass" else symbol
+        with use_kind(True):
+            words, symbol = parameter.own_words, parameter.own_symbol.lstrip(chr(92))
     return Slider(f"{words} {symbol}", unit, per_si, low * per_si, high * per_si, parameter.whole)
 
 
@@ -164,6 +165,7 @@ class Controls:
             if isinstance(value, bool) or not isinstance(value, int | float) or not -_LARGEST <= value <= _LARGEST:
                 raise InputError(f"{new.sliders[name].label}: got {str(value)[:40]!r}; a finite number is needed")
             slider = new.sliders[name]
+            _check_range(name, slider, value)
             number = round(value) if slider.whole else _round(float(value) / slider.per_si, 15)
             new = replace(new, scene=new.scene.replace(**{_NORMALIZED.get(name, name): number}))
         return new.check()
@@ -224,6 +226,15 @@ class Controls:
         numbers = stiffness * rate / period, damping * rate, scene.damping * rate, float(scene.d) * period
         *wall, own, delay = (_round(float(number), 12) for number in numbers)
         return Controls(Scene(Device(mass, own, rotary=rotary), Timing(period, delay), VirtualWall(*wall)))
+
+
+def _check_range(name: str, slider: Slider, value: float) -> None:
+    """Raise an error in the unit of the page if a number lies outside its range."""
+    allowed, by = PARAMETERS[name].allowed, slider.per_si
+    if not allowed.holds(float(value) / by):
+        ends = allowed._replace(low=allowed.low * by, high=allowed.high * by)
+        unit = f" {slider.unit}" if slider.unit else ""
+        raise InputError(f"{slider.label}: got {value:g}{unit}; it must be {ends}{unit}")
 
 
 def _round(value: float, digits: int) -> float:

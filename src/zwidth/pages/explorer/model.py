@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
-from zwidth.pages.words import check_lines, list_slopes, pole_words, row, spell_radius, word_of
+from zwidth.pages.verdict import write_check
+from zwidth.pages.words import list_slopes, pole_words, row, spell_radius, word_of
 from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin
 from zwidth.scenes.scene import Scene
-from zwidth.simulation.result import MotionKind
+from zwidth.simulation.ending import describe_ending
 from zwidth.words.formatting import plain, round_safely, tell_apart
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -132,11 +133,7 @@ def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     # device; the normalized one at as many units.
     start = -_APPROACH * _IMPACT * scene.timing.period / max(1.0, 2.0 * _APPROACH * float(scene.delta))
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
-    kind = MotionKind(int(hit.outcome))
-    end = "" if kind in (MotionKind.UNCLEAR, MotionKind.INVALID) else f", {kind.name.lower()} at the end"
-    count = int(hit.bounces)
-    words = f"(leaves it {count} {'time' if count == 1 else 'times'}{end})"
-    return hit.time, hit.position, hit.wall_force, words
+    return hit.time, hit.position, hit.wall_force, f"({describe_ending(hit)})"
 
 
 def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
@@ -232,7 +229,7 @@ def compute_details(
     length = 1.0 if normalized else 1e3
     verdict = assess(scene)
     own = normalized_lines(verdict) if normalized else None
-    lines = own or check_lines(scene, verdict, [])
+    text = "\n".join(own) if own else write_check(scene, verdict, None)
     word = word_of(verdict)
     captions = {"poles_words": caption_poles(scene.poles(), word), **caption_curves(verdict, normalized)}
     time, position = step_motion(scene, length_of(scene, verdict))
@@ -241,12 +238,12 @@ def compute_details(
         "step": {"x": time, "y": position * length},
         "best": {"x": [verdict.stiffness_max], "y": [verdict.virtual_damping_at_max]},
     }
-    yield {"word": word, "verdict": "\n".join(lines), **captions, **curves}
+    yield {"word": word, "verdict": text, **captions, **curves}
     if of_device:
         x, y = passive_set(scene) or (np.empty(0), np.empty(0))
         yield {"passive": {"x": x, "y": y}, "contours": contours(scene, across, up)}
     if not own:
-        yield {"verdict": "\n".join(check_lines(scene, verdict, limits_of(scene)))}
+        yield {"verdict": write_check(scene, verdict, limits_of(scene))}
     # Of a linear system no damping is known that could grow, and no place to hit the wall from.
     bodies = isinstance(scene.device, Device)
     if of_device:

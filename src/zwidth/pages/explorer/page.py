@@ -196,7 +196,8 @@ class Page:
     def _name_axes(self) -> None:
         spring, damper = own_unit("N/m"), own_unit("N s/m")
         hertz, time, walls = "frequency in Hz", "time in s", (f"stiffness K in {spring}", f"damping B in {damper}")
-        place, step = (f"position in m{own_unit(unit)}" for unit in ("m", "m/N"))
+        deflection = "angle" if is_rotary() else "position"
+        place, step = (f"{deflection} in m{own_unit(unit)}" for unit in ("m", "m/N"))
         force = f"wall {'torque' if is_rotary() else 'force'} in {own_unit('N')}"
         if self.controls.normalized:
             hertz, time, walls = "cycles per period", "time in periods", ("alpha", "beta")

@@ -68,7 +68,7 @@ def test_the_units_are_changed_there_and_back():
 @pytest.mark.parametrize(
     "change, says",
     [
-        ({"mass": -1}, "mass: got -0.001"),
+        ({"mass": -1}, "mass m: got -1 g; it must be greater than 0 g"),
         ({"mass": "1"}, "mass m: got '1'"),
         ({"mass": True}, "mass m: got 'True'"),
         ({"mass": float("nan")}, "mass m: got 'nan'"),

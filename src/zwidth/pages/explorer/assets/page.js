@@ -204,7 +204,8 @@ function download(blob, kind) {
 }
 async function save(kind) {
   const name = by("figure").value;
-  by("copied").textContent = by(name).offsetParent === null ? "simulate a hit first" : document.body.matches(".busy, .stale") ? "not yet: it is being computed" : "";
+  by("copied").textContent = by(name).offsetParent === null ? "simulate a hit first" : document.body.matches(".busy") ? "not yet: it is being computed"
+    : document.body.matches(".stale") ? "not saved: an entry is not valid; correct it, or press Escape in its field" : "";
   if (by("copied").textContent) return;
   if (kind === "csv") return void (inputs.data = { json: [JSON.stringify({ serial: ++serial, csv: name })] });
   const view = Bokeh.index.get(Bokeh.documents[0].get_model_by_name(name));

@@ -1,0 +1,49 @@
+"""Options of encoder, friction and motor, with which a wall is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from zwidth.cli.options import Command, quantity_type, warn_implausible
+from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
+
+if TYPE_CHECKING:
+    from zwidth.scenes.scene import Scene
+
+_HARDWARE = (
+    ("--resolution", "resolution", "m", POSITIVE, "Step of the encoder, in m; or '2000 counts' of a revolution."),
+    ("--friction", "coulomb", "N", NOT_NEGATIVE, "Coulomb friction of the device, in N."),
+    ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N; --friction if left out."),
+    ("--max-force", "max_force", "N", POSITIVE, "Largest force of the motor, in N."),
+    ("--max-rate", "max_rate", "N/s", POSITIVE, "Largest rate of the commanded force, in N/s."),
+)
+
+
+def hardware_options(command: Command) -> Command:
+    """Add the options of encoder, friction and motor; the command receives those given as ``hardware``."""
+
+    @wraps(command)
+    def with_hardware(**given: Any) -> Any:
+        hardware = {name: value for _, name, *_ in _HARDWARE if (value := given.pop(name)) is not None}
+        if "resolution" in hardware:
+            warn_implausible({"resolution": hardware["resolution"]})
+        return command(hardware=hardware, **given)
+
+    decorated: Callable[..., Any] = with_hardware
+    for flag, name, unit, allowed, text in reversed(_HARDWARE):
+        kind = quantity_type(unit, allowed, counts=name == "resolution")
+        decorated = click.option(flag, name, type=kind, help=text)(decorated)
+    return decorated
+
+
+def diagnose_wall(scene: Scene, hardware: dict[str, Any]) -> Any:
+    """Return the `zwidth.diagnose` of a wall with the hardware that options give; None without any."""
+    if not hardware:
+        return None
+    from zwidth.scenes.diagnosis import diagnose
+
+    return diagnose(scene, **hardware)

@@ -1,0 +1,139 @@
+"""Commands in the time domain: one simulated motion, and the diagnosis of a wall that oscillates."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+
+from zwidth.cli.commands import cli
+from zwidth.cli.hardware import hardware_options
+from zwidth.cli.help import OF_SCENE, show_example
+from zwidth.cli.options import (
+    figure_option,
+    json_option,
+    quantity_type,
+    save_figure,
+    scene_options,
+)
+from zwidth.pages import words
+from zwidth.pages.words import row
+from zwidth.parts.linear_device import LinearDevice
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import with_unit
+from zwidth.words.quantities import ANY, POSITIVE
+
+TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
+FEWEST_PERIODS, MOST_PERIODS = 300, 20_000
+DEFAULT_DEPTH = 1e-3  # displacement of a held device in m or rad, without an encoder
+DEFAULT_STEPS = 50  # the same in steps of the encoder
+APPROACH = 2.0  # periods before contact at which a hit begins
+
+_WALL = "--stiffness '10 kN/m' --virtual-damping '40 N s/m'"
+_LIMITS = "--resolution '20 um' --friction '50 mN'"
+
+
+@cli.command(**show_example("diagnose", _WALL, OF_SCENE, _LIMITS))
+@scene_options(wall=True)
+@hardware_options
+@json_option
+def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
+    """Find out why a device oscillates on a wall, and what stops it.
+
+    The causes are: linear instability, steps of the encoder, limits of the motor. It needs --stiffness, --mass (or
+    --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies what no option gives.
+    """
+    from zwidth.scenes.diagnosis import diagnose as find_cause
+
+    found = find_cause(scene, **hardware)
+    remedy = found.advise()
+    words.tell(
+        found.as_dict(), [row(found.word, found.explain()), *([row("to stop it", remedy)] if remedy else [])], as_json
+    )
+
+
+@cli.command(**show_example("simulate --hit '0.1 m/s'", _WALL, OF_SCENE))
+@scene_options(wall=True)
+@click.option("--hit", type=quantity_type("m/s", POSITIVE), help="Hit the wall from outside at this speed, in m/s.")
+@click.option("--push", type=quantity_type("N", ANY), help="Constant external force, in N, positive into the wall.")
+@click.option(
+    "--hold", type=quantity_type("m", ANY), help="Release the device at rest at this depth in the wall, in m."
+)
+@hardware_options
+@click.option("--duration", type=quantity_type("s", POSITIVE, periods=True), help="Length, in s or as '500 periods'.")
+@figure_option
+@json_option
+def simulate(
+    scene: Any,
+    hit: float | None,
+    push: float | None,
+    hold: float | None,
+    hardware: dict[str, Any],
+    duration: Any,
+    figure: Path | None,
+    as_json: bool,
+) -> None:
+    """Simulate a hit, a push or a release of the device on one wall.
+
+    A hit meets a wall on one side of its surface; otherwise the wall acts on both sides. Without --hit, --push and
+    --hold the device is released 1 mm (1 mrad, 50 steps of the encoder) deep. It needs --stiffness, --mass (or
+    --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies what no option gives.
+    """
+    from zwidth.scenes.diagnosis import diagnose as find_cause
+    from zwidth.simulation.ending import describe_ending
+    from zwidth.simulation.result import OF_WHOLE, MotionKind
+
+    options = _choose_start(scene, hit, push, hold, hardware)
+    periods = _choose_length(scene) if duration is None else max(1, round(duration.periods(scene.timing.period)))
+    motion = scene.simulate(**options, **hardware, periods=periods)
+    cause, ending = find_cause(scene, **hardware, remedies=False), describe_ending(motion)
+    start = [
+        f"hit at {with_unit(hit, 'm/s', 3)}" if hit is not None else "",
+        f"pushed with {with_unit(options['push'], 'N', 3)}" if options.get("push") else "",
+        f"released at a depth of {with_unit(options['start_position'], 'm', 3)}"
+        if hit is None and options.get("start_position")
+        else "",
+    ]
+    force = max(abs(float(motion.command.min())), abs(float(motion.command.max())))
+    depth = f"penetrates {with_unit(float(motion.penetration), 'm', 3)}, force up to {with_unit(force, 'N', 3)}"
+    lines = [
+        row("start", ", ".join(filter(None, start)) or "at rest"),
+        row("motion", f"{depth}; {ending}"),
+        row(cause.word, cause.explain()),
+    ]
+    if cause.cause not in ("none", "undecided"):
+        lines.append(row("remedies", "zwidth diagnose, with the same options"))
+    if figure is not None:
+        from zwidth.figures import plot
+
+        lines.append(save_figure(plot.motion(motion).figure, figure))
+    result = {name: getattr(motion, name) for name in OF_WHOLE if name not in ("outcome", "status")}
+    result = {name: value.item() for name, value in result.items()} | {"outcome": MotionKind(int(motion.outcome)).name}
+    words.tell(result | {"ending": ending, "periods": periods, "diagnosis": cause.as_dict()}, lines, as_json)
+
+
+def _choose_start(
+    scene: Any, hit: float | None, push: float | None, hold: float | None, hardware: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the initial conditions of a motion, as arguments of `zwidth.simulate`."""
+    if hit is not None and hold is not None:
+        raise InputError("--hold: given together with --hit; a device is released inside, or comes from outside")
+    if hit is not None:
+        before = -APPROACH * hit * scene.timing.period
+        return {"start_position": before, "start_velocity": hit, "push": push or 0.0, "contact": "unilateral"}
+    if hold is None and push is None:
+        depth = DEFAULT_STEPS * hardware["resolution"] if "resolution" in hardware else DEFAULT_DEPTH
+        if isinstance(scene.device, LinearDevice):
+            # A linear system starts at rest at 0; an external force displaces it.
+            return {"push": depth * float(scene.wall.stiffness)}
+        hold = depth
+    return {"start_position": hold or 0.0, "push": push or 0.0}
+
+
+def _choose_length(scene: Any) -> int:
+    """Return how many periods show the slowest decay of the linear loop."""
+    dominant = scene.loop.slowest(float(scene.alpha), float(scene.beta))
+    rate = abs(float(dominant.rate))
+    return int(min(max(TIME_CONSTANTS / rate, FEWEST_PERIODS), MOST_PERIODS)) if 0 < rate < math.inf else MOST_PERIODS

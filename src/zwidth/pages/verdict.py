@@ -1,0 +1,250 @@
+"""The printed answers of `zwidth check` and `zwidth recommend`: the answer in the first line, then margins and advice.
+
+The explorer shows the answer of `zwidth check` as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import isfinite, isnan
+from typing import TYPE_CHECKING
+
+from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.pages.words import fold, line, part_lines, scene_notes, spell_radius, word_of
+from zwidth.parts.device import Device
+from zwidth.parts.grasps import RADIUS
+from zwidth.scenes.assessment import round_margin
+from zwidth.scenes.stabilization import stabilize
+from zwidth.words.formatting import plain, round_safely, spell_periods, spell_stiffness, tell_apart, with_unit
+from zwidth.words.rotation import in_own_units, is_rotary
+
+if TYPE_CHECKING:
+    from zwidth.scenes.assessment import Assessment, Intervals, Limit
+    from zwidth.scenes.recommendation import Recommendation
+    from zwidth.scenes.scene import Scene
+
+ROUNDED = 1e-12  # a smaller share of the dampings is their rounding error
+NOTEWORTHY = 1.005  # gains below this are left to --verbose
+LONG = 20  # characters of a heading that has a line of its own
+COUNTS = ("no", "one", "two", "three", "four", "five", "six")
+
+
+@in_own_units
+def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
+    """Return device and timing in words; ``silent`` are the options that were not given."""
+    device, timing = scene.device, scene.timing
+
+    def name_default(name: str) -> str:
+        return f"{name} 0 (not given)" if name in silent else f"{name} 0"
+
+    if isinstance(device, Device):
+        damping = with_unit(device.damping, "N s/m") if device.damping else name_default("damping")
+        body = f"{with_unit(device.mass, 'kg')}, {damping}"
+    else:
+        body = device.spell()
+    delay = spell_periods(float(scene.d)) if scene.d else ""
+    if delay and not timing.in_periods:
+        delay = f"{with_unit(timing.delay, 's')} ({delay})"
+    delay = f"delay {delay}" if delay else name_default("delay")
+    return f"{body}, at {with_unit(1.0 / timing.period, 'Hz')}, {delay}"
+
+
+@in_own_units
+def check_lines(
+    scene: Scene,
+    verdict: Assessment,
+    limits: Iterable[Limit] | None,
+    *,
+    silent: frozenset[str] = frozenset(),
+    verbose: bool = False,
+) -> list[str]:
+    """Return the answer of `zwidth check` without its notes; None for the limits leaves out what takes a second."""
+    wall, word = scene.wall, word_of(verdict).upper()
+    K, B = spell_stiffness(wall.stiffness), with_unit(wall.virtual_damping, "N s/m")
+    wall_words, device_words = f"K = {K}, B = {B}", spell_device(scene, silent)
+    if isinstance(scene.device, Device):
+        wall_words += f" (alpha {plain(verdict.alpha)}, beta {plain(verdict.beta)})"
+        device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
+    lines = [line(word, wall_words), line("device", device_words)]
+    lines += part_lines(scene)
+    if word == "MARGINAL":
+        lines.append(line("", _explain_marginal(scene)))
+    lines.append("")
+    if word == "UNSTABLE" and _is_damper(scene, verdict):
+        lines.append(line("remedy", f"a pure damper: {_spell_dampers(scene)}"))
+    elif word == "UNSTABLE" and limits is not None:
+        changes = [each.spell() for each in stabilize(scene)] or ["no change of a single parameter is known"]
+        lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
+    lines += margin_lines(verdict)
+    lines += decay_lines(verdict)
+    if word != "UNSTABLE" or verbose:
+        lines.append(line("room", _spell_room(verdict, _find_dampings(scene, verdict))))
+    lines.append(line("passive", spell_passivity(scene, verdict)))
+    lines += _list_maximum(scene, verdict, verbose)
+    return lines + gain_lines("To gain K_max:", limits or (), verbose)
+
+
+def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | None) -> str:
+    """Return the answer of `zwidth check` with its notes as one text, without color."""
+    lines = [*check_lines(scene, verdict, limits), *(line("note", note) for note in scene_notes(scene))]
+    return "\n".join(fold(lines))
+
+
+def _is_damper(scene: Scene, verdict: Assessment) -> bool:
+    """Return whether the wall is a pure damper on a device with known poles."""
+    return scene.wall.stiffness == 0 and not isnan(verdict.frequency)
+
+
+def _find_dampings(scene: Scene, verdict: Assessment) -> Intervals:
+    """Return the intervals of B of the wall's stiffness, of pure dampers apart from the free position."""
+    if not _is_damper(scene, verdict):
+        return verdict.stable_damping
+    return tuple((low, high) for low, high in scene.damper_range().tolist())
+
+
+def _spell_dampers(scene: Scene) -> str:
+    intervals = tuple((low, high) for low, high in scene.damper_range().tolist())
+    return _spell_intervals("B", intervals, "N s/m", "K").removesuffix(" at this K")
+
+
+def _explain_marginal(scene: Scene) -> str:
+    """Return the reason for a marginal wall: the free position of a pure damper, or a plant without damping."""
+    if scene.wall.stiffness:
+        return "poles on the unit circle: the response neither decays nor grows"
+    return f"only for the free position (a pole at z = 1): a pure damper, {_spell_dampers(scene)}"
+
+
+def _spell_room(verdict: Assessment, dampings: Intervals | None = None) -> str:
+    """Return the stable intervals of K and of B next to the wall."""
+    of_damping = verdict.stable_damping if dampings is None else dampings
+    rooms = (("K", verdict.stable_stiffness, "N/m", "B"), ("B", of_damping, "N s/m", "K"))
+    return "; ".join(_spell_intervals(*room) for room in rooms)
+
+
+def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> str:
+    if not intervals:
+        return f"no {name} at this {other}"
+    spelled = []
+    for ends in intervals:
+        low, high = tell_apart(*ends, unit)
+        shared = f" {high.partition(' ')[2]}"
+        low = "0" if not ends[0] else low.removesuffix(shared)
+        spelled.append(f"{low} to {high}")
+    return f"{name} from {' and '.join(spelled)} at this {other}"
+
+
+def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]:
+    """Return the stiffest stable wall of the device and the share that this wall uses."""
+    if not isfinite(verdict.stiffness_max):
+        none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response proves none"
+        return [line("K_max", none)]
+    top = f"{spell_stiffness(verdict.stiffness_max)} at B = {with_unit(verdict.virtual_damping_at_max, 'N s/m')}"
+    used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
+    lines = [line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
+    if verbose:
+        kind, at = verdict.ridge_kind.replace("_", " "), with_unit(verdict.ridge_frequency, "Hz")
+        normalized = f"; alpha_max {plain(verdict.alpha_max)}, beta {plain(verdict.beta_at_max)}"
+        lines.append(line("", f"{kind} optimum at {at}{normalized if isinstance(scene.device, Device) else ''}"))
+    return lines
+
+
+def margin_lines(verdict: Assessment) -> list[str]:
+    """Return the margins of a stable wall."""
+    if not verdict.stable:
+        return []
+    gain, phase, late, least = (
+        round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay", "modulus")
+    )
+    parts = [f"gain {plain(gain)}"]
+    if isfinite(phase):
+        parts.append(f"phase {plain(phase)} deg at {with_unit(verdict.gain_crossover, 'Hz', 3)}")
+    parts += [f"delay {'not known' if isnan(late) else with_unit(late, 's')}", f"modulus {plain(least)}"]
+    return [line("margins", ", ".join(parts))]
+
+
+def decay_lines(verdict: Assessment) -> list[str]:
+    """Return the asymptotic decay or growth; nothing for a measured response, which has no poles."""
+    if isnan(verdict.frequency):
+        return []
+    constant, frequency = verdict.time_constant, verdict.frequency
+    label = "growth" if constant < 0 else "decay"
+    at = f" at {with_unit(frequency, 'Hz')}" if frequency else ""
+    if isnan(constant):
+        text = f"below numerical resolution{at}: next to the boundary or to poles of one size"
+    elif not isfinite(constant):
+        text = f"none{at}"
+    else:
+        text = f"time constant {with_unit(abs(constant), 's')}{at}"
+    return [line(label, f"{text} ({spell_radius(verdict.spectral_radius)})")]
+
+
+def spell_passivity(scene: Scene, verdict: Assessment) -> str:
+    """Return the passivity of a wall in words; with a coupling a wall that misses the condition may be passive."""
+    stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
+    if verdict.passive is None:
+        return f"not known {find_obstacle(**vars(scene.device)).partition(':')[0]}"
+    if stiffness < 0:
+        return "no: no damping makes a negative stiffness passive"
+    dampings = scene.device.damping + abs(scene.wall.virtual_damping) + stiffness * scene.timing.period
+    if abs(margin) <= ROUNDED * dampings:
+        return "on the limit: no physical damping to spare"
+    if verdict.passive:
+        return f"yes: {with_unit(round_safely(margin, 'below'), 'N s/m')} of physical damping to spare"
+    word = "no" if scene.device.coupling is None else "not proved"
+    return f"{word}: {with_unit(round_safely(-margin, 'above'), 'N s/m')} more physical damping needed"
+
+
+def gain_lines(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
+    """Return a table of the improvements of a device and their gains, those that matter unless ``verbose``."""
+    known = [limit for limit in limits if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY)]
+    if not known:
+        return []
+    width, rows = max(len(limit.words) for limit in known), []
+    for limit in known:
+        stiffness = with_unit(round_safely(limit.stiffness, "below"), "N/m")
+        kept = f"; {limit.note}" if limit.note else ""
+        rows.append(f"{limit.words:<{width}}  {stiffness}  (x {plain(limit.gain, 3)}{kept})")
+    if len(heading) > LONG:
+        return ["", heading, *(line("", row) for row in rows)]
+    return ["", *(f"{heading if not k else '':<{len(heading)}}  {row}" for k, row in enumerate(rows))]
+
+
+@in_own_units
+def recommend_lines(
+    found: Recommendation,
+    *,
+    silent: frozenset[str] = frozenset(),
+    hardware: Iterable[str] = (),
+    verbose: bool = False,
+) -> list[str]:
+    """Return the answer of `zwidth recommend` without its notes; ``hardware`` are the lines of a diagnosis."""
+    scene, verdict = found.scene, found.verdict
+    device = line("device", spell_device(scene, silent))
+    if verdict is None:
+        return [line("NO WALL", found.reason), device, *part_lines(scene)]
+    margins = [line("margins", found.spell_margins())]
+    if verbose:
+        margins = [*margin_lines(verdict), *decay_lines(verdict), line("room", _spell_room(verdict))]
+    lines = [
+        line("SET", f"{found.spell_wall()}; {found.spell_limit()}"),
+        device,
+        *part_lines(scene),
+        *margins,
+        *_list_hands(found),
+        *hardware,
+        line("passive", spell_passivity(scene, verdict) if verbose else found.spell_passive()),
+        *(line("CAUTION", caution) for caution in found.cautions),
+    ]
+    return lines + gain_lines("To gain stiffness under the same requirements:", found.steps, verbose)
+
+
+def _list_hands(found: Recommendation) -> list[str]:
+    """Return the stability in the reference grasps."""
+    labels = {name: stable for name, stable in found.grasps.items() if name != "released"}
+    if not labels:
+        return []
+    at = f" at a radius of {1e3 * RADIUS:g} mm" if is_rotary() else ""
+    unstable = [name for name, stable in labels.items() if not stable]
+    if not unstable:
+        return [line("in a hand", f"stable in all {COUNTS[len(labels)]} reference grasps{at}")]
+    return [line("in a hand", f"stable in {len(labels) - len(unstable)} of {len(labels)} reference grasps{at}")]

@@ -1,0 +1,97 @@
+"""Cautions of a recommended wall: thin margins, slow decay, and grasps that destabilize it, each with a remedy."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from zwidth.parts.device import Device
+from zwidth.parts.grasps import list_grasps
+from zwidth.scenes.assessment import Assessment, assess, round_margin
+from zwidth.scenes.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN, choose_wall
+from zwidth.words.formatting import name_wall, plain, with_unit
+from zwidth.words.status import Status
+
+# A wall with less than this is on the brink.
+LEAST_PHASE_MARGIN = 10.0  # degrees
+LEAST_GAIN_MARGIN = 1.3
+LEAST_DELAY_MARGIN = 0.1  # sampling periods
+LONGEST_TIME_CONSTANT = 1.0  # s
+
+SHARES = np.linspace(1.0, 0.02, 50)  # of K and B together, tried until a wall is stable in every grasp
+
+
+def find_thin(verdict: Assessment, period: float) -> list[str]:
+    """Return the thin margins of a stable wall in words."""
+    gain, phase, late = (round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay"))
+    constant = verdict.time_constant
+    thin = {
+        f"phase margin {plain(phase, 2)} deg": phase < LEAST_PHASE_MARGIN,
+        f"gain margin {plain(gain, 3)}": gain > 0 and abs(math.log(gain)) < math.log(LEAST_GAIN_MARGIN),
+        f"delay margin {with_unit(late, 's', 2)}": late < LEAST_DELAY_MARGIN * period,
+        f"time constant {with_unit(constant, 's', 2)}": constant > LONGEST_TIME_CONSTANT,
+    }
+    return [words for words, short in thin.items() if short]
+
+
+def list_cautions(found: Any) -> tuple[str, ...]:
+    """Return the cautions of a `Recommendation` with a wall."""
+    scene, cautions = found.scene, []
+    if thin := find_thin(found.verdict, scene.timing.period):
+        rings = f": rings for {with_unit(found.verdict.time_constant, 's', 2)}" if found.verdict.frequency else ""
+        cautions.append(f"{', '.join(thin)}{rings}; {_advise_margins(found)}")
+    if unstable := [name for name, stable in found.grasps.items() if not stable]:
+        cautions.append(f"unstable in the hand ({'; '.join(unstable)}); {_advise_grasps(scene)}")
+    return tuple(cautions)
+
+
+def _advise_margins(found: Any) -> str:
+    """Return the margins to ask for and their cost in stiffness."""
+    scene, wanted = found.scene, found.wanted
+    phase = max(DEFAULT_PHASE_MARGIN, wanted.phase_margin or 0.0)
+    gain = max(DEFAULT_GAIN_MARGIN, wanted.gain_margin or 0.0)
+    by_phase, by_gain = f"--phase-margin {phase:g}", f"--gain-margin {gain:g}"
+    tried = {by_phase: wanted._replace(phase_margin=phase)}
+    tried[f"{by_phase} {by_gain}"] = wanted._replace(phase_margin=phase, gain_margin=gain)
+    if wanted.passive:
+        tried[f"{by_phase} without --passive"] = wanted._replace(phase_margin=phase, passive=False)
+    advice = "no softer wall has more"
+    for words, more in tried.items():
+        wall = choose_wall(scene, more, found.stiffest, found.stiffness, COARSE)
+        if wall.status != Status.OK:
+            continue
+        change = 100.0 * (wall.stiffness / found.stiffness - 1.0)
+        cost = f"{'costs' if change <= 0 else 'gains'} {max(abs(change), 0.1):.2g} % of the stiffness"
+        thin = find_thin(
+            assess(scene.replace(stiffness=wall.stiffness, virtual_damping=wall.damping)), scene.timing.period
+        )
+        advice = f"ask for {words} ({cost}{''.join(f'; still {each}' for each in thin)})"
+        if not thin:
+            break
+    return advice
+
+
+def judge_grasps(scene: Any) -> dict[str, bool]:
+    """Return the stability of a wall in each reference grasp, by name, and without the operator that the scene has."""
+    if not isinstance(scene.device, Device):
+        return {}
+    held = {name: scene.replace(operator=grasp) for name, grasp in list_grasps(bool(scene.device.rotary)).items()}
+    if scene.operator is not None:
+        held["released"] = scene.replace(operator=None)
+    return {name: bool(each.is_stable()) for name, each in held.items()}
+
+
+def _advise_grasps(scene: Any) -> str:
+    """Return the wall on the line through the origin that is stable in every grasp, and its cost."""
+    grasps = [*list_grasps(bool(scene.device.rotary)).values(), None]
+    K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
+    walls = K * SHARES, B * SHARES
+    stable = np.all([scene.replace(operator=grasp).is_stable(*walls) for grasp in grasps], axis=0)
+    # From the softest upwards, so that every softer wall is stable as well.
+    count = int(np.argmin(np.append(stable[::-1], False)))
+    if not count:
+        return "a passive wall is stable in every grasp: ask for --passive"
+    share = SHARES[-count]
+    return f"{name_wall(share * K, share * B)} is stable in all (costs {100.0 * (1.0 - share):.2g} % of the stiffness)"
