@@ -52,7 +52,9 @@ class LinearDevice(WholeDevice):
     """A device as any strictly proper linear system from commanded force (N) to sensed position (m).
 
     Every question about walls is answered of it; its numbers are taken as exact. Nothing is known of bodies: a hand,
-    friction, starts and energies of motions are for `Device`.
+    friction, starts and energies of motions are for `Device`. Only walls with B >= 0 count for the stiffest wall and
+    for recommendations: B < 0 would cancel damping of the model that the device may not have. `Scene.max_stiffness`
+    with ``negative_damping=True`` includes them.
 
     Args:
         system: matrices ``(A, B, C)``, coefficients ``(numerator, denominator)`` with the highest power first, as text
