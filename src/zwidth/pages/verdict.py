@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 ROUNDED = 1e-12  # a smaller share of the dampings is their rounding error
 NOTEWORTHY = 1.005  # gains below this are left to --verbose
 LONG = 20  # characters of a heading that has a line of its own
+MARGINAL_DAMPER = "a pure damper: marginal only because no stiffness returns the free position (a pole at z = 1)"
+MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
@@ -67,18 +69,21 @@ def check_lines(
         device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
     lines = [line(word, wall_words), line("device", device_words)]
     lines += part_lines(scene)
+    # A measured response has no poles.
+    damper = wall.stiffness == 0 and not isnan(verdict.frequency)
+    dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
-        lines.append(line("", _explain_marginal(scene)))
+        lines.append(line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
     lines.append("")
-    if word == "UNSTABLE" and _is_damper(scene, verdict):
-        lines.append(line("remedy", f"a pure damper: {_spell_dampers(scene)}"))
+    if word == "UNSTABLE" and damper and dampings:
+        lines.append(line("remedy", f"a pure damper: {_spell_intervals('B', dampings, 'N s/m', 'K')}"))
     elif word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no change of a single parameter is known"]
         lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
     lines += margin_lines(verdict)
     lines += decay_lines(verdict)
     if word != "UNSTABLE" or verbose:
-        lines.append(line("room", _spell_room(verdict, _find_dampings(scene, verdict))))
+        lines.append(line("room", _spell_room(verdict, dampings)))
     lines.append(line("passive", spell_passivity(scene, verdict)))
     lines += _list_maximum(scene, verdict, verbose)
     return lines + gain_lines("To gain K_max:", limits or (), verbose)
@@ -90,34 +95,9 @@ def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | Non
     return "\n".join(fold(lines))
 
 
-def _is_damper(scene: Scene, verdict: Assessment) -> bool:
-    """Return whether the wall is a pure damper on a device with known poles."""
-    return scene.wall.stiffness == 0 and not isnan(verdict.frequency)
-
-
-def _find_dampings(scene: Scene, verdict: Assessment) -> Intervals:
-    """Return the intervals of B of the wall's stiffness, of pure dampers apart from the free position."""
-    if not _is_damper(scene, verdict):
-        return verdict.stable_damping
-    return tuple((low, high) for low, high in scene.damper_range().tolist())
-
-
-def _spell_dampers(scene: Scene) -> str:
-    intervals = tuple((low, high) for low, high in scene.damper_range().tolist())
-    return _spell_intervals("B", intervals, "N s/m", "K").removesuffix(" at this K")
-
-
-def _explain_marginal(scene: Scene) -> str:
-    """Return the reason for a marginal wall: the free position of a pure damper, or a plant without damping."""
-    if scene.wall.stiffness:
-        return "poles on the unit circle: the response neither decays nor grows"
-    return f"only for the free position (a pole at z = 1): a pure damper, {_spell_dampers(scene)}"
-
-
-def _spell_room(verdict: Assessment, dampings: Intervals | None = None) -> str:
+def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
     """Return the stable intervals of K and of B next to the wall."""
-    of_damping = verdict.stable_damping if dampings is None else dampings
-    rooms = (("K", verdict.stable_stiffness, "N/m", "B"), ("B", of_damping, "N s/m", "K"))
+    rooms = (("K", verdict.stable_stiffness, "N/m", "B"), ("B", dampings, "N s/m", "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
 
 
@@ -224,7 +204,11 @@ def recommend_lines(
         return [line("NO WALL", found.reason), device, *part_lines(scene)]
     margins = [line("margins", found.spell_margins())]
     if verbose:
-        margins = [*margin_lines(verdict), *decay_lines(verdict), line("room", _spell_room(verdict))]
+        margins = [
+            *margin_lines(verdict),
+            *decay_lines(verdict),
+            line("room", _spell_room(verdict, verdict.stable_damping)),
+        ]
     lines = [
         line("SET", f"{found.spell_wall()}; {found.spell_limit()}"),
         device,

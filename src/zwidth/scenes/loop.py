@@ -201,15 +201,15 @@ class LinearLoop:
         """The pieces of the stable set without soft walls, with dampings above ``least``."""
         return self.border.islands(least)
 
-    def least_stiffness(self, least: float) -> float | None:
-        """Return the alpha below which no wall of a device unstable by itself is stable; None for other devices."""
-        softest = self.border.find_softest(least) if self.roots.device_is_unstable else 0.0
-        return softest if softest > 0 else None
-
     def critical_walls(self, w: Array) -> tuple[Array, Array]:
         """Return alpha and beta of the walls that put a pole pair at the angles w, in (0, pi), on the unit circle."""
         curve = curve_at(self.roots, w)
         return curve.alpha, curve.beta
+
+    def least_stiffness(self, least: float) -> float | None:
+        """Return the alpha below which no wall of a device unstable by itself is stable; None for other devices."""
+        softest = self.border.find_softest(least) if self.roots.device_is_unstable else 0.0
+        return softest if softest > 0 else None
 
     def outlines(self) -> list[Outline]:
         """Closed outlines of the stable set, the largest first."""
