@@ -75,7 +75,9 @@ def check_lines(
     if word == "MARGINAL":
         lines.append(line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
     lines.append("")
-    if word == "UNSTABLE" and limits is not None:
+    if word == "UNSTABLE" and damper and dampings:
+        lines.append(line("remedy", f"a pure damper: {_spell_intervals('B', dampings, 'N s/m', 'K')}"))
+    elif word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no change of a single parameter is known"]
         lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
     lines += margin_lines(verdict)

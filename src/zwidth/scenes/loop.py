@@ -184,6 +184,10 @@ class LinearLoop:
         """What keeps a wall undecided, a sentence each: nothing, where there is a model."""
         return []
 
+    def explain_limit(self) -> str:
+        """Return the reason for a stiffest wall that is not decided: empty, because a model decides every wall."""
+        return ""
+
     def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
         """Those above ``least`` whose walls lie in a piece of the stable set with soft walls."""
         column = np.maximum(self.column(alpha), least).tolist()

@@ -191,6 +191,16 @@ class MeasuredLoop(LinearLoop):
                 said.append(f"{where}: {remedy}" if by_gap else f"the deviation is too large; {where}, with {remedy}")
         return said
 
+    def explain_limit(self) -> str:
+        """Return the reason why no wall is decided: what the wall with the fewest undecided points requires."""
+        rows = [(*self.walls.ends(beta), beta) for beta in self._tops[0].tolist()]
+        walls = [(0.5 * (low + high), beta) for low, high, beta in rows if low < high]
+        count = f"the {self.scene.device.frequency.size} lines of the response decide no wall"
+        if not walls:
+            return f"{count}: begin lower, end higher, or reduce the deviation"
+        alpha, beta = min(walls, key=lambda wall: np.count_nonzero(self.walls.doubts(*wall)))
+        return "; ".join([count, *self.explain(float(alpha), float(beta))])
+
     def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """``L = (alpha + beta F) G`` at angles between the first line and the last; NaN at others."""
         S, F = self.walls.curve.at(w)

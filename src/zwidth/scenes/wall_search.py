@@ -14,7 +14,7 @@ import numpy as np
 
 from zwidth.arrays.roots import false_position, find_lowest
 from zwidth.parts.safe_limit import SafeLimit
-from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, soft_dampings
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, soft_dampings
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.status import Status
@@ -202,9 +202,7 @@ def choose_wall(
     """Choose the stiffest wall of a scene, whose stiffest stable wall is known, that satisfies the requirements."""
     nan = math.nan
     if top.status != Status.OK:
-        status = Status(int(top.status))
-        reason = "no stiffness is stable at any damping" if status == Status.NO_BOUNDARY else status.message
-        return WallChoice(nan, nan, "", status, reason)
+        return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
     most, binding = (wanted.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
     safe = None if wanted.beyond_safe else scene.safe_limit
     if safe is not None:
