@@ -128,7 +128,7 @@ class Recommendation:
 
     @cached_property
     def grasps(self) -> dict[str, bool]:
-        """Stability of the wall in each of `zwidth.REFERENCE_GRASPS`, by name; empty for a device given as a whole.
+        """Stability of the wall in each of `zwidth.reference_grasps`, by name; empty for a device given as a whole.
 
         A rotary device is held at a radius of 50 mm. If the scene has an operator, "released" is the device without it.
         """

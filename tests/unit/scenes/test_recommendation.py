@@ -272,7 +272,7 @@ def test_grasps_that_destabilize_a_wall_are_named_with_a_wall_that_none_destabil
     K, B = re.search(
         r"in the hand \(firm, light damping\); K = (.*?), B = (.*?) is stable in all", found.cautions[1]
     ).groups()
-    assert all(scene.replace(operator=grasp).is_stable(K, B) for grasp in zwidth.REFERENCE_GRASPS.values())
+    assert all(scene.replace(operator=grasp).is_stable(K, B) for grasp in zwidth.reference_grasps().values())
     assert all(scene.recommend().grasps.values())
 
 
