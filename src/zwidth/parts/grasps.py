@@ -12,7 +12,8 @@ from zwidth.words.quantities import POSITIVE
 HAND = Operator(**Operator.usual["rigid"])
 SPRINGS = {"soft": 1e3, "firm": 10e3}  # N/m
 DAMPERS = {"light": 1.0, "medium": 5.0, "strong": 20.0}  # N s/m
-RADIUS = 0.05  # m, from the axis of a rotary device to the hand
+# From the axis of a rotary device to the hand, in m. Light damping destabilizes narrow ranges of the radius.
+RADII = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.032, 0.04, 0.05, 0.063, 0.08, 0.1)
 
 
 def reference_grasps(radius: float | str | None = None) -> dict[str, Operator]:
@@ -48,6 +49,7 @@ def reference_grasps(radius: float | str | None = None) -> dict[str, Operator]:
     return grasps
 
 
-def list_grasps(rotary: bool) -> dict[str, Operator]:
-    """Return the reference grasps of a linear device, or of a rotary one at the default radius."""
-    return reference_grasps(RADIUS if rotary else None)
+def list_grasps(rotary: bool) -> list[tuple[str, Operator]]:
+    """Return the reference grasps of a linear device with their names, or of a rotary one at each of the radii."""
+    radii = RADII if rotary else (None,)
+    return [each for radius in radii for each in reference_grasps(radius).items()]
