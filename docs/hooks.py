@@ -20,6 +20,9 @@ _TOKEN = re.compile(
     r"(?P<word>[a-z]+'s\b)|(?P<name>[A-Za-z]+\d*(?:_(?:\w+|\((?=[^()]*\))[^()]*\)))?'{0,2})|(?P<number>\d+(?:\.\d+)?)|(?P<space>\s+)"
     r"|(?P<sign><=|>=|!=|->|\.\.\.|\S)"
 )
+# Pygments takes a comment in the output of a command for the prompt of root.
+_COMMENT = re.compile(r'^<span class="gp"># ?</span>(.*)$', re.MULTILINE)
+_TAG = re.compile(r"<[^>]*>")
 # Brackets of one size: taller ones would part the lines.
 _FLAT = ' stretchy="false"'
 # Signs that stand as near to their neighbors as they are typed.
@@ -149,10 +152,16 @@ def _lay(block: re.Match[str]) -> str:
     return f'<div class="formulas{" single" if len(lines) == 1 else ""}">{cells}</div>'
 
 
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Name the language of examples with prompts, so that prompts and output have classes of their own."""
+    return markdown.replace("```python\n>>> ", "```pycon\n>>> ")
+
+
 def on_page_content(html: str, page: Any, **_: Any) -> str:
     """Link `zwidth.name` to its place in the reference, if it has one, and typeset the formulas of the theory."""
     if page.file.src_uri.startswith("theory/"):
         html = _BLOCK.sub(_lay, html)
+    html = _COMMENT.sub(lambda line: f'<span class="go"># {_TAG.sub("", line[1])}</span>', html)
     return _NAME.sub(r'<autoref identifier="\1" optional>\g<0></autoref>', html)
 
 

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -92,6 +93,16 @@ def test_formulas_are_typeset(hooks):
     ):
         assert part in shown
     assert hooks.typeset("a (b < c") == "<code>a (b &lt; c</code>"
+
+
+def test_prompts_and_output_have_classes_of_their_own(hooks):
+    """The copy button leaves both out."""
+    assert hooks.on_page_markdown("```python\n>>> 1\n1\n```") == "```pycon\n>>> 1\n1\n```"
+    assert hooks.on_page_markdown("```python\nx = 1\n```") == "```python\nx = 1\n```"
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="index.md"))
+    line = '<span class="gp"># </span>A<span class="w"> </span>first study'
+    assert hooks.on_page_content(f"{line}\n", page) == '<span class="go"># A first study</span>\n'
+    assert "data-md-copying" in (DOCS / "stylesheets" / "extra.css").read_text(encoding="utf-8")
 
 
 def test_every_formula_of_the_theory_can_be_typeset(hooks):

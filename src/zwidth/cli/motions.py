@@ -10,14 +10,13 @@ import click
 
 from zwidth.cli.commands import cli
 from zwidth.cli.hardware import hardware_options
+from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
-    OF_SCENE,
     figure_option,
     json_option,
     quantity_type,
     save_figure,
     scene_options,
-    show_example,
 )
 from zwidth.pages import words
 from zwidth.pages.words import row

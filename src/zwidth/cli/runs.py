@@ -55,6 +55,7 @@ def _read_figure_size(text: str) -> tuple[float, float | None]:
 
 _SIZE = Parsed("size", _read_size, "write a size from 128 MiB to 1024 GiB, as in '512 MiB'")
 _SLICE = Parsed("name=value", _read_slice, "write NAME=VALUE, as in delta=0.1")
+_DPI = click.IntRange(10, 2400)
 _FIGURE_SIZE = Parsed(
     "WxH", _read_figure_size, "write width x height from 1 to 100 inches, as in 7x4.5, or a width, as in 85mm"
 )
@@ -69,8 +70,9 @@ _FIGURE_SIZE = Parsed(
 @click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
 @click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size of the studies' figures in inches, as 7x4.5, or width, as 85mm.")
+@click.option("--dpi", type=_DPI, help="Dots per inch of the studies' figures.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
-def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **options: Any) -> None:
+def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi: int | None, **options: Any) -> None:
     """Run the studies of a CONFIG file.
 
     Data, figures and a record of the run go into one folder, the results of each sweep into a store DIR/STUDY.zarr.
@@ -86,10 +88,10 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, **op
     if dry_run:
         _print_plan(config, **options)
         return
-    command = _spell_resume_command(path, size=size, **options)
+    command = _spell_resume_command(path, size=size, dpi=dpi, **options)
     with _interrupt_on_sigterm() as stopped_by:
         try:
-            with reporter() as progress, style_sheet(size=size):
+            with reporter() as progress, style_sheet(size=size, dpi=dpi):
                 # The options are those of `zwidth.run`, by their names.
                 result = run_studies(path, progress=progress, **options)
         except KeyboardInterrupt:
@@ -140,7 +142,7 @@ def _spell_resume_command(path: Path, *, out: Path | None, **given: Any) -> str:
     words = ["zwidth", "run", path, *(["--out", out] if out else []), "--resume"]
     size = given["size"] and "x".join(f"{25.4 * side:.12g}" for side in given["size"] if side) + "mm"
     for name, value in {**given, "size": size}.items():
-        words += [f"--{name}", value] if value and name in ("workers", "scheduler", "size") else []
+        words += [f"--{name}", value] if value and name in ("workers", "scheduler", "size", "dpi") else []
     return shlex.join(map(str, words))
 
 
@@ -227,7 +229,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 )
 @click.option("--format", "formats", multiple=True, type=click.Choice(("png", "svg", "pdf")), default=("png", "svg"),
               help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
-@click.option("--dpi", type=click.IntRange(10, 2400), help="Dots an inch.")
+@click.option("--dpi", type=_DPI, help="Dots per inch.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size in inches, as 7x4.5, or width, as 85mm.")
 @click.option(
     "--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib, as one with 'svg.fonttype: none'."

@@ -65,8 +65,8 @@ _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"
 
 _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
 Size: TypeAlias = tuple[float, float | None]
-# What a user's style sheet changes of it, and the size of new figures that a user wants.
-_wanted: ContextVar[tuple[Any, Size | None]] = ContextVar("wanted", default=((), None))
+# What a user's style sheet changes of it, and the size and the dots per inch of new figures that a user wants.
+_wanted: ContextVar[tuple[Any, Size | None, float | None]] = ContextVar("wanted", default=((), None, None))
 # Narrower, in inches, panels stand below each other: beside each other their labels would have no room.
 _ONE_COLUMN = 5.0
 
@@ -79,15 +79,15 @@ def house_style() -> Iterator[None]:
 
 
 @contextmanager
-def style_sheet(file: Path | None = None, size: Size | None = None) -> Iterator[None]:
+def style_sheet(file: Path | None = None, size: Size | None = None, dpi: float | None = None) -> Iterator[None]:
     """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given."""
-    # Of a size without a height type is as large as ever. Where there is a size already, it stays.
-    changes, known = _wanted.get()
+    # Of a size without a height type is as large as ever. A size or a resolution that is set already stays.
+    changes, known, dots = _wanted.get()
     try:
         changes = changes if file is None else dict(rc_params_from_file(file, use_default_template=False))
     except OSError as error:
         raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error
-    token = _wanted.set((changes, known or size))
+    token = _wanted.set((changes, known or size, dots or dpi))
     try:
         yield
     finally:
@@ -268,7 +268,7 @@ def save(
         drawn: the figure, or Axes of it.
         stem: the files' name without its ending.
         formats: the endings, of "png", "svg" and "pdf".
-        dpi: dots an inch, also of maps within an SVG or a PDF.
+        dpi: dots per inch, also of maps within an SVG or a PDF; for PNG 180 if left out.
     """
     figure = figure_of(drawn)
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
@@ -277,7 +277,7 @@ def save(
         for file in files:
             usual = PNG_DPI if file.suffix == ".png" else "figure"
             kind = {"format": file.suffix[1:], "metadata": _METADATA[file.suffix]}
-            figure.savefig(drawing := BytesIO(), dpi=dpi or usual, **kind)
+            figure.savefig(drawing := BytesIO(), dpi=dpi or _wanted.get()[2] or usual, **kind)
             write_whole(file, drawing.getvalue())
             # What is laid out once need not be again: it is half of the work.
             figure.set_layout_engine(None)

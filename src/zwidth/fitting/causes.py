@@ -98,6 +98,9 @@ def explain_residuals(best: FittedModel) -> str:
     left = best.residuals - basis @ (basis.T @ best.residuals)
     squares = float(left @ left)
     g = float(best.theta[0])
+    # Rounding errors drift as a weak spring does, so that they are looked at first.
+    if rounded := _explain_rounding(best, basis, squares):
+        return rounded
 
     def share(*pushes: list[np.ndarray]) -> tuple[float, np.ndarray]:
         columns = np.array([_respond(best, push) for push in pushes]).T
@@ -116,7 +119,7 @@ def explain_residuals(best: FittedModel) -> str:
         stiffness = float(values[0]) / g
         kind = "a spring or gravity" if stiffness > 0 else "gravity away from rest"
         return f"it follows the position as {kind} of {with_unit(abs(stiffness), 'N/m', 3)} does"
-    return _explain_rounding(best, basis, squares)
+    return ""
 
 
 def _respond(best: FittedModel, pushes: list[np.ndarray]) -> np.ndarray:

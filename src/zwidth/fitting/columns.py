@@ -185,7 +185,7 @@ def _name_units(
         notes.append(f"position {heads[places['position'].places[0]]!r} has no unit and is read in counts")
     if _turns(units, places, resolution):
         for name, unit in (("position", "rad"), ("force", "N m")):
-            if not units[name]:
+            if not units[name] and places[name].turns is not False:
                 units[name] = unit
                 notes.append(f"{name} {heads[places[name].places[0]]!r} has no unit and is read in {unit}")
     return units, notes

@@ -35,6 +35,7 @@ _MEASURED = ("meas", "measured", "actual", "sensed", "sensor", "est", "estimated
 _DERIVED = ("error", "err", "vel", "velocity", "speed", "dot", "acc", "rate", "temp")
 # Words that say that an axis turns.
 _TURNS = ("angle", "phi", "theta", "winkel", "torque", "tau", "moment", "drehmoment", "sollmoment")
+_MOVES = ("force", "f", "kraft", "sollkraft", "weg")
 # Columns read in place of a position or a force without one, and their unit if the header has none.
 _INSTEAD = {
     "position": (("velocity", "vel", "speed"), "m/s"),
@@ -53,7 +54,7 @@ class Column(NamedTuple):
 
     places: tuple[int, ...]  # one column; two of a time in seconds and parts of a second
     units: tuple[str, ...]  # of each, "" without one
-    turns: bool  # whether the name is that of an angle or a torque
+    turns: bool | None  # whether the name is that of an angle or a torque, or of a force; None of any axis
     guessed: bool = False  # whether only a word of the header says which quantity it is
     header_unit: str = ""  # the unit in the header, if another one is asked for
 
@@ -107,7 +108,7 @@ def _find_by_name(heads: Sequence[str], name: str) -> tuple[Column | None, list[
         places = [k for k, (title, _) in enumerate(titles) if title.lower() in others]
         if len(places) != 1:
             return None, places
-        return Column((places[0],), (titles[places[0]][1] or usual,), False), []
+        return Column((places[0],), (titles[places[0]][1] or usual,), None), []
     best = min(ranks)
     if len(ranks[best]) > 1:
         return None, ranks[best]
@@ -129,6 +130,9 @@ def _rank(name: str, head: str, title: str) -> int | None:
     excluded = {"position": (*_COMMANDED, *_DERIVED), "force": (*_MEASURED, *_DERIVED), "time": ()}[name]
     if set(words) & set(excluded):
         return None
+    core = [word for word in words if word not in (*_COMMANDED, *_MEASURED)]
+    if len(core) == 1 < len(words) and core[0] in _NAMES[name]:
+        return 1
     if any(
         word in _WORDS[name] or (name != "time" and word.endswith(_ENDINGS) and _ends(name, word)) for word in words
     ):
@@ -137,7 +141,7 @@ def _rank(name: str, head: str, title: str) -> int | None:
     bare = head.strip()
     if name == "position" and bare.lower() in COUNTS:
         return _UNIT_ONLY
-    if len(bare) > 1 and any(each.in_base("1", 0, bare) is not None for each in DIMENSIONS[name]):
+    if (len(bare) > 1 or bare == "N") and any(each.in_base("1", 0, bare) is not None for each in DIMENSIONS[name]):
         return _UNIT_ONLY
     return None
 
@@ -153,8 +157,11 @@ def _split_words(title: str) -> list[str]:
     return [re.sub(r"[0-9]+$", "", word).lower() for word in re.split(r"[\W_]+", spaced) if word]
 
 
-def _is_turning(words: Iterable[str]) -> bool:
-    return any(word in _TURNS for word in words)
+def _is_turning(words: Sequence[str]) -> bool | None:
+    """Return whether words of a header are of a rotary axis, or of a linear one; None if they say neither."""
+    if any(word in _TURNS for word in words):
+        return True
+    return False if any(word in _MOVES for word in words) else None
 
 
 def _find_parts(heads: Sequence[str]) -> Column | None:
@@ -169,7 +176,7 @@ def _find_parts(heads: Sequence[str]) -> Column | None:
     if len(pairs) != 1:
         return None
     (i, j), *_ = pairs
-    return Column((i, j), ("s", _PARTS[words[j][-1]]), False)
+    return Column((i, j), ("s", _PARTS[words[j][-1]]), None)
 
 
 def _find_asked(file: object, heads: Sequence[str], name: str, wanted: str) -> Column:
@@ -178,7 +185,7 @@ def _find_asked(file: object, heads: Sequence[str], name: str, wanted: str) -> C
     if name == "time" and "+" in title and not _matches(heads, title):
         parts = [_find_asked(file, heads, name, part) for part in title.split("+")]
         units = tuple(unit for part in parts for unit in part.units)
-        return Column(tuple(place for part in parts for place in part.places), units, False)
+        return Column(tuple(place for part in parts for place in part.places), units, None)
     unit = None
     found = _matches(heads, title)
     if not found:

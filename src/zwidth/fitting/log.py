@@ -263,7 +263,7 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
             f"force: {cause.words} as well; support the device, or play a record of zwidth.excite, for zwidth.respond "
             "needs no model"
         )
-    if theta[0] <= 0 and cause.reversed:
+    if theta[0] <= 0 and (cause.reversed or left < _UNEXPLAINED):
         raise InputError(
             f"force: the device runs away from it, as if its mass were {with_unit(period**2 / theta[0], 'kg')}; "
             "turn the sign of the force, or of the position; a velocity given as a position looks so too"

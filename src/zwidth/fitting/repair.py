@@ -6,6 +6,7 @@ fitted as two logs.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple, NoReturn
 
 import numpy as np
@@ -76,8 +77,8 @@ def repair_log(clock: np.ndarray | None, position: np.ndarray, force: np.ndarray
     if clock is not None:
         kept = _drop_repeated(clock, position, force, notes)
         clock, row, position, force = clock[kept], row[kept], position[kept], force[kept]
-    position = unwrap(position, step or find_resolution(position), notes)
-    kept = ~find_glitches(position)
+    modulus = find_modulus(position, step or find_resolution(position))
+    kept = ~find_glitches(unwrap(position, modulus) if modulus else position, modulus)
     if not kept.all():
         bad = np.flatnonzero(~kept)
         if bad.size > _WILD * position.size:
@@ -88,6 +89,12 @@ def repair_log(clock: np.ndarray | None, position: np.ndarray, force: np.ndarray
         notes.append(f"left out {_count(bad.size, 'glitch', 'es')} of the position, the first at sample {row[bad[0]]}")
         clock = None if clock is None else clock[kept]
         row, position, force = row[kept], position[kept], force[kept]
+    if modulus:
+        # Without glitches, whose sides may lie a modulus apart.
+        count = int(np.count_nonzero(np.round(np.diff(position) / modulus)))
+        size = f"{with_unit(modulus, 'm', 6)}{' (360 deg)' if is_rotary() and np.isclose(modulus, 2 * np.pi) else ''}"
+        notes.append(f"the position wraps at {size}, {_count(count, 'time')}, and was continued")
+        position = unwrap(position, modulus)
     return RepairedLog(clock, row, position, force, notes)
 
 
@@ -170,39 +177,41 @@ def _drop_repeated(clock: np.ndarray, position: np.ndarray, force: np.ndarray, n
     return np.ones(clock.size, bool)
 
 
-def unwrap(position: np.ndarray, step: float, notes: list[str]) -> np.ndarray:
-    """Return positions that go on where the encoder, or its counter, wraps."""
-    moves = np.diff(position)
-    for modulus in _list_moduli(position, moves, step):
-        turns = np.round(moves / modulus)
-        events = np.flatnonzero(turns)
+def find_modulus(position: np.ndarray, step: float) -> float:
+    """Return the modulus at which the encoder, or its counter, wraps; 0 if it does not."""
+    for modulus in _list_moduli(position, step):
+        # Jumps of glitches are no wraps.
+        places = position[~find_glitches(unwrap(position, modulus), modulus)]
+        events = np.flatnonzero(np.round(np.diff(places) / modulus))
         if not events.size:
             continue
-        unwrapped = position - modulus * np.append(0.0, np.cumsum(turns))
-        bends = np.abs(np.diff(unwrapped, 2))
+        bends = np.abs(np.diff(unwrap(places, modulus), 2))
         typical = float(np.quantile(bends, 0.99)) if bends.size else 0.0
-        # The bends before and after each wrap; those of glitches are not smooth, whatever is subtracted.
+        # The bends before and after each wrap.
         around = np.maximum(*(np.append(bends, 0.0)[np.clip(events - k, 0, bends.size)] for k in (0, 1)))
         smooth = around <= np.maximum(_SMOOTH * typical, _NEAR_WRAP * modulus)
         if smooth.mean() > 0.5:
-            size = with_unit(modulus, "m", 6)
-            size = f"{size} (360 deg)" if is_rotary() and np.isclose(modulus, 2 * np.pi, rtol=1e-3) else size
-            notes.append(f"the position wraps at {size}, {_count(events.size, 'time')}, and was continued")
-            return unwrapped
-    return position
+            return modulus
+    return 0.0
 
 
-def _list_moduli(position: np.ndarray, moves: np.ndarray, step: float) -> list[float]:
-    """Return the moduli at which positions of this span may wrap: a turn, powers of two of the step, or the jumps'."""
+def unwrap(position: np.ndarray, modulus: float) -> np.ndarray:
+    """Return positions that go on where they wrap."""
+    return position - modulus * np.append(0.0, np.cumsum(np.round(np.diff(position) / modulus)))
+
+
+def _list_moduli(position: np.ndarray, step: float) -> Iterator[float]:
+    """Yield the moduli at which positions of this span may wrap: a turn, powers of two of the step, then the jumps'."""
     # Isolated glitches do not count.
-    span = float(np.ptp(_filter_median(position, 1)))
+    places = _filter_median(position, _REACH)
+    span, largest = float(np.ptp(places)), float(np.abs(np.diff(position)).max(initial=0.0))
     moduli = [2.0 * np.pi] if is_rotary() and span <= 2.0 * np.pi * (1.0 + 1e-9) + step else []
     if step > 0 and span > 0:
         counts = round(span / step) + 1
         moduli.append(step * 2.0 ** max(8, int(np.ceil(np.log2(counts)))))
-    if modulus := _measure_modulus(moves, span, step):
-        moduli.append(modulus)
-    return [modulus for modulus in moduli if np.any(np.abs(moves) > 0.5 * modulus)]
+    yield from (modulus for modulus in moduli if largest > 0.5 * modulus)
+    if modulus := _measure_modulus(np.diff(position[~find_glitches(position)]), span, step):
+        yield modulus
 
 
 def _measure_modulus(moves: np.ndarray, span: float, step: float) -> float:
@@ -229,23 +238,31 @@ def _measure_modulus(moves: np.ndarray, span: float, step: float) -> float:
     )
 
 
-def find_glitches(position: np.ndarray) -> np.ndarray:
-    """Return a mask of isolated positions, up to 3 in a row, that leave the motion and return to it at once."""
+def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
+    """Return a mask of isolated positions, up to 3 in a row, that leave the motion and return to it at once.
+
+    Positions that were unwrapped return up to whole moduli.
+    """
     bends = np.abs(np.diff(position, 2))
     moving = bends[bends > 0]
     wild = np.zeros(position.size, bool)
     if position.size < 4 * _REACH or not moving.size:
         return wild
     off = np.abs(position - _filter_median(position, _REACH))
-    # The encoder's step bounds bends of a slow motion.
-    limit = _FAR * float(np.quantile(moving, 0.9)) + _STEPS * float(moving.min())
-    for first in np.flatnonzero((off > limit) & (np.append(0.0, off[:-1]) <= limit)):
+    # The encoder's step bounds bends of a slow motion; a glitch moves the median of a fast one by some samples.
+    speed = _filter_median(np.abs(np.diff(position, prepend=position[0])), _REACH)
+    far = off > _FAR * float(np.quantile(moving, 0.9)) + _STEPS * float(moving.min()) + 3.0 * speed
+    for first in np.flatnonzero(far & ~np.append(False, far[:-1])):
         after = first + 1
-        while after < position.size and off[after] > limit:
+        while after < position.size and far[after]:
             after += 1
         if first > 0 and after < position.size and after - first <= _REACH:
-            jump = np.abs(position[first:after] - position[first - 1]).min()
-            if abs(position[after] - position[first - 1]) < _RETURN * jump:
+            jump, back = (
+                np.abs(position[first:after] - position[first - 1]).min(),
+                position[after] - position[first - 1],
+            )
+            back -= modulus * np.round(back / modulus) if modulus else 0.0
+            if abs(back) < _RETURN * jump:
                 wild[first:after] = True
     return wild
 
@@ -299,7 +316,7 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
     odd = int(np.sum(np.abs(steps - usual) > 0.5 * tick))
     allowed = 1.0 + (0.1 if odd >= _MANY_ODD else 0.02)
     if np.ptp(late) > allowed * tick or np.any(np.diff(place) < 1) or odd < _FEW_ODD or tick > _COARSEST * period:
-        if period > 1.5 * tick:
+        if odd >= _FEW_ODD and period > 1.5 * tick:
             _refuse_left_out(steps, tick)
         return None
     if not np.isclose(np.log10(tick), np.round(np.log10(tick)), rtol=0, atol=1e-3) and period > 1.5 * tick:

@@ -16,10 +16,11 @@ from zwidth.figures.plane import Edges, draw_plane
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.style import Size, save, style_sheet
 from zwidth.parts.checks import check_number
+from zwidth.runs.record import RUN_FILE
 from zwidth.studies.ridge import find_edges
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import SUFFIX, Store, list_stores
-from zwidth.words.errors import InputError
+from zwidth.words.errors import InputError, StoreError
 from zwidth.words.formatting import short
 from zwidth.words.quantities import ANY, OUTPUTS, VARIABLES
 
@@ -87,6 +88,9 @@ def draw_stores(
     # is called with every file, ``note`` with what a reader should know: other values than those wanted, stores without
     # a figure.
     folder = Path(os.fsdecode(path))
+    if (folder / RUN_FILE).is_file() and not any(folder.glob(f"*{SUFFIX}")):
+        remedy = "for another look run again: zwidth run CONFIG --overwrite --size 85mm --dpi 300"
+        raise StoreError(f"{folder}: holds no sweep, and the figures of its studies are drawn already; {remedy}")
     stores = list_stores(folder)
     beside = folder.parent if stores == [folder] else folder
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))

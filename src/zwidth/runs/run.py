@@ -258,7 +258,7 @@ class _Run:
             stage.mkdir()
             try:
                 look = self.config.figure or FigureLook()
-                with use_kind(self.config.rotary), style_sheet(size=look.size):
+                with use_kind(self.config.rotary), style_sheet(size=look.size, dpi=look.dpi):
                     outcome = study.compute(self.config.scene, alone)
                     outcome.write(stage, study.name, look.formats)
             except Exception as caught:

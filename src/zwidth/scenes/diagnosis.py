@@ -180,8 +180,8 @@ def diagnose(
     """Find out why a device oscillates on a wall, and which change stops it.
 
     The linear loop is judged by `zwidth.Scene.is_stable`. Then the wall is simulated with encoder, friction and motor
-    from several initial displacements, without an external force and with the worst constant one, half a step of the
-    encoder times K. An oscillation that ends without the encoder, or without the limits of the motor, is attributed to
+    from several initial displacements, with and without the worst constant external force, half a step of the encoder
+    times K. An oscillation that ends without the encoder, or without the limits of the motor, is attributed to
     it. Each remedy is simulated in the same way, with the value returned and with values further from the present one.
 
     Args:

@@ -108,6 +108,9 @@ class FigureLook(Strict, what="the look of figures"):
     format: Literal["png", "svg", "pdf"] | None = None
     """Kind of file; PNG and SVG where left out."""
 
+    dpi: Annotated[float, Quantity(allowed=Range(10, 2400))] | None = None
+    """Dots per inch of PNG, and of maps within SVG and PDF; 180 for PNG if left out."""
+
     @property
     def formats(self) -> tuple[str, ...]:
         """The endings of the files."""
@@ -135,7 +138,7 @@ class Config(Strict, what="a configuration"):
     """Device, timing and wall that supply what a study leaves out."""
 
     figure: FigureLook | None = None
-    """Width and kind of the figures of studies; `zwidth figures` has options for those of sweeps."""
+    """Width, kind and resolution of the figures of studies; `zwidth figures` has options for those of sweeps."""
 
     studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""

@@ -135,8 +135,8 @@ def tell_kind(value: Any) -> bool | None:
         return True
     size = measure_unit(unit) if unit else None
     if size is None:
-        return None
-    # An unknown unit per angle is of no linear device.
+        # An unknown unit per angle is of no linear device.
+        return True if _canonical(unit).endswith(("/rad", "/deg", "/°", "/turn", "/rev")) else None
     return _KIND_OF_EXPONENTS.get(size.exponents, True if size.exponents[3] else None)
 
 

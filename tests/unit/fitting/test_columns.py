@@ -104,9 +104,8 @@ REFUSED = {
     "names in a remark": ("# t,x,F\n0;1,5;2\n1;2;3\n", {}, "log.csv:2: got numbers where the names"),
     "one column": ("t\n0\n", {}, "log.csv:1: got 't'; separate the columns"),
     "text": ("# r\nt,x,F\n0,1,2\n1,no,3\n", {}, "log.csv:4: got 'no' under 'x'; a number is needed"),
-    "cut off": ("t,x,F\n0,1,2\n1,4\n", {}, "log.csv:3: got nothing under 'F'"),
-    "an empty cell": ("t,x,F\n0,,2\n", {}, "log.csv:2: got nothing under 'x'"),
-    "not finite": ("t,x,F\n0,nan,2\n", {}, "log.csv:2: got 'nan' under 'x'"),
+    "an empty column": ("t,x,F\n0,,2\n", {}, "no cell of column 'x' holds a number"),
+    "not finite": ("t,x,F\n0,nan,2\n", {}, "no cell of column 'x' holds a number"),
     "too large": ("t,x,F\n0,1,1e999\n", {}, "log.csv:2: got '1e999' under 'F'"),
     "underscores": ("t,x,F\n0,1,1_000\n", {}, "log.csv:2: got '1_000' under 'F'"),
     "thousands": ("t;x;F\n0;1.000,5;1\n", {}, "log.csv:2: got '1.000,5' under 'x'"),
@@ -116,8 +115,8 @@ REFUSED = {
     "decimal commas between commas": ("t,x,F\n0,1,5,2\n", {}, "got 4 cells for 3 columns; a comma as decimal sign"),
     "no text": (b"\xff\xfet,x,F", {}, "no text in UTF-8"),
     "no such column": ("t,xpos,F\n0,1,2\n", {"position": "xpso"}, "no column 'xpso'; did you mean 'xpos'?"),
-    "ambiguous": ("t,x,angle,F\n0,1,2,3\n", {}, "position: by its name it may be any of 'x', 'angle'"),
-    "unknown": ("t,y,F\n0,1,2\n", {}, "position: by its name it is none of 't', 'y', 'F'"),
+    "ambiguous": ("t,x,angle,F\n0,1,2,3\n", {}, "position: may be any of 'x', 'angle' in"),
+    "unknown": ("t,y,F\n0,1,2\n", {}, "position: no column for position recognized in"),
     "twice": ("t,a,a,F\n0,1,2,3\n", {"position": "a"}, "has 2 columns 'a'"),
     "one for two": ("t,x\n0,1\n", {"force": "x"}, "one column is taken twice: time 't', position 'x', force 'x'"),
     "unit in the header": ("t,x [furlong],F\n0,1,2\n", {}, "position: got the unit 'furlong'; allowed are m, cm"),
@@ -125,7 +124,9 @@ REFUSED = {
     "counts alone": ("t,x [counts],F\n0,1,2\n", {}, "give the resolution, as 0.03 mm"),
     "length and torque": ("t,x [mm],tau [N m]\n0,1,2\n", {}, "got a position in mm with a torque in N m"),
     "angle and force": ("t,phi [deg],F\n0,1,2\n", {}, "a position in deg with a force in N (no unit is given)"),
-    "angle without unit": ("t,phi,tau [N m]\n0,1,2\n", {}, "a position in m (no unit is given) with a torque in N m"),
+    "length without unit": ("t,weg,tau [N m]\n0,1,2\n", {}, "in m (no unit is given) with a torque in N m"),
+    "all at once": ("a,b,c\n0,1,2\n1,2,3\n", {}, "no column for time, position and force recognized in"),
+    "two of three": ("t,b,c\n0,1,2\n1,2,3\n", {}, "among 't', 'b', 'c'; give position 'COLUMN:unit', force"),
 }  # fmt: skip
 
 

@@ -28,7 +28,8 @@ def test_a_delay_in_periods_stays_in_periods():
 def test_the_repr_keeps_the_unit():
     timing = zwidth.Timing(rate="4 kHz", delay="1.5 periods")
     again = eval(repr(timing), {"Timing": zwidth.Timing})
-    assert again.in_periods and again.d == 1.5
+    assert again.in_periods
+    assert again.d == 1.5
     assert repr(SECONDS.timing) == "Timing(period=0.001, delay=0.001)"
 
 

@@ -1,5 +1,7 @@
 """The width and the kind of a run's figures, as a configuration and the command line ask for them."""
 
+import json
+
 import pytest
 from click.testing import CliRunner
 from matplotlib.text import Text
@@ -28,6 +30,22 @@ def test_figures_have_the_width_and_the_kind_that_are_asked_for(ending, tmp_path
         for name in drawn:
             with Image.open(tmp_path / "r" / name) as picture:
                 assert picture.width == int(85 / 25.4 * style.PNG_DPI)
+
+
+def test_the_resolution_is_that_of_the_configuration_or_of_the_command(tmp_path):
+    widths = []
+    for look, options in (({}, []), ({"dpi": 90}, []), ({}, ["--dpi", "360"]), ({"dpi": 90}, ["--dpi", "360"])):
+        file, out = tmp_path / "c.json", tmp_path / f"r{len(widths)}"
+        file.with_suffix(".yaml").write_text(json.dumps({**CONFIG, "figure": look}), encoding="utf-8")
+        done = CliRunner().invoke(cli, ["run", str(file.with_suffix(".yaml")), "--out", str(out), *options])
+        assert done.exit_code == 0, done.output
+        with Image.open(out / "best.png") as picture:
+            widths.append(picture.width / picture.info["dpi"][0])
+            assert round(picture.info["dpi"][0]) == (360 if options else look.get("dpi", 180))
+    assert widths == pytest.approx(widths[:1] * 4, rel=0.01)
+    done = CliRunner().invoke(cli, ["figures", str(tmp_path / "r0")])
+    assert "holds no sweep" in str(done.exception)
+    assert "--overwrite --size 85mm --dpi 300" in str(done.exception)
 
 
 def test_another_look_is_another_run(tmp_path):
@@ -61,6 +79,7 @@ def test_type_is_legible_at_that_width():
         ("{width: 85}", "figure.width: got 85 m; it must be at least 0.05"),
         ("{format: jpg}", "figure.format: got 'jpg'; allowed are 'png', 'svg', 'pdf'"),
         ("{size: 3}", "figure.size: unknown key"),
+        ("{dpi: 3}", "figure.dpi: got 3; it must be at least 10 and at most 2400"),
         ("wide", "figure: got 'wide'; the look of figures is a mapping"),
     ],
 )

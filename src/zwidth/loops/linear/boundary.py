@@ -83,10 +83,7 @@ class Boundary:
         limits = dict.fromkeys([0.0, np.pi, *poles.tolist()], (np.nan, np.nan))
         limits |= {line.w: (line.q - line.meeting * line.f, line.meeting) for line in lines}
         lossless = find_lossless(loop, w, here, limits[0.0][1])
-        if np.isfinite(lossless):
-            arcs = [level_arc(w, here, lossless)]
-        else:
-            arcs = cut_arcs(loop, w, here, turns, limits)
+        arcs = [level_arc(w, here, lossless)] if np.isfinite(lossless) else cut_arcs(loop, w, here, turns, limits)
         return cls(loop, w, tuple(arcs), tuple(lines), poles, limits, lossless)
 
     def are_lossless(self, beta: np.ndarray) -> np.ndarray:
