@@ -223,6 +223,7 @@ OTHERS = {
     "load_config": "a file: tests/unit/config/test_reader.py",
     "load_scene": "a file: tests/unit/cli/test_scene_file.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",
+    "reference_grasps": "one radius: tests/unit/scenes/test_recommendation.py",
     "respond": "one record: tests/unit/fitting/test_respond.py",
     "robust_max_stiffness": "boxes of devices: tests/unit/scenes/test_robust.py",
     "robust_wall": "boxes of devices: tests/unit/scenes/test_robust.py",

@@ -277,7 +277,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
         >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=30))
         >>> [limit.words for limit in zwidth.limits_of(scene)][:2]
-        ['half the delay', 'a velocity filter twice as fast']
+        ['twice the rate', 'half the delay']
     """
     return compute_gains(scene, _stiffness(scene), _stiffness)
 
