@@ -121,6 +121,30 @@ class TrueDevice:
         return float(found.stiffness) if found.status == 0 else 0.0
 
 
+def draw_hidden(seed: int) -> tuple[TrueDevice, np.ndarray, np.ndarray]:
+    """Return a device with an actuator lag, resonances or both, a force on it, and what a coarse encoder reads."""
+    rng = np.random.default_rng([52, seed])
+    mass = float(10 ** rng.uniform(-1.5, 0.0))
+    kind = ("amplifier", "one resonance", "amplifier and resonance", "two resonances")[rng.integers(4)]
+    count = {"amplifier": 0, "two resonances": 2}.get(kind, 1)
+    modes = tuple(
+        (
+            float(10 ** rng.uniform(1.5, 2.6)),
+            float(10 ** rng.uniform(np.log10(0.005), -1.0)),
+            float(mass * 10 ** rng.uniform(0.0, 1.5)) * (-1.0 if rng.random() < 0.3 else 1.0),
+        )
+        for _ in range(count)
+    )
+    lag = float(10 ** rng.uniform(-4.3, -3.0)) if "amplifier" in kind else 0.0
+    damping, delay = float(mass * 10 ** rng.uniform(0.0, 2.0)), float(rng.uniform(0.0, 3e-3))
+    encoder, limit = float(10 ** rng.uniform(-4.7, -3.3)), float(mass * 10 ** rng.uniform(0.5, 1.5))
+    true = TrueDevice(kind, mass, damping, lag, modes, delay, 1e-3, encoder, limit)
+    size, hold = int(rng.choice([800, 1500])), int(rng.integers(8, 60))
+    force = limit * np.repeat(rng.choice([-1.0, 1.0], -(-size // hold)), hold)[:size]
+    exact = true.play(force, read=False)
+    return true, force, encoder * np.round(exact / encoder + 0.2 * rng.standard_normal(size))
+
+
 MASS, DAMPING, DELAY, PERIOD, STRONGEST = 0.1, 1.0, 1.5e-3, 1e-3, 3.0
 
 

@@ -22,9 +22,10 @@ from zwidth.cli.options import (
     read_logs,
     save_figure,
     velocity_options,
+    verbose_option,
     warn_implausible,
 )
-from zwidth.pages.words import row, tell
+from zwidth.pages.words import LABEL, line, print_folded, print_json, row, tell
 from zwidth.parts.checks import find_kind
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
@@ -76,7 +77,9 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
 @figure_option
-@click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run`.")
+@click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
+@click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run` and the other commands.")
+@verbose_option
 @json_option
 def fit(
     logs: tuple[Path, ...],
@@ -85,22 +88,24 @@ def fit(
     noise: float | None,
     velocity: Any,
     figure: Path | None,
+    code: Any,
     as_yaml: bool,
+    verbose: bool,
     as_json: bool,
     **of_logs: Any,
 ) -> None:
-    """Find a device's mass, damping and delay.
+    """Find a device's mass, damping and delay, and the wall to set.
 
     With --buzz: from walls at which it began to buzz as K was raised, at two dampings or more, and the frequencies
     heard. With LOG.csv: from its free motion under a force that a computer commanded, friction included; several logs
     are of one device and have the same columns. Units stand in headers, as 'encoder [counts]', or behind a colon.
     """
-    from zwidth.fitting.words import describe_fit, list_units, write_scene
+    from zwidth.fitting.words import detail_fit, list_units, summarize_fit, write_scene
 
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
-    if as_json and as_yaml:
-        raise click.UsageError("give one of --json and --yaml")
+    if sum(map(bool, (as_json, as_yaml, code))) > 1:
+        raise click.UsageError("give one of --json, --yaml and --code: each has all of the output")
     points = ()
     if walls:
         for name, value in of_logs.items():
@@ -133,11 +138,18 @@ def fit(
 
         evidence: dict[str, Any] = gather_evidence(found, source, points)
         wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
-    if as_yaml:
-        click.echo("\n".join(write_scene(found, source)))
+    if as_yaml or code:
+        given = "\n".join(write_scene(found, source, period_given=period is not None)) + "\n"
+        click.echo(given if as_yaml else found.recommended.code(code), nl=False)
         return
-    lines = () if as_json else describe_fit(found, source)
-    tell({**found.as_dict(), "units": list_units(found)}, [*(row(*each) for each in lines), *wrote], as_json)
+    if as_json:
+        print_json({**found.as_dict(), "units": list_units(found)})
+        return
+    details = [("", ""), *detail_fit(found, source)] if verbose else []
+    lines = [line(*each).rstrip() for each in (*summarize_fit(found), *details)]
+    more = "the rest: --verbose; a scene for the other commands: --yaml"
+    more += "; a program for the loop: --code c" if found.recommended.status == Status.OK else ""
+    print_folded([*lines, *wrote, line("more", more)], LABEL)
 
 
 _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)

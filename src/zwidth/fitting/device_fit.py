@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ from zwidth.fitting.device_estimate import RELIABILITY, UPPER, DeviceEstimate, f
 from zwidth.fitting.hidden import HiddenLag, HiddenResonances
 from zwidth.fitting.safe_scene import limit_walls, round_scene
 from zwidth.fitting.safe_wall import SafeWall, find_safe_wall
+from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import to_json, with_unit
@@ -184,6 +185,11 @@ class DeviceFit(DeviceEstimate):
         return replace(round_scene(self), safe_limit=limit_walls(self))
 
     @cached_property
+    def recommended(self) -> Recommendation:
+        """The wall to set: `zwidth.Scene.recommend` of ``scene``, with its default margins."""
+        return self.scene.recommend()
+
+    @cached_property
     def virtual_damping(self) -> float:
         """B in N s/m of the stiffest stable wall; NaN where ``stiffness_max`` is."""
         return float(self.nominal.max_stiffness().virtual_damping) if self.stiffness_max > 0 else np.nan
@@ -319,9 +325,22 @@ class DeviceFit(DeviceEstimate):
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),
             "safe_wall": self.safe_wall()._asdict(),
+            "safe_limit": asdict(self.scene.safe_limit) if self.scene.safe_limit else None,
+            "recommended": self._spell_recommended(),
             "lag": None if self.lag is None else self.lag._asdict(),
         }
         return to_json(numbers)
+
+    def _spell_recommended(self) -> dict[str, Any]:
+        """Return the wall to set as plain numbers."""
+        found = self.recommended
+        margins = ("gain_margin", "phase_margin", "delay_margin")
+        return {
+            **{name: getattr(found, name) for name in ("stiffness", "virtual_damping", "limited_by", "reason")},
+            **{name: getattr(found.verdict, name, None) for name in margins},
+            "status": int(found.status),
+            "cautions": list(found.cautions),
+        }
 
 
 def doubt_period(period: float) -> list[str]:

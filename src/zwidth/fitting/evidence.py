@@ -10,10 +10,11 @@ import numpy as np
 from zwidth.fitting.buzz import BuzzPoint
 from zwidth.fitting.device_estimate import reach_of
 from zwidth.fitting.device_fit import DeviceFit
-from zwidth.fitting.words import choose_wall, unit_of
+from zwidth.fitting.words import unit_of
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import header
 from zwidth.words.rotation import in_own_units
+from zwidth.words.status import Status
 
 # Devices drawn around the estimate, dampings of the boundary, and how far beyond its end.
 _DRAWS, _ROWS, _BEYOND = 1000, 121, 1.1
@@ -91,9 +92,9 @@ def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.
 def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str, np.ndarray]:
     """The stiffest wall, the one to set, and walls that buzzed: errors, frequencies, and distances from the fit."""
     # Distances are in units of the noise, stiffness and frequency apart.
-    top, choice, lost = fit.nominal.max_stiffness(), choose_wall(fit), (np.nan,) * 4
+    top, choice, lost = fit.nominal.max_stiffness(), fit.recommended, (np.nan,) * 4
     rows: list[tuple[Any, ...]] = [("stiffest", float(top.stiffness), float(top.virtual_damping), *lost)]
-    rows += [] if choice is None else [("set", choice.stiffness, choice.virtual_damping, *lost)]
+    rows += [] if choice.status != Status.OK else [("set", choice.stiffness, choice.virtual_damping, *lost)]
     share = fit.noise[0] if isinstance(fit.noise, tuple) else np.nan
     for each, rest in zip(points, fit.residuals if points else (), strict=True):
         rows.append(("buzzing", each.stiffness, each.virtual_damping, share * each.stiffness, each.frequency, *rest))

@@ -60,13 +60,16 @@ def name_trouble(fit: DeviceFit) -> str:
     return "" if status == Status.OK else _TROUBLES.get(status, status.message)
 
 
-def limit_walls(fit: DeviceFit) -> SafeLimit:
-    """Return the limit of the walls that a fit supports, `DeviceFit.safe_wall`, with its reason and the warnings."""
+def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
+    """Return the limit of the walls that a fit supports, with its reason and the warnings of the fit.
+
+    ``rigid`` assumes that the device has no other resonances, as in `DeviceFit.safe_wall`.
+    """
     with use_kind(bool(fit.nominal.device.rotary)):
         if fit.is_doubted:
             trouble = name_trouble(fit)
             return SafeLimit(0.0, reason=trouble or "resolve the warnings first", warnings=fit.doubts)
-        wall = fit.safe_wall()
+        wall = fit.safe_wall(rigid=rigid)
         if wall.status != Status.OK or not wall.stiffness > 0:
             return SafeLimit(0.0, reason="the records leave the device too uncertain for any wall; record longer")
         stiffness = round_safely(wall.stiffness, "below", LIMIT_DIGITS)

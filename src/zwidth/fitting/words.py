@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
-from zwidth.fitting.device_fit import SEE_MORE, DeviceFit, RivalDevice
-from zwidth.fitting.safe_wall import bears_resonances
+from zwidth.fitting.device_fit import DeviceFit, RivalDevice
+from zwidth.fitting.safe_scene import advise_record, limit_walls, name_trouble, round_number, round_period
 from zwidth.parts.paths import spell_estimate
-from zwidth.words.formatting import name_wall, plain, with_unit
-from zwidth.words.quantities import FIELDS, RECOMMENDED_SHARE
+from zwidth.scenes.recommendation import Recommendation
+from zwidth.words.formatting import plain, with_unit
+from zwidth.words.quantities import FIELDS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 from zwidth.words.status import Status
+
+NEAR_ROUNDING = 1.1  # residuals over those of an encoder's rounding that count as equal
 
 SYMBOLS = {
     "mass": "m",
@@ -26,15 +29,6 @@ SYMBOLS = {
 # SI units of a linear device by the last part of a path: of parameters, and of what a fit has beside them.
 _UNITS = {path.rpartition(".")[2]: known.unit.removeprefix("1") for path, known in FIELDS.items()}
 _UNITS |= {"stiffness_max": "N/m", "friction": "N", "offset": "N", "force": "N", "position": "m"}
-# What a status says of a fit; the doubts say more.
-_TROUBLES = {
-    Status.NOT_CONVERGED: "the search ended before its aim",
-    Status.NO_BOUNDARY: "the walls do not lie on the edge of any device's stable set",
-    Status.UNDECIDED: "another device fits as well",
-    Status.UNREACHABLE: "the delay ends the range looked in",
-}
-_TRY_MORE = "try walls of more damping"
-NO_WALL = "under a doubt no safe wall is given, and none to set; do what it says, and record again"
 
 
 def unit_of(name: str) -> str:
@@ -53,94 +47,135 @@ def spell(name: str, value: float, digits: int = 4) -> str:
     return with_unit(value, _UNITS.get(name.rpartition(".")[2], ""), digits)
 
 
-class WallChoice(NamedTuple):
-    """A wall to set on a fitted device: N/m, N s/m, and why this one."""
+@in_own_units
+def summarize_fit(fit: DeviceFit) -> list[tuple[str, str]]:
+    """Return the answer of a fit as labels and texts: the wall to set with its reason, then the device."""
+    found = fit.recommended
+    rows = [("NO WALL", found.reason)]
+    if fit.is_doubted:
+        rows = [("NO WALL", "resolve the warnings first, then record again")]
+    elif found.status == Status.OK:
+        limit = found.scene.safe_limit
+        cause = limit.reason.partition("; ")[0] if limit is not None and found.is_held_back else ""
+        rows = [("SET", found.spell_wall()), ("", ": ".join(filter(None, (found.spell_requirement(), cause))))]
+    rows += [("", ""), *_describe_device(fit)]
+    known = math.isfinite(fit.stiffness_max)
+    rows.append(("K_max", _spell_estimate(fit, "stiffness_max") if known else "open: see the warnings"))
+    rows.append(("fit", _describe_residuals(fit)))
+    if found.status == Status.OK:
+        rows.append(("margins", f"{found.spell_margins()}; passive: {found.spell_passive()}"))
+        rows += [("CAUTION", caution) for caution in found.cautions]
+    trouble = [f"{Status(fit.status).name}: {name_trouble(fit)}"] if fit.status != Status.OK else []
+    rows += [("WARNING", text) for text in (*trouble, *fit.doubts)] or [("warnings", "none")]
+    rows += [("note", note) for note in fit.notes]
+    if fit.next is not None:
+        rows.append(("next", _describe_next(fit)))
+    elif found.status == Status.OK and found.is_held_back and fit.motions:
+        rigid = _assume_rigid(fit)
+        gain = "" if rigid is None else f" (up to {spell('stiffness', rigid.stiffness)} if nothing is hidden)"
+        rows.append(("next", f"for a stiffer wall{gain} {advise_record(fit)}"))
+    return rows
 
-    stiffness: float
-    virtual_damping: float
-    why: str
 
-
-def choose_wall(fit: DeviceFit, rigid: bool = False) -> WallChoice | None:
-    """What the study ``recommend`` sets, or what `DeviceFit.safe_wall` leaves; None without one, as under a doubt."""
-    safe = fit.safe_wall(rigid=rigid)
-    if safe.status != Status.OK or not safe.stiffness > 0:
+def _assume_rigid(fit: DeviceFit) -> Recommendation | None:
+    """Return the wall to set if the device has no further parts; None if it is the same wall, or none exists."""
+    limit = limit_walls(fit, rigid=True)
+    if limit == fit.scene.safe_limit:
         return None
-    usual = RECOMMENDED_SHARE * fit.stiffness_max, fit.virtual_damping
-    share = f"{100 * RECOMMENDED_SHARE:g} % of K_max"
-    if usual[0] <= safe.stiffness and fit.scene.is_stable(*usual) and (rigid or bears_resonances(fit, *usual)):
-        return WallChoice(*usual, share)
-    if math.isnan(safe.resonance):
-        why = "what 99 % of the devices bear, less than usual"
-        if usual[0] <= safe.stiffness:
-            why = f"{share}, at {'a safer B' if rigid or fit.damping_tried is None else 'the largest B tried'}"
-        return WallChoice(min(usual[0], safe.stiffness), safe.virtual_damping, why)
-    share = f"{100 * RECOMMENDED_SHARE:g} % of the safe wall"
-    return WallChoice(RECOMMENDED_SHARE * safe.stiffness, safe.virtual_damping, share)
+    found = replace(fit.scene, safe_limit=limit).recommend()
+    return found if found.status == Status.OK else None
+
+
+def _describe_device(fit: DeviceFit) -> list[tuple[str, str]]:
+    """Return the rows of the fitted parameters with their intervals."""
+    symbols = SYMBOLS | ({"mass": "J"} if is_rotary() else {}) | {"delay": "delay"}
+    texts = [
+        f"{symbols[name]}{' = ' if name != 'delay' else ' '}{_spell_estimate(fit, name)}" for name in fit.numbers[:3]
+    ]
+    if "friction" in fit.errors:
+        certain = math.isfinite(fit.errors["friction"])
+        friction = f"friction {_spell_estimate(fit, 'friction')}" if fit.friction else "no friction"
+        texts.append(friction if certain else "friction open")
+    rows = [("device", ", ".join(texts))]
+    for name in fit.numbers[3:]:
+        *owner, last = name.split(".")
+        label = "actuator" if owner[0] == "actuator" else "resonance"
+        text = f"{last.replace('_', ' ')} {_spell_estimate(fit, name)}"
+        # All parameters of one part share a line.
+        new = rows[-1][0] != label or last == "frequency"
+        rows = [*rows, (label, text)] if new else [*rows[:-1], (label, f"{rows[-1][1]}, {text}")]
+    return rows
+
+
+def _spell_estimate(fit: DeviceFit, name: str) -> str:
+    """Return a value with its 95 % interval."""
+    if not math.isfinite(fit.value_of(name)):
+        return "open"
+    interval = fit.intervals[name]
+    if not math.isfinite(sum(interval)):
+        return f"{_spell(fit, name)} (uncertain)"
+    value = _spell(fit, name)
+    low, high = (spell(name, end, _count_digits(fit, name)) for end in interval)
+    unit = f" {high.partition(' ')[2]}"
+    low, high = low.removesuffix(unit), high.removesuffix(unit) if value.endswith(unit) else high
+    return f"{value} (95 %: {low} to {high})"
+
+
+def _describe_residuals(fit: DeviceFit) -> str:
+    """Return the size of the residuals and their cause."""
+    if isinstance(fit.noise, tuple):
+        return f"noise of K and f {' and '.join(f'{plain(100 * share, 2)} %' for share in fit.noise)}"
+    size = f"residuals of {spell('position', fit.noise, 3)}"
+    if not fit.resolution:
+        return size
+    expected = fit.noise < NEAR_ROUNDING * fit.resolution / math.sqrt(12.0)
+    return f"{size}, {'as expected of' if expected else 'with'} an encoder of {spell('position', fit.resolution, 3)}"
+
+
+def _describe_next(fit: DeviceFit) -> str:
+    """Return the next experiment with walls, and the standard error of K_max after it."""
+    step = fit.next
+    assert step is not None, "only walls name a next experiment"
+    B, K = spell("damping", step.virtual_damping, 3), spell("stiffness", step.stiffness, 3)
+    text = f"raise K at B = {B}, to about {K} and {with_unit(step.frequency, 'Hz', 3)}"
+    if math.isfinite(fit.stiffness_error + step.error_afterwards):
+        errors = [spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards)]
+        text += f": the standard error of K_max falls from {' to '.join(errors)}"
+    return text
 
 
 @in_own_units
-def describe_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
-    """Each line's label and its text, what is wrong first."""
-    rows = []
-    if fit.status != Status.OK:
-        rows.append((Status(fit.status).name, f"do not rely on these numbers: {name_trouble(fit)}"))
-    rows.append(("fitted to", source))
+def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
+    """Return the labels and texts that `summarize_fit` leaves out."""
+    rows = [("fitted to", source)]
     count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
     gaps = sum(int(np.count_nonzero(np.diff(motion.time) > 1.5 * fit.period)) for motion in fit.motions)
     if gaps:
-        behind = "a gap" if gaps == 1 else f"each of {gaps} gaps"
-        rows.append(("of it", f"{count:,} of {total:,} samples: behind {behind} the first are past force alone"))
+        where = "a gap" if gaps == 1 else f"each of {gaps} gaps"
+        rows.append(("of it", f"{count:,} of {total:,} samples: after {where} the first ones depend on unknown forces"))
     elif any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
         rows.append(("of it", f"{count:,} of {total:,} samples, the first ones; more would only narrow the errors"))
-    for name in (*fit.numbers, "stiffness_max"):
-        symbol = "J" if name == "mass" and is_rotary() else SYMBOLS.get(name) or _name_part(name, len(fit.modes))
-        known = math.isfinite(fit.value_of(name))
-        rows.append((symbol, f"{_spell(fit, name)} ({_between(fit, name)})" if known else "open"))
     if math.isfinite(fit.virtual_damping):
         B, error = (spell("damping", value) for value in (fit.virtual_damping, fit.virtual_damping_error))
-        rows.append(("at B", f"{B} (standard error {error})"))
-    for name, label in (("friction", "friction"), ("offset", "constant force")):
-        if name in fit.errors:
-            known = math.isfinite(fit.errors[name])
-            bar = _between(fit, name) if known else "open: this log does not tell friction from a constant force"
-            rows.append((label, f"{_spell(fit, name)} ({bar})"))
-    if isinstance(fit.noise, tuple):
-        rows.append(("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in fit.noise)))
-    else:
-        rows.append(("position noise", spell("position", fit.noise, 3)))
-        if fit.resolution:
-            rows.append(("step of the encoder", spell("position", fit.resolution, 3)))
+        rows.append(("at K_max", f"B = {B} (standard error {error})"))
+    for name in ("friction", "offset"):
+        if name in fit.errors and not math.isfinite(fit.errors[name]):
+            rows.append(
+                (name, f"{_spell(fit, name)}, uncertain: this log does not separate friction and constant force")
+            )
+        elif name == "offset" and name in fit.errors:
+            rows.append((name, f"{_spell_estimate(fit, name)}, a constant force"))
     rows += [("or as well", spell_rival(rival)) for rival in fit.rivals]
     if fit.lag is not None:
         names = ("time_constant", "delay", "stiffness_max")
         lag, delay, K = (spell(name, value, 3) for name, value in zip(names, fit.lag, strict=True))
-        rows.append(("or as well", f"an amplifier's lag of up to {lag}, with t_d = {delay} and K_max = {K}"))
-    safe, wall = fit.safe_wall(), choose_wall(fit)
-    if safe.status == Status.OK and safe.stiffness > 0:
-        borne = "stable on 99 % of the devices that these records allow"
-        rows.append(("safe wall", f"{name_wall(*safe[:2])}: {borne}"))
-    if fit.is_doubted:
-        rows.append(("no wall", NO_WALL))
-    if wall is not None:
-        rows.append(("set", f"{name_wall(*wall[:2])}: {wall.why}"))
-    rows += [("doubt", doubt) for doubt in fit.doubts]
-    rows += [("note", note) for note in fit.notes]
-    if not fit.is_doubted and (rigid := choose_wall(fit, rigid=True)) not in (None, wall):
-        at = "" if math.isnan(safe.resonance) else f" near {with_unit(safe.resonance, 'Hz', 3)}"
-        hidden = f"a resonance{at} may make stiffer walls unstable, K_max too, and not show in this log: {SEE_MORE}"
-        if fit.damping_tried is not None:
-            hidden = f"a resonance may make other walls unstable, K_max too, and not show in these: {_TRY_MORE}"
-        alone = "if nothing hides" if fit.is_structured else "if it is rigid"
-        rows += [("not seen", hidden), (alone, f"{name_wall(*rigid[:2])}: {rigid.why}")]
-    if fit.next is not None:
-        step = fit.next
-        B, K = spell("damping", step.virtual_damping, 3), spell("stiffness", step.stiffness, 3)
-        errors = [spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards)]
-        text = f"K at B = {B}, near {K} and {with_unit(step.frequency, 'Hz', 3)}"
-        if math.isfinite(fit.stiffness_error + step.error_afterwards):
-            text += f": K_max's standard error falls from {' to '.join(errors)}"
-        rows.append(("measure next", text))
+        rows.append(("or as well", f"an actuator lag of up to {lag}, with a delay of {delay} and K_max = {K}"))
+    if fit.is_doubted or fit.scene.safe_limit is None:
+        return rows
+    rows.append(("safe limit", fit.scene.safe_limit.describe()))
+    if (wall := _assume_rigid(fit)) is not None:
+        kind = "no further parts" if fit.is_structured else "a rigid device"
+        rows.append(("assuming", f"{kind}: {wall.spell_wall()}; {wall.spell_requirement()}"))
     return rows
 
 
@@ -152,14 +187,6 @@ def _name_part(name: str, count: int) -> str:
     if number == "frequency":
         return f"resonance {int(place[0]) + 1}" if count > 1 else "resonance"
     return f"  its {number.replace('_', ' ')}"
-
-
-def name_trouble(fit: DeviceFit) -> str:
-    """What the status of a fit says, "" where it is OK."""
-    status = Status(fit.status)
-    if status == Status.UNDECIDED and not fit.rivals:
-        return "what the fit leaves is no noise"
-    return "" if status == Status.OK else _TROUBLES.get(status, status.message)
 
 
 def spell_rival(rival: RivalDevice) -> str:
@@ -188,32 +215,42 @@ def _count_digits(fit: DeviceFit, name: str) -> int:
     return min(max(4, 2 + math.ceil(math.log10(known))), 9) if known > 0 and math.isfinite(known) else 4
 
 
-def _write(fit: DeviceFit, name: str) -> str:
-    """A value to a thousandth of its standard error: further digits differ from machine to machine."""
-    value, error = fit.value_of(name), fit.errors[name]
-    if not (error > 0 and value):
-        return repr(float(f"{value:.12g}"))
-    digits = 4 + math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
-    return repr(float(f"{value:.{min(max(digits, 4), 12)}g}"))
+def _write_number(fit: DeviceFit, name: str) -> str:
+    """Return a parameter of the scene as a line of YAML."""
+    return f"{name.rpartition('.')[2]}: {round_number(fit, name)!r} {unit_of(name)}".rstrip()
 
 
 def _write_part(fit: DeviceFit, name: str) -> str:
-    """A number of a section of the scene."""
-    text = f"{name.rpartition('.')[2]}: {_write(fit, name)} {unit_of(name)}".rstrip()
-    return f"{text} # fitted, {_between(fit, name)}"
+    """Return a parameter of the scene as a line of YAML, with its interval as a comment."""
+    return f"{_write_number(fit, name)} # fitted, {_between(fit, name)}"
+
+
+def _write_limit(fit: DeviceFit) -> list[str]:
+    """Return the safe limit as lines of YAML."""
+    limit = fit.scene.safe_limit
+    assert limit is not None, "a fit has one"
+    lines = [
+        "  # Of this loop. Measure again after a change of the device, its timing or its velocity estimate.",
+        "  safe_limit:",
+        f"    stiffness: {float(limit.stiffness)!r} {unit_of('stiffness')}",
+        f"    virtual_damping: {float(limit.virtual_damping)!r} {unit_of('damping')}",
+        f"    reason: {json.dumps(limit.reason, ensure_ascii=False)}",
+    ]
+    warnings = [f"      - {json.dumps(text, ensure_ascii=False)}" for text in limit.warnings]
+    return lines + (["    warnings:", *warnings] if warnings else [])
 
 
 @in_own_units
-def write_scene(fit: DeviceFit, source: str) -> list[str]:
-    """A configuration for `zwidth run` in which every number says where it is from."""
-    lines = [f"# Fitted to {source}: {_between(fit, 'stiffness_max')} for K_max."]
-    if fit.status != Status.OK:
-        lines.append(f"# {Status(fit.status).name}: do not rely on these numbers: {name_trouble(fit)}.")
-    lines += [f"# Doubt: {doubt}" for doubt in fit.doubts]
-    lines += [f"# Note: {note}" for note in fit.notes]
-    lines += ["version: 1", "name: fitted_device", "scene:"]
-    lines += [f"  {_write_part(fit, key)}" for key in fit.numbers[:3]]
-    lines.append(f"  period: {fit.period!r} s # as given")
+def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> list[str]:
+    """Return a configuration for `zwidth run`: the fitted device with the origin of every value, and its safe limit."""
+    origin = "as given" if period_given or not fit.motions else "from the times of the log"
+    lines = [
+        f"# Fitted to {source}: {_between(fit, 'stiffness_max')} for K_max.",
+        *(f"# Note: {note}" for note in fit.notes),
+        *("version: 1", "name: fitted_device", "scene:"),
+        *(f"  {_write_part(fit, key)}" for key in fit.numbers[:3]),
+        f"  period: {round_period(fit)!r} s # {origin}",
+    ]
     if fit.actuator is not None:
         lines += ["  actuator:", f"    order: {fit.actuator.order} # fitted"]
         lines += [f"    {_write_part(fit, name)}" for name in fit.numbers if name.startswith("actuator")]
@@ -224,19 +261,10 @@ def write_scene(fit: DeviceFit, source: str) -> list[str]:
     for key, section in spell_estimate(fit.velocity, every=True).items():
         inside = ", ".join(f"{name}: {json.dumps(value).strip(chr(34))}" for name, value in section.items())
         lines.append(f"  {key}: {{{inside}}} # as given")
-    if fit.is_doubted:
-        lines += [f"studies: [] # {NO_WALL}"]
-    else:
-        safe = fit.safe_wall()
-        if not math.isnan(safe.resonance):
-            alone = "these parts alone" if fit.is_structured else "a rigid device"
-            lines += [
-                f"# As of {alone}. A resonance that the log does not show may make walls unstable,",
-                f"# if they are stiffer than {name_wall(*safe[:2])}: {SEE_MORE}.",
-            ]
-        lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
+    lines += _write_limit(fit)
+    lines += ["studies:", "  - kind: recommend # the wall to set on this device", "    name: recommended"]
     if fit.friction and math.isfinite(fit.errors["friction"]):
-        friction = f"{_write(fit, 'friction')} {unit_of('friction')}, {_between(fit, 'friction')}"
+        friction = f"{round_number(fit, 'friction')!r} {unit_of('friction')}, {_between(fit, 'friction')}"
         lines.append(f"# For studies of kind simulate: coulomb: {friction}.")
     if fit.resolution:
         resolution = float(f"{fit.resolution:.12g}")

@@ -104,9 +104,10 @@ class Recommendation:
     def steps(self) -> list[Limit]:
         """The improvements of `zwidth.limits_of` that allow a stiffer wall under the same requirements, the best first.
 
-        Their stiffness is that of the wall recommended for the improved device, right to some 0.2 %.
+        Their stiffness is that of the wall recommended for the improved device, right to some 0.2 %. Within a safe
+        limit that allows no better wall, only a new measurement allows a stiffer one: the list is empty.
         """
-        if self.status != Status.OK:
+        if self.status != Status.OK or self.is_held_back:
             return []
         found = compute_gains(self.scene.replace(wall=NoWall()), self.stiffness, self._choose_again)
         return [step for step in found if step.gain > 1.0]
@@ -172,17 +173,20 @@ class Recommendation:
         """Return the share of K_max and the requirement that allows no stiffer wall, in words."""
         largest = float(self.stiffest.stiffness)
         share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {spell_stiffness(largest)}"
-        if self.limited_by == "stiffness_fraction":
-            return share
-        within = " within the safe limit" if self.limited_by != "safe_limit" and self._is_clipped else ""
-        return f"{share}; limited by {self.wanted.spell(self.limited_by)}{within}"
+        return share if self.limited_by == "stiffness_fraction" else f"{share}; {self.spell_requirement()}"
+
+    def spell_requirement(self) -> str:
+        """Return the requirement that allows no stiffer wall, in words."""
+        within = " within the safe limit" if self.limited_by != "safe_limit" and self.is_held_back else ""
+        return f"limited by {self.wanted.spell(self.limited_by)}{within}"
 
     @property
-    def _is_clipped(self) -> bool:
-        """True if the virtual damping lies at an end of the safe limit."""
+    def is_held_back(self) -> bool:
+        """True if the safe limit allows no better wall: the stiffness is at the limit, or the virtual damping."""
         limit = None if self.wanted.beyond_safe else self.scene.safe_limit
         ends = None if limit is None else limit.dampings(self.stiffness)
-        return ends is not None and any(math.isclose(self.virtual_damping, end, rel_tol=1e-3) for end in ends)
+        at_end = ends is not None and any(math.isclose(self.virtual_damping, end, rel_tol=1e-3) for end in ends)
+        return at_end or self.limited_by == "safe_limit"
 
     def spell_margins(self) -> str:
         """Return the margins of the wall in words, rounded to the safe side."""
@@ -245,7 +249,8 @@ class Recommendation:
 
 def _describe_limit(limit: SafeLimit | None, ignored: bool) -> list[str]:
     """Return the notes on a safe limit: the limit with its reason, and its warnings."""
-    if limit is None:
+    if limit is None or (limit.forbids_all and not ignored):
+        # A limit that forbids all walls is the reason of the recommendation.
         return []
     return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe()}", *limit.warnings]
 

@@ -23,7 +23,7 @@ from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.evidence import gather_evidence
-from zwidth.fitting.words import describe_fit, unit_of, write_scene
+from zwidth.fitting.words import detail_fit, summarize_fit, unit_of, write_scene
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
 from zwidth.words.errors import InputError
@@ -206,19 +206,13 @@ class FitStudy(ComputedStudy):
         documents = {f"{self.name}_{name}.csv": csv_text(table) for name, table in evidence.items()}
         for each in fits:
             middle = f"_{each.name}" if len(fits) > 1 else ""
-            text = "\n".join(write_scene(each.fit, each.source))
+            text = "\n".join(write_scene(each.fit, each.source, period_given=self.period is not None))
             documents[f"{self.name}{middle}_scene.yaml"] = text + "\n"
         answers, notes = [], []
         for each in fits:
-            rows = describe_fit(each.fit, each.source)
-            said = dict(rows)
-            trouble = [f"{label}: {text}" for label, text in rows[:1] if each.fit.status != Status.OK]
-            labels = [label for label in _DEVICE if label in said and (label != "friction" or each.fit.friction)]
-            device = ", ".join(f"{label} = {said[label].partition(' (')[0]}" for label in labels)
-            answers += [*trouble, f"{device}, fitted to {each.source}", f"K_max = {said['K_max']}"]
-            answers += [f"set {said['set']}"] if "set" in said else []
-            answers += [said["no wall"]] if "no wall" in said else []
-            notes += [f"{each.source}: {label}: {text}" for label, text in rows if label not in _LABELS]
+            rows = [f"{label}: {text}" if label else text for label, text in summarize_fit(each.fit) if text]
+            answers += [f"fitted to {each.source}", *rows]
+            notes += [f"{each.source}: {label}: {text}" for label, text in detail_fit(each.fit, each.source)[1:]]
         answers += [_compare(fits[0].fit, fits[1].fit)] if len(fits) > 1 else []
         step = next((each.fit.resolution for each in fits if each.fit.motions), 0.0)
         draw = partial(figures.draw_device_fit, **evidence, step=step)
@@ -246,11 +240,6 @@ class FitStudy(ComputedStudy):
             found = fit_buzz(walls, period=period, velocity=velocity, noise=self.noise)
             fits.append(_Fitted("buzz", f"{len(walls)} buzzing walls", found, walls))
         return fits
-
-
-# Labels of what a device is, and of all that is told in answers.
-_DEVICE = ("m", "J", "b", "t_d", "friction")
-_LABELS = ("m", "J", "b", "t_d", "K_max", "set", "no wall", "fitted to")
 
 
 @in_own_units
