@@ -76,6 +76,8 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
     if as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
         unstable = verdict.stable is False and not verdict.marginal
+        if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
+            result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
         lines = check_lines(scene, verdict, limits, silent=find_silent(), verbose=verbose)

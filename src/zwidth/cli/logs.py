@@ -138,9 +138,11 @@ def fit(
 
         evidence: dict[str, Any] = gather_evidence(found, source, points)
         wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
-    if as_yaml or code:
-        given = "\n".join(write_scene(found, source, period_given=period is not None)) + "\n"
-        click.echo(given if as_yaml else found.recommended.code(code), nl=False)
+    if code:
+        click.echo(found.recommended.code(code), nl=False)
+        return
+    if as_yaml:
+        click.echo("\n".join(write_scene(found, source, period_given=period is not None)))
         return
     if as_json:
         print_json({**found.as_dict(), "units": list_units(found)})

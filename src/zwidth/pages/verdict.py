@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 ROUNDED = 1e-12  # a smaller share of the dampings is their rounding error
 NOTEWORTHY = 1.005  # gains below this are left to --verbose
 LONG = 20  # characters of a heading that has a line of its own
+MARGINAL_DAMPER = "a pure damper: marginal only because no stiffness returns the free position (a pole at z = 1)"
+MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
@@ -67,8 +69,11 @@ def check_lines(
         device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
     lines = [line(word, wall_words), line("device", device_words)]
     lines += part_lines(scene)
+    # A measured response has no poles.
+    damper = wall.stiffness == 0 and not isnan(verdict.frequency)
+    dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
-        lines.append(line("", "a pole at z = 1: without stiffness no force pulls back"))
+        lines.append(line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
     lines.append("")
     if word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no change of a single parameter is known"]
@@ -76,7 +81,7 @@ def check_lines(
     lines += margin_lines(verdict)
     lines += decay_lines(verdict)
     if word != "UNSTABLE" or verbose:
-        lines.append(line("room", _spell_room(verdict)))
+        lines.append(line("room", _spell_room(verdict, dampings)))
     lines.append(line("passive", spell_passivity(scene, verdict)))
     lines += _list_maximum(scene, verdict, verbose)
     return lines + gain_lines("To gain K_max:", limits or (), verbose)
@@ -88,9 +93,9 @@ def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | Non
     return "\n".join(fold(lines))
 
 
-def _spell_room(verdict: Assessment) -> str:
+def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
     """Return the stable intervals of K and of B next to the wall."""
-    rooms = (("K", verdict.stable_stiffness, "N/m", "B"), ("B", verdict.stable_damping, "N s/m", "K"))
+    rooms = (("K", verdict.stable_stiffness, "N/m", "B"), ("B", dampings, "N s/m", "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
 
 
@@ -197,7 +202,11 @@ def recommend_lines(
         return [line("NO WALL", found.reason), device, *part_lines(scene)]
     margins = [line("margins", found.spell_margins())]
     if verbose:
-        margins = [*margin_lines(verdict), *decay_lines(verdict), line("room", _spell_room(verdict))]
+        margins = [
+            *margin_lines(verdict),
+            *decay_lines(verdict),
+            line("room", _spell_room(verdict, verdict.stable_damping)),
+        ]
     lines = [
         line("SET", f"{found.spell_wall()}; {found.spell_limit()}"),
         device,

@@ -197,6 +197,24 @@ class SceneAnswers(SceneParts):
         alpha, _ = one_wall(*self.normalize_walls(stiffness, 0.0))
         return self.loop.column(alpha) * self.units.virtual_damping
 
+    def damper_range(self) -> np.ndarray:
+        """Return the intervals of the virtual damping B of a pure damper, K = 0.
+
+        Without stiffness nothing pulls the position of a free device back: a pole stays at z = 1, so that `is_stable`
+        is False for every B. In these intervals all other poles lie inside the unit circle. A device with a spring to
+        ground has no such pole: then these are the intervals of `stable_damping` at K = 0.
+
+        Returns:
+            Array (n, 2) in N s/m. The ends do not belong to the intervals.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> print("{:.2f} to {:.2f} N s/m".format(*scene.damper_range()[0]))
+            -10.00 to 90.48 N s/m
+        """
+        return self.loop.dampers() * self.units.virtual_damping
+
     def decide_stability(
         self, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
     ) -> Stability:

@@ -12,6 +12,7 @@ import numpy as np
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.checks import Span
 from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
+from zwidth.scenes.answers import allows_negative
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
@@ -53,7 +54,7 @@ class Assessment:
     delta: float  # the damping to ground of that mass in the same units
     d: float  # the delay in periods
     stable: bool | None  # every pole lies strictly inside the unit circle; None: a measured response leaves it open
-    marginal: bool  # not stable for one pole at z = 1 alone: without stiffness nothing pulls back
+    marginal: bool  # poles on the circle, none outside: one at z = 1 (K = 0), or all of a sampled plant without damping
     spectral_radius: float  # the largest pole magnitude, 1 to rounding where the decay is very slow
     decay_rate: float  # of the slowest motion, in 1/s, with relative accuracy; negative for a growing one
     stable_stiffness: Intervals  # every stable interval of K at this B, in N/m
@@ -292,8 +293,12 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
 
 @in_own_units
 def describe_islands(scene: SceneOptima) -> list[str]:
-    """A line for each island: stable walls that K_max does not count."""
+    """Return a line for each island, and one if the device is unstable by itself."""
     lines = []
+    least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
+    if least is not None:
+        softest = with_unit(round_safely(least * scene.units.stiffness, "above"), "N/m")
+        lines.append(f"the device is unstable by itself: no wall softer than K = {softest} is stable")
     for island in scene.islands():
         units = {"K": (island.stiffness, "N/m"), "B": (island.virtual_damping, "N s/m")}
         ends = (f"{name} from {' to '.join(tell_apart(*ends, u))}" for name, (ends, u) in units.items())

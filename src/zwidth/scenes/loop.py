@@ -48,11 +48,15 @@ from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array, DelayModel
 from zwidth.words.xp import is_jax, is_traced, namespace, nan_beyond
 
+# Logarithm of the largest pole magnitude of a lossless loop below which all poles are on the circle but for rounding:
+# 1e-16^(1/2), as of two poles that meet there.
+_ON_CIRCLE = 1e-7
+
 
 class SlowestMotion(NamedTuple):
     """The slowest motion of a loop with one wall."""
 
-    marginal: bool  # not stable for one pole at z = 1 alone
+    marginal: bool  # poles on the unit circle, none outside: one at z = 1, or all of a plant without damping
     radius: float  # the spectral radius
     rate: float  # -log(radius) per period, with relative accuracy
     angle: float  # of the slowest pole, per period
@@ -156,6 +160,8 @@ class LinearLoop:
         zeta = poles_less_one(self.roots, *wall)[0]
         slowest = zeta[np.argmax(log_size(zeta))]
         turn = abs(np.arctan2(slowest.imag, 1.0 + slowest.real))
+        if self.boundary.are_lossless(wall[1])[0] and log_size(slowest) <= _ON_CIRCLE:
+            return SlowestMotion(True, 1.0, 0.0, float(turn))
         return SlowestMotion(False, float(self.radius(*wall)[0]), -float(log_size(slowest)), float(turn))
 
     def row(self, beta: np.ndarray) -> np.ndarray:
@@ -165,6 +171,14 @@ class LinearLoop:
     def column(self, alpha: float) -> np.ndarray:
         """The stable intervals of beta at a stiffness: shape (intervals, 2)."""
         return stable_dampings(self.boundary, float(*nan_beyond(WALL_RANGE, alpha)))
+
+    def dampers(self) -> np.ndarray:
+        """Return the intervals of beta of pure dampers, shape (intervals, 2): all poles inside but the free z = 1."""
+        damper = self.roots.as_damper()
+        if damper is None:
+            return LinearLoop.column(self, 0.0)
+        found = bound_intervals(Boundary.trace(damper), np.zeros(1))
+        return np.stack([found.low[0], found.high[0]], -1)
 
     def explain(self, alpha: float, beta: float) -> list[str]:
         """What keeps a wall undecided, a sentence each: nothing, where there is a model."""
@@ -187,6 +201,11 @@ class LinearLoop:
         """Return alpha and beta of the walls that put a pole pair at the angles w, in (0, pi), on the unit circle."""
         curve = curve_at(self.roots, w)
         return curve.alpha, curve.beta
+
+    def least_stiffness(self, least: float) -> float | None:
+        """Return the alpha below which no wall of a device unstable by itself is stable; None for other devices."""
+        softest = self.border.find_softest(least) if self.roots.device_is_unstable else 0.0
+        return softest if softest > 0 else None
 
     def outlines(self) -> list[Outline]:
         """Closed outlines of the stable set, the largest first."""

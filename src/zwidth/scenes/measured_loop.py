@@ -118,6 +118,9 @@ class MeasuredLoop(LinearLoop):
         """None is named: between stable walls that softer ones do not lead to others may be undecided."""
         return []
 
+    def least_stiffness(self, least: float) -> None:
+        """None: a response without a model does not show the poles of its device."""
+
     @cached_property
     def _tops(self) -> tuple[np.ndarray, np.ndarray]:
         """Dampings of rows across the plane, and the stiffest wall of each, 0 where there is none."""

@@ -193,9 +193,9 @@ class SceneOptima(SceneAnswers):
         """The stiffest stable wall that soft ones lead to, and what binds it.
 
         ``sup {K : some B is stable}`` over the pieces of the stable set that contain soft walls, down to K = 0: along a
-        path of stable walls K and B can rise to it. Walls apart from these are `islands`. With parts, a tip of
-        the set may lean, so that no softer wall is stable at the very damping of the stiffest: `recommend` says what to
-        set.
+        path of stable walls K and B can rise to it. Walls apart from these are `islands`. A device unstable by itself
+        may have no stable soft walls: then the piece with the softest stable walls counts. With parts, a tip of the set
+        may lean, so that no softer wall is stable at the very damping of the stiffest: `recommend` says what to set.
 
         Args:
             negative_damping: whether walls with B < 0 count. By default they do with the backward difference; behind a

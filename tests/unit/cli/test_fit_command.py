@@ -43,8 +43,9 @@ def test_walls_are_fitted_as_in_python():
     assert found["next"] == expected.as_dict()["next"] != {}
     assert found["safe_wall"]["stiffness"] == expected.safe_wall().stiffness
     words = run(*WALLS, "--period", "1 ms", "--noise", "0.02")
-    assert "m                     100.0 g (95 % between" in words
-    assert "measure next" in words
+    assert words.startswith(f"SET        {expected.recommended.spell_wall()}\n")
+    assert "device     m = 100.0 g (95 %: " in words
+    assert "next       raise K at B = " in words
 
 
 def test_a_log_in_millimeters_and_milliseconds(log):
@@ -53,7 +54,9 @@ def test_a_log_in_millimeters_and_milliseconds(log):
     assert found["delay"] == pytest.approx(0.0, abs=1e-9)
     # Nothing but the name says which column the force is, and which are the others.
     assert json.loads(run(log, "--time", "t:ms", "--position", "x:mm", "--json")) == found
-    assert "fitted to             log.csv" in run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f")
+    words = run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f", "--verbose")
+    assert "fitted to  log.csv" in words
+    assert "fitted to" not in run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f")
 
 
 @pytest.mark.parametrize(
@@ -97,7 +100,7 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(unpain
         (["LOG", "--figure", "fit.txt"], "ends with .png"),
         ([*WALLS, "--period", "1 ms", "--resolution", "1mm"], "--resolution belongs to a LOG.csv"),
         ([*WALLS, "--period", "1 ms", "--resample"], "--resample belongs to a LOG.csv"),
-        ([*WALLS, "--period", "1 ms", "--json", "--yaml"], "give one of --json and --yaml"),
+        ([*WALLS, "--period", "1 ms", "--json", "--yaml"], "give one of --json, --yaml and --code"),
         (["LOG", "--noise", "1%"], "--noise belongs to --buzz"),
     ],
 )
@@ -130,10 +133,10 @@ def test_several_logs_in_counts_and_a_figure(tmp_path):
     for k, part in enumerate((lines[:1500], lines[1500:])):
         files.append(tmp_path / f"part{k}.csv")
         files[-1].write_text("\n".join([head, *part]), encoding="utf-8")
-    words = run(*map(str, files), "--resolution", "0.03mm", "--figure", str(tmp_path / "fit.png"))
-    assert words.startswith("fitted to             part0.csv and part1.csv\n")
-    assert "friction" in words
-    assert "constant force" in words
+    words = run(*map(str, files), "--resolution", "0.03mm", "--verbose", "--figure", str(tmp_path / "fit.png"))
+    assert "\nfitted to  part0.csv and part1.csv\n" in words
+    assert "friction 8" in words
+    assert "a constant force" in words
     assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
     found = json.loads(run(*map(str, files), "--position", "encoder [counts]", "--resolution", "0.03 mm", "--json"))
     for name, true in (("mass", 0.075), ("damping", 0.6), ("delay", 2.3e-3), ("friction", 0.08)):
@@ -152,7 +155,7 @@ def test_a_rotary_axis_is_the_linear_one_in_other_units(tmp_path):
         assert turned[name] == pytest.approx(linear[name], rel=1e-9)
     words = run(str(file), "--resolution", "0.03mrad")
     # 1 kg m^2 is 10^7 g cm^2.
-    assert re.search(r"^J +7500\d\d\.\d* g cm\^2 \(95 % between", words, re.MULTILINE)
+    assert re.search(r"^device +J = 7500\d\d\.\d* g cm\^2 \(95 %: ", words, re.MULTILINE)
     assert "mN m s/rad" in words
     assert "kN m/rad" in words
     scene = run(str(file), "--resolution", "0.03mrad", "--yaml")
@@ -175,17 +178,22 @@ def test_walls_of_a_rotary_axis():
     assert found["mass"] == pytest.approx(expected.mass, rel=1e-12)
     assert found["units"]["stiffness"] == "N m/rad"
     words = run(*walls, *options)
-    assert re.search(r"^J +1000 g cm\^2", words, re.MULTILINE)
-    assert "measure next          K at B = 80.4 mN m s/rad, near 7.55 N m/rad" in words
+    assert re.search(r"^device +J = 1000 g cm\^2", words, re.MULTILINE)
+    assert "next       raise K at B = 80.4 mN m s/rad, to about 7.55 N m/rad" in words
 
 
 def test_what_is_not_ok_is_told_first():
     arguments = [str(CONFIGS / "fit_log.csv"), "--resolution", "0.03mm", "--max-delay", "1 ms"]
-    first, second, *others = run(*arguments).splitlines()
-    assert not any(line.startswith("set ") for line in others)
-    assert first == "UNREACHABLE           do not rely on these numbers: the delay ends the range looked in"
-    assert second == "fitted to             fit_log.csv"
-    assert "# UNREACHABLE: do not rely on these numbers" in run(*arguments, "--yaml")
+    first, *others = run(*arguments).splitlines()
+    assert not any(line.startswith("SET ") for line in others)
+    assert first == "NO WALL    resolve the warnings first, then record again"
+    assert "WARNING    UNREACHABLE: the delay is at the end of the range searched" in others
+    text = run(*arguments, "--yaml")
+    assert 'reason: "the delay is at the end of the range searched"' in text
+    assert "    stiffness: 0.0 N/m\n" in text
+    result = CliRunner().invoke(cli, ["fit", *arguments, "--code", "c"])
+    assert result.exit_code == 2
+    assert "no wall is safe" in str(result.exception)
 
 
 def test_a_rate_stands_for_the_period():

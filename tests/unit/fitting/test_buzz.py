@@ -7,7 +7,6 @@ from measured_devices import OTHERS, PERIOD, OtherDevice
 from scipy.linalg import expm
 
 import zwidth
-from zwidth.fitting.words import choose_wall
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -284,11 +283,10 @@ def test_no_wall_to_set_has_more_damping_than_a_wall_that_was_tried():
     walls = [(494.7, 0.0, 10.92), (4044.0, 8.053, 33.66), (6577.0, 16.11, 45.92), (8703.0, 24.16, 54.96)]
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=0.02)
     assert not fit.is_doubted
-    known, safe, wall = fit.safe_wall(rigid=True), fit.safe_wall(), choose_wall(fit)
+    known, safe, wall = fit.safe_wall(rigid=True), fit.safe_wall(), fit.recommended
     assert known.virtual_damping > 26.8
     assert not true.is_stable(*known[:2])
-    assert wall is not None
-    for stiffness, damping in (safe[:2], wall[:2]):
+    for stiffness, damping in (safe[:2], (wall.stiffness, wall.virtual_damping)):
         assert damping <= 24.16
         assert true.is_stable(stiffness, damping)
     assert safe.stiffness > 0.8 * true.limit_of_walls()

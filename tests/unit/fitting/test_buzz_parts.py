@@ -7,7 +7,7 @@ from measured_devices import OTHERS, PERIOD, OtherDevice, TrueDevice
 import zwidth
 from zwidth.fitting.buzzing import Onsets
 from zwidth.fitting.device_estimate import DimensionlessDevice, differentiate, name_numbers
-from zwidth.fitting.words import choose_wall, describe_fit, write_scene
+from zwidth.fitting.words import detail_fit, summarize_fit, write_scene
 from zwidth.parts.circle import circle
 from zwidth.words.status import Status
 
@@ -117,15 +117,13 @@ def test_walls_to_set_on_a_device_with_parts_are_stable_and_have_a_damping_that_
     assert not fit.is_doubted
     bar, limit = fit.intervals["stiffness_max"], true.limit_of_walls()
     assert bar.low <= limit <= bar.high
-    safe, wall = fit.safe_wall(), choose_wall(fit)
-    assert wall is not None
+    safe, wall = fit.safe_wall(), fit.recommended
     assert safe.share >= 0.985
     assert safe.stiffness > 0.5 * limit
-    for stiffness, damping in (safe[:2], wall[:2]):
+    for stiffness, damping in (safe[:2], (wall.stiffness, wall.virtual_damping)):
         assert damping <= walls[:, 1].max()
         assert true.is_stable(stiffness, damping)
-    said = dict(describe_fit(fit, "walls"))
-    assert ("amplifier's lag" if true is LAG else "resonance") in said
+    assert ("actuator" if true is LAG else "resonance") in dict(summarize_fit(fit))
     assert ("actuator:" if true is LAG else "modes:") in " ".join(write_scene(fit, "walls"))
 
 
@@ -146,9 +144,9 @@ def test_a_lag_and_a_resonance_that_explain_walls_alike_leave_no_wall_to_set():
     assert rival.parts is not None
     assert "another device fits as well" in " ".join(fit.doubts)
     assert np.isnan([fit.stiffness_max, fit.safe_wall().stiffness]).all()
-    assert choose_wall(fit) is None
+    assert fit.recommended.status == Status.UNREACHABLE
     assert fit.as_dict()["rivals"][0]["parts"] == rival.parts
-    assert "resonance = 65.6" in dict(describe_fit(fit, "walls"))["or as well"]
+    assert "resonance = 65.6" in dict(detail_fit(fit, "walls"))["or as well"]
     # The wall to measure next is one that the two do not have alike.
     values = [rival.mass, rival.damping, rival.delay, *rival.parts.values()]
     other = DimensionlessDevice.of_numbers(np.array(values), PERIOD, 0).to_scene(PERIOD, VELOCITY)

@@ -1,5 +1,6 @@
 """What a fit rests on: its tables against the fit itself, and its words."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import zwidth
 from zwidth import figures
 from zwidth.fitting.buzz import BuzzPoint
 from zwidth.fitting.evidence import correlate_residuals, gather_evidence, trace_boundary
-from zwidth.fitting.words import choose_wall, describe_fit, write_scene
+from zwidth.fitting.words import summarize_fit, write_scene
 
 HEARD = tuple(BuzzPoint(*wall) for wall in ((6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)))
 B, K = "virtual_damping_N_s_per_m", "stiffness_N_per_m"
@@ -93,21 +94,24 @@ def test_walls_that_buzzed_keep_their_errors_and_distances(heard):
     np.testing.assert_array_equal(walls["frequency_residual"][those], heard.residuals[:, 1])
 
 
-def test_the_wall_to_set_is_softer_where_k_max_is_hardly_known(heard):
+def test_the_wall_to_set_is_softer_if_k_max_is_uncertain(heard):
     top = heard.scene.max_stiffness()
-    wall, known = choose_wall(heard), choose_wall(heard, rigid=True)
-    assert wall is not None
-    assert known is not None
-    assert wall.stiffness == known.stiffness == pytest.approx(0.75 * float(top.stiffness), rel=1e-12)
-    # No larger B was tried than that of the last wall; of a device known to be rigid it is that of the stiffest one.
-    assert (wall.virtual_damping, known.virtual_damping) == (HEARD[-1].virtual_damping, float(top.virtual_damping))
+    limit = heard.scene.safe_limit
+    # No wall with more damping than the last one was tried.
+    assert limit.virtual_damping <= HEARD[-1].virtual_damping
+    wall = heard.scene.recommend(stiffness_fraction=0.75)
+    assert wall.limited_by == "safe_limit"
+    assert wall.stiffness == 0.75 * limit.stiffness
+    # The share is the same whichever limit binds.
+    assert 0.9 * 0.75 * float(top.stiffness) < wall.stiffness < 0.75 * float(top.stiffness)
     vague = zwidth.fit_buzz(HEARD, period=1e-3, noise=0.3)
-    softer = choose_wall(vague)
-    assert softer is not None
-    assert softer[:2] == vague.safe_wall()[:2]
+    softer = vague.scene.recommend(stiffness_fraction=0.75)
+    assert softer.stiffness == pytest.approx(0.75 * vague.safe_wall().stiffness, rel=1e-3)
     assert softer.stiffness < 0.6 * float(top.stiffness)
-    # Where the walls leave all open, there is none to set.
-    assert choose_wall(replace(heard, covariance=1e6 * heard.covariance)) is None
+    # If the walls leave the device open, no wall is recommended.
+    lost = replace(heard, covariance=1e6 * heard.covariance)
+    assert lost.recommended.status == zwidth.Status.UNREACHABLE
+    assert "too uncertain" in lost.recommended.reason
 
 
 def test_the_error_of_the_best_damping_is_that_of_devices_drawn(heard):
@@ -138,7 +142,7 @@ def test_an_estimate_of_any_kind_is_written_into_the_scene():
 def test_intervals_have_digits_to_show(heard):
     exact = zwidth.fit_buzz(HEARD, period=1e-3, noise=1e-6)
     for fit in (heard, exact):
-        for label, text in describe_fit(fit, "walls"):
-            if "95 % between" in text and label in ("m", "b", "K_max"):
-                low, high = text.partition("between ")[2].rstrip(")").split(" and ")
-                assert low != high
+        said = dict(summarize_fit(fit))
+        for text in re.findall(r"\(95 %: (.*?)\)", f"{said['device']}, {said['K_max']}"):
+            low, high = text.split(" to ")
+            assert low != high

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 import zwidth
 from zwidth.fitting.moving import Recording
-from zwidth.fitting.words import choose_wall, describe_fit, write_scene
+from zwidth.fitting.words import detail_fit, summarize_fit, write_scene
 from zwidth.words.status import Status
 
 
@@ -37,16 +37,15 @@ def fit_hidden():
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_device_with_more_parts_is_modelled_with_them_or_has_no_wall(name):
     true, fit = OtherDevice.of(OTHERS[name]), fit_other(name)
-    safe, wall = fit.safe_wall(), choose_wall(fit)
+    safe, wall = fit.safe_wall(), fit.recommended
     if fit.is_doubted:
-        assert wall is None
+        assert wall.status == Status.UNREACHABLE
         assert np.isnan([fit.stiffness_max, fit.stiffness_error, safe.stiffness]).all()
         return
     # A current loop of 500 Hz is taken for a delay, a compliance of 300 Hz for a mode without damping of its own.
     assert fit.stiffness_max == pytest.approx(true.limit_of_walls(), rel=0.05)
     assert true.is_stable(*safe[:2])
-    assert wall is not None
-    assert true.is_stable(*wall[:2])
+    assert true.is_stable(wall.stiffness, wall.virtual_damping)
 
 
 def test_a_resonance_is_found_with_its_numbers_and_written_into_the_scene(tmp_path):
@@ -58,9 +57,10 @@ def test_a_resonance_is_found_with_its_numbers_and_written_into_the_scene(tmp_pa
         path = f"modes.0.{name}"
         assert abs(fit.value_of(path) - value) < 4 * fit.errors[path]
         assert fit.errors[path] < 0.1 * value
-    said = dict(describe_fit(fit, "a log"))
-    assert said["resonance"].startswith(f"{fit.value_of('modes.0.frequency'):.2f} Hz")
-    assert "if nothing hides" in said
+    resonance = dict(summarize_fit(fit))["resonance"]
+    assert resonance.startswith(f"frequency {fit.value_of('modes.0.frequency'):.2f} Hz (95 %: ")
+    assert "damping ratio" in resonance
+    assert dict(detail_fit(fit, "a log"))["assuming"].startswith("no further parts: K = ")
     (tmp_path / "scene.yaml").write_text("\n".join(write_scene(fit, "a log")))
     section: Any = zwidth.load_config(tmp_path / "scene.yaml").scene
     (written,) = section.modes
@@ -85,7 +85,7 @@ def test_a_resonance_whose_numbers_are_open_has_no_safe_wall():
     assert fit.is_doubted or fit.respond(0.99, True) is None
     assert safe.status == Status.UNDECIDED
     assert np.isnan(safe.stiffness)
-    assert choose_wall(fit) is None
+    assert fit.recommended.status == Status.UNREACHABLE
 
 
 def test_a_lag_is_found_and_the_delay_without_it():
@@ -106,7 +106,7 @@ def test_the_interval_of_the_stiffest_wall_reaches_to_a_lag_that_does_not_show()
     assert fit.intervals["stiffness_max"].high >= fit.lag.stiffness_max
     assert fit.lag.delay < fit.delay
     assert fit.as_dict()["lag"]["time_constant"] == fit.lag.time_constant
-    assert any("lag" in text for label, text in describe_fit(fit, "a log") if label == "or as well")
+    assert any("lag" in text for label, text in detail_fit(fit, "a log") if label == "or as well")
 
 
 @pytest.mark.parametrize("top, bottom", [([0.2], [1.0, -0.8]), ([0.2] * 5, [1.0])])
@@ -140,14 +140,22 @@ def test_a_resonance_that_a_coarse_encoder_hides_bounds_the_safe_wall():
     safe, rigid = fit.safe_wall(), fit.safe_wall(rigid=True)
     assert hidden.is_stable(*safe[:2])
     assert not hidden.is_stable(*rigid[:2])
-    wall = choose_wall(fit)
-    assert wall is not None
-    assert wall[:2] == (0.75 * safe.stiffness, safe.virtual_damping)
-    assert hidden.is_stable(*wall[:2])
-    said = dict(describe_fit(fit, "a log"))
-    assert "may make stiffer walls unstable" in said["not seen"]
-    assert said["if it is rigid"].startswith("K = ")
-    assert any("A resonance that the log does not show" in line for line in write_scene(fit, "a log"))
+    limit = fit.scene.safe_limit
+    assert limit is not None
+    # Rounded down to four digits.
+    assert 0.998 * safe.stiffness < limit.stiffness <= safe.stiffness
+    assert 0.998 * safe.virtual_damping < limit.virtual_damping <= safe.virtual_damping
+    wall = fit.scene.recommend(stiffness_fraction=0.75)
+    assert (wall.stiffness, wall.virtual_damping) == (0.75 * limit.stiffness, limit.virtual_damping)
+    for found in (wall, fit.recommended):
+        assert limit.allows(found.stiffness, found.virtual_damping)
+        assert hidden.is_stable(found.stiffness, found.virtual_damping)
+    said = summarize_fit(fit)
+    assert [label for label, _ in said[:2]] == ["SET", ""]
+    assert "within the safe limit: a resonance near" in said[1][1]
+    assert "zwidth excite --rate '1.000 kHz' --force '3.0 N' --resolution '200 µm'" in dict(said)["next"]
+    assert dict(detail_fit(fit, "a log"))["assuming"].startswith("a rigid device: K = ")
+    assert any(line.startswith('    reason: "a resonance near') for line in write_scene(fit, "a log"))
 
 
 def test_a_hidden_resonance_lies_within_the_radius_of_the_response():

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter, ss2tf
 
 import zwidth
-from zwidth.fitting.words import choose_wall, describe_fit, write_scene
+from zwidth.fitting.words import detail_fit, summarize_fit, write_scene
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -300,12 +300,16 @@ def test_under_a_doubt_there_is_no_wall(period, scale, word):
     assert any(word in doubt for doubt in fit.doubts)
     assert np.isnan(fit.safe_wall()[:3]).all()
     assert fit.safe_wall().status == Status.UNDECIDED
-    assert choose_wall(fit) is None
-    said = dict(describe_fit(fit, "a log"))
-    assert "set" not in said
-    assert "safe wall" not in said
-    assert "record again" in said["no wall"]
-    assert not any("recommend" in line for line in write_scene(fit, "a log"))
+    assert fit.recommended.status == Status.UNREACHABLE
+    assert word in fit.recommended.reason
+    said = dict(summarize_fit(fit))
+    assert "SET" not in said
+    assert "resolve the warnings first" in said["NO WALL"]
+    assert word in said["WARNING"]
+    assert "safe limit" not in dict(detail_fit(fit, "a log"))
+    text = "\n".join(write_scene(fit, "a log"))
+    assert "    stiffness: 0.0 N/m\n" in text
+    assert f'    warnings:\n      - "{fit.doubts[0]}"' in text
 
 
 def test_of_a_long_log_the_beginning_is_fitted_and_that_is_said(monkeypatch):
@@ -318,5 +322,5 @@ def test_of_a_long_log_the_beginning_is_fitted_and_that_is_said(monkeypatch):
     assert (known[0], known.size) == (22, known[-1] - 21)
     assert 400 <= known.size < 500
     assert abs(fit.mass - 0.1) < 4 * fit.errors["mass"]
-    assert dict(describe_fit(fit, "a log"))["of it"].startswith(f"{known.size} of 900 samples")
-    assert "of it" not in dict(describe_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))
+    assert dict(detail_fit(fit, "a log"))["of it"].startswith(f"{known.size} of 900 samples")
+    assert "of it" not in dict(detail_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))

@@ -11,7 +11,7 @@ import zwidth
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import FittedModel
 from zwidth.fitting.structure import Recordings
-from zwidth.fitting.words import describe_fit
+from zwidth.fitting.words import detail_fit
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -130,8 +130,8 @@ def test_what_lies_before_and_behind_a_gap_is_fitted_as_two_logs():
     np.testing.assert_allclose(motion.time, clock[kept], rtol=1e-9, atol=1e-12)
     both = np.concatenate([each.modelled for each in apart.motions])
     np.testing.assert_allclose(motion.modelled[(motion.time < 0.1495) | (motion.time > 0.1905)], both, rtol=1e-9)
-    said = dict(describe_fit(fit, "log"))["of it"]
-    assert said == "315 of 379 samples: behind each of 2 gaps the first are past force alone"
+    said = dict(detail_fit(fit, "log"))["of it"]
+    assert said == "315 of 379 samples: after each of 2 gaps the first ones depend on unknown forces"
     with pytest.raises(InputError, match="log 1 lacks 21 samples, most of them after sample 169"):
         zwidth.respond(clock[kept], position[kept], force[kept])
 

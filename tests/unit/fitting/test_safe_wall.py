@@ -67,14 +67,14 @@ def test_what_the_records_leave_open_leaves_nothing_to_render(fit):
 
 @pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=100)])
 def test_devices_beyond_all_bounds_bear_nothing(fit, velocity):
-    lost = replace(fit, covariance=1e8 * fit.covariance, freedom=1, scene=replace(fit.scene, velocity=velocity))
+    lost = replace(fit, covariance=1e8 * fit.covariance, freedom=1, nominal=replace(fit.nominal, velocity=velocity))
     assert lost.safe_wall()[:2] == (0.0, 0.0)
 
 
 def test_another_route_to_the_same_wall(fit, monkeypatch):
     # A window of one sample is the backward difference, of which this scene does not know the closed form.
-    alike = replace(fit, scene=replace(fit.scene, velocity=zwidth.WindowedDifference(samples=1)))
-    assert alike.scene.parts_beyond
+    alike = replace(fit, nominal=replace(fit.nominal, velocity=zwidth.WindowedDifference(samples=1)))
+    assert alike.nominal.parts_beyond
     monkeypatch.setattr("zwidth.fitting.safe_wall._SAMPLES", 1000)
     wall, same = alike.safe_wall(), replace(fit).safe_wall()
     assert wall.stiffness == pytest.approx(same.stiffness, rel=5e-3)
@@ -83,7 +83,7 @@ def test_another_route_to_the_same_wall(fit, monkeypatch):
 
 
 def test_a_filtered_wall_is_borne_by_other_devices(fit):
-    filtered = replace(fit, scene=replace(fit.scene, velocity=zwidth.LowPass(cutoff=150)))
+    filtered = replace(fit, nominal=replace(fit.nominal, velocity=zwidth.LowPass(cutoff=150)))
     wall = filtered.safe_wall()
     scenes = [
         zwidth.Scene(zwidth.Device(mass, damping), zwidth.Timing(PERIOD, delay), velocity=filtered.velocity)

@@ -128,10 +128,11 @@ def test_walls_alone_are_fitted_as_in_python():
     for name, head in (("mass", "mass_kg"), ("delay", "delay_s"), ("stiffness_max", "stiffness_max_N_per_m")):
         assert outcome.table[head].tolist() == [getattr(expected, name)]
     assert outcome.table["mass_error_kg"].tolist() == [expected.errors["mass"]]
-    assert outcome.answer[0].startswith("m = 99.98 g, b = 10.01 N s/m, t_d = ")
-    assert outcome.answer[1].startswith("K_max = 19.87 kN/m (95 % between ")
-    assert outcome.answer[2] == "set K = 14.90 kN/m, B = 37.40 N s/m: 75 % of K_max, at the largest B tried"
-    assert any("measure next" in note for note in outcome.notes)
+    wall = expected.recommended
+    assert outcome.answer[:2] == ("fitted to 3 buzzing walls", f"SET: {wall.spell_wall()}")
+    assert any(line.startswith("device: m = 99.98 g (95 %: ") for line in outcome.answer)
+    assert any(line.startswith("K_max: 19.87 kN/m (95 %: ") for line in outcome.answer)
+    assert any(line.startswith("next: raise K at B = ") for line in outcome.answer)
     # A wall to set is written no stiffer than it is.
     evidence = outcome.figures[""].keywords
     walls = {**evidence["walls"], "stiffness_N_per_m": np.where(evidence["walls"]["kind"] == "set", 14897.0, 1e4)}
@@ -144,7 +145,8 @@ def test_an_answer_that_is_not_ok_begins_with_that(monkeypatch):
     monkeypatch.chdir(ROOT / "configs")
     outcome = study_of(log={"csv": "fit_log.csv", "resolution": "0.03 mm"}, max_delay="1 ms").compute(None, True)
     assert outcome.table["status"].tolist() == ["UNREACHABLE"]
-    assert outcome.answer[0].startswith("UNREACHABLE: do not rely on these numbers")
+    assert outcome.answer[1] == "NO WALL: resolve the warnings first, then record again"
+    assert "WARNING: UNREACHABLE: the delay is at the end of the range searched" in outcome.answer
 
 
 def test_records_of_two_devices_do_not_agree(monkeypatch):

@@ -223,11 +223,24 @@ class Border:
 
     @cached_property
     def main(self) -> frozenset[int]:
-        """The pieces that contain soft walls, as sets do, too, that narrow towards K = 0."""
+        """The pieces that contain soft walls, as sets do, too, that narrow towards K = 0.
+
+        A device unstable by itself may have none: then the piece with the softest stable walls, with B > 0 if possible.
+        """
         ends: dict[int, list[float]] = {}
+        damped = {edge.piece for edge in self.edges if edge.beta[-1] > 0}
         for edge in self.edges:
             ends.setdefault(edge.piece, []).extend([edge.alpha.min(), edge.alpha.max()])
-        return frozenset(piece for piece, both in ends.items() if reaches_down(np.min(both), np.max(both)))
+        soft = frozenset(piece for piece, both in ends.items() if reaches_down(np.min(both), np.max(both)))
+        stiff = [piece for piece, both in ends.items() if np.max(both) > 0]
+        if soft or not stiff or not self.boundary.loop.device_is_unstable:
+            return soft
+        return frozenset([min(stiff, key=lambda piece: (piece not in damped, np.min(ends[piece])))])
+
+    def find_softest(self, least: float) -> float:
+        """Return the lowest alpha of the stable walls with dampings above ``least`` that `main` contains."""
+        walls = [edge.alpha[edge.beta >= least] for edge in self.soft_edges(least)]
+        return float(min((alpha.min() for alpha in walls if alpha.size), default=np.nan))
 
     def holds_softly(self, alpha: float, beta: float) -> bool:
         """Whether a wall is stable in a piece with soft walls."""

@@ -51,6 +51,27 @@ class LoopRoots:
         f = self.estimate
         return self.poles.size + self.lag + f.poles.size + max(f.window + f.lag, 0)
 
+    @property
+    def device_is_unstable(self) -> bool:
+        """Whether the device without a wall has a pole outside the unit circle."""
+        return bool(np.any((depths(self.poles) < 0) & ~are_on_circle(self.poles)))
+
+    def as_damper(self) -> LoopRoots | None:
+        """Return the loop at K = 0 with B in place of K, without its pole at z = 1; None if it has none there."""
+        f = self.estimate
+        free, still = np.flatnonzero(self.poles == 0), np.flatnonzero(f.zeros == 0)
+        if not free.size or not (f.window or still.size):
+            return None
+        # F/(z - 1): a window of n samples has its other zeros at the n-th roots of 1.
+        turns = 2.0 * np.pi * np.arange(1, f.window) / max(f.window, 1)
+        # Exactly -1 as a zero of the device may be.
+        window = np.where(turns == np.pi, 2.0, -2j * np.sin(0.5 * turns) * np.exp(0.5j * turns))
+        lag = self.lag + f.lag + f.window
+        velocity = f.zeros if f.window else np.delete(f.zeros, still[0])
+        zeros = np.concatenate([self.zeros, velocity, window, np.ones(max(-lag, 0))])
+        poles = np.concatenate([np.delete(self.poles, free[0]), f.poles])
+        return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
+
     def take_root(self) -> tuple[LoopRoots, int]:
         """The loop in z whose poles are the k-th powers of its own, and the largest such k: mostly itself and 1."""
         f = self.estimate

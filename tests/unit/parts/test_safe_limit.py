@@ -1,0 +1,146 @@
+"""The safe limit of a scene: the walls within it, and the ways in which it is given and kept."""
+
+import re
+
+import pytest
+
+import zwidth
+from zwidth.studies.document import load_scene
+
+LIMIT = zwidth.SafeLimit("484 N/m", "1.13 N s/m", reason="a resonance may hide in the log")
+DEVICE, TIMING = zwidth.Device("80 g", 0.5), zwidth.Timing("1 ms", 0.7e-3)
+SCENE = zwidth.Scene(DEVICE, TIMING, safe_limit=LIMIT)
+
+
+@pytest.mark.parametrize(
+    "wall, within",
+    [
+        ((484, 1.13), True),
+        ((100, 1.13), True),
+        ((242, 0.565), True),
+        ((0, 0), True),
+        ((485, 1.13), False),
+        ((242, 0.5), False),
+        ((100, 1.2), False),
+        ((-1, 0.5), False),
+    ],
+)
+def test_walls_within_the_limit_are_softer_or_scaled_down(wall, within):
+    assert LIMIT.allows(*wall) == within
+
+
+def test_a_limit_of_no_stiffness_allows_no_wall():
+    none = zwidth.SafeLimit(0, warnings=["turn the sign of the force"])
+    assert none.forbids_all
+    assert not none.allows(0, 0)
+    found = SCENE.replace(safe_limit=none).recommend()
+    assert found.status == zwidth.Status.UNREACHABLE
+    assert "turn the sign of the force" in found.reason
+    with pytest.raises(zwidth.InputError, match="turn the sign of the force"):
+        found.code("c")
+    assert SCENE.replace(safe_limit=none).recommend(beyond_safe=True).stiffness > 1e3
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"stiffness": -1}, "it must be 0 or more"),
+        ({"stiffness": 1, "warnings": 3}, "write a list of texts"),
+        ({"stiffness": 1, "reason": 3}, "write a text"),
+        ({"stiffness": "1 kg"}, "got '1 kg'"),
+    ],
+)
+def test_a_wrong_limit_is_refused(given, words):
+    with pytest.raises(zwidth.InputError, match=re.escape(words)):
+        zwidth.SafeLimit(**given)
+
+
+def test_a_limit_in_rotary_units_belongs_to_a_rotary_device():
+    with pytest.raises(zwidth.InputError, match="safe_limit"):
+        SCENE.replace(safe_limit=zwidth.SafeLimit("484 N m/rad"))
+    rotary = zwidth.Scene(zwidth.Device("60 g cm^2", "0.02 mN m s/rad"), TIMING)
+    assert rotary.replace(safe_limit=zwidth.SafeLimit("484 mN m/rad")).safe_limit.stiffness == 0.484
+
+
+@pytest.mark.parametrize("change", [{"mass": 0.1}, {"rate": 2e3}, {"velocity": zwidth.LowPass(cutoff=100)}])
+def test_a_changed_loop_keeps_the_limit_and_warns(change):
+    changed = SCENE.replace(**change).replace(**change)
+    assert changed.safe_limit.allows(484, 1.13)
+    (warning,) = changed.safe_limit.warnings
+    assert warning.startswith(f"{next(iter(change))} changed after the safe limit was measured")
+    assert SCENE.replace(stiffness=1e3, virtual_damping=2).safe_limit == LIMIT
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        {},
+        {"phase_margin": 30},
+        {"gain_margin": 2},
+        {"stiffness_fraction": 0.5},
+        {"stiffness_fraction": 0.9},
+        {"passive": True},
+    ],
+)
+def test_recommendations_stay_within_the_limit(wanted):
+    found = SCENE.recommend(**wanted)
+    assert found.status == zwidth.Status.OK
+    assert LIMIT.allows(found.stiffness, found.virtual_damping)
+    assert found.stiffness <= wanted.get("stiffness_fraction", 0.75) * 484
+    assert any("a resonance may hide in the log" in note for note in found.notes)
+    # Without the limit each of these walls is stiffer.
+    free = SCENE.recommend(**wanted, beyond_safe=True)
+    assert free.stiffness > 2 * found.stiffness or wanted == {"passive": True}
+    assert free.stiffness == pytest.approx(SCENE.replace(safe_limit=None).recommend(**wanted).stiffness, rel=1e-12)
+    assert found.steps == []
+    assert "limited by" in found.lines()[0]
+    assert "safe limit" in found.lines()[0]
+
+
+def test_a_limit_that_does_not_bind_changes_no_wall():
+    free = SCENE.replace(safe_limit=None).recommend()
+    found = SCENE.replace(safe_limit=zwidth.SafeLimit(16e3, 39.0)).recommend()
+    assert (found.stiffness, found.virtual_damping) == pytest.approx((free.stiffness, free.virtual_damping), rel=1e-3)
+    assert found.limited_by == free.limited_by
+
+
+def test_maxima_and_verdicts_ignore_the_limit():
+    free = SCENE.replace(safe_limit=None)
+    assert SCENE.max_stiffness() == free.max_stiffness()
+    assert SCENE.is_stable(5e3, 30)
+    assert zwidth.assess(SCENE.replace(stiffness=5e3, virtual_damping=30)).stable
+
+
+@pytest.mark.parametrize("language", ["c", "python"])
+def test_programs_name_the_limit_and_its_warnings(language):
+    text = 'ends here */ """ \\'
+    limit = zwidth.SafeLimit(484, 1.13, reason=text, warnings=["look at the log"])
+    scene = SCENE.replace(safe_limit=limit)
+    code = scene.recommend().code(language)
+    assert "Safe limit: K = 484.0 N/m, B = 1.130 N s/m: ends here * /" in code
+    assert "Warning: look at the log" in code
+    assert "WARNING: this wall is beyond" not in code
+    assert "WARNING: this wall is beyond the safe limit" in scene.recommend(beyond_safe=True).code(language)
+    if language == "python":
+        namespace = {}
+        exec(code, namespace)
+        assert namespace["Wall"]().force(0.0) == 0.0
+    else:
+        assert code.count("*/") == 1
+
+
+def test_a_file_carries_the_limit(tmp_path):
+    file = tmp_path / "scene.yaml"
+    file.write_text(
+        "version: 1\nname: a\nscene:\n  mass: 80 g\n  damping: 0.5\n  period: 1 ms\n  delay: 0.7 ms\n  safe_limit:\n"
+        "    stiffness: 0.484 kN/m\n    virtual_damping: 1.13 N s/m\n    reason: a resonance may hide in the log\n"
+        "    warnings: [one, two]\nstudies: [{kind: recommend, name: r}, {kind: ridge, name: s, delta: 0, d: 1}]\n",
+        encoding="utf-8",
+    )
+    limit = load_scene(file).safe_limit
+    assert limit == zwidth.SafeLimit(484.0, 1.13, "a resonance may hide in the log", ("one", "two"))
+    study = zwidth.load_config(file).studies[0]
+    assert study.device.to_scene().safe_limit == limit  # pyright: ignore[reportAttributeAccessIssue]
+    file.write_text(file.read_text("utf-8").replace("0.484 kN/m", "-1"), encoding="utf-8")
+    with pytest.raises(zwidth.ConfigError, match=r"scene.safe_limit.stiffness: got -1"):
+        load_scene(file)

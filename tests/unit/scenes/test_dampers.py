@@ -1,0 +1,74 @@
+"""Pure dampers, K = 0: the range of B with which only the free position stays, against eigenvalues."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from independent_scenes import KINDS, closed_loop_matrix, random_scene
+
+import zwidth
+from zwidth.cli import cli
+
+
+def other_radius(scene, damping):
+    """The largest pole magnitude at K = 0 without the pole next to z = 1, if the device is free."""
+    poles = np.linalg.eigvals(closed_loop_matrix(scene, 0.0, damping))
+    free = scene.operator is None or scene.operator.stiffness == 0
+    return np.abs(np.delete(poles, np.argmin(np.abs(poles - 1.0))) if free else poles).max()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_range_is_that_of_eigenvalues(kind):
+    rng = np.random.default_rng(21)
+    for _ in range(6):
+        scene = random_scene(kind, rng)
+        if scene.operator is not None and scene.operator.stiffness:
+            scene = scene.replace(**{"operator.stiffness": 0.0})
+        ranges = scene.damper_range()
+        assert np.all(ranges[:, 1] > ranges[:, 0])
+        unit = scene.units.virtual_damping
+        # Nearer to the ends eigenvalues of two poles that meet at z = 1 are not told apart.
+        beside = 1e-3 * np.ptp(ranges, axis=1)[:, None]
+        dampings = np.concatenate([rng.uniform(-0.3, 2.0, 30) * unit, (ranges + beside).ravel()])
+        dampings = np.append(dampings, (ranges - beside).ravel())
+        inside = np.array([np.any((ranges[:, 0] < damping) & (damping < ranges[:, 1])) for damping in dampings])
+        radii = np.array([other_radius(scene, damping) for damping in dampings])
+        clear = np.abs(radii - 1.0) > 1e-10
+        np.testing.assert_array_equal(inside[clear], radii[clear] < 1.0)
+        assert clear.sum() > 20
+
+
+@pytest.mark.parametrize(
+    "velocity",
+    [
+        zwidth.VelocityFilter([1000, -1000], [1, 0]),
+        zwidth.VelocityFilter([500, 0, -500], [1, 0, 0]),
+        zwidth.WindowedDifference(7),
+        zwidth.LowPass(cutoff=60, order=2),
+        zwidth.Butterworth(90, order=4),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("delay", [0.0, 0.4e-3, 2e-3])
+def test_filters_and_delays(velocity, delay):
+    scene = zwidth.Scene(zwidth.Device(0.1, 4.0), zwidth.Timing(1e-3, delay), velocity=velocity)
+    ranges = scene.damper_range()
+    assert ranges[0, 0] == pytest.approx(-4.0, rel=1e-9)
+    assert other_radius(scene, ranges[0, 1] * (1 - 1e-6)) < 1.0 < other_radius(scene, ranges[0, 1] * (1 + 1e-6))
+
+
+def test_a_device_with_a_spring_to_ground_has_its_stable_dampings():
+    scene = zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 500"), zwidth.Timing(1e-3, 1e-3))
+    np.testing.assert_allclose(scene.damper_range(), scene.stable_damping(0.0))
+
+
+def test_check_shows_the_range():
+    options = ["--mass", "120 g cm^2", "--damping", "80 uN m s/rad", "--rate", "1 kHz", "--delay", "0.7 ms"]
+    damper = ["--stiffness", "0", "--virtual-damping"]
+    found = CliRunner().invoke(cli, ["check", *options, *damper, "6.4 mN m s/rad"])
+    assert found.exit_code == 0
+    text = " ".join(found.output.split())
+    assert "marginal (only for the free position, a pole at z = 1: a pure damper, B from" in text
+    found = CliRunner().invoke(cli, ["check", *options, *damper, "100 mN m s/rad"])
+    text = " ".join(found.output.split())
+    assert "UNSTABLE" in text
+    assert "to the boundary in B B must fall by" in text
