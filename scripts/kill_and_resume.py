@@ -19,6 +19,7 @@ import argparse
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -134,7 +135,8 @@ def wait_for(condition: Callable[[], object]) -> None:
 
 def chunks_done(out: Path) -> int:
     """How many chunks are marked as done."""
-    return len(list(out.glob("*.zarr/*_checksum/c/*/0")))
+    files = [f"{top}/{file}" for top, _, files in os.walk(out) for file in files]
+    return sum(bool(re.search(r"status/c(/\d+)*$", file)) for file in files)
 
 
 def marked_files(out: Path, *, flat: bool = False) -> dict:

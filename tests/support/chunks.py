@@ -25,8 +25,7 @@ def replay(path, family, index):
         perform(path, family, index)
     elif not store.is_done(task):
         source = Store(Path(named.read_text(encoding="utf-8")) / store.path.name)
-        files = [*source.files(task), source.flag(task)], [*store.files(task), store.flag(task)]
-        for theirs, ours in zip(*files, strict=True):
+        for theirs, ours in zip(source.files(task), store.files(task), strict=True):
             ours.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(theirs, ours)
 

@@ -1,6 +1,7 @@
 """What the tests of sweeps share: small configurations, the command line, and stores to compare."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -115,7 +116,8 @@ def assert_same(first, second):
 def flags(path):
     """The marks of finished chunks, each with what would change if it were written again."""
     # Unlike `rglob` it goes on where a folder gets its name meanwhile.
-    marks = [Path(top, "0") for top, _, files in os.walk(path) if "_checksum/c/" in top and "0" in files]
+    files = [f"{top}/{file}" for top, _, files in os.walk(path) for file in files]
+    marks = [Path(file) for file in files if re.search(r"status/c(/\d+)*$", file)]
     return {mark: (mark.stat().st_ino, mark.stat().st_mtime_ns) for mark in marks}
 
 

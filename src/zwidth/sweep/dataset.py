@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.sweep.store import (
-    FILES,
     SEAL,
     Store,
     check_installed,
     find_store,
     list_stores,
-    name_checksums,
     silence_zarr,
 )
 from zwidth.words.errors import StoreError, StoreExistsError
@@ -66,16 +64,17 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     # Loads Zarr.
     from zwidth.sweep.checked import CheckedStore
 
-    attributes = store.attributes
     checked = CheckedStore(store)
     with silence_zarr():
-        dataset = xarray.open_zarr(checked, consolidated=False, chunks={})
-    dataset = dataset.drop_vars([name_checksums(family.family) for family in store.plan.families])
+        dataset = xarray.open_zarr(checked, consolidated=store.has_checksums, chunks={})
+    # Without the checksums that an old store keeps in arrays.
+    dataset = dataset[[name for family in store.plan.families for name in family.variables]]
     if "device" in dataset.coords:
         # Neither netCDF nor pandas knows NumPy's strings of variable length.
         labels = np.array([str(label) for label in dataset["device"].values])
         dataset = dataset.assign_coords(device=("device", labels, dataset["device"].attrs))
-    dataset.attrs = {key: value for key, value in attributes.items() if key not in (SEAL, FILES, "coordinates")}
+    hidden = SEAL, "file_checksums", "coordinates"
+    dataset.attrs = {key: value for key, value in store.attributes.items() if key not in hidden}
     return dataset.assign_attrs(complete=int(checked.complete))
 
 
@@ -169,6 +168,8 @@ def verify(path: str | os.PathLike[str]) -> tuple[Verification, ...]:
 def _verify_store(path: Path) -> Verification:
     store = Store(path)
     try:
+        if not store.has_checksums:
+            return Verification(path, error="an old format, whose checksums this release does not read")
         tasks = list(store.plan.tasks())
         damaged = [f"{name} is damaged or missing" for name in store.damaged_files()]
     except StoreError as error:

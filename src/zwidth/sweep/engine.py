@@ -197,7 +197,9 @@ def store_path(folder: Path, study: SweepStudy) -> Path:
 
 
 def check_same(store: Store, study: SweepStudy) -> None:
-    """Refuse a store that was made from another study or by other releases."""
+    """Refuse a store that was made from another study, by other releases or in an old format."""
+    if not store.has_checksums:
+        raise StoreError(f"{store.path}: an old format, which can be read but not continued; {ELSEWHERE}")
     now = study.model_dump(mode="json", exclude_none=True)
     refuse_changes(store.path, study.name, "store", store.attributes["study"], now)
     refuse_versions(store.path, store.attributes["versions"])

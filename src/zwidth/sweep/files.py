@@ -12,7 +12,6 @@ import json
 import os
 import platform
 import socket
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -74,12 +73,6 @@ def content(path: Path) -> bytes:
     with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return path.read_bytes()
     return b""
-
-
-def checksum(path: Path) -> int:
-    """The CRC-32 of a file; -1, which is none, where there is no file or nothing in it."""
-    data = content(path)
-    return zlib.crc32(data) if data else -1
 
 
 def digest(value: Any) -> str:

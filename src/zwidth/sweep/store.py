@@ -1,9 +1,10 @@
 """The store of one sweep: a Zarr group that xarray opens, which knows what is in it and whether that is whole.
 
-A chunk of the plan is a chunk of every variable of its family, so that no two tasks ever write one file. When all files
-of a chunk are there, their checksums are written, in one small file that says by being there that the chunk is done.
-Every file appears under its name at once and whole. That holds when a program is killed at any moment; it does not
-when the machine loses power, since nothing waits for the disk: whoever reads a file compares its checksum.
+A chunk of the plan is a chunk of every variable of its family, so that no two tasks ever write one file. The file of
+the status is written last: its existence marks the chunk as done. Every file appears under its name at once and
+complete. That holds when a program is killed at any moment; it does not when the machine loses power, because nothing
+waits for the disk. Therefore every file of values ends with its checksum (Zarr's codec crc32c). The group's description
+contains those of all arrays and has a checksum as well.
 
 Only this module, which writes, and `dataset` with `checked`, which read, import zarr or xarray.
 """
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.config.sweep import SweepStudy
-from zwidth.sweep.files import checksum, content, digest
+from zwidth.sweep.files import content, digest
 from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.words.errors import InputError, StoreError, how_to_install
 from zwidth.words.files import hidden_beside, remove_quietly, write_whole
@@ -32,10 +33,11 @@ from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
 
 SUFFIX = ".zarr"
-FORMAT = 1
+FORMAT = 2
+# Written by earlier releases with checksums in arrays of their own, which are not read any more.
+OLD_FORMAT = 1
 SEAL = "attributes_sha256"
-FILES = "file_checksums"
-# Zarr reads the first; the second is a copy of it, for the whole store would be lost with one flipped bit.
+# Zarr reads the first; the second is a copy of it, because one flipped bit would lose the whole store.
 _DESCRIPTIONS = ("zarr.json", "zwidth.json")
 
 
@@ -55,10 +57,6 @@ def check_installed() -> None:
             raise InputError(f"sweep: needs {name}, which is not installed; install it: {how_to_install('store')}")
 
 
-def name_checksums(family: str) -> str:
-    return f"{family}_checksum"
-
-
 class Store:
     """A store on the disk, in a folder ``<study>.zarr``."""
 
@@ -66,13 +64,13 @@ class Store:
         self.path = path
 
     @cached_property
-    def attributes(self) -> dict[str, Any]:
-        """What the store says of itself, twice; raises `StoreError` where neither can be trusted."""
+    def description(self) -> dict[str, Any]:
+        """The description of the group and its arrays; a `StoreError` if neither copy has a valid checksum."""
         faults = []
         for name in _DESCRIPTIONS:
             try:
-                attributes = json.loads((self.path / name).read_text(encoding="utf-8"))["attributes"]
-                if digest({key: value for key, value in attributes.items() if key != SEAL}) == attributes[SEAL]:
+                description = json.loads((self.path / name).read_text(encoding="utf-8"))
+                if _seal(description) == description["attributes"][SEAL]:
                     break
                 faults.append(f"{name} is damaged, its checksum is wrong")
             except FileNotFoundError:
@@ -83,10 +81,17 @@ class Store:
             if not any((self.path / name).exists() for name in _DESCRIPTIONS):
                 raise StoreError(f"{self.path}: no store of a sweep ({faults[0]}); check the path")
             raise StoreError(f"{self.path}: {'; '.join(faults)}; start again in a new folder")
-        if attributes.get("zwidth_format") != FORMAT:
-            what = attributes.get("zwidth_format")
-            raise StoreError(f"{self.path}: format {what}, this release reads format {FORMAT}; use another release")
-        return attributes
+        if (found := description["attributes"].get("zwidth_format")) not in (OLD_FORMAT, FORMAT):
+            raise StoreError(f"{self.path}: format {found}, this release reads format {FORMAT}; use another release")
+        return description
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        return self.description["attributes"]
+
+    @property
+    def has_checksums(self) -> bool:
+        return self.attributes["zwidth_format"] != OLD_FORMAT
 
     @cached_property
     def study(self) -> SweepStudy:
@@ -101,7 +106,7 @@ class Store:
         import zarr
 
         with silence_zarr():
-            group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=False)
+            group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=True)
             arrays: dict[str, Any] = {name: group[name] for family in self.plan.families for name in family.variables}
         # To look whether a chunk holds its fill value alone takes Zarr longer than to write it.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
@@ -111,13 +116,13 @@ class Store:
         return f"{self.study.name}/{task}"
 
     def files(self, task: Task) -> list[Path]:
-        """The files that hold a chunk, in the order of its variables."""
+        """Return the files of a chunk, in the order of its variables, which ends with the status."""
         key = "/".join(("c", *map(str, task.position)))
         return [self.path / name / key for name in task.plan.variables]
 
     def flag(self, task: Task) -> Path:
-        """The file that says by being there that a chunk is done."""
-        return self.path / name_checksums(task.family) / "c" / str(task.index) / "0"
+        """Return the file whose existence marks a chunk as done: that of its status."""
+        return self.files(task)[-1]
 
     def is_done(self, task: Task) -> bool:
         return self.flag(task).exists()
@@ -126,7 +131,7 @@ class Store:
         """The same of a chunk that another machine may have done just now."""
         if not self.is_done(task):
             # A network file system remembers for a while that a file was not there, unless its folder is read again.
-            for folder in reversed(self.flag(task).parents[:2]):
+            for folder in reversed(self.flag(task).parents[: len(task.position) + 1]):
                 with suppress(OSError):
                     os.listdir(folder)
         return self.is_done(task)
@@ -136,24 +141,20 @@ class Store:
         return [task for task in self.plan.tasks() if not self.is_done(task)]
 
     def write(self, task: Task, values: Mapping[str, np.ndarray]) -> None:
-        """Write all variables of a chunk, then mark it as done."""
-        files = self.files(task)
+        """Write all variables of a chunk, the status last."""
         shape = tuple(part.stop - part.start for part in task.place)
         with silence_zarr():
-            for name, file in zip(task.plan.variables, files, strict=True):
+            for name, file in zip(task.plan.variables, self.files(task), strict=True):
                 # Zarr would read what is left of a damaged chunk at the edge of the grid before it replaces it.
                 remove_quietly(file)
                 self._arrays[name][task.place or ...] = np.ascontiguousarray(values[name]).reshape(shape)
-        sums = np.array([checksum(file) for file in files], dtype="<u4")
-        write_whole(self.flag(task), sums.tobytes())
 
     def count_statuses(self) -> dict[str, np.ndarray]:
         """How many points of each family have each status; those of damaged chunks are not counted."""
         counts = {family.family: np.zeros(NOT_COMPUTED, int) for family in self.plan.families}
         for task in self.plan.tasks():
             name = STATUS_OF[task.family]
-            file = self.files(task)[task.plan.variables.index(name)]
-            if self.is_done(task) and checksum(file) == self.checksums(task).get(name):
+            if self.is_done(task) and not self.find_fault(self.flag(task)):
                 with silence_zarr():
                     status = np.asarray(self._arrays[name][task.place or ...])
                 # Nearly all are 0.
@@ -167,29 +168,25 @@ class Store:
         remove_quietly(self.flag(task))
 
     def fault_of(self, task: Task) -> str:
-        """What is wrong with a chunk that is marked as done; nothing where its files are what was written."""
-        sums = self.checksums(task)
-        if not sums:
-            return "its record of checksums is damaged"
-        files = zip(sums, self.files(task), strict=True)
-        wrong = [(name, file) for name, file in files if checksum(file) != sums[name]]
-        return ", ".join(f"{name} is {'damaged' if file.exists() else 'missing'}" for name, file in wrong)
+        """Return the names of the damaged and missing variables of a chunk that is marked as done; "" if none."""
+        faults = zip(task.plan.variables, map(self.find_fault, self.files(task)), strict=True)
+        return ", ".join(f"{name} is {fault}" for name, fault in faults if fault)
 
-    def checksums(self, task: Task) -> dict[str, int]:
-        """The checksums of the files of a chunk that is done, by their variables; nothing where they are damaged."""
-        kept, variables = content(self.flag(task)), task.plan.variables
-        whole = len(kept) == 4 * len(variables)
-        return dict(zip(variables, np.frombuffer(kept, "<u4").tolist(), strict=True)) if whole else {}
+    def find_fault(self, file: Path, data: bytes | None = None) -> str:
+        """Return "missing" or "damaged" for a file of values, read if not given; "" if its checksum is right."""
+        import google_crc32c
 
-    @property
-    def described(self) -> dict[str, int]:
-        """The checksums of the files beside the chunks, by their names: coordinates and descriptions of variables."""
-        return self.attributes[FILES]
+        data = content(file) if data is None else data
+        if not data:
+            return "damaged" if file.exists() else "missing"
+        right = google_crc32c.value(data[:-4]).to_bytes(4, "little") == data[-4:]
+        return "" if right or not self.has_checksums else "damaged"
 
     def damaged_files(self) -> list[str]:
-        """Those files that are not what was written, and the store's own description where it is damaged."""
-        found = [name for name, expected in self.described.items() if checksum(self.path / name) != expected]
-        # Two copies that differ: which of them is damaged, what is made anew from the sound one tells.
+        """Return the names of damaged coordinates, and of the group's description if its copies differ."""
+        places = ((name, len(dims)) for name, (dims, *_) in self.plan.grid.coordinates().items())
+        names = ["/".join((name, "c", *["0"] * count)) for name, count in places]
+        found = [name for name in names if self.find_fault(self.path / name)]
         first, second = (content(self.path / name) for name in _DESCRIPTIONS)
         return found if first == second else [*_DESCRIPTIONS, *found]
 
@@ -214,30 +211,37 @@ def create(path: Path, attributes: dict[str, Any]) -> Store:
 @contextmanager
 def _build_beside(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
     """A complete store without chunks, beside ``path``; what is left of it goes when the block ends."""
+    import zarr
+
     plan = kept_plan(SweepStudy.model_validate(attributes["study"]), attributes["plan"])
     grid = plan.grid
     with hidden_beside(path) as fresh:
         with silence_zarr():
             _build(fresh, plan)
-        files = sorted(file for file in fresh.rglob("*") if file.is_file() and file != fresh / "zarr.json")
-        sums = {file.relative_to(fresh).as_posix(): checksum(file) for file in files}
+            zarr.consolidate_metadata(fresh, zarr_format=3)
         # The coordinates that are no dimension, as CF lists them.
         auxiliary = " ".join(
             name for name in grid.coordinates() if name not in {dim.replace(".", "_") for dim in grid.dims}
         )
         described = {"Conventions": "CF-1.11", "zwidth_format": FORMAT, "coordinates": auxiliary, **attributes}
-        described = {key: value for key, value in described.items() if key not in (FILES, SEAL)} | {FILES: sums}
-        document = json.loads((fresh / "zarr.json").read_text(encoding="utf-8"))
-        document["attributes"] = {**described, SEAL: digest(described)}
+        document = json.loads((fresh / "zarr.json").read_text(encoding="utf-8")) | {"attributes": described}
+        document["attributes"] = described | {SEAL: _seal(document)}
         for name in _DESCRIPTIONS:
             write_whole(fresh / name, json.dumps(document, indent=2).encode())
         yield fresh
 
 
+def _seal(description: dict[str, Any]) -> str:
+    """Return the checksum of a description, without the checksum in it."""
+    attributes = {key: value for key, value in description["attributes"].items() if key != SEAL}
+    old = attributes.get("zwidth_format") == OLD_FORMAT
+    return digest(attributes if old else {**description, "attributes": attributes})
+
+
 def _build(path: Path, plan: Plan) -> None:
     """Write the coordinates and describe the variables."""
     import zarr
-    from zarr.codecs import BloscCodec, ZstdCodec
+    from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
     from zarr.codecs.numcodecs import PackBits
 
     group = zarr.create_group(path, zarr_format=3)
@@ -247,17 +251,20 @@ def _build(path: Path, plan: Plan) -> None:
         array = group.create_array(
             name,
             shape=values.shape,
+            chunks=values.shape,
             dtype=values.dtype,
+            compressors=[ZstdCodec(level=3), Crc32cCodec()],
             # NaN, which no value is: a chunk of zeros would otherwise not be written, and not be found missing.
             fill_value="" if values.dtype.kind == "T" else np.nan,
             dimension_names=dims,
             attributes=attributes,
         )
         array[...] = values
+    small, blosc = [ZstdCodec(level=3), Crc32cCodec()], BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
     keeping: dict[str, dict[str, Any]] = {
-        "bool": {"filters": [PackBits()], "compressors": [ZstdCodec(level=3)], "fill_value": False},
-        "float64": {"compressors": [BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")], "fill_value": np.nan},
-        "uint8": {"compressors": [ZstdCodec(level=3)], "fill_value": NOT_COMPUTED},
+        "bool": {"filters": [PackBits()], "compressors": small, "fill_value": False},
+        "float64": {"compressors": [blosc, Crc32cCodec()], "fill_value": np.nan},
+        "uint8": {"compressors": small, "fill_value": NOT_COMPUTED},
     }
     for family in plan.families:
         common: dict[str, Any] = {
@@ -274,16 +281,6 @@ def _build(path: Path, plan: Plan) -> None:
             group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
         kept = common | keeping["uint8"]
         group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **kept)
-        group.create_array(
-            name_checksums(family.family),
-            shape=(family.count, len(family.variables)),
-            chunks=(1, len(family.variables)),
-            dtype="<u4",
-            compressors=None,
-            fill_value=0,
-            dimension_names=(f"{family.family}_chunk", f"{family.family}_variable"),
-            attributes={"long_name": f"CRC-32 of the files of a chunk: {', '.join(family.variables)}; written last"},
-        )
 
 
 def list_stores(path: str | os.PathLike[str]) -> list[Path]:

@@ -111,7 +111,7 @@ def test_what_is_damaged_or_missing_is_named_and_not_shown(run, tmp_path):
         "config.yaml is damaged": lambda out: edit(out / "config.yaml", "num: 30", "num: 31"),
         "config.yaml is missing": lambda out: (out / "config.yaml").unlink(),
         "plane.zarr is missing": lambda out: shutil.rmtree(out / "plane.zarr"),
-        "plane.zarr: chunks are missing": lambda out: shutil.rmtree(out / "plane.zarr" / "wall_checksum" / "c"),
+        "plane.zarr: chunks are missing": lambda out: shutil.rmtree(out / "plane.zarr" / "status" / "c"),
         "top.svg is damaged": lambda out: edit(out / "top.svg", "</svg>", "</svg> "),
     }
     for number, (says, damage) in enumerate(damages.items()):
