@@ -42,7 +42,7 @@ from .parts import devices as devices
 from .parts.actuator import Actuator as Actuator
 from .parts.device import Coupling as Coupling
 from .parts.device import Device as Device
-from .parts.grasps import REFERENCE_GRASPS as REFERENCE_GRASPS
+from .parts.grasps import reference_grasps as reference_grasps
 from .parts.linear_device import LinearDevice as LinearDevice
 from .parts.measured import MeasuredDevice as MeasuredDevice
 from .parts.mode import Mode as Mode

@@ -41,6 +41,15 @@ class Case:
     single: float = 2e-3
     # A bad number by itself raises as well, since quantities in SI units come one by one.
     strict: bool = False
+    # A point of whole numbers, at which `contract.matrix` tries every type; arguments without an entry are 1.
+    point: dict[str, int] = field(default_factory=dict)
+    # Arguments that are single numbers, as the parameters of a scene are.
+    one_number: tuple[str, ...] = ()
+
+    @property
+    def whole(self) -> dict[str, int]:
+        """The point of whole numbers."""
+        return {name: self.point.get(name, 1) for name in self.good}
 
     @property
     def function(self) -> str:
@@ -75,6 +84,9 @@ SI = {"mass": [0.1, 0.2, 1.0], "period": [1e-3, 1e-3, 2e-3]}
 SI_DEVICE = {**SI, "damping": [0.0, 10.0, 5.0], "delay": [0.0, 1e-3, 3e-3]}
 BAD_SI = {"mass": -1.0, "period": 0.0, "damping": -1.0, "delay": np.nan}
 BEYOND_SI = {"mass": 1e31, "period": 1e-31, "damping": 1e31, "delay": 1e31}
+# A stable wall of whole numbers, and the same in SI units.
+WHOLE_WALL = {"delta": 8}
+WHOLE_SI = {"mass": 2, "damping": 8}
 DOMAINS = {
     (WALLS := "walls"): "a device, and alpha and beta 0 or 1e-60 to 1e60 in magnitude",
     (DEVICES := "devices"): "delta 0 to 1e12, d 0 to 1e5",
@@ -83,7 +95,7 @@ DOMAINS = {
 
 
 def of_walls(call, **options):
-    options = {"domain": WALLS, **options}
+    options = {"domain": WALLS, "point": WHOLE_WALL, **options}
     return Case(call.__name__, call, {**WALL, **ONE_DELAY}, BAD_WALL, BEYOND_WALL, **options)
 
 
@@ -91,11 +103,13 @@ def of_devices(name, call, line=None, **options):
     line = line or {}
     bad = {**BAD_DEVICE, **dict.fromkeys(line, np.nan)}
     beyond = {**BEYOND_DEVICE, **{key: 1e61 for key in line if key != "omega"}}
-    return Case(name, call, {**line, **DEVICE}, bad, beyond, domain=DEVICES, **options)
+    return Case(name, call, {**line, **DEVICE}, bad, beyond, domain=DEVICES, point=WHOLE_WALL, **options)
 
 
 def of_quantities(call, **options):
-    return Case(call.__name__, call, SI_DEVICE, BAD_SI, BEYOND_SI, domain=QUANTITIES, strict=True, **options)
+    return Case(
+        call.__name__, call, SI_DEVICE, BAD_SI, BEYOND_SI, domain=QUANTITIES, strict=True, point=WHOLE_SI, **options
+    )
 
 
 CASES = [
@@ -107,6 +121,7 @@ CASES = [
         {**BEYOND_SI, "stiffness": 1e31},
         domain=QUANTITIES,
         strict=True,
+        point=WHOLE_SI,
     ),
     Case(
         "denormalize",
@@ -116,6 +131,7 @@ CASES = [
         {"mass": 1e31, "alpha": 1e61, "delta": 1e13},
         domain=f"{WALLS}, {QUANTITIES}",
         strict=True,
+        point=WHOLE_SI,
     ),
     of_walls(zwidth.char_poly, concrete=("d",), extra_axes=1),
     of_walls(zwidth.poles, concrete=("d",), extra_axes=1, derivatives=1, domain=f"{WALLS}, at most 4,000 poles"),
@@ -158,6 +174,43 @@ CASES = [
     ),
 ]
 
+
+def of_scenes(question, answer, velocity=None, **options):
+    """A question of a scene and a wall, as a function of their numbers."""
+    wall = () if "max_stiffness" in question else ("stiffness", "virtual_damping")
+    device = ("mass", "damping", "period", "delay")
+
+    def call(mass, damping, period, delay=0, **wall):
+        parts = {} if velocity is None else {"velocity": velocity}
+        return answer(zwidth.Scene(zwidth.Device(mass, damping), zwidth.Timing(period, delay), **parts), **wall)
+
+    left_out = options.pop("without", ())
+    names = [name for name in (*device, *wall) if name not in left_out]
+    good = {name: [1.0] for name in names}
+    return Case(f"Scene.{question}", call, good, {}, point=WHOLE_SI, one_number=device, **options)
+
+
+# Methods of scenes that the matrix of types runs through as well: rigid ones, and `max_stiffness` behind a filter.
+SCENE_CASES = [
+    of_scenes("is_stable", zwidth.Scene.is_stable, derivatives=None),
+    of_scenes("is_passive", zwidth.Scene.is_passive, derivatives=None),
+    of_scenes("decide_stability", zwidth.Scene.decide_stability, derivatives=None, refuses_tracing=True),
+    of_scenes("spectral_radius", zwidth.Scene.spectral_radius),
+    of_scenes("poles", zwidth.Scene.poles, concrete=("period", "delay"), extra_axes=1, derivatives=1),
+    of_scenes("margins", zwidth.Scene.margins, gradient_in="tests/unit/loops/rigid/test_margins.py"),
+    of_scenes("passivity_margin", zwidth.Scene.passivity_margin),
+    of_scenes("max_stiffness", zwidth.Scene.max_stiffness),
+    of_scenes("max_stiffness without delay", zwidth.Scene.max_stiffness, without=("delay",)),
+    of_scenes(
+        "max_stiffness behind a filter",
+        zwidth.Scene.max_stiffness,
+        zwidth.LowPass(time_constant=2),
+        concrete=("period", "delay"),
+        derivatives=1,
+    ),
+    of_scenes("to_si", lambda scene, stiffness, virtual_damping: scene.to_si(alpha=stiffness, beta=virtual_damping)),
+]
+
 # Public functions that take no arrays point by point, or that compile for long: who holds their contract instead.
 OTHERS = {
     "assess": "one scene: tests/unit/studies/test_published.py, tests/properties/test_consistency.py",
@@ -170,6 +223,7 @@ OTHERS = {
     "load_config": "a file: tests/unit/config/test_reader.py",
     "load_scene": "a file: tests/unit/cli/test_scene_file.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",
+    "reference_grasps": "one radius: tests/unit/scenes/test_recommendation.py",
     "respond": "one record: tests/unit/fitting/test_respond.py",
     "robust_max_stiffness": "boxes of devices: tests/unit/scenes/test_robust.py",
     "robust_wall": "boxes of devices: tests/unit/scenes/test_robust.py",

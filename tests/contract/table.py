@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contract.cases import CASES, DOMAINS, OTHERS, Case
+from contract.matrix import EVERY_CASE, combinations
 
 _HEAD = """# What every public function promises
 
@@ -12,6 +13,10 @@ tests of `tests/contract/test_contract.py`:
 - **Anything in.** Numbers, lists, NumPy and JAX arrays that broadcast; numbers give NumPy scalars, NumPy arrays give
   NumPy arrays, JAX arrays give JAX arrays, all in float64 whatever JAX's settings. A number is answered without loading
   JAX. Nothing in, nothing out. What is no real number, and shapes that do not fit, raise `InputError` by name.
+- **Every type of argument.** One argument traced or none, the others Python numbers, NumPy scalars and arrays of ints
+  and floats, 0-d arrays, lists or JAX arrays; called directly and inside `jit`, `vmap`, `grad`, `jit(grad)` and the
+  second derivative; in float64 and float32: {combinations:,} combinations, of methods of a rigid `Scene` as well
+  (`tests/contract/test_matrix.py`).
 - **Bad points.** An entry that is NaN, infinite or negative where it must not be gives what the column "bad points"
   says, with INVALID_INPUT where there is a status; one beyond the domain likewise, with OUT_OF_RANGE. Its neighbors
   keep every bit. A number beyond the domain raises `InputError` with field, value and range; "raises" in the column
@@ -41,7 +46,8 @@ def page() -> str:
     rows = "".join(_row(case) for case in CASES)
     elsewhere = ", ".join(f"`{case.name}`" for case in CASES if case.gradient_in)
     domains = "".join(f"| {name} | {said} |\n" for name, said in DOMAINS.items())
-    head = _HEAD.format(elsewhere=elsewhere, domains=domains)
+    number = sum(1 for case in EVERY_CASE for _ in combinations(case))
+    head = _HEAD.format(elsewhere=elsewhere, domains=domains, combinations=number)
     others = "".join(f"| `{name}` | {why} |\n" for name, why in sorted(OTHERS.items()))
     rest = "Functions that take no arrays point by point, or that a number has compiled:"
     return f"{head}{rows}\n{rest}\n\n| function | takes, and where its promises are tested |\n|---|---|\n{others}"

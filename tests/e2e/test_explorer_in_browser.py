@@ -138,6 +138,8 @@ def test_a_click_gives_the_verdict_of_check(page, place):
     wait(page, f"document.getElementById('stiffness').valueAsNumber !== {before!r}")
     settle(page)
     assert page.get_attribute("#verdict", "data-text") == words_of_check(shown_scene(page))
+    labels = page.evaluate("[...document.querySelectorAll('#verdict div > :first-child')].map(e => e.textContent)")
+    assert {"device", "passive", "K_max"} <= set(labels)
     assert page.inner_text("#word") == ("stable" if zwidth.assess(shown_scene(page)).stable else "UNSTABLE")
 
 

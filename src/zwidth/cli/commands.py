@@ -102,6 +102,9 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
 def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as_json: bool) -> None:
     """Print the stiffest stable wall of a device.
 
+    Only B >= 0 counts with a velocity filter, a linear system or a measured response: there a negative B may cancel
+    damping that exists in the model alone. Scene.max_stiffness(negative_damping=True) in Python includes B < 0.
+
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
     would change is printed as well. `zwidth recommend` says which softer wall to set. SCENE.yaml (or the folder of a
     run) supplies what no option gives; options override it.
@@ -109,6 +112,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     from zwidth.pages.verdict import spell_device
     from zwidth.scenes.assessment import name_kind
     from zwidth.scenes.scene import Scene
+    from zwidth.scenes.stiffest import explain_missing
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --rate (with --damping and --delay)")
@@ -119,7 +123,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
         what = "no wall with K > 0 is stable on this device" if none else "K_max of this device was not found"
-        raise click.UsageError(f"{what}: {Status(int(wall.status)).message}")
+        raise click.UsageError(f"{what}: {explain_missing(scene, wall.status)}")
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
     if isinstance(scene.device, Device):

@@ -100,7 +100,7 @@ def _scale(table: Table) -> tuple[dict[float, Any], float, str]:
 
 
 def _name_damping(damping: float) -> str:
-    return f"$b =$ {with_unit(damping, 'N s/m', 3)}"
+    return f"$b$ = {with_unit(damping, 'N s/m', 3)}"
 
 
 def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) -> str:

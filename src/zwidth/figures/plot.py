@@ -183,7 +183,7 @@ def _draw_response(ax: Axes, response: Table) -> None:
     if settled <= time[-1]:
         dot = Line2D([], [], linestyle="", marker="o", markersize=4.5, color=ax.lines[0].get_color())
         text = f"settled to 2 % after {settled * clock:.3g} {unit}"
-        ax.legend([dot], [text], loc="upper right", handletextpad=0.2)
+        ax.legend([dot], [text], loc="lower right", handletextpad=0.2)
 
 
 @_draws_scene

@@ -12,7 +12,7 @@ from matplotlib.path import Path
 
 from zwidth.figures import style
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select, stack
-from zwidth.words.formatting import round_safely
+from zwidth.words.formatting import round_safely, with_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -205,12 +205,15 @@ def draw_stable_set(
     beyond, most = 0.28 * max(1.0, 5.6 / wide), max(rows[names[0]], default=np.nan) * factors[0]
     rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
     for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
+        # Rounded down, K is stable as it is read.
+        read = round_safely(wall[0], "below", digits), wall[1]
         wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
         which = kind.split()[0]
-        # It holds as it is read.
-        read = round_safely(wall[0], "below", digits), wall[1]
-        symbols = zip((r"\alpha", r"\beta") if normalized else "KB", read, units, strict=True)
-        numbers = [f"${symbol} = {value:.{digits}g}$ {unit}".rstrip() for symbol, value, unit in symbols]
+        symbols = zip((r"\alpha", r"\beta") if normalized else "KB", read, ("N/m", "N s/m"), strict=True)
+        numbers = [
+            f"${symbol}$ = {f'{value:.{digits}g}' if normalized else with_unit(value, unit, digits)}"
+            for symbol, value, unit in symbols
+        ]
         text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""
         look = {"color": style.BLACK} if alone else {"color": colors[label]}
         look |= {"marker": markers[label]} if which == "stiffest" else {}

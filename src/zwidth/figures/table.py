@@ -38,14 +38,14 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
     def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         given: Any = [*args, *kwargs.values()]
         read: Any = [name_as_linear(each) for each in given]
-        turned = any(new is not old for new, old in zip(read, given, strict=True)) or any(map(_turns, given))
+        turned = any(new is not old for new, old in zip(read, given, strict=True)) or any(map(is_of_rotary, given))
         with house_style(), use_kind(turned or is_rotary()):
             return function(*read[: len(args)], **dict(zip(kwargs, read[len(args) :], strict=True)))  # pyright: ignore
 
     return within
 
 
-def _turns(data: Any) -> bool:
+def is_of_rotary(data: Any) -> bool:
     """Return whether a dataset of a sweep has units of rotary devices."""
     variables = getattr(data, "variables", {})
     return any(str(each.attrs.get("units", "")) in ROTARY.values() for each in variables.values())

@@ -97,28 +97,24 @@ def explain_residuals(best: FittedModel) -> str:
     basis = np.linalg.qr(slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300))[0]
     left = best.residuals - basis @ (basis.T @ best.residuals)
     squares = float(left @ left)
-    g = float(best.theta[0])
     # Rounding errors drift as a weak spring does, so that they are looked at first.
     if rounded := _explain_rounding(best, basis, squares):
         return rounded
 
-    def share(*pushes: list[np.ndarray]) -> tuple[float, np.ndarray]:
+    def share(*pushes: list[np.ndarray]) -> float:
         columns = np.array([_respond(best, push) for push in pushes]).T
         columns = columns - basis @ (basis.T @ columns)
-        values, rest = _solve(left, list(columns.T))
-        return 1.0 - rest / squares, values
+        return 1.0 - _solve(left, list(columns.T))[1] / squares
 
     places = [log.position - log.position.mean() for log in best.model.logs]
-    spring, values = share([-each for each in places])
+    spring = share([-each for each in places])
     if is_rotary() and max(map(np.ptp, places)) > 0.5:
-        gravity, torques = share(*([turn(log.position) for log in best.model.logs] for turn in (np.sin, np.cos)))
+        gravity = share(*([turn(log.position) for log in best.model.logs] for turn in (np.sin, np.cos)))
         if gravity > _SHARE and gravity > spring + 0.1:
-            size = with_unit(float(np.hypot(*torques)) / g, "N", 3)
-            return f"it follows the angle as gravity does, with a torque of {size}"
+            return "it follows the angle, as of gravity"
+    # Friction hides a part of a spring, so that its stiffness is not found here.
     if spring > _SHARE:
-        stiffness = float(values[0]) / g
-        kind = "a spring or gravity" if stiffness > 0 else "gravity away from rest"
-        return f"it follows the position as {kind} of {with_unit(abs(stiffness), 'N/m', 3)} does"
+        return "it follows the position, as of a weak spring, a cable or gravity"
     return ""
 
 

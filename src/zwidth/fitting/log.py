@@ -260,8 +260,8 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
     cause = explain_motion(model.logs, period) if theta[0] <= 0 or unexplained else Cause("")
     if cause.words:
         raise InputError(
-            f"force: {cause.words} as well; support the device, or play a record of zwidth.excite, for zwidth.respond "
-            "needs no model"
+            f"force: {cause.words}; support the device, or measure its response without a model: zwidth.excite, "
+            "zwidth.respond"
         )
     if theta[0] <= 0 and (cause.reversed or left < _UNEXPLAINED):
         raise InputError(

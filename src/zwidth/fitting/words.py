@@ -117,7 +117,8 @@ def _spell_estimate(fit: DeviceFit, name: str) -> str:
     value = _spell(fit, name)
     low, high = (spell(name, end, _count_digits(fit, name)) for end in interval)
     unit = f" {high.partition(' ')[2]}"
-    low, high = low.removesuffix(unit), high.removesuffix(unit) if value.endswith(unit) else high
+    if low.endswith(unit):
+        low, high = low.removesuffix(unit), high.removesuffix(unit) if value.endswith(unit) else high
     return f"{value} (95 %: {low} to {high})"
 
 

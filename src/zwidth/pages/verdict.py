@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.pages.words import fold, line, part_lines, scene_notes, spell_radius, word_of
 from zwidth.parts.device import Device
-from zwidth.parts.grasps import RADIUS
+from zwidth.parts.grasps import RADII
 from zwidth.scenes.assessment import round_margin
 from zwidth.scenes.stabilization import stabilize
 from zwidth.words.formatting import plain, round_safely, spell_periods, spell_stiffness, tell_apart, with_unit
@@ -75,7 +75,9 @@ def check_lines(
     if word == "MARGINAL":
         lines.append(line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
     lines.append("")
-    if word == "UNSTABLE" and limits is not None:
+    if word == "UNSTABLE" and damper and dampings:
+        lines.append(line("remedy", f"a pure damper: {_spell_intervals('B', dampings, 'N s/m', 'K')}"))
+    elif word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no change of a single parameter is known"]
         lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
     lines += margin_lines(verdict)
@@ -225,7 +227,7 @@ def _list_hands(found: Recommendation) -> list[str]:
     labels = {name: stable for name, stable in found.grasps.items() if name != "released"}
     if not labels:
         return []
-    at = f" at a radius of {1e3 * RADIUS:g} mm" if is_rotary() else ""
+    at = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if is_rotary() else ""
     unstable = [name for name, stable in labels.items() if not stable]
     if not unstable:
         return [line("in a hand", f"stable in all {COUNTS[len(labels)]} reference grasps{at}")]

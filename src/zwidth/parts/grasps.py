@@ -1,36 +1,55 @@
-"""Reference grasps: hands that hold a device, with which a recommended wall is checked.
-
-The hand is that of `configs/operator.yaml`: 0.554 kg, 6.45 N s/m and 135 N/m, measured in one trial (Sci. Rep. 5:18004,
-2015, Fig. 3). The grasp between hand and device is a spring of 1 kN/m (soft) or 10 kN/m (firm), with a damper of 1, 5
-or 20 N s/m: the values of that configuration, which are assumed, not measured.
-"""
+"""Reference grasps: hands that hold a device, with which a recommended wall is checked."""
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
 from itertools import product
 
+from zwidth.parts.checks import check_number
 from zwidth.parts.operator import Operator
+from zwidth.words.quantities import POSITIVE
 
 HAND = Operator(**Operator.usual["rigid"])
 SPRINGS = {"soft": 1e3, "firm": 10e3}  # N/m
 DAMPERS = {"light": 1.0, "medium": 5.0, "strong": 20.0}  # N s/m
-RADIUS = 0.05  # m, from the axis of a rotary device to the hand
-
-REFERENCE_GRASPS: dict[str, Operator] = {
-    f"{spring}, {damper} damping": replace(HAND, coupling_stiffness=SPRINGS[spring], coupling_damping=DAMPERS[damper])
-    for spring, damper in product(SPRINGS, DAMPERS)
-}
+# From the axis of a rotary device to the hand, in m. Light damping destabilizes narrow ranges of the radius.
+RADII = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.032, 0.04, 0.05, 0.063, 0.08, 0.1)
 
 
-def list_grasps(rotary: bool, radius: float = RADIUS) -> dict[str, Operator]:
-    """Return the reference grasps for a linear device, or for a rotary one that is held at a radius in m.
+def reference_grasps(radius: float | str | None = None) -> dict[str, Operator]:
+    """Return the grasps with which a recommended wall is checked.
 
-    Mass, damping and stiffness about the axis are those of the hand times the radius squared.
+    One hand (0.554 kg, 6.45 N s/m and 135 N/m to ground, measured in one trial) holds the device by a spring of 1 kN/m
+    (soft) or 10 kN/m (firm) and a damper of 1, 5 or 20 N s/m (light, medium, strong damping). The springs and dampers
+    are assumed, as in the example configuration ``operator``.
+
+    Args:
+        radius: distance of the hand from the axis of a rotary device, in m, > 0; its mass, dampers and springs are
+            multiplied by the radius squared. None for a linear device.
+
+    Returns:
+        A dict of six `zwidth.Operator` by name, such as "soft, light damping".
+
+    References:
+        Sci. Rep. 5:18004 (2015), Fig. 3 (the hand).
+
+    Example:
+        >>> import zwidth
+        >>> scene = zwidth.Scene(zwidth.Device("100 g", damping=1), zwidth.Timing(rate="1 kHz", delay="1 periods"))
+        >>> [name for name, grasp in zwidth.reference_grasps().items()
+        ...  if not scene.replace(operator=grasp).is_stable("11.22 kN/m", 42.37)]
+        ['firm, light damping']
     """
-    if not rotary:
-        return REFERENCE_GRASPS
-    return {
-        name: Operator(**{item.name: getattr(grasp, item.name) * radius**2 for item in fields(grasp)})
-        for name, grasp in REFERENCE_GRASPS.items()
-    }
+    scale = 1.0 if radius is None else check_number("radius", radius, "m", POSITIVE) ** 2
+    grasps = {}
+    for spring, damper in product(SPRINGS, DAMPERS):
+        grasp = replace(HAND, coupling_stiffness=SPRINGS[spring], coupling_damping=DAMPERS[damper])
+        scaled = {item.name: getattr(grasp, item.name) * scale for item in fields(grasp)}
+        grasps[f"{spring}, {damper} damping"] = Operator(**scaled)
+    return grasps
+
+
+def list_grasps(rotary: bool) -> list[tuple[str, Operator]]:
+    """Return the reference grasps of a linear device with their names, or of a rotary one at each of the radii."""
+    radii = RADII if rotary else (None,)
+    return [each for radius in radii for each in reference_grasps(radius).items()]

@@ -5,16 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from math import lcm
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from zwidth.parts.exact_polynomials import (
+    Polynomial,
+    characteristic_polynomial,
+    divide,
+    find_common_factor,
+    find_roots,
+    multiply,
+    subtract,
+    trim,
+)
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import short
-
-Polynomial: TypeAlias = tuple[Fraction, ...]
-"""Exact coefficients, highest power first."""
 
 _FORMS = (
     "(A, B, C), (numerator, denominator), (zeros, poles, gain), or a model of scipy.signal or python-control with one "
@@ -46,7 +52,9 @@ class LinearDevice(WholeDevice):
     """A device as any strictly proper linear system from commanded force (N) to sensed position (m).
 
     Every question about walls is answered of it; its numbers are taken as exact. Nothing is known of bodies: a hand,
-    friction, starts and energies of motions are for `Device`.
+    friction, starts and energies of motions are for `Device`. Only walls with B >= 0 count for the stiffest wall and
+    for recommendations: B < 0 would cancel damping of the model that the device may not have. `Scene.max_stiffness`
+    with ``negative_damping=True`` includes them.
 
     Args:
         system: matrices ``(A, B, C)``, coefficients ``(numerator, denominator)`` with the highest power first, as text
@@ -139,29 +147,23 @@ def split_fraction(text: str) -> tuple[list[float], list[float]]:
 
 def _read(given: Any) -> RationalResponse:
     """The exact response of a system in any form."""
-    try:
-        import flint
-    except ImportError as error:
-        raise InputError("device: a LinearDevice needs python-flint; pip install 'zwidth[certified]'") from error
     given = split_fraction(given) if isinstance(given, str) else given
     dt = getattr(given, "dt", None)
     if dt is True:
         raise InputError("device: got a sampled system without its period; give it dt, that of the loop, in s")
     try:
-        top, bottom = _read_form(given, flint)
+        top, bottom = _read_form(given)
     except (TypeError, ValueError, OverflowError, LookupError) as error:
         raise InputError(f"device: got {str(given)[:60]!r}; needed are finite numbers as {_FORMS}") from error
-    if not top or bottom.degree() < 1:
+    if not top or len(bottom) < 2:
         raise InputError("device: got a system that a force does not move; check input and output")
-    if top.degree() >= bottom.degree():
+    if len(top) >= len(bottom):
         raise InputError(
-            f"device: got a numerator of degree {top.degree()} over a denominator of degree {bottom.degree()}; a force "
+            f"device: got a numerator of degree {len(top) - 1} over a denominator of degree {len(bottom) - 1}; a force "
             "must not move the position at once, so the denominator's must be higher: add the lag that is missing"
         )
-    parts = (top, bottom, top.gcd(bottom))
-    first, second, common = (tuple(Fraction(int(c.p), int(c.q)) for c in reversed(part.coeffs())) for part in parts)
-    _refuse_stuck(find_roots(common), "z" if dt else "s")
-    return RationalResponse(first, second, float(dt) if dt else None)
+    _refuse_stuck(find_roots(find_common_factor(top, bottom)), "z" if dt else "s")
+    return RationalResponse(top, bottom, float(dt) if dt else None)
 
 
 def _refuse_stuck(roots: np.ndarray, letter: str) -> None:
@@ -174,51 +176,56 @@ def _refuse_stuck(roots: np.ndarray, letter: str) -> None:
         )
 
 
-def _read_form(given: Any, flint: Any) -> tuple[Any, Any]:
-    """Numerator and denominator of matrices, coefficients or roots, as polynomials of exact numbers."""
+def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
+    """Return numerator and denominator of matrices, coefficients or roots."""
     if hasattr(given, "A") and hasattr(given, "C"):
         given = (given.A, given.B, given.C, given.D)
     elif hasattr(given, "num") and hasattr(given, "den"):
         given = tuple(_take_channel(part) for part in (given.num, given.den))
     elif hasattr(given, "zeros") and hasattr(given, "gain"):
         given = (given.zeros, given.poles, given.gain)
-
-    def exact(value: Any) -> Any:
-        return flint.fmpq(*float(value).as_integer_ratio())
-
-    def expand(roots: Any) -> Any:
-        """The monic polynomial of real roots and conjugate pairs."""
-        known: Any = np.asarray(roots, complex).ravel()
-        found = flint.fmpq_poly([1])
-        for root in known[known.imag >= 0].tolist():
-            real, imag = exact(root.real), exact(root.imag)
-            if root.imag and np.sum(known == root.conjugate()) != np.sum(known == root):
-                raise ValueError("a root without its conjugate")
-            found *= flint.fmpq_poly([real * real + imag * imag, -2 * real, 1] if root.imag else [-real, 1])
-        if found.degree() != known.size:
-            raise ValueError("a root without its conjugate")
-        return found
-
-    def reduce(top: Any, bottom: Any) -> tuple[Any, Any]:
-        """Without common factors, as sums of responses have them: a response knows of no hidden motion."""
-        common = top.gcd(bottom) if top.degree() < bottom.degree() else 1
-        return top // common, bottom // common
-
     if len(given) == 2:
-        top, bottom = (flint.fmpq_poly([exact(c) for c in np.ravel(part)[::-1]]) for part in given)
-        return reduce(top, bottom)
+        return _reduce(*(trim(np.ravel(part)) for part in given))
     if np.ndim(given[0]) < 2:
         zeros, poles, gain = given
-        return reduce(expand(zeros) * exact(gain), expand(poles))
+        return _reduce(multiply(_expand(zeros), trim([gain])), _expand(poles))
     A, B, C, *D = given
     size = len(A)
     if np.shape(A) != (size, size) or np.size(B) != size or np.size(C) != size or np.any(D):
         raise ValueError("matrices of one input and one output without feedthrough")
-    rate = flint.fmpq_mat([[exact(value) for value in row] for row in np.asarray(A, float)])
-    outer = flint.fmpq_mat([[exact(b) * exact(c) for c in np.ravel(C)] for b in np.ravel(B)])
-    bottom = rate.charpoly()
+    rate, push, seen = (_as_fractions(part) for part in (A, np.ravel(B), np.ravel(C)))
+    bottom = characteristic_polynomial(rate)
     # C adj(s - A) B by the lemma of the determinant.
-    return (rate - outer).charpoly() - bottom, bottom
+    return subtract(characteristic_polynomial(rate - np.outer(push, seen)), bottom), bottom
+
+
+def _as_fractions(values: Any) -> np.ndarray:
+    """Return an array of exact fractions of floats."""
+    floats = np.asarray(values, float)
+    return np.array([Fraction(value) for value in floats.ravel().tolist()], object).reshape(floats.shape)
+
+
+def _expand(roots: Any) -> Polynomial:
+    """Return the monic polynomial of real roots and conjugate pairs."""
+    known: Any = np.asarray(roots, complex).ravel()
+    found: Polynomial = (Fraction(1),)
+    for root in known[known.imag >= 0].tolist():
+        real, imag = Fraction(root.real), Fraction(root.imag)
+        if root.imag and np.sum(known == root.conjugate()) != np.sum(known == root):
+            raise ValueError("a root without its conjugate")
+        factor = (Fraction(1), -2 * real, real * real + imag * imag) if root.imag else (Fraction(1), -real)
+        found = multiply(found, factor)
+    if len(found) - 1 != known.size:
+        raise ValueError("a root without its conjugate")
+    return found
+
+
+def _reduce(top: Polynomial, bottom: Polynomial) -> tuple[Polynomial, Polynomial]:
+    """Return both without common factors, as sums of responses have them: a response shows no hidden mode."""
+    if not top or len(top) >= len(bottom):
+        return top, bottom
+    common = find_common_factor(top, bottom)
+    return divide(top, common)[0], divide(bottom, common)[0]
 
 
 def _take_channel(part: Any) -> Any:
@@ -228,16 +235,3 @@ def _take_channel(part: Any) -> Any:
     if np.ndim(part) != 1:
         raise ValueError("more than one channel")
     return part
-
-
-def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
-    """All roots to the last digits, or 1 less each of them; equal ones as often as they are there."""
-    import flint
-
-    scale = lcm(*(value.denominator for value in polynomial))
-    whole = flint.fmpz_poly([int(value * scale) for value in reversed(polynomial)])
-    if offsets:
-        whole = whole(flint.fmpz_poly([1, -1]))
-    with flint.ctx.workprec(128):
-        found: Any = whole.complex_roots()
-        return np.array([complex(root) for root, times in found for _ in range(times)], complex)

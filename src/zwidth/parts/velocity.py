@@ -188,13 +188,17 @@ class VelocityFilter(Part):
     """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
 
     Args:
-        numerator: coefficients, highest power first, in 1/s.
-        denominator: likewise, of at least the numerator's degree (a filter cannot see the future), stable.
+        numerator: coefficients, highest power first, in 1/s; or a list of them, one for each section in series.
+        denominator: likewise, of at least the numerator's degree (a filter cannot see the future), stable. Sections
+            keep the poles of a filter of high order, which the rounding errors of its coefficients move.
 
     Example:
         >>> import zwidth
         >>> zwidth.VelocityFilter([1000, -1000], [1, 0]).estimate(1e-3).gain
         1.0
+        >>> from scipy import signal
+        >>> sos = signal.butter(8, 2, fs=1000, output="sos")
+        >>> velocity = zwidth.VelocityFilter([[1000, -1000], *sos[:, :3]], [[1, 0], *sos[:, 3:]])
     """
 
     numerator: Any
@@ -202,43 +206,63 @@ class VelocityFilter(Part):
 
     def __post_init__(self) -> None:
         for name in ("numerator", "denominator"):
-            try:
-                values = np.atleast_1d(np.asarray(getattr(self, name), float))
-            except (TypeError, ValueError, OverflowError) as error:
-                raise InputError(f"velocity.{name}: a list of real coefficients is needed") from error
-            values = np.trim_zeros(values, "f") if values.ndim == 1 else values
-            if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
-                raise InputError(
-                    f"velocity.{name}: got {getattr(self, name)!r}; a list of finite coefficients, highest power "
-                    "first, not all 0, is needed"
-                )
-            object.__setattr__(self, name, tuple(values.tolist()))
-        if len(self.numerator) > len(self.denominator):
+            sections: tuple[Any, ...] = _read_sections(name, getattr(self, name))
+            (first, *others) = sections
+            object.__setattr__(self, name, sections if others else first)
+        top, bottom = (sum(len(section) - 1 for section in part) for part in self._sections)
+        if top > bottom:
             raise InputError(
-                f"velocity.numerator: degree {len(self.numerator) - 1} above the denominator's "
-                f"{len(self.denominator) - 1} needs samples of the future; multiply the denominator by z"
+                f"velocity.numerator: degree {top} above the denominator's {bottom} needs samples of the future; "
+                "multiply the denominator by z"
             )
-        largest = np.max(np.abs(1.0 - self._roots[1]), initial=0.0)
-        if largest >= 1.0:
-            raise InputError(
-                f"velocity.denominator: a pole of magnitude {largest:.6g}; a filter with a pole on or outside the "
-                "unit circle never forgets, and no wall makes such a loop stable"
-            )
+        self._check_poles()
+
+    def _check_poles(self) -> None:
+        """Refuse poles on or outside the unit circle."""
+        poles = self._roots[1]
+        largest = np.max(np.abs(1.0 - poles), initial=0.0)
+        if largest < 1.0:
+            return
+        got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
+        # An integrator has one pole at z = 1; rounding errors move several that are next to it.
+        slow = np.abs(poles) < _NEXT_TO_ONE
+        if np.sum(slow) != 1 and any(_is_rounding(section) for section in self._sections[1]):
+            cause = "Cause: rounding of the coefficients; give sections in series (scipy.signal: output='sos')"
+        elif np.any(poles[slow] == 0):
+            cause = "Integral action: give controller times sampled device as one LinearDevice (K = 1)"
+        else:
+            cause = "Check the coefficients: highest power first"
+        raise InputError(got + cause)
+
+    @property
+    def _sections(self) -> tuple[Any, Any]:
+        """The coefficients of the sections of numerator and denominator."""
+        both: Any = self.numerator, self.denominator
+        top, bottom = (part if isinstance(part[0], tuple) else (part,) for part in both)
+        return top, bottom
 
     @cached_property
     def _roots(self) -> tuple[np.ndarray, np.ndarray, int]:
         """Zeros and poles by their offsets from 1, and by how many powers of z the denominator exceeds both."""
-        top, bottom = np.array(self.numerator), np.array(self.denominator)
-        behind = _trailing(bottom) - _trailing(top)
-        top, bottom = np.trim_zeros(top, "b"), np.trim_zeros(bottom, "b")
-        return _offsets(top), _offsets(bottom), behind
+        found, trailing = [], []
+        for part in self._sections:
+            sections = [np.array(section) for section in part]
+            trailing.append(sum(map(_trailing, sections)))
+            found.append(np.concatenate([_offsets(np.trim_zeros(section, "b")) for section in sections]))
+        return found[0], found[1], trailing[1] - trailing[0]
 
     def estimate(self, period: Any) -> Estimate:
         """The estimate for a loop of this period, normalized."""
-        gain = self.numerator[0] / self.denominator[0] * period
+        tops, bottoms = self._sections
+        gain = period
+        for section in tops:
+            gain = section[0] * gain
+        for section in bottoms:
+            gain = gain / section[0]
         if hasattr(period, "mid"):
             # Exact coefficients have exact zeros at z = 1, which rounded roots lose.
-            return Estimate(0, gain, 0, _ball_offsets(self.numerator), _ball_offsets(self.denominator))
+            exact = (np.concatenate([_ball_offsets(section) for section in part]) for part in (tops, bottoms))
+            return Estimate(0, gain, 0, *exact)
         zeros, poles, lag = self._roots
         return Estimate(0, gain, lag, zeros, poles)
 
@@ -344,6 +368,44 @@ def _ball_offsets(coefficients: tuple[Any, ...]) -> np.ndarray:
     exact = flint.fmpq_poly([flint.arb(value).fmpq() for value in reversed(coefficients)])
     found: Any = exact(flint.fmpq_poly([1, -1])).numer().complex_roots()
     return np.array([flint.acb(root) for root, times in found for _ in range(times)], object)
+
+
+_NEXT_TO_ONE = 1e-2  # distance from z = 1 of poles that rounding errors of coefficients can move to it
+
+
+def _read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
+    """Return the coefficients of one polynomial, or of several in series, without leading zeros."""
+    try:
+        rows = list(given) if np.ndim(given) or any(map(np.ndim, given)) else [given]
+    except ValueError:
+        # Sections of different lengths.
+        rows = list(given)
+    except TypeError:
+        rows = [given]
+    nested = any(np.ndim(row) for row in rows)
+    sections = []
+    for row in rows if nested else [rows]:
+        try:
+            values = np.atleast_1d(np.asarray(row, float))
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"velocity.{name}: a list of real coefficients is needed") from error
+        values = np.trim_zeros(values, "f") if values.ndim == 1 else values
+        if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
+            raise InputError(
+                f"velocity.{name}: got {given!r}; a list of finite coefficients, highest power first, not all 0, is "
+                "needed"
+            )
+        sections.append(tuple(values.tolist()))
+    return tuple(sections)
+
+
+def _is_rounding(coefficients: tuple[float, ...]) -> bool:
+    """Return whether rounding errors of the coefficients can move the largest root to or over the unit circle."""
+    roots = 1.0 - _offsets(np.trim_zeros(np.array(coefficients), "b"))
+    on = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))
+    # A polynomial within rounding errors of this one has a root there on the circle.
+    noise = 4.0 * len(coefficients) * np.finfo(float).eps * np.abs(coefficients).sum()
+    return bool(on.size and len(coefficients) > 2 and np.all(np.abs(np.polyval(coefficients, on)) <= noise))
 
 
 def _trailing(polynomial: np.ndarray) -> int:

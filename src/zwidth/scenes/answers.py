@@ -13,6 +13,7 @@ from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.rows import Island
 from zwidth.loops.rigid.verdict import STABILITY_METHODS, StabilityMethod
 from zwidth.parts.checks import read_texts
+from zwidth.parts.linear_device import WholeDevice
 from zwidth.parts.state_space import StateSpace
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.base import SceneParts
@@ -279,7 +280,13 @@ class SceneAnswers(SceneParts):
 
 
 def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
-    """Whether walls with B < 0 count: by default only where B acts on the plain difference of two samples."""
+    """Return whether walls with B < 0 count.
+
+    By default they do if B acts on the difference of two samples of a `zwidth.Device`. Of a device given as a whole
+    system the damping is unknown: with B < 0 the wall would cancel damping of the model that may not exist.
+    """
+    if negative_damping is None and isinstance(scene.device, WholeDevice):
+        return False
     if negative_damping is None:
         estimate = scene.velocity.estimate(scene.timing.period)
         return estimate.is_difference and bool(is_traced(estimate.gain) or estimate.gain > 0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.checks import Span
-from zwidth.parts.velocity import FOAW, BackwardDifference, Butterworth, LowPass, VelocityFilter, WindowedDifference
+from zwidth.parts.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.scenes.answers import allows_negative
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
@@ -277,7 +277,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
         >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=30))
         >>> [limit.words for limit in zwidth.limits_of(scene)][:2]
-        ['half the delay', 'a velocity filter twice as fast']
+        ['twice the rate', 'half the delay']
     """
     return compute_gains(scene, _stiffness(scene), _stiffness)
 
@@ -335,7 +335,7 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
         if better == now:
             continue
         improved = scene.replace(**{path: better})
-        if path == "velocity.cutoff" and isinstance(scene.velocity, LowPass | Butterworth):
+        if path == "velocity.cutoff":
             try:
                 improved.check_parts()
             except InputError:
@@ -348,8 +348,8 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
 
 
 def _can_sample_faster(scene: SceneOptima) -> bool:
-    """Whether twice the rate can be computed; nobody knows what a filter of coefficients were then."""
-    if isinstance(scene.velocity, VelocityFilter):
+    """Return whether twice the rate can be computed; coefficients in z are those of one rate alone."""
+    if isinstance(scene.velocity, VelocityFilter) or getattr(scene.device, "dt", None) is not None:
         return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
     later = scene.d if scene.timing.in_periods else 2 * scene.d

@@ -77,15 +77,17 @@ def judge_grasps(scene: Any) -> dict[str, bool]:
     """Return the stability of a wall in each reference grasp, by name, and without the operator that the scene has."""
     if not isinstance(scene.device, Device):
         return {}
-    held = {name: scene.replace(operator=grasp) for name, grasp in list_grasps(bool(scene.device.rotary)).items()}
-    if scene.operator is not None:
-        held["released"] = scene.replace(operator=None)
-    return {name: bool(each.is_stable()) for name, each in held.items()}
+    held = list_grasps(bool(scene.device.rotary))
+    hands = [*held, *([("released", None)] if scene.operator is not None else [])]
+    labels: dict[str, bool] = {}
+    for name, grasp in hands:
+        labels[name] = labels.get(name, True) and bool(scene.replace(operator=grasp).is_stable())
+    return labels
 
 
 def _advise_grasps(scene: Any) -> str:
     """Return the wall on the line through the origin that is stable in every grasp, and its cost."""
-    grasps = [*list_grasps(bool(scene.device.rotary)).values(), None]
+    grasps = [*(grasp for _, grasp in list_grasps(bool(scene.device.rotary))), None]
     K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
     walls = K * SHARES, B * SHARES
     stable = np.all([scene.replace(operator=grasp).is_stable(*walls) for grasp in grasps], axis=0)

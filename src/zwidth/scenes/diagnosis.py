@@ -265,6 +265,7 @@ class _Starts(NamedTuple):
     velocity: np.ndarray
     push: np.ndarray  # constant external force
     half_steps: np.ndarray  # additional external force, in units of K Q/2
+    scaled: np.ndarray  # bool; the displacement is proportional to the steps of the encoder
 
 
 def _list_starts(scene: Any, hardware: Hardware) -> _Starts:
@@ -272,18 +273,22 @@ def _list_starts(scene: Any, hardware: Hardware) -> _Starts:
     K, Q, period = float(scene.wall.stiffness), hardware.resolution, scene.timing.period
     position = [Q * factor for factor in DISPLACEMENTS if Q > 0]
     half_steps = [0.0] * len(position) + [1.0] * len(position)
-    position = position * 2
+    # The widest one stays when an encoder with other steps is tried; the others follow its steps.
+    scaled = 2 * len(position)
+    position, half_steps = position * 2 + position[-1:] * 2, half_steps + [0.0, 1.0][: 2 * len(position)]
     loads = [hardware.max_force, hardware.max_rate * period]
     position += [factor * load / K for load in loads if K > 0 and load < math.inf for factor in OVERLOADS]
     position = position or [FIRST_DISPLACEMENT]
     velocity = np.zeros(len(position))
     if K == 0:
         velocity = np.resize(SPEEDS, len(position)) * position / period
-    starts = np.array(position), velocity, np.zeros(len(position)), np.resize(half_steps + [0.0] * 9, len(position))
+    halves = np.zeros(len(position))
+    halves[: len(half_steps)] = half_steps
+    starts = np.array(position), velocity, np.zeros(len(position)), halves, np.arange(len(position)) < scaled
     if isinstance(scene.device, LinearDevice):
         # A linear system starts at rest at 0: an external force displaces the rest position instead.
         push = np.minimum(K * starts[0], LARGEST_PUSH * hardware.max_force)
-        return _Starts(np.zeros(len(push)), np.zeros(len(push)), push, starts[3])
+        return _Starts(np.zeros(len(push)), np.zeros(len(push)), push, *starts[3:])
     return _Starts(*starts)
 
 
@@ -325,11 +330,13 @@ class _Experiment(NamedTuple):
         """Simulate trials, one for each row of a table."""
         starts = self.starts
         columns: dict[str, Any] = {name: value[:, None] for name, value in table.items()}
+        present = self.hardware.resolution
+        ratio = columns["resolution"] / present if present > 0 else 1.0
         push = starts.push + 0.5 * starts.half_steps * columns["stiffness"] * columns["resolution"]
         motion = simulate(
             self.scene,
             **columns,
-            start_position=starts.position,
+            start_position=starts.position * np.where(starts.scaled, ratio, 1.0),
             start_velocity=starts.velocity,
             push=push,
             periods=self.periods,

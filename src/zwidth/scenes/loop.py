@@ -184,6 +184,10 @@ class LinearLoop:
         """What keeps a wall undecided, a sentence each: nothing, where there is a model."""
         return []
 
+    def explain_limit(self) -> str:
+        """Return the reason for a stiffest wall that is not decided: empty, because a model decides every wall."""
+        return ""
+
     def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
         """Those above ``least`` whose walls lie in a piece of the stable set with soft walls."""
         column = np.maximum(self.column(alpha), least).tolist()
@@ -221,7 +225,7 @@ class LinearLoop:
         found, status = self.ridge(negative)
         if found is None:
             nan = np.float64(math.nan)
-            return RidgePoint(nan, nan, nan, np.int32(RidgeKind.SMOOTH), np.int32(status))
+            return RidgePoint(nan, nan, nan, np.int32(RidgeKind.NONE), np.int32(status))
         alpha, beta, omega = map(np.float64, (found.alpha, found.beta, found.omega))
         return RidgePoint(alpha, beta, omega, np.int32(found.kind), np.int32(status))
 
@@ -335,7 +339,8 @@ class RigidLoop(LinearLoop):
         if negative or not (is_traced(below) or below):
             return found
         row = boundary_point(delta, d, beta=0.0 * delta, delay=model)
-        end = RidgePoint(row.alpha, 0.0 * row.alpha, row.omega, int(RidgeKind.NO_DAMPING), row.status)
+        kind = xp.where(row.status == Status.OK, int(RidgeKind.NO_DAMPING), int(RidgeKind.NONE))
+        end = RidgePoint(row.alpha, 0.0 * row.alpha, row.omega, kind, row.status)
         return RidgePoint(*(xp.where(below, there, here) for there, here in zip(end, found, strict=True)))
 
     def sensitivities(self, negative: bool) -> SceneSensitivities:

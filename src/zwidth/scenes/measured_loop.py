@@ -157,7 +157,7 @@ class MeasuredLoop(LinearLoop):
         best = int(np.argmax(top))
         nan, kind = np.float64(np.nan), np.int32(RidgeKind.SMOOTH)
         if not top[best] > 0:
-            return RidgePoint(nan, nan, nan, kind, np.int32(Status.UNDECIDED))
+            return RidgePoint(nan, nan, nan, np.int32(RidgeKind.NONE), np.int32(Status.UNDECIDED))
         low, middle, high = (float(beta[k]) for k in (max(best - 1, 0), best, min(best + 1, beta.size - 1)))
         low, middle, high, cost = (
             np.array([end]) for end in (low if negative else max(low, 0.0), middle, high, -top[best])
@@ -190,6 +190,16 @@ class MeasuredLoop(LinearLoop):
                 where = "measure anew from {:.4g} to {:.4g} Hz".format(*ends)
                 said.append(f"{where}: {remedy}" if by_gap else f"the deviation is too large; {where}, with {remedy}")
         return said
+
+    def explain_limit(self) -> str:
+        """Return the reason why no wall is decided: what the wall with the fewest undecided points requires."""
+        rows = [(*self.walls.ends(beta), beta) for beta in self._tops[0].tolist()]
+        walls = [(0.5 * (low + high), beta) for low, high, beta in rows if low < high]
+        count = f"the {self.scene.device.frequency.size} lines of the response decide no wall"
+        if not walls:
+            return f"{count}: begin lower, end higher, or reduce the deviation"
+        alpha, beta = min(walls, key=lambda wall: np.count_nonzero(self.walls.doubts(*wall)))
+        return "; ".join([count, *self.explain(float(alpha), float(beta))])
 
     def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """``L = (alpha + beta F) G`` at angles between the first line and the last; NaN at others."""

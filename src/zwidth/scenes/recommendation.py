@@ -129,9 +129,10 @@ class Recommendation:
 
     @cached_property
     def grasps(self) -> dict[str, bool]:
-        """Stability of the wall in each of `zwidth.REFERENCE_GRASPS`, by name; empty for a device given as a whole.
+        """Stability of the wall in each of `zwidth.reference_grasps`, by name; empty for a device given as a whole.
 
-        A rotary device is held at a radius of 50 mm. If the scene has an operator, "released" is the device without it.
+        A rotary device is held at radii of 10 to 100 mm. If the scene has an operator, "released" is the device
+        without it.
         """
         return {} if self.status != Status.OK else judge_grasps(self.scene)
 
@@ -277,8 +278,8 @@ class SceneAdvice(SceneOptima):
             beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its stiffness is
                 at most ``stiffness_fraction`` (or 0.75) of the limit's.
 
-        Without any requirement these are the defaults: at most 0.75 of K_max, a gain margin of 2 and a phase margin of
-        30 degrees. Any requirement replaces all of them.
+        Without any requirement these are the defaults: at most 0.75 of K_max, a gain margin of 2, a phase margin of 30
+        degrees, and stability in the soft reference grasps. Any requirement replaces all of them.
 
         Returns:
             Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, the active requirement; ``cautions``,

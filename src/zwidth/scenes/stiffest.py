@@ -39,6 +39,14 @@ class StiffestWall(NamedTuple):
     status: Array
 
 
+def explain_missing(scene: SceneAnswers, status: Any) -> str:
+    """Return the reason for a stiffest wall without numbers."""
+    if status == Status.NO_BOUNDARY:
+        return "no stiffness is stable at any damping"
+    explained = scene.loop.explain_limit() if status == Status.UNDECIDED else ""
+    return explained or Status(int(status)).message
+
+
 def choose_damping(scene: SceneAnswers, top: StiffestWall, stiffness: float) -> float:
     """A damping with which a softer wall than the stiffest is stable, where it can be so without leaving its piece."""
     # That of the stiffest wall, if all walls of that damping between the two are stable; else the middle of the widest
@@ -198,9 +206,10 @@ class SceneOptima(SceneAnswers):
         may lean, so that no softer wall is stable at the very damping of the stiffest: `recommend` says what to set.
 
         Args:
-            negative_damping: whether walls with B < 0 count. By default they do with the backward difference; behind a
-                filter a negative B is a lead compensator and no damper, and B >= 0 is meant. What is a piece does not
-                depend on it: a path may lead through B < 0.
+            negative_damping: whether walls with B < 0 count. By default they do for a `Device` with the backward
+                difference. With a filter a negative B is a lead compensator; with a `LinearDevice` or `MeasuredDevice`
+                it would cancel damping inside the model, which is unsafe: B >= 0 there unless True is given. What is a
+                piece does not depend on it: a path may lead through B < 0.
 
         Returns:
             ``stiffness`` in N/m; ``virtual_damping`` in N s/m; ``frequency`` in Hz of the pole pair on the unit circle,

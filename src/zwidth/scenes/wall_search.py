@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import false_position, find_lowest
+from zwidth.parts.device import Device
+from zwidth.parts.grasps import list_grasps
 from zwidth.parts.safe_limit import SafeLimit
-from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, soft_dampings
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, soft_dampings
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.status import Status
@@ -31,6 +33,7 @@ STEP_DOWN = 0.25  # ratio of two stiffnesses, until one has a wall with the marg
 FIRST_STEP = 0.9  # the same near a guess
 WIDTH = 4e-5  # half the bracket of log K at the end of the search
 COARSE = 1e-3  # the same for an improvement of the device, whose gain is printed with three digits
+HELD_SHARES = np.linspace(0.95, 0.05, 19)  # of K, tried if a soft grasp destabilizes the wall
 MAX_STEPS = 60  # bisections included; the bracket of log K ends after some 8
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
@@ -48,6 +51,7 @@ class Wanted(NamedTuple):
     phase_margin: float | None = None  # at least, in degrees
     passive: bool = False
     beyond_safe: bool = False  # ignore the safe limit of the scene
+    soft_grasps: bool = False  # stable in the soft ones of `zwidth.reference_grasps`
 
     @classmethod
     def check(
@@ -69,9 +73,10 @@ class Wanted(NamedTuple):
         for name, value in switches.items():
             if not isinstance(value, bool | np.bool_):
                 raise InputError(f"{name}: got {value!r}; True or False is needed")
-        if not passive and all(value is None for value in given.values()):
+        default = not passive and all(value is None for value in given.values())
+        if default:
             given = dict(zip(given, (RECOMMENDED_SHARE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN), strict=True))
-        return cls(**given, passive=bool(passive), beyond_safe=bool(beyond_safe))
+        return cls(**given, passive=bool(passive), beyond_safe=bool(beyond_safe), soft_grasps=default)
 
     def spell(self, name: str) -> str:
         """Return one requirement in words."""
@@ -80,6 +85,7 @@ class Wanted(NamedTuple):
             "gain_margin": f"gain margin {self.gain_margin:g}" if self.gain_margin else "",
             "phase_margin": f"{self.phase_margin:g} deg phase margin" if self.phase_margin else "",
             "passive": "passivity",
+            "soft_grasps": "stability in the soft reference grasps",
             "safe_limit": f"{100.0 * self.safe_share:.4g} % of the safe limit",
         }[name]
 
@@ -200,11 +206,29 @@ def choose_wall(
     scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> WallChoice:
     """Choose the stiffest wall of a scene, whose stiffest stable wall is known, that satisfies the requirements."""
+    found = _choose_free(scene, wanted, top, near, width)
+    if not wanted.soft_grasps or found.status != Status.OK or _is_stable_held(scene, found):
+        return found
+    for share in HELD_SHARES * (found.stiffness / float(top.stiffness)):
+        softer = _choose_free(scene, wanted._replace(stiffness_fraction=float(share)), top, None, width)
+        if softer.status == Status.OK and _is_stable_held(scene, softer):
+            return softer._replace(limit="soft_grasps")
+    return found
+
+
+def _is_stable_held(scene: SceneOptima, wall: WallChoice) -> bool:
+    """Return the stability of a wall in all soft reference grasps; True if a hand cannot be added to the scene."""
+    if not isinstance(scene.device, Device) or scene.operator is not None:
+        return True
+    grasps = (grasp for name, grasp in list_grasps(bool(scene.device.rotary)) if name.startswith("soft"))
+    return all(bool(scene.replace(operator=grasp).is_stable(wall.stiffness, wall.damping)) for grasp in grasps)
+
+
+def _choose_free(scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None, width: float) -> WallChoice:
+    """Choose the wall without regard to grasps."""
     nan = math.nan
     if top.status != Status.OK:
-        status = Status(int(top.status))
-        reason = "no stiffness is stable at any damping" if status == Status.NO_BOUNDARY else status.message
-        return WallChoice(nan, nan, "", status, reason)
+        return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
     most, binding = (wanted.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
     safe = None if wanted.beyond_safe else scene.safe_limit
     if safe is not None:

@@ -83,7 +83,8 @@ def simulate(
         virtual_damping: B in N s/m. Neither means each scene's own wall, as for `zwidth.Scene.is_stable`.
         force: a law in place of the wall's spring and damper: a function of the measured position (m), the estimated
             velocity (m/s) and the time of the sample (s; without jitter), arrays of one value a simulation, written
-            with `jax.numpy`, that returns the force on the device in N. It is sampled, held and delayed as the wall's
+            with `jax.numpy`, that returns the force on the device in N. It is compiled once: it must not keep values
+            between calls, and needs ``jnp.where`` in place of ``if``. It is sampled, held and delayed as the wall's
             is. Nothing can be proved of a law, so the outcome is UNCLEAR or DIVERGED.
         periods: how many sampling periods, >= 1.
         substeps: instants recorded in each period, >= 1.
@@ -112,7 +113,7 @@ def simulate(
 
     Raises:
         InputError: a number is not usable; friction on a link that rings hundreds of times a period; JAX cannot trace
-            the law.
+            the law, or the law keeps values between calls.
         ResourceError: what is recorded or drawn takes more than 4 GiB.
 
     Numerics:
@@ -187,29 +188,51 @@ def _refuse_bodies(known: list[Any], which: np.ndarray, name: str, values: np.nd
 
 
 def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
-    """The law as it is now; refuse one beside a wall, and one that is no function of three arrays of JAX."""
+    """Return the law as it is now; refuse a law given together with a wall, with memory, or that JAX cannot trace."""
     if stiffness is not None or virtual_damping is not None:
         raise InputError("force: got a law and a stiffness or damping; write both into the law, or leave it out")
     # What JAX is needed for begins here.
     import jax
 
+    name = getattr(force, "__name__", repr(force))
+    programs, found = [], None
     with compute_concretely(), jax.numpy_rank_promotion("allow"):
         try:
             hash(force)
-            # Through a new function each time: of one it knows, JAX would keep the numbers that it read at first.
-            own = jax.jit(lambda position, velocity, time: force(position, velocity, time))
-            lowered = own.lower(*[jax.ShapeDtypeStruct((2,), float)] * 3)
-            found, program = lowered.out_info, lowered.as_text()
+            # Twice: a law with memory differs the second time, or fails on a value that it kept from the first.
+            for _ in range(2):
+                # A new function each time, because JAX keeps the numbers that a function it knows read at first.
+                own = jax.jit(lambda position, velocity, time: force(position, velocity, time))
+                trace = own.trace(*[jax.ShapeDtypeStruct((2,), float)] * 3)
+                # A value kept from an earlier trace is one input more.
+                if len(trace.jaxpr.in_avals) != 3:
+                    raise _refuse_memory(name)
+                found = trace.out_info
+                programs.append(trace.lower().as_text())
+        except InputError:
+            raise
         except Exception as error:
-            name, words = getattr(force, "__name__", repr(force)), str(error).partition("\n")[0][:200]
+            if programs or isinstance(error, jax.errors.UnexpectedTracerError):
+                raise _refuse_memory(name) from error
+            words = str(error).partition("\n")[0][:200]
             raise InputError(
                 f"force: JAX cannot trace {name}: {words}; a function of position, velocity and time is needed, "
                 "written with jax.numpy, jnp.where in place of if"
             ) from error
+    if programs[0] != programs[1]:
+        raise _refuse_memory(name)
     kind = getattr(found, "dtype", np.dtype(object)).kind
     if getattr(found, "shape", None) not in ((), (2,)) or kind not in "if":
         raise InputError(f"force: the law returns {found} for two simulations; one force in N for each is needed")
-    return TracedLaw(force, program)
+    return TracedLaw(force, programs[0])
+
+
+def _refuse_memory(name: str) -> InputError:
+    """Return the error for a law whose force depends on earlier calls."""
+    return InputError(
+        f"force: the law {name} keeps values between calls; it may use position, velocity, time and constants only, "
+        "because it is compiled once"
+    )
 
 
 def _spread_starts(known: list[Any], given: dict[str, Any]) -> dict[str, Any]:

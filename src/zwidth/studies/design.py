@@ -31,7 +31,7 @@ from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiff
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, short, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
-from zwidth.words.rotation import own_unit
+from zwidth.words.rotation import is_rotary, own_unit
 from zwidth.words.status import Status
 
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
@@ -147,6 +147,11 @@ class DesignStudy(ComputedStudy):
     def points(self) -> int:
         return self.stiffness.size * (_TRIALS + self.draws) + self.num
 
+    @property
+    def _name(self) -> str:
+        """The parameter in words: a rotary device has an inertia."""
+        return "inertia" if self.find == "mass" and is_rotary() else self.find
+
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         nominal = self.device.to_scene()
         rows, answer, notes, ranges, unit = [], [], [], [], PARAMETERS[self.find].unit
@@ -157,7 +162,7 @@ class DesignStudy(ComputedStudy):
             notes += self._note(stiffness, needed)
             if needed.crossings and needed.status == Status.OK:
                 value = spell_enough(needed.value, needed.enough, [one.value for one in needed.crossings], unit)
-                answer.append(f"K_max = {with_unit(self.reserve * stiffness, 'N/m')}: {self.find} of {value}")
+                answer.append(f"K_max = {with_unit(self.reserve * stiffness, 'N/m')}: {self._name} of {value}")
         low, high = min(ends[0] for ends in ranges), max(ends[1] for ends in ranges)
         curve = self._trace(nominal, low, high)
         table = stack(rows)
@@ -208,11 +213,11 @@ class DesignStudy(ComputedStudy):
         wanted = with_unit(self.reserve * stiffness, "N/m")
         low, high = (with_unit(end, PARAMETERS[self.find].unit) for end in needed.range)
         if needed.status != Status.OK:
-            yield f"{wanted}: {self.find} from {low} to {high}: {Status(needed.status).message}"
+            yield f"{wanted}: {self._name} from {low} to {high}: {Status(needed.status).message}"
         elif needed.enough == "everywhere":
-            yield f"{wanted}: any {self.find} from {low} to {high} is enough"
+            yield f"{wanted}: any {self._name} from {low} to {high} is enough"
         elif len(needed.crossings) > 1:
-            yield f"{wanted}: K_max passes it at {len(needed.crossings)} values of {self.find}; the nearest is given"
+            yield f"{wanted}: K_max passes it at {len(needed.crossings)} values of {self._name}; the nearest is given"
 
     def _trace(self, nominal: Scene, low: float, high: float) -> dict[str, np.ndarray]:
         """K_max over the parameter; NaN where a value is refused or no wall is stable."""

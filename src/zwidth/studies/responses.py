@@ -39,6 +39,7 @@ from zwidth.scenes.wall_search import RANGES
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range
+from zwidth.words.rotation import is_rotary
 
 
 class ResponseStudy(ComputedStudy, HeldStudy):
@@ -243,7 +244,9 @@ def _describe(found: Recommendation, told: dict[str, Any]) -> str:
         every = "by the measured curve" if scene.device.deviation is None else "for every response in the band"
         said.append(f"stable {every}")
     if settled is not None:
-        said.append(f"settles to 2 % of a step of force in about {with_unit(settled, 's')}")
+        said.append(
+            f"settles to 2 % of a step of {'torque' if is_rotary() else 'force'} in about {with_unit(settled, 's')}"
+        )
     lines = [
         *("# Recommended virtual wall", ""),
         "Device: {}, sampled every {}, force delayed by {}.".format(scene.device.spell(), *times),

@@ -273,10 +273,10 @@ CHOICES = {
 }
 
 OF_LOGS = {
-    "time": "Column of the time: its header, or HEADER:ms. Found by its name where left out.",
+    "time": "Column of the time: its header, or HEADER:ms; of two columns HEADER:s+HEADER:ns. Default: by its name.",
     "position": "Column of the position: its header, or HEADER:mm, :counts, :deg.",
     "force": "Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.",
-    "resolution": "One count of the encoder, as 0.03mm or 0.09deg.",
+    "resolution": "One count of the encoder, as 0.03mm, 0.09deg or '4000 counts/rev'.",
     "motor_constant": "What an ampere of a force in A makes, as 5N/A.",
 }
 """What stands in the columns of a log, and what counts and amperes stand for."""

@@ -46,11 +46,12 @@ class Method(IntEnum):
 
 
 class RidgeKind(IntEnum):
-    """Which kind of optimum the ridge is."""
+    """Kind of the optimum at the stiffest wall."""
 
     SMOOTH = 0
     CORNER = 1
     NO_DAMPING = 2  # of a scene where only B >= 0 counts: the end of the row B = 0
+    NONE = 3  # no stiffest wall: see the status
 
 
 _MESSAGES = {

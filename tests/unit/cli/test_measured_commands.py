@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -80,11 +81,11 @@ def test_the_table_that_was_kept_gives_the_same_wall(first):
     folder, said = first
     again = said_of(call("ridge", "--device", folder / "r.csv", "--period", "1 ms"))
     wall = said_of(said)["safe wall"].strip()
-    assert wall.partition(", ")[2].startswith(f"B = {again['B'].strip()}: ")
+    assert wall.partition(", ")[2].startswith(f"{again['K_max'].partition(' at ')[2].partition(',')[0]}: ")
     # Why no stiffer one is sure, in the same words.
     reason = next(line for line in said.splitlines() if "measure anew from" in line).partition("  ")[2].strip()
     assert said_of(said)["K_max"].strip().removeprefix("K = ").partition(",")[0] in again["note"]
-    assert again["note"].endswith(reason)
+    assert reason in again["note"]
     device = zwidth.MeasuredDevice.read(folder / "r.csv")
     top = zwidth.Scene(device, zwidth.Timing(1e-3)).max_stiffness()
     stiffness, damping = (part.partition(" = ")[2] for part in wall.partition(":")[0].split(", "))
@@ -116,7 +117,10 @@ def test_what_is_missing_is_said(arguments, said, tmp_path, monkeypatch, capsys)
 
 
 def said_of(output):
-    return dict(line.split("  ", 1) for line in output.splitlines() if line and line[0] != " ")
+    """Return the lines of an output by their labels, each unfolded."""
+    unfolded = re.sub(r"\n +", " ", output)
+    lines = (re.split(r" {2,}", line, maxsplit=1) for line in unfolded.splitlines())
+    return {line[0]: line[1] for line in lines if len(line) == 2}
 
 
 def test_a_response_is_a_device_of_every_command_that_judges(first):
@@ -170,3 +174,44 @@ def test_what_is_no_device_is_refused_in_one_line(options, words):
     done = CliRunner().invoke(cli, ["ridge", "--period", "1 ms", *options])
     assert done.exit_code != 0
     assert words in (done.output or str(done.exception)) or words in str(done.exception)
+
+
+def test_a_rotary_device_is_measured_from_the_file_to_play_to_the_safe_wall(tmp_path):
+    loop = ["--rate", "1 kHz", "--force", "10 mN m", "--resolution", "2000 counts", "--duration", "15 s"]
+    said = call("excite", *loop, "--out", tmp_path / "play.csv")
+    assert "up to 10.00 mN m" in said
+    assert "rad/(N m) to expect" in said
+    with (tmp_path / "play.csv").open() as played:
+        assert next(played) == "time [s],torque [N m]\n"
+    time, torque = np.genfromtxt(tmp_path / "play.csv", delimiter=",", skip_header=1).T
+    knob = zwidth.Scene(zwidth.Device("60 g cm^2", "0.02 mN m s/rad"), zwidth.Timing("1 ms"))
+    moved = zwidth.simulate(knob, 0.0, 0.0, push_history=torque, periods=torque.size).position[: torque.size]
+    # The encoder wraps after each turn.
+    counts = np.mod(np.round(moved * 2000 / (2 * np.pi)), 2000)
+    rows = [f"{1e3 * t:.6g},{count:.0f},{f:.7g}" for t, count, f in zip(time, counts, torque, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["t_ms,encoder_counts,torque_Nm", *rows]))
+    given = [tmp_path / "log.csv", "--resolution", "2000 counts", "--save", tmp_path / "r.csv"]
+    found = json.loads(call("respond", *given, "--figure", tmp_path / "r.png", "--json"))
+    assert found["rotary"]
+    assert any("wraps at 6.28319 rad (360 deg)" in note for note in found["notes"])
+    # The true device has no other delay than the hold.
+    true = knob.max_stiffness().stiffness
+    assert 0 < found["safe_wall"]["stiffness"] < true
+    assert knob.is_stable(found["safe_wall"]["stiffness"], found["safe_wall"]["virtual_damping"])
+    device = zwidth.MeasuredDevice.read(tmp_path / "r.csv")
+    assert device.rotary
+    device.save(tmp_path / "again.csv")
+    assert zwidth.MeasuredDevice.read(tmp_path / "again.csv") == device
+    held = ["--device", tmp_path / "r.csv", "--rate", "1 kHz"]
+    for command in (["ridge", *held], ["recommend", *held], ["check", *held, "--stiffness", "50 mN m/rad"]):
+        assert "N m/rad" in call(*command)
+    refused = CliRunner().invoke(cli, [*map(str, ["check", *held]), "--stiffness", "50 N/m"])
+    assert "of a linear one" in str(refused.exception)
+    second = call("excite", *loop, "--response", tmp_path / "r.csv", "--out", tmp_path / "second.csv")
+    assert "N m/rad" in second
+    mixed = ["excite", "--rate", "1 kHz", "--force", "1 N", "--resolution", "10 um", "--response", tmp_path / "r.csv"]
+    assert "--response is of another kind" in CliRunner().invoke(cli, [*map(str, mixed)]).output
+    config = tmp_path / "knob.yaml"
+    scene = "{device: r.csv, rate: 1 kHz}"
+    config.write_text(f"version: 1\nname: knob\nscene: {scene}\nstudies: [{{kind: recommend, name: r}}]\n")
+    assert "N m/rad" in call("run", config, "--out", tmp_path / "run")

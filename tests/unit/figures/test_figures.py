@@ -334,7 +334,7 @@ def test_a_wall_to_be_set_is_written_no_stiffer_than_it_is():
     outlines |= {"stiffness_N_per_m": np.array([0, 2e4, 0]), "virtual_damping_N_s_per_m": np.array([0, 40.0, 90])}
     walls = {"label": np.array([""]), "wall": np.array(["recommended (75 %)"])}
     walls |= {"stiffness_N_per_m": np.array([14897.0]), "virtual_damping_N_s_per_m": np.array([41.6])}
-    for digits, text in ({}, "$K = 14.89$ kN/m"), ({"digits": np.array([6])}, "$K = 14.897$ kN/m"):
+    for digits, text in ({}, "$K$ = 14.89 kN/m"), ({"digits": np.array([6])}, "$K$ = 14.8970 kN/m"):
         (ax,) = figures.draw_stable_set(outlines, walls | digits)
         assert text in ax.texts[0].get_text()
 

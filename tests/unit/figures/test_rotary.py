@@ -29,7 +29,7 @@ FILTERS = {"kind": "filters", "damping": ["0 N m s/rad", "0.02 mN m s/rad"], "cu
 
 
 def test_dampings_and_stiffnesses_in_legends_have_prefixes():
-    assert texts(draw(**FILTERS, samples=[2, 5]))[:2] == ["$b =$ 0 N m s/rad", "$b =$ 20.0 µN m s/rad"]
+    assert texts(draw(**FILTERS, samples=[2, 5]))[:2] == ["$b$ = 0 N m s/rad", "$b$ = 20.0 µN m s/rad"]
     noisy = draw("_noise", **FILTERS, samples=[2, 5], resolution="0.18 deg", noise_limit="20 deg/s")
     assert texts(noisy)[1].endswith(" mN m/rad")
 
@@ -55,6 +55,8 @@ def test_a_sweep_has_its_units_as_people_write_them(tmp_path):
     titles = [ax.get_title("left") for ax in panels]
     assert titles[0].endswith(r"$t_d = 0.7\,\mathrm{periods}$")
     assert titles[1].endswith(r"$t_d = 1\,\mathrm{period}$")
+    report = zwidth.write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert " degrees; gray" in report
     with zwidth.open_dataset(tmp_path / "run" / "m.zarr") as data:
         (ax,) = draw_curves(data, "stiffness_max")
     assert ax.get_xlabel() == "inertia  $J$  in g cm$^2$"

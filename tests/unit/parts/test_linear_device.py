@@ -244,3 +244,17 @@ def test_what_needs_bodies_is_refused():
     assert zwidth.assess(scene.replace(stiffness=1e3)).passive is None
     with pytest.raises(zwidth.InputError, match="a pole of 1e\\+06 radians a period"):
         zwidth.Scene(zwidth.LinearDevice(([1.0], [1.0, 1e9])), TIMING).is_stable(1.0)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4e-3, 2e-3])
+def test_a_zero_at_rest_is_a_sampled_zero_at_one(delay):
+    """A velocity sensor with a centering spring: s/(s^2 + 2 s + 1), against eigenvalues of the sampled system."""
+    timing = zwidth.Timing(1e-3, delay)
+    scene = zwidth.Scene(zwidth.LinearDevice("1 0 / 1 2 1"), timing, velocity=zwidth.LowPass(cutoff=100))
+    assert np.sum(scene.loop.roots.zeros == 0) == 1
+    top = scene.max_stiffness()
+    assert top.status == zwidth.Status.OK
+    damping = float(top.virtual_damping)
+    for share, stable in ((1 - 1e-6, True), (1 + 1e-6, False)):
+        matrix = scene.state_space(share * top.stiffness, damping).A
+        assert (np.abs(np.linalg.eigvals(matrix)).max() < 1.0) == stable

@@ -66,10 +66,10 @@ CASES = {
         "velocity.denominator",
         "1.5",
     ),
-    "filter that never forgets": (
+    "filter with a pole at z = -1": (
         lambda: zwidth.VelocityFilter([1.0, -1.0], [1.0, 1.0]),
         "velocity.denominator",
-        "unit circle",
+        "must be below 1",
     ),
     "filter of the future": (
         lambda: zwidth.VelocityFilter([1.0, 0.0, -1.0], [1.0, 0.0]),

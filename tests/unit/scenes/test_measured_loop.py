@@ -268,3 +268,13 @@ def test_an_assessment_says_what_samples_tell_and_leaves_the_rest_open():
     assert [limit.name for limit in zwidth.limits_of(known)] == [], "at no other rate or delay is it known"
     (row,) = zwidth.assess_many({"measured": known.replace(wall=zwidth.VirtualWall(1e3, 1.0))})
     assert (row["status"], row["spectral_radius"]) == ("OK", None)
+
+
+def test_too_few_lines_are_named_as_the_cause():
+    frequency = np.geomspace(20.0, 400.0, 8)
+    z = np.exp(2j * np.pi * frequency * 1e-3)
+    device = zwidth.MeasuredDevice(frequency, 5e-6 * (z + 1) / (z * (z - 1) ** 2))
+    found = zwidth.Scene(device, zwidth.Timing(1e-3)).recommend()
+    assert found.status == Status.UNDECIDED
+    assert found.reason.startswith("the 8 lines of the response decide no wall; measure anew from")
+    assert found.reason.endswith("lines there are too far apart; measure more")

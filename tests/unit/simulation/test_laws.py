@@ -112,6 +112,56 @@ def test_what_is_refused(given, words):
         RIGID.simulate(**given)
 
 
+def hysteresis() -> Any:
+    contact: Any = False
+
+    def law(x: Any, v: Any, t: Any) -> Any:
+        nonlocal contact
+        contact = jnp.where(contact, x > -1e-4, x > 0)
+        return jnp.where(contact, -1e3 * x, 0.0)
+
+    return law
+
+
+class Damper:
+    """A damper from its own difference of positions."""
+
+    def __init__(self) -> None:
+        self.last: Any = 0.0
+
+    def __call__(self, x: Any, v: Any, t: Any) -> Any:
+        force, self.last = -5e3 * (x - self.last), x
+        return force
+
+
+def counting() -> Any:
+    calls = [0]
+
+    def law(x: Any, v: Any, t: Any) -> Any:
+        calls[0] += 1
+        return -1e3 * x * calls[0]
+
+    return law
+
+
+@pytest.mark.parametrize("make", [hysteresis, Damper, counting])
+def test_a_law_with_memory_is_refused(make):
+    law = make()
+    for _ in range(2):
+        with pytest.raises(zwidth.InputError, match=r"keeps values between calls; it may use position, velocity, time"):
+            RIGID.simulate(force=law, start_position=1e-3, periods=5)
+
+
+def test_a_law_that_only_records_its_calls_is_simulated():
+    calls: list[Any] = []
+
+    def law(x: Any, v: Any, t: Any) -> Any:
+        calls.append(1)
+        return -1e3 * x
+
+    assert RIGID.simulate(force=law, start_position=1e-3, periods=5).command[0] == pytest.approx(-1.0)
+
+
 def test_every_body_has_a_start_of_its_own():
     start: dict[str, Any] = {"position": 1e-3, "tip_position": "1.02 mm", "hand_position": -2e-3}
     speed = {"hand_position": 0.1}

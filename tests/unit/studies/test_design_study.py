@@ -105,7 +105,10 @@ def test_the_figure_marks_what_is_needed_on_the_curve():
     borne = outcome.table | {"stable_share": np.array([0.9996, 1.0])}
     assert list(figures.draw_requirement(curve, borne, ax)) == [ax]
     words = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert [text.partition(": ")[2] for text in words[:2]] == ["99.9 % of devices bear it", "100 % of devices bear it"]
+    assert [text.partition(": ")[2] for text in words[:2]] == [
+        "stable on 99.9 % of devices",
+        "stable on 100 % of devices",
+    ]
 
 
 def test_a_stiffness_that_every_value_reaches_is_told_with_units():

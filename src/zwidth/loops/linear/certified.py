@@ -119,6 +119,8 @@ def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -
     # What the aliases of fast poles leave of slow zeros is not to be had in floats.
     import flint
 
+    # A device that answers a constant force with 0 at rest has a zero at z = 1 exactly.
+    still = device.system.numerator[-1] == 0
     for bits in BITS:
         with flint.ctx.workprec(bits):
             ball = flint.arb(period)
@@ -130,11 +132,14 @@ def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -
             if coefficients and coefficients[-1].rel_accuracy_bits() > _FLOAT_BITS:
                 try:
                     offsets = flint.arb_poly(coefficients)(flint.arb_poly([1, -1]))
-                    roots = flint.acb_poly(offsets).roots(tol=2.0 ** (-bits // 3))
+                    if still:
+                        offsets = flint.arb_poly(offsets.coeffs()[1:])
+                    roots = flint.acb_poly(offsets).roots(tol=2.0 ** (-bits // 3)) if offsets.degree() > 0 else []
                 except ValueError:
                     roots = None
                 if roots is not None and all(root.rel_accuracy_bits() > _FLOAT_BITS for root in roots):
-                    return float(coefficients[-1]), np.array([complex(root) for root in roots], complex)
+                    zeros = [complex(root) for root in roots] + [0j] * still
+                    return float(coefficients[-1]), np.array(zeros, complex)
     raise InputError("device: its zeros between samples cannot be told from each other; leave out what hardly answers")
 
 

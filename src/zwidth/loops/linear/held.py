@@ -17,9 +17,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.arrays.balls import available
 from zwidth.arrays.held_mass import Plant, factor_numerator, held_plant
 from zwidth.loops.linear.certified import prove_zeros
 from zwidth.loops.linear.roots import LoopRoots, step_apart
+from zwidth.loops.linear.sampled_zeros import find_sampled_zeros
 from zwidth.parts.chain import AnyChain, Chain, is_zero
 from zwidth.parts.circle import CirclePoints, circle, lag_jet
 from zwidth.parts.state_space import StateSpace, estimate_matrices, in_series
@@ -115,7 +117,11 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         lag, (zeros, poles) = chain.whole + (chain.d != chain.whole), chain.device.offsets
         gain = chain.device.gain * float(chain.mass) / float(chain.period) ** 2
         if not chain.sampled:
-            gain, zeros = prove_zeros(chain.device, float(chain.period), (float(chain.d), chain.whole))
+            if available():
+                gain, zeros = prove_zeros(chain.device, float(chain.period), (float(chain.d), chain.whole))
+            else:
+                lead, zeros = find_sampled_zeros(chain.device, float(chain.period), float(chain.d) - chain.whole)
+                gain = lead * float(chain.mass) / float(chain.period) ** 2
             poles = -np.expm1(chain.device.poles * float(chain.period))
         # Poles at z = 0 are periods of delay, which zeros there take away as far as there are any.
         lag, still = int(lag + np.sum(poles == 1)), int(np.sum(zeros == 1))

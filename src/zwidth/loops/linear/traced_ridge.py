@@ -31,7 +31,7 @@ from zwidth.words.types import Array
 from zwidth.words.xp import is_traced, nan_with_nan_slopes
 
 # A harmless start for a lane without a ridge.
-_NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
+_NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.NONE))
 
 
 class Structure(NamedTuple):
@@ -85,7 +85,8 @@ def compiled_ridge(structure: Structure, *values: Array) -> RidgePoint:
     status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
     spoiled = nan_with_nan_slopes(status == Status.OK, *values)
     omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
-    return RidgePoint(alpha + spoiled, beta + spoiled, omega + spoiled, told[6].astype(jnp.int32), status)
+    kind = jnp.where(status == Status.OK, told[6].astype(jnp.int32), int(RidgeKind.NONE))
+    return RidgePoint(alpha + spoiled, beta + spoiled, omega + spoiled, kind, status)
 
 
 def _search(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:

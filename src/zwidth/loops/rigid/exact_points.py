@@ -121,11 +121,13 @@ def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
     converged = summit.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
     spoiled = nan_with_nan_slopes(ok & converged, *inputs)
     status = jnp.where(ok & ~converged, int(Status.NOT_CONVERGED), status)
+    kind = jnp.where(summit.is_ridge, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
+    kind = jnp.where(status == Status.OK, kind, int(RidgeKind.NONE))
     return (
         jnp.where(summit.is_ridge, summit.alpha, smooth.alpha) + spoiled,
         jnp.where(summit.is_ridge, summit.beta, smooth.beta) + spoiled,
         jnp.where(summit.is_ridge, jnp.pi, omega) + spoiled,
-        jnp.where(summit.is_ridge, RidgeKind.CORNER, RidgeKind.SMOOTH).astype(jnp.int32),
+        kind.astype(jnp.int32),
         status.astype(jnp.int32),
     )
 

@@ -159,20 +159,23 @@ def spread(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def fold(array: np.ndarray) -> np.ndarray:
-    """Shorten to 1 every axis along which the array repeats itself."""
+    """Return the array with length 1 along every axis along which its values repeat."""
+    # The size before folding decides: a constant array is short after its first axis is folded.
+    compare = array.size >= _WORTH_FOLDING
     for axis in range(array.ndim):
-        if array.shape[axis] > 1 and _repeats(array, axis):
+        if array.shape[axis] > 1 and _repeats(array, axis, compare):
             array = array[(slice(None),) * axis + (slice(0, 1),)]
     return array
 
 
-def _repeats(array: np.ndarray, axis: int) -> bool:
+def _repeats(array: np.ndarray, axis: int, compare: bool) -> bool:
+    """Return whether the values repeat along an axis, by strides and, if wanted, by comparison."""
     if array.strides[axis] == 0:
         return True
-    if array.size < _WORTH_FOLDING:
+    if not compare:
         return False
     along = np.moveaxis(array, axis, 0)
-    # Most arrays that do not repeat are found out by their last slice.
+    # The last slice exposes most arrays that do not repeat.
     return bool(np.array_equal(along[0], along[-1]) and (along == along[0]).all())
 
 

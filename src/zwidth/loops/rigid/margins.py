@@ -44,8 +44,9 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
 
     - ``gain_margin``: the factor by which stiffness and virtual damping together may grow; below 1 the factor to which
       they must fall. A smaller gain was never seen to harm a stable wall.
-    - ``phase_margin``: by how much the phase of L at the gain crossover lies above -180 degrees. The wall is stable
-      exactly where it is positive (and ``beta > -delta``).
+    - ``phase_margin``: the least turn of L, in degrees, that moves a pole to the unit circle: for a stable wall the
+      phase of L at the gain crossover above -180 degrees; for an unstable wall the same modulo 360 degrees, as a
+      negative number. The wall is stable if and only if it is positive (and ``beta > -delta``).
     - ``delay_margin``: how many periods more of delay the wall bears, with the fraction held as the hardware does it;
       the first loss counts, though a still longer delay may be borne again.
     - ``modulus_margin``: the least distance of L from -1, the inverse of the largest sensitivity.
@@ -59,10 +60,11 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
     Returns:
         Margins of the broadcast shape: ``gain_margin`` (a factor), ``phase_margin`` (degrees), ``delay_margin``
         (periods), ``modulus_margin``, and ``phase_crossover``, ``gain_crossover``, ``modulus_frequency`` in radians a
-        period, at most pi; ``omega/(2 pi T)`` is in Hz. NaN where alpha <= 0 or out of range. For an unstable wall:
-        ``gain_margin`` is below 1, and 0 (with a NaN ``phase_crossover``) if no gain is stable; ``phase_margin`` is
-        negative, below -180 too; ``delay_margin`` is 0; ``phase_margin`` and ``gain_crossover`` are NaN if ``|L|`` is
-        above 1 at every frequency, ``phase_margin`` also if beta <= -delta, where it decides nothing.
+        period, at most pi; ``omega/(2 pi T)`` is in Hz. NaN where alpha <= 0 or out of range.
+        An unstable wall has no margins in the usual sense: ``gain_margin`` is below 1, the factor to which K and B must
+        fall, and 0 (with a NaN ``phase_crossover``) if no factor gives a stable wall; ``phase_margin`` is in [-180, 0];
+        ``delay_margin`` is 0, because no delay can be added; ``phase_margin`` and ``gain_crossover`` are NaN if
+        ``|L|`` is above 1 at every frequency, ``phase_margin`` also if beta <= -delta, where it decides nothing.
 
     Numerics:
         Phase margin and gain crossover are in closed form, the others are found to about 1e-14, at a cost that does not
@@ -108,6 +110,9 @@ def margins_kernel(
         delay = xp.where(stable, _delay_margin(tuple(wall), lag, lead, xp), 0.0)
     if with_modulus:
         distance, closest = modulus(alpha, beta, here)
+    # Only the sign of an unstable wall's phase is fixed: turns by 360 degrees are the same turn.
+    turns = 2.0 * np.pi * xp.round(frozen(phase, xp) / (2.0 * np.pi))
+    phase = xp.where(stable, phase, -xp.abs(phase - turns))
     decided = nan_with_nan_slopes(crosses & (beta > -delta), alpha, beta, delta, d)
     fields = (
         _on_the_side(gain, 1.0, epsilon(gain), stable, xp),

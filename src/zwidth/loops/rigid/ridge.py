@@ -156,7 +156,8 @@ def alpha_max(
     Returns:
         RidgePoint with arrays of the broadcast shape: ``alpha``; ``beta``, the damping that goes with it; ``omega``,
         the frequency in radians a period at which the loop then oscillates; ``kind``, 0 smooth or 1 corner (a double
-        pole at z = -1); ``status``, see `zwidth.Status`. NaN where the status is not 0.
+        pole at z = -1), a code of `zwidth.RidgeKind`; ``status``, see `zwidth.Status`. If the status is not 0, numbers
+        are NaN and ``kind`` is 3 (NONE).
 
     Numerics:
         alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable in delta and d, also
@@ -280,6 +281,7 @@ def _point(ridge: Ridge, status: Array) -> RidgePoint:
     arrived = converged(ridge)
     status = xp.where((status == Status.OK) & ~arrived, int(Status.NOT_CONVERGED), status)
     kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
+    kind = xp.where(status == Status.OK, kind, int(RidgeKind.NONE))
     alpha, beta, omega = nan_unless(arrived, ridge.alpha, ridge.beta, ridge.omega)
     return RidgePoint(alpha, beta, omega, kind.astype(np.int32), status.astype(np.int32))
 

@@ -53,7 +53,9 @@ def is_stable(
         delay: only "held" has poles.
 
     Returns:
-        Boolean array of the broadcast shape, maybe read-only. False for a point out of range.
+        Boolean array of the broadcast shape, maybe read-only. False for an unstable wall, and also for input that
+        is NaN, infinite, negative where it must not be, or out of range: `zwidth.decide_stability` returns the status
+        that distinguishes them.
 
     Raises:
         InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, or a name is

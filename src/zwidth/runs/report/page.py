@@ -21,7 +21,8 @@ from matplotlib.colors import to_hex
 from zwidth.config.study import KINDS
 from zwidth.figures.grid import choose_axes, in_order
 from zwidth.figures.plane import ColorScale, Edges, choose_scale
-from zwidth.figures.style import pick_evenly, save, style_sheet
+from zwidth.figures.style import pick_evenly, save, style_sheet, write_unit
+from zwidth.figures.table import is_of_rotary
 from zwidth.runs.draw import figures_of, make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
@@ -30,6 +31,7 @@ from zwidth.words.errors import StoreError
 from zwidth.words.files import write_whole
 from zwidth.words.formatting import tell_apart
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, VARIABLES
+from zwidth.words.rotation import use_kind
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -164,7 +166,9 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
                 if not data.attrs["complete"]:
                     raise StoreError(f"{path}: chunks are missing; 'zwidth run CONFIG --resume' computes them")
                 edges = make_edges(Store(path))
-                yield "".join([*find_slices(data, edges), *_draw_curves(data, entry["name"])]) or (
+                with use_kind(is_of_rotary(data)):
+                    shown = [*find_slices(data, edges), *_draw_curves(data, entry["name"])]
+                yield "".join(shown) or (
                     '<p class="soft">It holds no plane of numbers and no curve; zwidth export writes its table.</p>'
                 )
 
@@ -302,9 +306,9 @@ def _axis(values: xarray.DataArray, dim: str) -> dict[str, Any]:
 
 
 def _unit(values: xarray.DataArray) -> str:
-    unit = str(values.attrs.get("units", ""))
-    return "" if unit == "1" else unit
+    unit = write_unit(str(values.attrs.get("units", "")))
+    return unit.replace("$", "")
 
 
 def _words(dim: str) -> str:
-    return VARIABLES[dim].words if dim in VARIABLES else dim
+    return VARIABLES[dim].own_words if dim in VARIABLES else dim

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from zwidth.loops.rigid.folding import fold, group_by
+import zwidth
+from zwidth.loops.rigid.folding import fold, fold_arguments, group_by
 
 SHAPE = (3, 4, 5)
 
@@ -30,4 +31,21 @@ def test_an_axis_along_which_values_repeat_is_shortened_and_no_other():
     ends[5] = 2.0
     assert fold(ends).shape == (64, 1)
     ends[5] = 1.0
-    assert fold(ends).shape == (1, 64)
+    assert fold(ends).shape == (1, 1)
+
+
+@pytest.mark.parametrize("shape", [(512, 512), (64, 64), (4, 8, 512)])
+def test_a_constant_array_folds_to_one_value(shape):
+    assert fold(np.full(shape, 0.1)).size == 1
+
+
+def test_a_contiguous_meshgrid_is_folded_as_a_sparse_one():
+    alpha, beta = np.linspace(0.01, 0.5, 512), np.linspace(0.01, 1.0, 300)
+    full = np.meshgrid(alpha, beta)
+    constant = np.full(full[0].shape, 0.1), np.ones(full[0].shape)
+    points, shape = fold_arguments((*full, *constant))
+    assert shape == (300, 512)
+    assert [array.shape for array in points] == [(1, 512), (300, 1), (1, 1), (1, 1)]
+    assert points.is_dense
+    sparse = zwidth.is_stable(alpha, beta[:, None], 0.1, 1)
+    np.testing.assert_array_equal(zwidth.is_stable(*full, *constant), sparse)

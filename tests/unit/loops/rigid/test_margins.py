@@ -368,3 +368,21 @@ def test_a_damping_whose_square_float64_does_not_have_is_none(delta):
     np.testing.assert_array_equal(found, without)
     assert found.gain_margin.tolist()[:2] == [0.0, 0.0]
     assert np.isnan(found.phase_crossover[:2]).all()
+
+
+def test_the_phase_margin_of_an_unstable_wall_is_the_least_turn():
+    """From -180 to 0 degrees, by the loop's response at the gain crossover, computed apart from the kernel."""
+    random = np.random.default_rng(52)
+    wall = [10.0 ** random.uniform(low, high, 400) for low, high in ((-3, 1.5), (-3, 1), (-3, 1))]
+    wall.append(random.choice([0.0, 1.0, 2.0, 0.5, 3.3, 8.0], 400))
+    found = zwidth.margins(*wall)
+    unstable = np.flatnonzero(~zwidth.is_stable(*wall) & np.isfinite(found.phase_margin))
+    assert unstable.size > 100
+    for k in unstable:
+        alpha, beta, delta, d = (values[k] for values in wall)
+        z = np.exp(1j * found.gain_crossover[k])
+        free, closed = (np.polyval(zwidth.char_poly(*kb, delta, d), z) for kb in ((0.0, 0.0), (alpha, beta)))
+        turn = np.degrees(abs(np.angle(-(closed - free) / free)))
+        assert found.phase_margin[k] == pytest.approx(-turn, abs=1e-9)
+    # Formerly -346.9 degrees.
+    assert -180 <= found.phase_margin[unstable].min() < found.phase_margin[unstable].max() <= 0

@@ -383,3 +383,9 @@ def test_arguments_are_checked():
         zwidth.alpha_max(1.0, 1, delay="padé")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="delta"):
         zwidth.alpha_max("much", 1)
+
+
+def test_a_point_without_a_stiffest_wall_has_no_kind():
+    found = zwidth.alpha_max([np.nan, 1.0, -1.0, 1e13], 1)
+    assert found.kind.tolist() == [RidgeKind.NONE, RidgeKind.SMOOTH, RidgeKind.NONE, RidgeKind.NONE]
+    assert "kind=NONE" in repr(zwidth.alpha_max(np.nan, 1))

@@ -155,12 +155,14 @@ function show(answer) {
   if ("state" in answer || "error" in answer || "csv" in answer) answered = Math.max(answered, answer.serial);
   flush();
 }
-// Lines of the commands: a label of 20 characters or more, two spaces, and what is said.
+// Lines of the commands: a label of 10 characters, or a longer one before two spaces, and its text. A line that is
+// indented by these 10 characters and a space goes on with the text of the one before.
 function showLines(box, text) {
   box.dataset.text = text;
-  box.replaceChildren(...text.split("\n").map(line => {
-    const [, label, words] = /^(.{20}.*?) {2}(.*)$/.exec(line) ?? ["", line, ""];
-    return element("div", {}, ...[label.trim(), words].map(textContent => element("span", { textContent })));
+  const lines = text.replace(/\n {11}(?=\S)/g, " ").split("\n");
+  box.replaceChildren(...lines.map(line => {
+    const [, label, words] = /^(.{10}) (.*)$/.exec(line) ?? /^(\S.*?) {2,}(.*)$/.exec(line) ?? ["", line, ""];
+    return element("div", {}, ...[label, words].map(part => element("span", { textContent: part.trim() })));
   }));
 }
 function showState(state) {

@@ -1,0 +1,143 @@
+"""Every public function with every type of argument, in every transformation of JAX, in both precisions.
+
+One argument is traced, or none; all others have one type. Values are whole numbers, which every type holds exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import jaxpr_as_fun
+
+from contract.cases import CASES, SCENE_CASES, Case
+
+NUMBERS = {
+    "int": int,
+    "float": float,
+    **{kind.__name__: kind for kind in (np.int8, np.int32, np.int64, np.uint8, np.float16, np.float32, np.float64)},
+    "0-d int": lambda value: np.array(int(value)),
+    "0-d float32": lambda value: np.array(value, np.float32),
+    "JAX int": lambda value: jnp.asarray(int(value)),
+    "JAX float32": lambda value: jnp.asarray(value, jnp.float32),
+}
+ARRAYS = {
+    "list of int": lambda value: [int(value)] * 2,
+    "list of float": lambda value: [float(value)] * 2,
+    "int array": lambda value: np.full(2, int(value)),
+    "float32 array": lambda value: np.full(2, value, np.float32),
+    "float64 array": lambda value: np.full(2, float(value)),
+    "JAX int array": lambda value: jnp.full(2, int(value)),
+    "JAX float32 array": lambda value: jnp.full(2, value, jnp.float32),
+}
+TYPES = NUMBERS | ARRAYS
+DIFFERENTIATED = ("grad", "jit(grad)", "hessian")
+ALL = "all"  # in place of the name of an argument: every argument is traced
+EVERY_CASE = [*CASES, *SCENE_CASES]
+
+
+class Combination(NamedTuple):
+    """One entry of the matrix."""
+
+    type: str  # of the arguments that are not traced
+    transform: str
+    traced: str  # the traced argument, "" for a direct call, or ALL
+    x64: bool
+
+
+def combinations(case: Case) -> Iterator[Combination]:
+    """Yield what the contract promises of a function."""
+    for x64 in (True, False):
+        for kind in TYPES:
+            yield Combination(kind, "direct", "", x64)
+            if case.refuses_tracing:
+                continue
+            # JAX turns a list into one traced value per item. Single numbers need a program of their own.
+            if not kind.startswith("list") and (x64 or kind in ARRAYS):
+                yield Combination(kind, "jit", ALL, x64)
+            for traced in case.free:
+                yield Combination(kind, "jit", traced, x64)
+            # What is compiled depends on the argument, and the conversion of the others does not.
+            first = case.free[0]
+            yield Combination(kind, "vmap", first, x64)
+            if case.derivatives is not None:
+                yield Combination(kind, "grad", first, x64)
+                yield Combination(kind, "jit(grad)", first, x64)
+            # The contract promises no second derivatives in single precision.
+            if case.derivatives == 2 and not case.gradient_in and x64:
+                yield Combination(kind, "hessian", first, x64)
+
+
+def compute(case: Case, entry: Combination) -> dict[str, Any]:
+    """Return the leaves of one entry: values, or derivatives of their sum by the name "slope"."""
+    fixed = {name: convert(case, name, entry.type) for name in case.good}
+    if entry.transform == "direct":
+        return case.leaves(case.call(**fixed))
+    if entry.traced == ALL:
+        traced = {name: jnp.asarray(fixed.pop(name)) for name in case.free}
+        return run_traced(lambda arguments: case.leaves(case.call(**fixed, **arguments)), traced)
+    del fixed[entry.traced]
+
+    def values(x: Any) -> dict[str, Any]:
+        return case.leaves(case.call(**fixed, **{entry.traced: x}))
+
+    def total(x: Any) -> Any:
+        return sum_leaves(values(x), jnp)
+
+    # Two points, with numbers as with arrays beside them: one program serves both.
+    x = jnp.full(2, moving(case, entry.traced), jnp.float64 if entry.x64 else jnp.float32)
+    if entry.transform == "vmap":
+        return {name: leaf[0] for name, leaf in jax.vmap(values)(x[None]).items()}
+    if entry.transform == "jit":
+        return run_traced(values, x)
+    slope = jax.grad(total)
+    if entry.transform == "hessian":
+        # Each point depends on itself alone: the sum of its row is the second derivative of a point.
+        slope = jax.grad(lambda x: jnp.sum(jax.grad(total)(x)))
+    return {"slope": run_traced(slope, x) if entry.transform == "jit(grad)" else slope(x)}
+
+
+def run_traced(function: Any, x: Any) -> Any:
+    """Trace a function as jit does, and run the operations of the trace one by one.
+
+    The kernels in the trace are compiled functions, which all entries share; jit itself would compile each entry.
+    """
+    trace = jax.jit(function).trace(x)
+    leaves = jaxpr_as_fun(trace.jaxpr)(*jax.tree.leaves(x))
+    return jax.tree.unflatten(jax.tree.structure(trace.out_info), leaves)
+
+
+def convert(case: Case, name: str, kind: str) -> Any:
+    """Return the whole number of an argument as one type; parameters of scenes are single numbers."""
+    value = case.whole[name]
+    return (NUMBERS["int"] if name in case.one_number and kind in ARRAYS else TYPES[kind])(value)
+
+
+def moving(case: Case, name: str) -> float:
+    """Return the value of a traced argument: not whole, for a derivative in a delay jumps at whole ones."""
+    return case.whole[name] + 0.25
+
+
+def sum_leaves(leaves: dict[str, Any], xp: Any) -> Any:
+    """Return the sum of all real leaves and of the magnitudes of complex ones."""
+    kinds = {name: leaf.dtype.kind for name, leaf in leaves.items()}
+    parts = [xp.abs(leaf) if kinds[name] == "c" else leaf for name, leaf in leaves.items() if kinds[name] in "fc"]
+    return sum(xp.sum(part) for part in parts)
+
+
+def directly(case: Case, **moved: float) -> dict[str, np.ndarray]:
+    """Return the leaves of a direct call with Python floats."""
+    numbers = {name: float(value) for name, value in case.whole.items()} | moved
+    return {name: np.asarray(leaf) for name, leaf in case.leaves(case.call(**numbers)).items()}
+
+
+def expected_slope(case: Case, name: str, order: int) -> float:
+    """Return a derivative of the sum of the leaves by central differences of direct calls."""
+    step = (1e-5, 1e-3)[order - 1]
+    low, middle, high = (
+        float(sum_leaves(directly(case, **{name: moving(case, name) + k * step}), np)) for k in (-1, 0, 1)
+    )
+    return (high - low) / (2 * step) if order == 1 else (high - 2 * middle + low) / step**2

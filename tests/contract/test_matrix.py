@@ -1,0 +1,70 @@
+"""Every public function with every type of argument, in every transformation of JAX, in both precisions."""
+
+import jax
+import numpy as np
+import pytest
+
+import zwidth
+from contract.matrix import ALL, DIFFERENTIATED, EVERY_CASE, combinations, compute, directly, expected_slope, moving
+from zwidth.words.errors import InputError
+
+
+@pytest.mark.parametrize("case", EVERY_CASE, ids=lambda case: case.name)
+def test_every_type_in_every_transformation(case):
+    slopes = {}
+    for entry in combinations(case):
+        with jax.enable_x64(entry.x64):
+            found = {name: np.asarray(leaf) for name, leaf in compute(case, entry).items()}
+        if entry.transform in DIFFERENTIATED:
+            order = 2 if entry.transform == "hessian" else 1
+            if order not in slopes:
+                slopes[order] = expected_slope(case, entry.traced, order)
+            # Central differences have 5 to 6 digits; derivatives in single precision lose some to cancellation.
+            tolerance = 2e-4 if entry.x64 else 2e-2
+            size = max(1.0, abs(slopes[1]))
+            np.testing.assert_allclose(
+                found["slope"], slopes[order], rtol=tolerance, atol=tolerance * size, err_msg=str(entry)
+            )
+            continue
+        moved = {} if entry.traced in ("", ALL) else {entry.traced: moving(case, entry.traced)}
+        exact = entry.x64 or entry.transform == "direct"
+        for name, expected in directly(case, **moved).items():
+            if expected.dtype.kind == "c":
+                # The order of poles is open.
+                found[name], expected = np.sort_complex(found[name]), np.sort_complex(expected)
+            tolerance = 1e-11 if exact else case.single
+            np.testing.assert_allclose(
+                *np.broadcast_arrays(found[name], expected), rtol=tolerance, atol=tolerance, err_msg=f"{name}: {entry}"
+            )
+
+
+def test_the_line_of_the_optimizer():
+    """Typed as a user types it: Python whole numbers, a compiled function."""
+    with jax.enable_x64(True):
+        assert jax.jit(lambda delta: zwidth.alpha_max(delta, 1).alpha)(0.1) == pytest.approx(
+            zwidth.alpha_max(0.1, 1).alpha, rel=1e-14
+        )
+        stiffness = jax.jit(lambda period: zwidth.max_stiffness(mass=1, damping=10, period=period, delay=0))(1e-3)
+        assert stiffness == pytest.approx(zwidth.max_stiffness(mass=1, damping=10, period=1e-3, delay=0), rel=1e-14)
+        wall = jax.jit(lambda mass: zwidth.normalize(mass=mass, damping="10 N s/m", period=1, stiffness=[1, 2]).alpha)
+        np.testing.assert_allclose(wall(2), [0.5, 1.0])
+        point = jax.jit(lambda delta: zwidth.boundary_point(delta, 1, beta=1).alpha)(8)
+        assert point == pytest.approx(zwidth.boundary_point(8.0, 1.0, beta=1.0).alpha, rel=1e-14)
+
+
+@pytest.mark.parametrize("value", ["1", 1j, None, ["1"], {}], ids=repr)
+def test_inside_a_transformation_what_is_no_real_number_is_named(value):
+    with jax.enable_x64(True), pytest.raises(InputError, match=r"^d: got .*real number"):
+        jax.jit(lambda delta: zwidth.alpha_max(delta, value).alpha)(0.1)
+
+
+def test_inside_a_transformation_shapes_that_do_not_fit_are_named():
+    with pytest.raises(InputError, match=r"shapes do not broadcast: delta \(2,\), d \(3,\)"):
+        jax.jit(lambda delta: zwidth.alpha_max(delta, [1, 2, 3]).alpha)(np.ones(2))
+
+
+def test_traced_complex_numbers_and_lists_of_traced_numbers_are_named():
+    with pytest.raises(InputError, match="delta: got complex numbers"):
+        jax.jit(lambda delta: zwidth.alpha_max(delta, 1).alpha)(1j)
+    with pytest.raises(InputError, match="delta: got a list of values that JAX traces"):
+        jax.jit(lambda x: zwidth.alpha_max([x, 2 * x], 1).alpha)(0.1)

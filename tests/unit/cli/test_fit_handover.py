@@ -1,0 +1,120 @@
+"""From a record to a wall in the loop: one wall in every command, stable on the true device."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from measured_devices import TrueDevice, draw_hidden
+
+from zwidth.cli.commands import cli
+
+pytestmark = pytest.mark.usefixtures("fitted_once", "unpainted")
+
+
+def run(*arguments, code=0):
+    result = CliRunner().invoke(cli, list(map(str, arguments)))
+    assert result.exit_code == code, result.output
+    return result.stdout
+
+
+def write_log(folder, true, force, position):
+    """Write a log as loops do: seconds, millimeters, newtons, headers with units in the names."""
+    rows = [f"{k * true.period:g},{1e3 * x:.6g},{f:.6g}" for k, (x, f) in enumerate(zip(position, force, strict=True))]
+    file = folder / "log.csv"
+    file.write_text("\n".join(["time_s,x_mm,F_N", *rows]), encoding="utf-8")
+    return file, "--time", "time_s:s", "--position", "x_mm:mm", "--force", "F_N:N"
+
+
+def record_hidden_mode():
+    """Return an 80 g device with a resonance of 140 Hz, which an encoder of 60 um hides; true K_max is 11.8 kN/m."""
+    true = TrueDevice("", 0.08, 0.5, 0.0, ((140.0, 0.02, 0.6),), 0.7e-3, 1e-3, 6e-5, 0.4)
+    force = true.limit * np.repeat(np.random.default_rng(7).choice([-1.0, 1.0], 60), 25)
+    return true, force, true.play(force)
+
+
+def read_code(text):
+    """Return K and B of a program in C."""
+    return tuple(map(float, re.findall(r"-\((\S+) \* x \+ (\S+) \* v\)", text)[0]))
+
+
+@pytest.mark.parametrize("seed", [None, 2, 7])
+def test_one_wall_goes_from_the_record_to_the_loop(seed, tmp_path):
+    true, force, position = record_hidden_mode() if seed is None else draw_hidden(seed)
+    log = write_log(tmp_path, true, force, position)
+    found = json.loads(run("fit", *log, "--json"))["recommended"]
+    wall = found["stiffness"], found["virtual_damping"]
+    assert all(true.is_stable(share * wall[0], wall[1]) for share in (1.0, 0.5, 0.1))
+    assert found["phase_margin"] > 29.9
+    printed = run("fit", *log).splitlines()[0]
+    assert printed.startswith("SET        K = ")
+    words = printed.partition("SET")[2].strip()
+    file, out = tmp_path / "fitted.yaml", tmp_path / "run"
+    text = run("fit", *log, "--yaml")
+    file.write_text(text, encoding="utf-8")
+    assert "  period: 0.001 s # from the times of the log\n" in text
+    assert words in run("run", file, "--out", out)
+    assert words in (out / "recommendation.md").read_text("utf-8")
+    document = json.loads((out / "recommendation.json").read_text("utf-8"))["recommended"]
+    assert (document["stiffness"], document["virtual_damping"]) == wall
+    run("report", out)
+    page = (out / "report.html").read_text("utf-8")
+    assert words in page
+    document = json.loads(run("recommend", file, "--json"))["recommended"]
+    assert (document["stiffness"], document["virtual_damping"]) == wall
+    programs = [run("fit", *log, "--code", "c"), run("recommend", file, "--code", "c")]
+    assert [read_code(program) for program in programs] == [wall, wall]
+    # The limit and its reason go with the wall.
+    reason = re.search(r'reason: "(.*?);', text)
+    assert reason is not None
+    for each in (page, (out / "recommendation.md").read_text("utf-8"), " ".join(programs[0].split())):
+        assert reason[1] in each
+
+
+def test_beyond_the_safe_limit_only_on_demand_and_with_a_warning(tmp_path):
+    true, force, position = record_hidden_mode()
+    file = tmp_path / "fitted.yaml"
+    file.write_text(run("fit", *write_log(tmp_path, true, force, position), "--yaml"), encoding="utf-8")
+    wanted = "--stiffness-fraction", "0.75"
+    document = json.loads(run("recommend", file, *wanted, "--json"))["recommended"]
+    assert document["limited_by"] == "safe_limit"
+    assert true.is_stable(document["stiffness"], document["virtual_damping"])
+    free = json.loads(run("recommend", file, *wanted, "--beyond-safe", "--json"))["recommended"]
+    # 75 % of the rigid device's K_max: unstable on the true device.
+    assert free["stiffness"] > 12e3
+    assert not true.is_stable(free["stiffness"], free["virtual_damping"])
+    wall = "--stiffness", free["stiffness"], "--virtual-damping", free["virtual_damping"]
+    assert "exceeds the safe limit" in " ".join(run("check", file, *wall).split())
+    own = "--stiffness", document["stiffness"], "--virtual-damping", document["virtual_damping"]
+    assert "exceeds" not in run("check", file, *own)
+    program = run("recommend", file, *wanted, "--beyond-safe", "--code", "c")
+    assert "WARNING: this wall is beyond the safe limit" in program
+
+
+def test_warnings_forbid_a_wall_in_every_command(tmp_path):
+    true, force, position = record_hidden_mode()
+    log = write_log(tmp_path, true, force, 1e4 * position)
+    lines = run("fit", *log).splitlines()
+    assert lines[0] == "NO WALL    resolve the warnings first, then record again"
+    assert any(line.startswith("WARNING ") for line in lines)
+    file, out = tmp_path / "fitted.yaml", tmp_path / "run"
+    file.write_text(run("fit", *log, "--yaml"), encoding="utf-8")
+    (warning,) = json.loads(run("fit", *log, "--json"))["safe_limit"]["warnings"][:1]
+    assert "NO WALL" in run("recommend", file)
+    run("run", file, "--out", out)
+    assert warning in (out / "recommendation.md").read_text("utf-8")
+    run("recommend", file, "--code", "c", code=2)
+    run("fit", *log, "--code", "c", code=2)
+
+
+def test_the_reserve_is_the_same_if_the_safe_limit_binds():
+    walls = ("K=0.0168 N m/rad B=0 N m s/rad f=8.52", "K=0.3991 N m/rad B=0.0005 N m s/rad f=41.68")
+    walls = (*walls, "K=0.9605 N m/rad B=0.0015 N m s/rad f=74.03")
+    options = [part for wall in walls for part in ("--buzz", wall)]
+    found = json.loads(run("fit", "--rate", "1 kHz", "--noise", "2%", *options, "--json"))
+    safe, wall = found["safe_limit"], found["recommended"]
+    assert safe["stiffness"] == pytest.approx(0.9158, rel=1e-3)
+    assert wall["stiffness"] < 0.75 * safe["stiffness"]
+    assert wall["phase_margin"] > 29.9
+    assert wall["virtual_damping"] <= 0.0015
