@@ -45,11 +45,11 @@ def spectral_radius(
         d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast.
         method: "newton" (and "auto") finds the outermost pole and proves each value by counts of the poles inside
             a circle, at a cost that does not grow with d; "companion" computes all poles.
-        accuracy: relative error to compute to, 1e-9 by default, at least 1e-12. It holds for poles apart from others.
-            Where two poles nearly meet the radius is ill-conditioned: rounding the coefficients moves it by up to
-            1e-8, whatever the accuracy (2.8e-9 was seen near a double pole at z = -1). On a large map (alpha along
-            one axis, beta along another) or line a larger accuracy is quicker, at long delays above all, and errors
-            are nearly as large in places; single walls keep most digits. "companion" takes any.
+        accuracy: largest relative error, 1e-9 by default, at least 1e-12. If two poles nearly coincide, the radius is
+            ill-conditioned: rounding errors of the coefficients then change it by up to 1e-8, whatever the accuracy
+            (2.8e-9 was observed near a double pole at z = -1). On large grids (alpha along one axis, beta along the
+            other) and lines, a larger value saves time, mostly at long delays, and errors come close to it at some
+            points; single walls are more accurate than required. Has no effect on "companion".
         delay: only "held" has poles.
 
     Returns:
@@ -66,8 +66,8 @@ def spectral_radius(
         `jit`, where d may be traced, and a radius within rounding of 1 may lie on either side of it. On a map a Taylor
         series serves a cell of walls (`loops.rigid.pole_map`); its terms fall faster than the bound that is proved of
         them. Derivatives are those of the outermost pole, of every order up to the second; NaN where it is a multiple
-        one. Near a k-fold pole the radius is known to about 1e-16^(1/k), whatever the accuracy. `decay_rate`
-        resolves how slowly a loop decays that is stable by less than 1e-16.
+        one. Near a k-fold pole the error of the radius is about 1e-16^(1/k), whatever the accuracy. If the radius
+        is within 1e-16 of 1, use `decay_rate`.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).

@@ -53,9 +53,9 @@ def is_stable(
         delay: only "held" has poles.
 
     Returns:
-        Boolean array of the broadcast shape, maybe read-only. False for an unstable wall, and also for input that
-        is NaN, infinite, negative where it must not be, or out of range: `zwidth.decide_stability` returns the status
-        that distinguishes them.
+        Boolean array of the broadcast shape, possibly read-only. False for unstable walls and for invalid input (NaN,
+        infinite, out of range, or negative if the argument must not be). To distinguish them, use the status that
+        `zwidth.decide_stability` returns.
 
     Raises:
         InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, or a name is
