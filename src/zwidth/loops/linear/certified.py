@@ -180,7 +180,7 @@ def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
 
 
 def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
-    """Return the velocity estimate in ball arithmetic, or in float64, taken as exact, if its class supports no balls."""
+    """Return the velocity estimate in balls, or in floats, taken as exact, if its class supports only floats."""
     try:
         return exact.velocity.estimate(exact.timing.period)
     except (ArithmeticError, AttributeError, TypeError, ValueError):

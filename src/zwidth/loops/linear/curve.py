@@ -220,7 +220,7 @@ def find_lossless(loop: LoopRoots, w: np.ndarray, here: CurvePoints, damping: fl
 
 
 def level_arc(w: np.ndarray, here: CurvePoints, beta: float) -> Arc:
-    """Return the curve of a lossless loop: one arc of constant damping, which has no crossings with lines of constant B."""
+    """Return the curve of a lossless loop: one arc of constant damping, which no line of constant B crosses."""
     blank, level = np.full(w.size + 2, np.nan), np.full(w.size + 2, beta)
     alpha = np.concatenate([[np.nan], here.alpha, [np.nan]])
     return Arc(np.concatenate([[0.0], w, [np.pi]]), level, alpha, blank, blank, blank, 2.0)

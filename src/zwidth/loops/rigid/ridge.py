@@ -154,8 +154,8 @@ def alpha_max(
             optimistix; "auto" is "newton".
 
     Returns:
-        RidgePoint with arrays of the broadcast shape: ``alpha``, the maximum stiffness; ``beta``, the virtual damping at
-        the maximum; ``omega``, the frequency of the oscillation there, in rad per sample; ``kind``, a code of
+        RidgePoint with arrays of the broadcast shape: ``alpha``, the maximum stiffness; ``beta``, the virtual damping
+        at the maximum; ``omega``, the frequency of the oscillation there, in rad per sample; ``kind``, a code of
         `zwidth.RidgeKind`: 0 for a smooth maximum, 1 for a corner (a double pole at z = -1); ``status``, see
         `zwidth.Status`. If the status is not 0, ``alpha``, ``beta`` and ``omega`` are NaN and ``kind`` is 3 (NONE).
 
