@@ -10,7 +10,7 @@ def main() -> None:
     # OpenBLAS reads this variable when NumPy is loaded. Its matrices here are small: on a busy machine several OpenBLAS
     # threads take several times as long as one. zwidth starts its own threads for large arrays.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Skip the garbage collection at exit: it takes a tenth of the time of a short command and frees nothing needed.
+    # Skip the garbage collection at exit, because it takes a tenth of the time of a short command.
     atexit.register(gc.freeze)
     from zwidth.cli import main as run
 

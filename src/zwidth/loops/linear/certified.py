@@ -116,7 +116,7 @@ def _exact(part: Any) -> Any:
 
 def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -> tuple[float, np.ndarray]:
     """Return the gain of the sampled response of a linear device, and ``1 - z`` of its zeros, to float64 accuracy."""
-    # Float64 does not suffice: aliases of fast poles cancel most digits of slow zeros.
+    # Use balls, because float64 does not resolve slow zeros next to the aliases of fast poles.
     import flint
 
     # A zero at s = 0 (no static response to a constant force) becomes a zero at exactly z = 1.

@@ -191,7 +191,7 @@ def cut_arcs(
 
 # Tests for a lossless loop
 _LOSSLESS_ERROR = 1e-12  # of Im(q - beta F), relative to its terms and their conditioning; smaller values are 0
-_LOSSLESS_ANGLE = 1e-2  # least angle in rad; below, rounding errors of poles at z = 1 dominate Im(q - beta F)
+_LOSSLESS_ANGLE = 1e-2  # rad; at smaller angles, rounding errors of poles at z = 1 dominate Im(q - beta F)
 
 
 def find_lossless(loop: LoopRoots, w: np.ndarray, here: CurvePoints, damping: float) -> float:
@@ -210,7 +210,7 @@ def find_lossless(loop: LoopRoots, w: np.ndarray, here: CurvePoints, damping: fl
     before, here = circle(w[shows]).before[:, None], CurvePoints(*(values[shows] for values in here))
     roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
     with np.errstate(all="ignore"):
-        # Near a root, the relative error grows by the reciprocal of the distance to the root.
+        # Conditioning: near a root, the relative error is proportional to 1/distance.
         near = 1.0 + (np.abs(roots) / np.abs(before + roots)).sum(1)
         for beta in (0.0, damping):
             rest = np.abs((here.beta - beta) * here.fall) / (here.size * near)

@@ -19,7 +19,7 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.words.errors import InputError
 
 AGREES = 1e-17  # largest relative difference between results of two precisions; a tenth of float64's resolution
-# Of n decimal digits: leading coefficients below 10^(-2n/NO_TERM) of the largest are rounding errors of 0.
+# With n decimal digits, leading coefficients below 10^(-2n/NO_TERM) of the largest are rounding errors of 0.
 NO_TERM = 3
 
 

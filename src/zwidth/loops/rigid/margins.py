@@ -111,7 +111,7 @@ def margins_kernel(
         delay = xp.where(stable, _delay_margin(tuple(wall), lag, lead, xp), 0.0)
     if with_modulus:
         distance, closest = modulus(alpha, beta, here)
-    # Of an unstable wall: phases that differ by 360 degrees are equivalent, so use the distance from the nearest one.
+    # Phases that differ by 360 degrees are equivalent: reduce the phase margin of an unstable wall to [-180, 0].
     turns = 2.0 * np.pi * xp.round(frozen(phase, xp) / (2.0 * np.pi))
     phase = xp.where(stable, phase, -xp.abs(phase - turns))
     decided = nan_with_nan_slopes(crosses & (beta > -delta), alpha, beta, delta, d)
