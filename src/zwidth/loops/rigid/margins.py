@@ -40,7 +40,7 @@ _NO_CROSSOVER = -1e-3
 def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Margins:
     """Return the gain, phase, delay and modulus margin of a wall, with their frequencies.
 
-    Of the open loop ``L = N(z) (alpha z + beta (z - 1))/(z^(2+n) (z - 1)(z - c))``, d = n + f, see `char_poly`:
+    The open loop is ``L = N(z) (alpha z + beta (z - 1))/(z^(2+n) (z - 1)(z - c))``, d = n + f, see `char_poly`.
 
     - ``gain_margin``: the factor on both stiffness and virtual damping at which the loop becomes unstable. Of an
       unstable wall: the factor below 1 at which it becomes stable. No stable wall is known that becomes unstable with
@@ -56,7 +56,7 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
         alpha: normalized stiffness, > 0.
         beta: normalized virtual damping.
         delta: normalized physical damping, >= 0.
-        d: delay in periods, >= 0, whole or not (held). All four broadcast.
+        d: delay in periods, >= 0, integer or fractional (held). All four broadcast.
 
     Returns:
         Margins of the broadcast shape: ``gain_margin`` (a factor), ``phase_margin`` (degrees), ``delay_margin``
@@ -68,12 +68,12 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
         beta <= -delta, because stability then does not depend on the phase.
 
     Numerics:
-        Phase margin and gain crossover are in closed form, the others are found to about 1e-14, at a cost that does not
-        grow with d. The fraction of the delay is sampled 64 times a period, closest to whole delays, and the lowest
-        place that the samples show is looked for: a strongly damped device may bear less for a moment just before a
-        whole delay. Traceable: `jit`, `vmap`, `grad`. A margin that is NaN has NaN derivatives; where it is one of
-        those of which `jax.jacrev` takes all at a time, so have the wall's others, unlike in `jax.jacfwd` or one by
-        one.
+        Phase margin and gain crossover are in closed form. The other margins are computed to about 1e-14, at a cost
+        independent of d. For the delay margin, fractional delays are sampled 64 times per period, most densely near
+        integer delays, and the lowest loss of stability between the samples is refined: with strong damping a wall may
+        be unstable only in a short interval below an integer delay. Traceable: `jit`, `vmap`, `grad`. A margin that is
+        NaN has NaN derivatives. `jax.jacrev` of several margins then returns NaN for all margins of the wall;
+        `jax.jacfwd` does not.
 
     References:
         Landau 1990 (modulus margin); python-control's `stability_margins`, which calls them gm, pm, sm, wpc, wgc, wms.
