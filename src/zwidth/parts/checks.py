@@ -229,6 +229,8 @@ def check_span(field: str, value: Any) -> Any:
 def _read(field: str, value: Any, read: Callable[[Any], Any]) -> Any:
     if not isinstance(value, str | Span) and np.ndim(value) != 0:
         raise InputError(f"{field}: got an array of shape {np.shape(value)}; a scene holds single numbers")
+    if isinstance(value, np.ndarray):
+        value = value.item()
     if isinstance(value, Real) and not isinstance(value, bool):
         # Also what NumPy holds.
         value = to_float(value)  # pyright: ignore[reportArgumentType]  (anything that float takes)
