@@ -114,7 +114,7 @@ def fit(
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if sum(map(bool, (as_json, as_yaml, code))) > 1:
-        raise click.UsageError("--json, --yaml and --code exclude each other; give only one")
+        raise click.UsageError("give one of --json, --yaml and --code: each prints the complete output")
     points = ()
     if walls:
         for name, value in of_logs.items():
