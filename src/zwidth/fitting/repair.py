@@ -43,7 +43,7 @@ _RETURN = 0.2  # largest net displacement across a glitch, relative to the glitc
 
 # Wraps of the position. A wrap is accepted if the second differences around it, once unwrapped, are below either limit.
 _SMOOTH = 8.0  # in typical second differences (their 99 % quantile)
-_NEAR_WRAP = 0.05  # relative to the modulus
+_NEAR_WRAP = 0.05  # relative to the modulus; also the tolerance of jumps of equal size, relative to their median
 _SPAN = 0.5  # least jump of a wrap at an unknown modulus, relative to the span of the positions
 
 # Times rounded to ticks of a coarse clock.
@@ -256,7 +256,7 @@ def _measure_modulus(moves: np.ndarray, span: float, step: float) -> float:
         step: encoder step, 0 if unknown.
 
     Raises:
-        InputError: the jumps have the same size, but determine the modulus less accurately than one encoder step.
+        InputError: the jumps have the same size, but do not determine the modulus to a whole number of encoder steps.
     """
     inner = np.flatnonzero(np.abs(moves[1:-1]) > _SPAN * span) + 1 if span else np.zeros(0, int)
     # Keep only jumps between small steps, because two successive jumps are a glitch.

@@ -70,7 +70,7 @@ class Timing(Part):
 
     @property
     def kept_delay(self) -> str:
-        """The delay in its original unit, as text: "1 period" or "1.000 ms". It is kept if the period changes."""
+        """The delay that stays constant if the period changes, as text: "1 period" or "1.000 ms"."""
         if self._periods is None:
             return with_unit(float(self.delay), "s")
         return spell_periods(self._periods)
