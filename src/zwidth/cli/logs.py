@@ -77,8 +77,17 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
 @figure_option
-@click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
-@click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run` and the other commands.")
+@click.option(
+    "--code",
+    type=click.Choice(("c", "python")),
+    help="Print only a program of the recommended wall.",
+)
+@click.option(
+    "--yaml",
+    "as_yaml",
+    is_flag=True,
+    help="Print the scene as a configuration for other commands.",
+)
 @verbose_option
 @json_option
 def fit(
@@ -94,7 +103,7 @@ def fit(
     as_json: bool,
     **of_logs: Any,
 ) -> None:
-    """Find a device's mass, damping and delay, and the wall to set.
+    """Find a device's mass, damping and delay, and recommend a wall.
 
     With --buzz: from walls at which it began to buzz as K was raised, at two dampings or more, and the frequencies
     heard. With LOG.csv: from its free motion under a force that a computer commanded, friction included; several logs
@@ -105,7 +114,7 @@ def fit(
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if sum(map(bool, (as_json, as_yaml, code))) > 1:
-        raise click.UsageError("give one of --json, --yaml and --code: each has all of the output")
+        raise click.UsageError("give one of --json, --yaml and --code: each prints the complete output")
     points = ()
     if walls:
         for name, value in of_logs.items():
@@ -149,8 +158,8 @@ def fit(
         return
     details = [("", ""), *detail_fit(found, source)] if verbose else []
     lines = [line(*each).rstrip() for each in (*summarize_fit(found), *details)]
-    more = "the rest: --verbose; a scene for the other commands: --yaml"
-    more += "; a program for the loop: --code c" if found.recommended.status == Status.OK else ""
+    more = "details: --verbose; scene for the other commands: --yaml"
+    more += "; program for the loop: --code c" if found.recommended.status == Status.OK else ""
     print_folded([*lines, *wrote, line("more", more)], LABEL)
 
 
@@ -164,7 +173,7 @@ _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
     "--resolution",
     type=quantity_type("m", POSITIVE, counts=True),
     required=True,
-    help="One count of the encoder, in m; or '2000 counts'.",
+    help="Encoder step in m, or counts per turn as '2000 counts'.",
 )
 @click.option("--duration", type=_TIME, default="60 s", show_default=True, help="How long it plays, in s.")
 @click.option("--response", type=_FILE, help="The response of a first record, to design the second.")
@@ -172,40 +181,42 @@ _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
 @velocity_options
 @json_option
 def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> None:
-    """Design the force to play before `zwidth respond`; of a rotary device the torque, by the units given."""
+    """Design the force to play before `zwidth respond`, or the torque if the units are those of a rotary device."""
     if options["period"] is None:
         raise click.UsageError("give --period or --rate")
     from zwidth.fitting.excite import excite as design
 
     warn_implausible({"resolution": options["resolution"]})
-    known = None if response is None else MeasuredDevice.read(response)
-    # Units of options say the kind of device; the numbers are plain by now.
-    told = find_kind(get_told())
-    if known is not None and told not in (None, known.rotary):
+    device = None if response is None else MeasuredDevice.read(response)
+    # Infer the kind of device from the options as typed, because their parsed values have no units.
+    implied = find_kind(get_told())
+    if device is not None and implied not in (None, device.rotary):
+        kinds = ("rotary", "linear") if device.rotary else ("linear", "rotary")
         raise click.UsageError(
-            "--response is of another kind of device, linear or rotary, than --force and --resolution"
+            f"--response is that of a {kinds[0]} device, but --force or --resolution have units of a {kinds[1]} one; "
+            "use one kind"
         )
-    rotary = known.rotary if known is not None else bool(told)
+    rotary = device.rotary if device is not None else bool(implied)
     with use_kind(rotary):
-        made = design(response=known, rotary=rotary, **options)
+        made = design(response=device, rotary=rotary, **options)
         made.save(out)
-        _tell_excitation(made, out, as_json)
+        _print_excitation(made, out, as_json)
 
 
-def _tell_excitation(made: Any, out: Path, as_json: bool) -> None:
-    """Print what a record is and what it will show."""
+def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
+    """Print the properties of a designed record and the safe wall that it is expected to determine."""
     low, high = (with_unit(end, "Hz") for end in made.frequency[[0, -1]])
     lines = [
         row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), 'N')}"),
         row("lines", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"),
         row("deviation", f"{_compliance(made.deviation)} to expect, in the median"),
     ]
-    found: dict[str, Any] = {"file": str(out), "samples": made.force.size, "cycle": made.cycle}
+    result: dict[str, Any] = {"file": str(out), "samples": made.force.size, "cycle": made.cycle}
     if made.expected is not None and made.limit is not None:
         share = float(made.expected.stiffness / made.limit.stiffness)
-        found |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
+        result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
         lines += [row("will tell", f"{name_wall(*made.expected[:2])} as safe, {100 * share:.0f} % of K_max by now")]
-    tell(found, [*lines, row("wrote", str(out))], as_json)
+    tell(result, [*lines, row("wrote", str(out))], as_json)
 
 
 @cli.command(**show_example("respond log.csv --save response.csv --figure response.png"))
@@ -237,13 +248,13 @@ def respond(
 
     found = respond_to_logs(read_logs(logs, period, **of_logs), period, cycle)
     with use_kind(found.device.rotary):
-        _tell_response(found, logs, velocity, save, figure, as_json)
+        _print_response(found, logs, velocity, save, figure, as_json)
 
 
-def _tell_response(
+def _print_response(
     found: Any, logs: tuple[Path, ...], velocity: Any, save: Path | None, figure: Path | None, as_json: bool
 ) -> None:
-    """Print a response and the wall that is safe by it, keep it and draw it."""
+    """Print a measured response and its safe wall, and save and plot the response if asked for."""
     from zwidth.fitting.respond import find_nominal_limit
     from zwidth.scenes.scene import Scene
 
@@ -270,10 +281,10 @@ def _tell_response(
         lines.append(row("wrote", str(save)))
     if figure is not None:
         lines.append(save_figure(_draw(scene, safe if safe.status == Status.OK else None), figure))
-    told = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
-    told |= {"safe_wall": _plain(safe) if given else None, "undecided": said, "doubts": list(doubts)}
-    told |= {"notes": list(found.notes), "rotary": device.rotary}
-    tell(told, lines, as_json)
+    result = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
+    result |= {"safe_wall": _plain(safe) if given else None, "undecided": said, "doubts": list(doubts)}
+    result |= {"notes": list(found.notes), "rotary": device.rotary}
+    tell(result, lines, as_json)
 
 
 def spell_safe_wall(scene: Any, wall: Any) -> str:

@@ -68,7 +68,7 @@ def fit_buzz(
 
     Args:
         points: walls, each (K in N/m, B in N s/m, f in Hz) or a `zwidth.BuzzPoint`; K > 0, 0 < f < 1/(2 T). At least
-            two dampings. Texts with units, as "0.4 N m/rad", are read too.
+            two dampings. Texts with units, as "0.4 N m/rad", are allowed.
         period: T in s.
         velocity: how the velocity was estimated; the backward difference by default.
         noise: relative standard deviation of K and f, one number or one for each. Left out, it is taken to be equal
@@ -108,11 +108,11 @@ def fit_buzz(
     period = check_number("period", period)
     if isinstance(points, Iterable) and not isinstance(points, str | dict):
         points = list(points)
-        told = find_kind(
+        rotary = find_kind(
             {f"points[{k}]": list(each) for k, each in enumerate(points) if isinstance(each, list | tuple)}
         )
-        if told is not None and told != is_rotary():
-            with use_kind(told):
+        if rotary is not None and rotary != is_rotary():
+            with use_kind(rotary):
                 return fit_buzz(points, period=period, velocity=velocity, noise=noise)
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
@@ -163,7 +163,7 @@ def fit_buzz(
     told = tuple(_describe_rival(*rival) for rival in rivals)
     if rivals:
         status = Status.UNDECIDED
-        doubts.append(f"another device fits as well: {spell_rival(told[0])}; add the experiment named next")
+        doubts.append(f"another device fits equally well: {spell_rival(told[0])}; add the experiment named next")
     if against:
         doubts.append(against)
     else:

@@ -1,7 +1,11 @@
-"""Causes of motion that a free mass under the logged force does not explain: gravity, a spring, a rounded force column.
+"""Identify causes of motion missing from a fitted model: gravity, a spring, a wrong sign, a rounded force column.
 
-Two tests: the weak form of the equation of motion, which needs no fit, for logs whose fit fails; and the share of a
-fit's residuals that one more force explains, for logs whose residuals are not white noise.
+Two tests, for two kinds of logs:
+
+- `explain_motion`, for logs whose fit fails: a linear regression on the weak form of the equation of motion, which
+  needs no fit.
+- `explain_residuals`, for logs whose residuals are not white noise: the share of the residual sum of squares that the
+  response to one further force explains.
 """
 
 from __future__ import annotations
@@ -16,62 +20,74 @@ from zwidth.fitting.output_error import FittedModel
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.rotation import is_rotary
 
-_WINDOWS = (32, 128)  # samples of test functions; a position error of 1 counts as 1/32^2 and less
-_FEWEST = 12  # windows of a log for a regression
-_EXPLAINED = 0.25  # share of the squares that may remain if one more force is the cause
-_SIGN = 0.3  # share of the squares that may remain if the sign of the force alone is wrong
-_SHARE = 0.5  # share of the residuals' squares that a cause explains
-_LEVELS, _COARSE = 8, 2e-4  # least distinct forces, and least step over the largest, of a rounded column
-_TRIALS = 4  # random rounding errors
+# Regression on the weak form.
+_WINDOWS = (32, 128)  # lengths of the test functions, in samples; position errors count in proportion to 1/length^2
+_MIN_WINDOWS = 12  # least number of half-overlapping windows that a log contains
+_SIGN = 0.3  # a wrong sign is the cause if it leaves less than this share of the sum of squares
+_EXPLAINED = 0.25  # a further force is the cause if it leaves less than this share of the residual sum of squares
+
+# Test of the residuals.
+_SHARE = 0.5  # a force is the cause if it explains more than this share of the residual sum of squares
+_ROUNDING_SHARE = 0.2  # the same for rounding errors of the force, whose size is computed and not fitted
+_TRIALS = 4  # random draws of the rounding errors
+_MIN_LEVELS = 8  # least number of distinct forces for which a common step is attributed to rounding
+_MIN_STEP = 2e-4  # least rounding step, relative to the largest force
 
 
 class Cause(NamedTuple):
-    """A cause of motion in words, or whether the force has the wrong sign."""
+    """A cause of motion that the logged force does not explain."""
 
-    words: str
-    reversed: bool = False
+    words: str  # clause for a message; "" if no cause was identified
+    reversed: bool = False  # the force, or the position, has the wrong sign
 
 
 def explain_motion(logs: tuple[Recording, ...], period: float) -> Cause:
-    """Return the cause of a motion that the force does not explain; empty words for an unknown one.
+    """Return the cause of a motion that the force does not explain; ``words`` is empty if no cause is identified.
 
-    With smooth test functions of some dozens of samples ``x'' = g F - delta x' + o + e(x)`` is linear in its
-    coefficients, and needs no derivative of a position. Delays are short against the test functions.
+    The equation of motion ``x'' = g F - delta x' + o + e(x)``, in sampling periods, is multiplied by smooth test
+    functions and integrated by parts. The result is linear in the coefficients g, delta and o and in those of e, the
+    spring or gravity, and contains no derivative of a measured position. The delay is neglected because it is short
+    compared with the test functions.
     """
     best = Cause("")
     lowest = np.inf
     for window in _WINDOWS:
-        rows = [found for log in logs if (found := _weigh(log, window)) is not None]
+        rows = [integrals for log in logs if (integrals := _integrate(log, window)) is not None]
         if not rows:
             continue
-        wanted, force, speed, constant, place, sine, cosine = np.concatenate(rows, axis=1)
-        total = float(wanted @ wanted)
-        free, rest = _solve(wanted, [force, speed, constant])
-        spring, with_spring = _solve(wanted, [force, speed, constant, place])
+        acceleration, force, speed, constant, position, sine, cosine = np.concatenate(rows, axis=1)
+        total = float(acceleration @ acceleration)
+        free, rest = _solve(acceleration, [force, speed, constant])
+        spring, with_spring = _solve(acceleration, [force, speed, constant, position])
         gravity, with_gravity = (
-            _solve(wanted, [force, speed, constant, sine, cosine]) if is_rotary() else (None, np.inf)
+            _solve(acceleration, [force, speed, constant, sine, cosine]) if is_rotary() else (None, np.inf)
         )
         if min(with_spring, with_gravity) < min(lowest, _EXPLAINED * rest):
             lowest = min(with_spring, with_gravity)
             if gravity is not None and gravity[0] > 0 and with_gravity < 0.5 * with_spring:
                 size = float(np.hypot(*gravity[3:])) / gravity[0]
-                best = Cause(f"gravity moves it, with a torque of up to {with_unit(size, 'N', 3)}")
+                best = Cause(f"gravity also moves the device, with a torque of up to {with_unit(size, 'N', 3)}")
             elif spring[0] > 0:
                 stiffness = -spring[3] / spring[0]
-                size = f"{with_unit(abs(stiffness), 'N/m', 3)}{' away from rest' if stiffness < 0 else ''}"
-                best = Cause(f"a spring or gravity of about {size} moves it")
+                size = f"{'-' if stiffness < 0 else ''}{with_unit(abs(stiffness), 'N/m', 3)}"
+                best = Cause(f"a spring or gravity of about {size} also moves the device")
         if not best.words and free[0] < 0 and rest < _SIGN * total:
             best = Cause("", reversed=True)
     return best
 
 
-def _weigh(log: Recording, window: int) -> np.ndarray | None:
-    """Return the acceleration and what may cause it, weighed by test functions: rows; None for a short log."""
+def _integrate(log: Recording, window: int) -> np.ndarray | None:
+    """Return the terms of the equation of motion, integrated with test functions; None if the log is too short.
+
+    Returns:
+        An array with a row per term (acceleration, force, velocity, constant, position, and sine and cosine of the
+        position) and a column per test function. The test functions are a quarter of the window apart.
+    """
     count = log.position.size
-    if count < (_FEWEST + 1) * window // 2:
+    if count < (_MIN_WINDOWS + 1) * window // 2:
         return None
     phase = np.pi * (np.arange(window + 1) / window)
-    # sin^4 and its derivatives, which vanish at the ends.
+    # sin^4 and its first derivative vanish at the ends, so that the integration by parts has no boundary terms.
     function = np.sin(phase) ** 4
     slope = 4.0 * np.sin(phase) ** 3 * np.cos(phase) * np.pi / window
     bend = (12.0 * np.sin(phase) ** 2 * np.cos(phase) ** 2 - 4.0 * np.sin(phase) ** 4) * (np.pi / window) ** 2
@@ -82,7 +98,7 @@ def _weigh(log: Recording, window: int) -> np.ndarray | None:
 
 
 def _solve(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Return the coefficients of least squares and the squares that remain."""
+    """Return the least-squares coefficients and the residual sum of squares."""
     matrix = np.array(columns).T
     sizes = np.linalg.norm(matrix, axis=0)
     sizes = np.where(sizes > 0, sizes, 1.0)
@@ -92,34 +108,40 @@ def _solve(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndarray, f
 
 
 def explain_residuals(best: FittedModel) -> str:
-    """Return the cause of residuals that are not white noise: a spring, gravity or a rounded force; "" for another."""
+    """Return the cause of residuals that are not white noise as a clause; "" if no cause is identified."""
     slopes = best.motion.slopes
     basis = np.linalg.qr(slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300))[0]
     left = best.residuals - basis @ (basis.T @ best.residuals)
     squares = float(left @ left)
-    # Rounding errors drift as a weak spring does, so that they are looked at first.
+    # Test for rounding first, because the response to rounding errors drifts and resembles that of a weak spring.
     if rounded := _explain_rounding(best, basis, squares):
         return rounded
 
-    def share(*pushes: list[np.ndarray]) -> float:
+    def explain(*pushes: list[np.ndarray]) -> float:
+        """Return the share of the residual sum of squares that the responses to further accelerations explain."""
         columns = np.array([_respond(best, push) for push in pushes]).T
         columns = columns - basis @ (basis.T @ columns)
         return 1.0 - _solve(left, list(columns.T))[1] / squares
 
     places = [log.position - log.position.mean() for log in best.model.logs]
-    spring = share([-each for each in places])
+    spring = explain([-each for each in places])
     if is_rotary() and max(map(np.ptp, places)) > 0.5:
-        gravity = share(*([turn(log.position) for log in best.model.logs] for turn in (np.sin, np.cos)))
+        gravity = explain(*([turn(log.position) for log in best.model.logs] for turn in (np.sin, np.cos)))
         if gravity > _SHARE and gravity > spring + 0.1:
-            return "it follows the angle, as of gravity"
-    # Friction hides a part of a spring, so that its stiffness is not found here.
+            return "they depend on the angle, as gravity would cause"
+    # The stiffness is not estimated, because the fitted friction absorbs a part of the spring force.
     if spring > _SHARE:
-        return "it follows the position, as of a weak spring, a cable or gravity"
+        return "they depend on the position, as a weak spring, a cable or gravity would cause"
     return ""
 
 
 def _respond(best: FittedModel, pushes: list[np.ndarray]) -> np.ndarray:
-    """Return the positions by further accelerations, one array for the positions of each log, without friction."""
+    """Return the position response to further accelerations, without friction, of all logs in one array.
+
+    Args:
+        best: fitted model, which supplies the damping.
+        pushes: accelerations of each log in m per squared sampling period, one per position.
+    """
     delta = float(best.theta[1])
     moved = []
     for log, push in zip(best.model.logs, pushes, strict=True):
@@ -129,23 +151,32 @@ def _respond(best: FittedModel, pushes: list[np.ndarray]) -> np.ndarray:
 
 
 def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float) -> str:
-    """Return the words for a force column whose rounding explains the residuals, "" if it does not."""
+    """Return a clause on the rounding of the force column if it explains residuals of this size, "" otherwise.
+
+    Args:
+        best: fitted model.
+        basis: orthonormal directions that the fitted parameters absorb.
+        squares: residual sum of squares.
+    """
     forces = np.concatenate([log.force for log in best.model.logs])
     step, largest = find_resolution(forces), best.model.largest
-    if step < _COARSE * largest or np.unique(forces).size < _LEVELS:
+    if step < _MIN_STEP * largest or np.unique(forces).size < _MIN_LEVELS:
         return ""
-    rng, found = np.random.default_rng(0), []
+    rng, expected = np.random.default_rng(0), []
     for _ in range(_TRIALS):
         pushes = []
         for log in best.model.logs:
             force = log.force[log.skip :][: log.position.size]
-            # One error for each stretch of equal force.
+            # Samples of equal force have the same rounding error.
             run = np.append(0, np.cumsum(np.diff(force) != 0))
             pushes.append(best.theta[0] * rng.uniform(-0.5 * step, 0.5 * step, run[-1] + 1)[run])
         moved = _respond(best, pushes)
         moved = moved - basis @ (basis.T @ moved)
-        found.append(float(moved @ moved))
-    if np.mean(found) < 0.2 * squares:
+        expected.append(float(moved @ moved))
+    if np.mean(expected) < _ROUNDING_SHARE * squares:
         return ""
     percent = plain(100.0 * step / largest, 1)
-    return f"the force column is rounded to {with_unit(step, 'N', 3)}, {percent} % of its largest, which leaves as much"
+    return (
+        f"the force column is rounded to {with_unit(step, 'N', 3)}, {percent} % of its largest value, which alone "
+        "accounts for residuals of this size"
+    )

@@ -1,6 +1,7 @@
-"""Logs in files: columns in any order, under any names, in any units, read into SI units (`words.tables` finds them).
+"""Read logs from files: identify the columns, convert them to SI units, and fit them.
 
-A velocity is summed up to a position, and a current is a force by the constant of its motor.
+`words.tables` reads the table and `fitting.headers` identifies its columns and their units. A velocity is integrated to
+a position, and a motor current is converted to a force by the motor constant.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from zwidth.words.units import (
 
 _AMPERES = {"A": 1.0, "mA": 1e-3}
 _PER_AMPERE = re.compile(r"(.*?)\s*/\s*A\s*")
-_MANY_COUNTS = 50.0  # least range of whole numbers that are counts
-_ROUNDING = 1e-9  # relative difference of equal units
-_OTHER = 0.1  # relative difference of periods that contradict each other
-# Units of mass that scales and load cells show for a force.
-_WEIGHTS = ("kg", "g", "lb", "oz")
-# The least epoch in seconds of a time without a unit, in 2001, and its units.
-_EPOCH, _EPOCH_UNITS = 1e9, (("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3))
-_COARSEST = 1.1  # largest step of a rotary encoder in rad, 6 steps per turn; a larger number is one of counts
+_MANY_COUNTS = 50.0  # least range of whole numbers that are read as encoder counts
+_ROUNDING = 1e-9  # largest relative difference of two equal units, for rounding errors
+_OTHER = 0.1  # relative difference above which two periods contradict each other
+# Units of mass that scales and load cells display for a force, and the unit of the corresponding weight.
+_WEIGHTS = {"kg": "kgf", "g": "gf", "lb": "lbf", "oz": "ozf"}
+_EPOCH = 1e9  # s, in 2001; times without a unit that exceed this value are times since 1970
+_EPOCH_UNITS = (("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3))  # tried in this order for times since 1970
+_COARSEST = 1.1  # rad or m, largest encoder step (6 steps per turn); a larger resolution is a number of counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +55,7 @@ class LoggedMotion:
         force: in N, or in N m of a rotary axis.
         resolution: step of the encoder in m or rad; None where it is not known.
         rotary: whether the axis turns.
-        notes: sentences on how the columns were read.
+        notes: interpretations of the columns that the user should check, one clause each.
 
     Cells without a number are NaN.
     """
@@ -67,7 +68,7 @@ class LoggedMotion:
     notes: tuple[str, ...] = ()
 
     def __eq__(self, other: object) -> bool:
-        """Return whether all numbers are the same; empty cells are."""
+        """Return whether all values are equal. NaN is compared as 0."""
         return isinstance(other, LoggedMotion) and all(
             np.array_equal(*(np.nan_to_num(getattr(each, part.name)) for each in (self, other)))
             if isinstance(getattr(self, part.name), np.ndarray) and isinstance(getattr(other, part.name), np.ndarray)
@@ -108,19 +109,19 @@ def read_log(
     wanted = [name for name in QUANTITIES if name != "time" or period is None]
     if table.nameless and not all((columns.get(name) or "").partition(":")[0] in heads for name in wanted):
         raise InputError(
-            f"{table.nameless}; add a line such as 'time [s],position [m],force [N]', or say which column is which by "
-            "its number, as 1:ms, 2:mm and 3:N for time, position and force, or 1:s+2:ns for a time in two columns"
+            f"{table.nameless}; add a header such as 'time [s],position [m],force [N]', or specify each column by its "
+            "number and unit, as 1:ms, 2:mm and 3:N for time, position and force (1:s+2:ns for a time in two columns)"
         )
     places = find_columns(file, heads, columns, wanted)
     taken = [place for column in places.values() for place in column.places]
     if len(set(taken)) < len(taken):
         words = ", ".join(f"{name} {heads[column.places[0]]!r}" for name, column in places.items())
-        raise InputError(f"{file}: one column is taken twice: {words}; name another")
+        raise InputError(f"{file}: the same column is used twice: {words}; specify another one")
     cells = dict(zip(taken, table.numbers(taken, gaps=True), strict=True))
     for place, column in cells.items():
         if not np.isfinite(column).any():
-            raise InputError(f"{file}: no cell of column {heads[place]!r} holds a number; name another column")
-    whole = _counts_alone(cells[places["position"].places[0]])
+            raise InputError(f"{file}: column {heads[place]!r} contains no number; specify another column")
+    whole = _look_like_counts(cells[places["position"].places[0]])
     given, notes = _name_units(heads, places, resolution, whole)
     moves = _without_rate(given["position"])
     units = {**given, "position": moves or given["position"]}
@@ -134,7 +135,7 @@ def read_log(
     if dimensions["position"] is None:
         if step is None:
             raise InputError(
-                "position: it is in counts; give the resolution, as 0.03 mm or 0.09 deg for a count of the encoder, or "
+                "position: it is in counts; specify the resolution, as 0.03 mm or 0.09 deg per count, or as "
                 "'4000 counts/rev'"
             )
         factors["position"] = step
@@ -144,55 +145,57 @@ def read_log(
     if period is not None:
         _compare_period(file, table, period)
     if moves is not None:
-        known = np.zeros(1) if time is None else time[np.isfinite(time)]
-        apart = float(known[-1] - known[0]) / max(1, known.size - 1) if period is None else period
+        timed = np.zeros(1) if time is None else time[np.isfinite(time)]
+        apart = float(timed[-1] - timed[0]) / max(1, timed.size - 1) if period is None else period
         speed = numbers["position"] * apart * (1 / 60 if given["position"] == "rpm" else 1.0)
         numbers["position"] = np.where(np.isnan(speed), np.nan, np.cumsum(np.nan_to_num(speed)))
     return LoggedMotion(time, numbers["position"], numbers["force"], step, rotary, tuple(notes))
 
 
-def _counts_alone(position: np.ndarray) -> bool:
-    """Return whether positions are whole numbers over a range that no length in m and no angle in rad has."""
-    known = position[np.isfinite(position)]
-    return bool(np.all(known == np.round(known))) and float(np.ptp(known)) >= _MANY_COUNTS
+def _look_like_counts(position: np.ndarray) -> bool:
+    """Return whether positions look like encoder counts: whole numbers over a range too large for m or rad."""
+    finite = position[np.isfinite(position)]
+    return bool(np.all(finite == np.round(finite))) and float(np.ptp(finite)) >= _MANY_COUNTS
 
 
 def _name_units(
     heads: Sequence[str], places: Mapping[str, Column], resolution: Any, whole: bool
 ) -> tuple[dict[str, str], list[str]]:
-    """Return the unit of each quantity, and notes on those that neither header nor option gives.
+    """Return the unit of each quantity, and notes on the interpretations that the user should check.
 
-    Positions that are ``whole`` numbers are counts if they have no unit.
+    Args:
+        heads: headers of the table.
+        places: column of each quantity.
+        resolution: encoder resolution as specified; an angle implies a rotary axis.
+        whole: whether the positions look like encoder counts; if so, positions without a unit are read in counts.
     """
     units = {name: column.units[0] for name, column in places.items()}
     notes = []
     if any(column.guessed for column in places.values()):
         names = [f"{name} {' + '.join(repr(heads[k]) for k in column.places)}" for name, column in places.items()]
-        notes.append(f"columns by their names: {', '.join(names)}")
+        notes.append(f"columns identified by their headers: {', '.join(names)}")
     for name in ("position", "force"):
-        own, asked = places[name].header_unit, places[name].units[0]
-        sizes = [size for unit in (own, asked) if (size := _measure(name, unit)) is not None]
-        if own != asked and len(sizes) == 2 and abs(sizes[0] / sizes[1] - 1) > _ROUNDING:
-            notes.append(f"{name} is read in {asked}, as asked, although the header has {own}")
+        header_unit, asked = places[name].header_unit, places[name].units[0]
+        sizes = [size for unit in (header_unit, asked) if (size := _measure(name, unit)) is not None]
+        if header_unit != asked and len(sizes) == 2 and abs(sizes[0] / sizes[1] - 1) > _ROUNDING:
+            notes.append(f"the {name} is read in {asked}, as specified, although its header has {header_unit}")
     if units["force"] in _WEIGHTS:
-        weight = FORCE.in_base("1", 0, {"kg": "kgf", "g": "gf", "lb": "lbf", "oz": "ozf"}[units["force"]])
-        notes.append(
-            f"force in {units['force']} is the weight of that mass: 1 {units['force']} is {plain(weight or 0)} N"
-        )
-        units["force"] = {"kg": "kgf", "g": "gf", "lb": "lbf", "oz": "ozf"}[units["force"]]
+        mass, units["force"] = units["force"], _WEIGHTS[units["force"]]
+        weight = FORCE.in_base("1", 0, units["force"])
+        notes.append(f"the force in {mass} is read as a weight: 1 {mass} = {plain(weight or 0)} N")
     if whole and not units["position"]:
         units["position"] = COUNTS[0]
-        notes.append(f"position {heads[places['position'].places[0]]!r} has no unit and is read in counts")
+        notes.append(f"the position {heads[places['position'].places[0]]!r} has no unit and is read in counts")
     if _turns(units, places, resolution):
         for name, unit in (("position", "rad"), ("force", "N m")):
             if not units[name] and places[name].turns is not False:
                 units[name] = unit
-                notes.append(f"{name} {heads[places[name].places[0]]!r} has no unit and is read in {unit}")
+                notes.append(f"the {name} {heads[places[name].places[0]]!r} has no unit and is read in {unit}")
     return units, notes
 
 
 def _turns(units: Mapping[str, str], places: Mapping[str, Column], resolution: Any) -> bool:
-    """Return whether units, or else names, are of a rotary axis."""
+    """Return whether the axis is rotary: by the units, by the resolution, or by the headers, in this order."""
     for name in ("force", "position"):
         linear, angular = DIMENSIONS[name]
         base = _without_rate(units[name]) or units[name]
@@ -205,7 +208,10 @@ def _turns(units: Mapping[str, str], places: Mapping[str, Column], resolution: A
 
 
 def _measure(name: str, unit: str) -> float | None:
-    """Return the size of a unit of a quantity, linear or rotary, in SI units; None for another unit."""
+    """Return the factor that converts a unit of position or force to SI; None if the unit belongs to neither.
+
+    Units of mass are converted to the weight.
+    """
     for dimension in (*DIMENSIONS[name], MASS):
         size = dimension.in_base("1", 0, unit) if unit else None
         if size is not None:
@@ -214,18 +220,25 @@ def _measure(name: str, unit: str) -> float | None:
 
 
 def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[str]) -> np.ndarray:
-    """Return the times in s, of one column or of seconds and a part of a second in two."""
+    """Return the times in s, from one column, or from two columns of seconds and fractions of a second.
+
+    Args:
+        column: the column or columns of the time.
+        numbers: cells by column index.
+        notes: receives a note if the unit is assumed.
+    """
     total: Any = 0.0
     for place, unit in zip(column.places, column.units, strict=True):
         values = numbers[place]
         size = _read_unit("time", unit)[0]
         first = float(values[np.isfinite(values)][0])
         if not unit:
-            # Times since 1970 have a magnitude of their own.
+            # The magnitude of a time since 1970 determines its unit.
             name, size = next(((name, size) for name, size in _EPOCH_UNITS if first * size >= _EPOCH), ("s", 1.0))
             if name != "s":
-                notes.append(f"time has no unit and is read in {name}, by its magnitude as a time since 1970")
-        # Whole seconds since 1970 would hide the digits of the other column.
+                notes.append(f"the time has no unit and is read in {name} since 1970, according to its magnitude")
+        # Subtract the first of the whole seconds, because the rounding error of seconds since 1970 would exceed the
+        # resolution of the other column.
         total = total + (values - first if len(column.places) > 1 and size == 1.0 else values) * size
     return total
 
@@ -308,13 +321,13 @@ def _check_pairs(units: Mapping[str, str], dimensions: Mapping[str, Dimension | 
 
 
 def read_step(resolution: Any) -> tuple[float, bool | None]:
-    """Return the step in SI units, and whether it is an angle; None for a number alone."""
+    """Return the encoder step in SI units, and whether it is an angle (None for a number without a unit)."""
     number = not isinstance(resolution, str) or looks_like_number(resolution)
     value = float(resolution) if isinstance(resolution, str) and number else resolution
     if number and isinstance(value, int | float) and value > _COARSEST:
         raise InputError(
-            f"resolution: got {describe(resolution)}, which is more than a radian or a metre per count; give counts as "
-            f"'{describe(resolution).strip(chr(39))} counts/rev' or a step as '0.09 deg'"
+            f"resolution: got {describe(resolution)}, more than 1 rad or 1 m per count; write counts per turn as "
+            f"'{describe(resolution).strip(chr(39))} counts/rev', or a step as '0.09 deg'"
         )
     try:
         return read_quantity(value, LENGTH, POSITIVE)[0], None if number else False
@@ -341,7 +354,7 @@ def join_logs(motions: Sequence[LoggedMotion], period: float | None) -> dict[str
 
 
 def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None, **options: Any) -> DeviceFit:
-    """Return `zwidth.fit_log` of logs that are read, with the notes on how they were read."""
+    """Fit logs that were read from files with `zwidth.fit_log`, and add the notes on their columns to the fit."""
     fit = fit_log(**join_logs(motions, period), **options)
     notes = dict.fromkeys(note for motion in motions for note in motion.notes)
     return replace(fit, notes=(*notes, *fit.notes)) if notes else fit

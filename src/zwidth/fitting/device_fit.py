@@ -105,7 +105,7 @@ class DeviceFit(DeviceEstimate):
         residuals: measured less fitted, of buzzing walls an array (n, 2) in units of the noise of K and f, of a log in
             m, NaN where samples are left out.
         doubts: what is odd about the records or about the estimate, a sentence each; then there is no safe wall.
-        notes: how a log was read and what was repaired in it, a sentence each.
+        notes: interpretations of the columns of a log and repairs of its rows, one clause each.
         status: of `zwidth.Status`: UNDECIDED where another device fits as well, or where a log shows more than the
             model has.
         rivals: those devices, a `zwidth.RivalDevice` each.
@@ -115,9 +115,10 @@ class DeviceFit(DeviceEstimate):
             ``errors_of_log`` and ``errors``, NaN where the log leaves open how much is of which.
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
         motions: of a log, each with its fit, a `zwidth.FittedMotion`.
-        scene: the estimated device in its loop, a `zwidth.Scene` with the safe limit of its walls; parameters are
-            rounded to a thousandth of their standard errors, as `zwidth fit --yaml` writes them.
-        nominal, period, velocity: the same loop without rounding and without the limit.
+        scene: the fitted loop, a `zwidth.Scene` with the safe limit of its walls. Its parameters are rounded to a
+            thousandth of their standard errors, as `zwidth fit --yaml` writes them.
+        nominal, period, velocity: the fitted loop before rounding and without the safe limit, its sampling period in s
+            and its velocity estimate.
         response: of a log, a `zwidth.MeasuredDevice`: the response of the estimated device, with the radius by which a
             resonance of a damping ratio of 0.005 or more may move it and not show in the log. None of buzzing walls, of
             a log without noise, and under a doubt of what the fit leaves.
@@ -181,12 +182,12 @@ class DeviceFit(DeviceEstimate):
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene to hand over, with rounded parameters and the safe limit."""
+        """The fitted scene with rounded parameters and the safe limit of its walls."""
         return replace(round_scene(self), safe_limit=limit_walls(self))
 
     @cached_property
     def recommended(self) -> Recommendation:
-        """The wall to set: `zwidth.Scene.recommend` of ``scene``, with its default margins."""
+        """The recommended wall: ``scene.recommend()`` with the default margins."""
         return self.scene.recommend()
 
     @cached_property
@@ -332,14 +333,14 @@ class DeviceFit(DeviceEstimate):
         return to_json(numbers)
 
     def _spell_recommended(self) -> dict[str, Any]:
-        """Return the wall to set as plain numbers."""
-        found = self.recommended
+        """Return the recommended wall as numbers and texts for JSON."""
+        recommended = self.recommended
         margins = ("gain_margin", "phase_margin", "delay_margin")
         return {
-            **{name: getattr(found, name) for name in ("stiffness", "virtual_damping", "limited_by", "reason")},
-            **{name: getattr(found.verdict, name, None) for name in margins},
-            "status": int(found.status),
-            "cautions": list(found.cautions),
+            **{name: getattr(recommended, name) for name in ("stiffness", "virtual_damping", "limited_by", "reason")},
+            **{name: getattr(recommended.verdict, name, None) for name in margins},
+            "status": int(recommended.status),
+            "cautions": list(recommended.cautions),
         }
 
 

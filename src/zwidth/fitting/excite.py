@@ -47,7 +47,7 @@ _FEWEST_SAMPLES = 600
 class Excitation:
     """A force to play, sample by sample, and what it will tell.
 
-    Of a rotary device forces are torques in N m, and m is rad.
+    For a rotary device, forces are torques in N m, and rad replaces m.
 
     Attributes:
         force: in N, one number a sample.
@@ -71,11 +71,11 @@ class Excitation:
 
     @property
     def in_rotary_units(self) -> bool:
-        """Whether its numbers are those of a rotary device."""
+        """True for a rotary device."""
         return self.rotary
 
     def save(self, file: str | Path) -> None:
-        """Write a CSV file with the time in s and the force in N, or torque in N m, of every sample."""
+        """Write a CSV file with a row per sample: the time in s, and the force in N or the torque in N m."""
         rows = [f"{k * self.period:.9g},{value:.7g}" for k, value in enumerate(self.force.tolist())]
         write_whole(
             Path(file),
@@ -105,8 +105,8 @@ def excite(
             is nearly unstable. Without it all lines from 1 Hz to nearly half the rate are equally strong.
         velocity: the velocity estimate of the walls that are meant; the backward difference by default.
         seed: of the phases.
-        rotary: whether the force is a torque in N m and the resolution an angle in rad; left out, their units or the
-            response say so, and plain numbers are of a linear device.
+        rotary: True if the force is a torque in N m and the resolution an angle in rad. By default, the response or
+            the units of force and resolution decide; numbers without units are those of a linear device.
 
     Returns:
         Excitation: ``force`` to play at every period, ``cycle``, the lines with the ``deviation`` to expect, and with a
@@ -128,13 +128,13 @@ def excite(
         >>> print(f"{record.force.size} samples, up to {abs(record.force).max():.1f} N, cycle {record.cycle} s")
         30000 samples, up to 3.0 N, cycle 2.0 s
     """
-    told = find_kind({"force": force, "resolution": resolution, "response": response})
-    if rotary is not None and told not in (None, rotary):
-        kind = "rotary" if told else "linear"
+    implied = find_kind({"force": force, "resolution": resolution, "response": response})
+    if rotary is not None and implied not in (None, rotary):
+        kind = "rotary" if implied else "linear"
         raise InputError(
-            f"rotary: got {rotary}, but force, resolution or response are of a {kind} device; leave it out"
+            f"rotary: got {rotary}, but force, resolution or response belong to a {kind} device; omit rotary"
         )
-    with use_kind(is_rotary() if rotary is None and told is None else bool(told or rotary)):
+    with use_kind(is_rotary() if rotary is None and implied is None else bool(implied or rotary)):
         return _design(period, force, resolution, duration, response, velocity, seed)
 
 
@@ -147,7 +147,7 @@ def _design(
     velocity: Velocity | None,
     seed: int,
 ) -> Excitation:
-    """Return the record of `excite`, in units of the kind of device in question."""
+    """Design the force as in `excite`, with the units of the current kind of device, linear or rotary."""
     period, most = check_number("period", period), check_number("force", force, "N", POSITIVE)
     step, length = check_number("resolution", resolution, "m"), check_number("duration", duration, "s", POSITIVE)
     count = int(length / period / (_STRETCHES * _PERIODS)) // 2 * 2
@@ -172,8 +172,8 @@ def _design(
     hertz, expected = lines / (count * period), None
     if scene is not None and response is not None:
         answer = _answer_at(scene, 2.0 * np.pi * lines / count)[0]
-        promised = MeasuredDevice(hertz, answer, deviation, is_rotary())
-        expected = Scene(promised, scene.timing, velocity=velocity).max_stiffness()
+        predicted = MeasuredDevice(hertz, answer, deviation, is_rotary())
+        expected = Scene(predicted, scene.timing, velocity=velocity).max_stiffness()
     return Excitation(played, period, count * period, hertz, amplitude, deviation, expected, limit, is_rotary())
 
 

@@ -1,6 +1,7 @@
-"""Columns of logs by their headers: the time, the position and the force, and their units.
+"""Identify the time, position and force columns of a log, and their units, by the headers.
 
-Headers are compared as a whole first, then word by word: ``tau_cmd_mNm`` is a torque in mN m, ``__time`` a time.
+A header is first compared as a whole, then word by word. For example, ``tau_cmd_mNm`` is a commanded torque in mN m,
+and ``__time`` is a time.
 """
 
 from __future__ import annotations
@@ -14,87 +15,105 @@ from zwidth.words.formatting import suggestion
 from zwidth.words.units import ANGLE, COUNTS, FORCE, LENGTH, TIME, TORQUE, Dimension, split_head, split_title
 
 QUANTITIES = ("time", "position", "force")
-# Units of each quantity, those of a linear axis first.
+# Admissible dimensions of each quantity: the first is that of a linear axis, the second that of a rotary axis.
 DIMENSIONS: dict[str, tuple[Dimension, ...]] = {"time": (TIME,), "position": (LENGTH, ANGLE), "force": (FORCE, TORQUE)}
-# Whole headers, in lower case.
+# Headers in lower case that name a quantity as a whole.
 _NAMES = {
     "time": ("time", "t", "clock", "timestamp", "stamp", "zeit"),
     "position": ("position", "pos", "x", "encoder", "angle", "phi", "theta", "q"),
     "force": ("force", "f", "torque", "tau"),
 }
-# Words of headers, and ends of words as in German compounds.
+# Words in lower case that name a quantity within a longer header.
 _WORDS = {
     "time": (*_NAMES["time"], "millis", "micros", "nanos", "elapsed", "uhrzeit"),
     "position": ("position", "pos", "encoder", "enc", "angle", "phi", "theta", "winkel", "weg"),
     "force": ("force", "torque", "tau", "effort", "kraft", "moment"),
 }
-_ENDINGS = ("moment", "kraft", "winkel", "position")
-# A commanded force is the one wanted; a commanded position is not the one measured.
+# Endings of compound words, as in the German "Sollmoment".
+_ENDINGS = {"time": (), "position": ("winkel", "position"), "force": ("moment", "kraft")}
+# Of several forces the commanded one is preferred, and measured forces are excluded. The reverse holds for positions.
 _COMMANDED = ("cmd", "command", "commanded", "des", "desired", "ref", "reference", "target", "setpoint", "soll", "goal")
 _MEASURED = ("meas", "measured", "actual", "sensed", "sensor", "est", "estimated", "ist")
+# Words for derivatives, errors and temperatures. Columns with these words are neither positions nor forces.
 _DERIVED = ("error", "err", "vel", "velocity", "speed", "dot", "acc", "rate", "temp")
-# Words that say that an axis turns.
+# Words that imply a rotary axis, and words that imply a linear axis.
 _TURNS = ("angle", "phi", "theta", "winkel", "torque", "tau", "moment", "drehmoment", "sollmoment")
 _MOVES = ("force", "f", "kraft", "sollkraft", "weg")
-# Columns read in place of a position or a force without one, and their unit if the header has none.
+# Headers of columns that replace a missing position or force, and their unit if the header has none.
 _INSTEAD = {
     "position": (("velocity", "vel", "speed"), "m/s"),
     "force": (("current", "iq", "i_q"), "A"),
 }
-# Headers that are units in words.
+# Words of headers that name a unit of time.
 _UNIT_WORDS = {"millis": "ms", "micros": "us", "nanos": "ns", "secs": "s", "seconds": "s"}
-# The second column of a time in two.
+# A time in two columns. Last words of the header of the second column (fractions of a second), with the unit.
 _PARTS: dict[str, str] = dict.fromkeys(("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"), "ns")
 _PARTS |= dict.fromkeys(("usec", "usecs", "microsec", "microseconds", "us"), "us")
+# Last words of the header of the first column (whole seconds).
 _WHOLE = ("sec", "secs", "seconds", "s")
 
 
 class Column(NamedTuple):
-    """Where a quantity stands in a table."""
+    """The column of a table that contains a quantity, or the two columns of a time split into seconds and fractions."""
 
-    places: tuple[int, ...]  # one column; two of a time in seconds and parts of a second
-    units: tuple[str, ...]  # of each, "" without one
-    turns: bool | None  # whether the name is that of an angle or a torque, or of a force; None of any axis
-    guessed: bool = False  # whether only a word of the header says which quantity it is
-    header_unit: str = ""  # the unit in the header, if another one is asked for
+    places: tuple[int, ...]  # column indices, counted from 0
+    units: tuple[str, ...]  # unit of each column, "" if none is specified
+    turns: bool | None  # True: the header implies a rotary axis; False: a linear axis; None: neither
+    guessed: bool = False  # True if the header contains more than the name of the quantity, or only a unit
+    header_unit: str = ""  # unit in the header if the user specified a unit as well
 
 
 def find_columns(
     file: object, heads: Sequence[str], asked: Mapping[str, str | None], wanted: Sequence[str]
 ) -> dict[str, Column]:
-    """Return the columns asked for or found by their names; raise one `InputError` for all that are missing."""
-    found: dict[str, Column] = {}
+    """Return the column of each quantity.
+
+    Args:
+        file: path of the table, for messages.
+        heads: headers of the table.
+        asked: user-specified columns by quantity, as "NAME" or "NAME:unit"; None to identify the column by its header.
+        wanted: the quantities to return.
+
+    Raises:
+        InputError: a column is missing or ambiguous. One message lists all missing columns.
+    """
+    columns: dict[str, Column] = {}
     missing, several = [], []
     for name in wanted:
         text = asked.get(name)
         if text is not None:
-            found[name] = _find_asked(file, heads, name, text)
+            columns[name] = _find_asked(file, heads, name, text)
             continue
         column, places = _find_by_name(heads, name)
         if column is not None:
-            found[name] = column
+            columns[name] = column
         elif places:
-            several.append(f"{name}: may be any of {list_heads(heads[k] for k in places)} in {file}; name the column")
+            several.append(
+                f"{name}: may be any of the columns {list_heads(heads[k] for k in places)} in {file}; specify one"
+            )
         else:
             missing.append(name)
     if missing:
         _refuse_missing(file, heads, missing)
     if several:
         raise InputError(several[0])
-    return found
+    return columns
 
 
 def _refuse_missing(file: object, heads: Sequence[str], missing: list[str]) -> None:
+    """Raise `InputError` for quantities without a column, with the headers of the table and the remedy."""
     names = " and ".join((", ".join(missing[:-1]), missing[-1])) if len(missing) > 1 else missing[0]
     if "frequency" in {split_head(head)[0].lower() for head in heads}:
-        raise InputError(f"{file}: a table of a response is a device: zwidth ridge --device {file}")
+        raise InputError(
+            f"{file}: got a frequency response in place of a log; use it as a device: zwidth ridge --device {file}"
+        )
     which = f"{missing[0]}: " if len(missing) == 1 else ""
     remedy = ", ".join(f"{name} 'COLUMN:unit'" for name in missing)
-    raise InputError(f"{which}no column for {names} recognized in {file} among {list_heads(heads)}; give {remedy}")
+    raise InputError(f"{which}no column for {names} recognized in {file} among {list_heads(heads)}; specify {remedy}")
 
 
 def _find_by_name(heads: Sequence[str], name: str) -> tuple[Column | None, list[int]]:
-    """Return the column of a quantity, or None and the columns that may be it."""
+    """Return the column of a quantity identified by its header, or None and the indices of all candidates."""
     if name == "time" and (pair := _find_parts(heads)) is not None:
         return pair, []
     titles = [split_head(head) for head in heads]
@@ -119,11 +138,22 @@ def _find_by_name(heads: Sequence[str], name: str) -> tuple[Column | None, list[
     return Column((k,), (unit or (heads[k].strip() if best == _UNIT_ONLY else ""),), _is_turning(words), best > 0), []
 
 
-_UNIT_ONLY = 3
+_UNIT_ONLY = 3  # rank of a header that is only a unit
 
 
 def _rank(name: str, head: str, title: str) -> int | None:
-    """Return 0 for a whole header, 1 and 2 for words of it, 3 for a unit alone; None for another quantity."""
+    """Return the rank of a header as the name of a quantity; 0 is the best.
+
+    Args:
+        name: the quantity.
+        head: the header.
+        title: the header without its unit.
+
+    Returns:
+        0 if the title is a name of the quantity; 1 if it contains such a name, together with words for the preferred
+        column (see ``_COMMANDED``) or only with words for commanded or measured values; 2 if it contains such a name
+        among other words; 3 if the header is only a unit of the quantity. None if the header names something else.
+    """
     if title.lower().strip("_") in _NAMES[name]:
         return 0
     words = _split_words(title)
@@ -133,9 +163,7 @@ def _rank(name: str, head: str, title: str) -> int | None:
     core = [word for word in words if word not in (*_COMMANDED, *_MEASURED)]
     if len(core) == 1 < len(words) and core[0] in _NAMES[name]:
         return 1
-    if any(
-        word in _WORDS[name] or (name != "time" and word.endswith(_ENDINGS) and _ends(name, word)) for word in words
-    ):
+    if any(word in _WORDS[name] or word.endswith(_ENDINGS[name]) for word in words):
         preferred = {"force": _COMMANDED, "position": _MEASURED, "time": ()}[name]
         return 1 if set(words) & set(preferred) or any(word.startswith("soll") for word in words) else 2
     bare = head.strip()
@@ -146,26 +174,21 @@ def _rank(name: str, head: str, title: str) -> int | None:
     return None
 
 
-def _ends(name: str, word: str) -> bool:
-    ends = {"position": ("winkel", "position"), "force": ("moment", "kraft")}[name]
-    return word.endswith(ends)
-
-
 def _split_words(title: str) -> list[str]:
-    """Return the words of a header in lower case, without numbers at their ends."""
+    """Return the words of a header in lower case, without trailing digits."""
     spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", title)
     return [re.sub(r"[0-9]+$", "", word).lower() for word in re.split(r"[\W_]+", spaced) if word]
 
 
 def _is_turning(words: Sequence[str]) -> bool | None:
-    """Return whether words of a header are of a rotary axis, or of a linear one; None if they say neither."""
+    """Return True if words of a header imply a rotary axis, False if they imply a linear axis, None otherwise."""
     if any(word in _TURNS for word in words):
         return True
     return False if any(word in _MOVES for word in words) else None
 
 
 def _find_parts(heads: Sequence[str]) -> Column | None:
-    """Return a time in two columns, seconds and the rest in nanoseconds or microseconds; None without one."""
+    """Return the two columns of a time split into seconds and nano- or microseconds; None if there is no such pair."""
     words = [_split_words(head) for head in heads]
     pairs = [
         (i, j)
@@ -180,40 +203,51 @@ def _find_parts(heads: Sequence[str]) -> Column | None:
 
 
 def _find_asked(file: object, heads: Sequence[str], name: str, wanted: str) -> Column:
-    """Return the column that is asked for, as "NAME", "NAME:unit", or of a time "NAME:s+NAME:ns"."""
+    """Return the user-specified column of a quantity.
+
+    Args:
+        file: path of the table, for messages.
+        heads: headers of the table.
+        name: the quantity.
+        wanted: the column as "NAME" or "NAME:unit"; for a time in two columns "NAME:s+NAME:ns".
+
+    Raises:
+        InputError: no column, or more than one, has this name.
+    """
     title = wanted.strip()
-    if name == "time" and "+" in title and not _matches(heads, title):
+    if name == "time" and "+" in title and not _match_title(heads, title):
         parts = [_find_asked(file, heads, name, part) for part in title.split("+")]
         units = tuple(unit for part in parts for unit in part.units)
         return Column(tuple(place for part in parts for place in part.places), units, None)
     unit = None
-    found = _matches(heads, title)
-    if not found:
+    matches = _match_title(heads, title)
+    if not matches:
         title, _, unit = (part.strip() for part in wanted.rpartition(":"))
-        found = _matches(heads, title)
-    if len(found) != 1:
+        matches = _match_title(heads, title)
+    if len(matches) != 1:
         title = title or wanted.strip()
-        if found:
-            raise InputError(f"{name}: {file} has {len(found)} columns {title!r}; give each a name of its own")
-        known = [*heads, *(split_head(head)[0] for head in heads)]
-        hint = suggestion(title, known, f"it has {list_heads(heads)}")
+        if matches:
+            raise InputError(f"{name}: {file} has {len(matches)} columns {title!r}; rename them, so that one is left")
+        names = [*heads, *(split_head(head)[0] for head in heads)]
+        hint = suggestion(title, names, f"it has {list_heads(heads)}")
         raise InputError(f"{name}: {file} has no column {title!r}; {hint}")
-    (k,) = found
-    words, own = _split_words(split_head(heads[k])[0]), split_head(heads[k])[1]
+    (k,) = matches
+    base, header_unit = split_head(heads[k])
+    words = _split_words(base)
     unit_word = next((_UNIT_WORDS[word] for word in words if word in _UNIT_WORDS), "") if name == "time" else ""
     if unit is not None:
-        return Column((k,), (unit,), _is_turning(words), header_unit=own)
-    return Column((k,), (own or unit_word,), _is_turning(words))
+        return Column((k,), (unit,), _is_turning(words), header_unit=header_unit)
+    return Column((k,), (header_unit or unit_word,), _is_turning(words))
 
 
-def _matches(heads: Sequence[str], title: str) -> list[int]:
-    """Return the columns of this header; else those of this name before the brackets or the unit."""
+def _match_title(heads: Sequence[str], title: str) -> list[int]:
+    """Return the indices of the headers equal to a title; if there are none, of those equal to it without the unit."""
     whole = [k for k, head in enumerate(heads) if head == title]
     whole = whole or [k for k, head in enumerate(heads) if title and split_head(head)[0] == title]
     return whole or [k for k, head in enumerate(heads) if title and split_title(head)[0] == title]
 
 
 def list_heads(heads: Iterable[str]) -> str:
-    """Return the first headers, between quotes."""
+    """Return the first 12 headers in quotes, for messages."""
     names = [repr(head) for head in heads if head]
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")

@@ -43,8 +43,8 @@ _SEEN = 5.0
 _UNEXPLAINED, _SMOOTH = 0.01, 5.0
 # What to do about a device that is more than the model.
 _RECORD_NEXT = (
-    "it has something that the model lacks, so that no K_max follows; play a record of zwidth.excite, for "
-    "zwidth.respond needs no model"
+    "the device has dynamics that the model lacks, so K_max stays open; play a force of zwidth.excite and use "
+    "zwidth.respond, which needs no model"
 )
 
 
@@ -132,7 +132,7 @@ def _fit(
     max_delay: Any,
     resolution: Any,
 ) -> DeviceFit:
-    """Return the device of logs that are read."""
+    """Return the fit of logs that were read and repaired."""
     logs, places, period, wavers, notes = read
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
@@ -205,19 +205,19 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float)
     cause = explain_residuals(best) if pole is not None or best.excess > ALIKE else ""
     if cause:
         remedy = "log the force with more digits" if "rounded" in cause else _RECORD_NEXT
-        return [f"what the fit leaves is no noise: {cause}: {remedy}"]
+        return [f"the residuals are not white noise: {cause}; {remedy}"]
     if pole is not None and pole.instead:
         near = with_unit(pole.frequency / period, "Hz", 3)
         what = f"an amplifier's lag explains the log, and so does a resonance near {near}, whose K_max is another one"
         return [f"{what}: {SEE_MORE}"]
     if pole is not None:
         kind = "most like a resonance near" if pole.rings else "with a lag, most like one of"
-        what = f"it follows the force{',' if pole.rings else ''} {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
+        what = f"they follow the force{',' if pole.rings else ''} {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
     elif best.excess > ALIKE:
-        what = f"its sums spread {plain(np.sqrt(best.excess), 2)} times as far, as of a hand or a compliance"
+        what = f"their sums spread {plain(np.sqrt(best.excess), 2)} times as far, as a hand or a compliance would cause"
     else:
         return []
-    return [f"what the fit leaves is no noise, {what}: {_RECORD_NEXT}"]
+    return [f"the residuals are not white noise: {what}; {_RECORD_NEXT}"]
 
 
 def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
@@ -260,8 +260,8 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
     cause = explain_motion(model.logs, period) if theta[0] <= 0 or unexplained else Cause("")
     if cause.words:
         raise InputError(
-            f"force: {cause.words}; support the device, or measure its response without a model: zwidth.excite, "
-            "zwidth.respond"
+            f"force: {cause.words}; support the device, or measure its frequency response, which needs no model "
+            "(zwidth.excite, zwidth.respond)"
         )
     if theta[0] <= 0 and (cause.reversed or left < _UNEXPLAINED):
         raise InputError(
@@ -270,8 +270,9 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
         )
     if theta[0] <= 0:
         raise InputError(
-            f"force: it leaves {plain(100 * np.sqrt(left), 2)} % of the motion unexplained, and the fitted mass is "
-            "negative; check that both columns are of one axis, every sample is logged, and nothing else moves it"
+            f"force: it does not explain {plain(100 * np.sqrt(left), 2)} % of the motion, and the fitted mass is "
+            "negative; check that both columns belong to one axis, that every sample is logged and nothing else moves "
+            "the device"
         )
     if unexplained:
         raise InputError(

@@ -25,17 +25,25 @@ _MISSING = 1.5
 
 
 class ReadLogs(NamedTuple):
-    """Logs that were read and repaired."""
+    """Logs at even times, after repair."""
 
     logs: tuple[Recording, ...]
-    places: tuple[np.ndarray, ...]  # of each sample, in periods
-    period: float  # in s
+    places: tuple[np.ndarray, ...]  # index of each sample of a log, in periods after its first sample
+    period: float  # s
     wavers: float  # relative standard error of the period
-    notes: tuple[str, ...]  # what was repaired
+    notes: tuple[str, ...]  # the repairs, one clause each
 
 
 def read_logs(time: Any, position: Any, force: Any, resample: bool = False, resolution: Any = None) -> ReadLogs:
-    """Return logs with what was repaired in them; raise `InputError` where nothing can be found from them."""
+    """Read and repair logs; raise `InputError` if no device can be fitted to them.
+
+    Args:
+        time: times in s, or the sampling period; a list for several logs.
+        position: positions in SI units, NaN where missing; a list for several logs.
+        force: forces in SI units, NaN where missing; a list for several logs.
+        resample: allow timestamp jitter up to a quarter of the period.
+        resolution: encoder step in SI units; None if unknown.
+    """
     several = isinstance(position, list | tuple) and len(position) > 0 and np.ndim(position[0]) == 1
     positions, forces = (position, force) if several else ([position], [force])
     times = time if several and isinstance(time, list | tuple) else [time] * len(positions)
@@ -70,10 +78,10 @@ def _read(
         text = ", ".join(f"{name} {array.shape}" for name, array in given.items())
         raise InputError(f"shapes differ or are no single columns: {text}; give one number a sample in each")
     for name, array in given.items():
-        known = array[np.isfinite(array)]
-        if not known.size:
-            raise InputError(f"{name}: it holds no number; check the column")
-        low, high = float(known.min()), float(known.max())
+        finite = array[np.isfinite(array)]
+        if not finite.size:
+            raise InputError(f"{name}: it contains no number; check the column")
+        low, high = float(finite.min()), float(finite.max())
         if max(-low, high) > SI_RANGE[1] or 0 < high - low < SI_RANGE[0]:
             least, most = SI_RANGE
             raise InputError(
@@ -95,7 +103,13 @@ def _read(
 
 
 def _place(clock: np.ndarray, wavering: bool, notes: list[str]) -> tuple[np.ndarray, float, float]:
-    """Return samples in whole periods by a clock that wavers, their period and its relative standard error."""
+    """Return the index of each sample in periods, the period in s and its relative standard error.
+
+    Args:
+        clock: times in s.
+        wavering: allow timestamp jitter up to ``_WAVERING`` periods.
+        notes: receives a note on times that are rounded to ticks.
+    """
     # The line through all times: nothing between the samples is guessed, they are taken as they are.
     steps = np.diff(clock)
     usual = float(np.median(steps))

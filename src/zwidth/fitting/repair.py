@@ -1,7 +1,7 @@
-"""Repair of logs as control loops write them: rows without numbers, clocks, wrapped positions, isolated glitches.
+"""Repair the usual faults of logs: missing numbers, clock rollover, coarse times, wrapped positions, isolated glitches.
 
-Every repair is counted in a note. Nothing is guessed: a doubtful row is left out, and the rows before and after it are
-fitted as two logs.
+A note reports every repair and its number of rows. No value is invented: a faulty row is left out, and the rows before
+and after it are fitted as two logs. Samples and rows are counted from 0.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.rotation import is_rotary
 
-# Clocks roll over after these times in s, by what counts them.
+# Times in s after which common clocks and counters roll over.
 _ROLLOVERS = {
     "a 32-bit counter of microseconds": 2.0**32 * 1e-6,
     "a 32-bit counter of milliseconds": 2.0**32 * 1e-3,
@@ -24,42 +24,56 @@ _ROLLOVERS = {
     "a 31-bit counter of microseconds": 2.0**31 * 1e-6,
     "a 16-bit counter of microseconds": 2.0**16 * 1e-6,
     "a 16-bit counter of milliseconds": 2.0**16 * 1e-3,
-    "a clock of the second, without its seconds": 1.0,
-    "a clock of the minute": 60.0,
-    "a clock of the hour": 3600.0,
-    "a clock of the day": 86400.0,
+    "a clock that shows only fractions of a second": 1.0,
+    "a clock that restarts every minute": 60.0,
+    "a clock that restarts every hour": 3600.0,
+    "a clock that restarts every day": 86400.0,
 }
-_GAP = 50  # steps that a log may lack where its clock rolls over
-_TWICE = 0.01  # share of rows that may repeat a time
-_PAIRED = 0.45  # periods between the times of a position and of a force that belong together
-_WILD = 0.02  # share of positions that may be isolated glitches
-_REACH = 3  # samples that a glitch lasts at most
-# A glitch exceeds this many typical second differences and encoder steps, and returns to within this share of it.
-_FAR, _STEPS, _RETURN = 10.0, 4.0, 0.2
-_SMOOTH = 8.0  # second differences at a wrap, in typical ones
-_NEAR_WRAP = 0.05  # and as a share of the modulus
-# Odd steps of times cut to ticks, at least, and from how many on they may jitter; the coarsest tick in periods.
-_FEW_ODD, _MANY_ODD, _COARSEST = 5, 20, 10.0
-_SPAN = 0.5  # of the modulus, the least span of positions that wrap at an unknown one
+_GAP = 50  # longest step across a rollover, in usual steps; some samples may be missing there
+_TWICE = 0.01  # largest share of rows with a repeated time that are left out
+_PAIRED = 0.45  # largest distance in time of a position and its force, in periods; below half, so that pairs are unique
+_UNPAIRED = 0.02  # largest share of positions without a force at this distance
+
+# Glitches of the position.
+_WILD = 0.02  # largest share of positions that are left out as glitches
+_REACH = 3  # maximum length of a glitch, and half-width of the running median, in samples
+_FAR = 10.0  # least distance of a glitch from the running median, in typical second differences
+_STEPS = 4.0  # added to this distance, in smallest second differences, i.e. encoder steps
+_RETURN = 0.2  # largest net displacement across a glitch, relative to the glitch
+
+# Wraps of the position. A wrap is accepted if the second differences around it, once unwrapped, are below either limit.
+_SMOOTH = 8.0  # in typical second differences (their 99 % quantile)
+_NEAR_WRAP = 0.05  # relative to the modulus; also the tolerance of jumps of equal size, relative to their median
+_SPAN = 0.5  # least jump of a wrap at an unknown modulus, relative to the span of the positions
+
+# Times rounded to ticks of a coarse clock.
+_FEW_ODD = 5  # least number of steps that differ from the usual one by a tick
+_MANY_ODD = 20  # from this number on the rounding errors may spread over 1.1 instead of 1.02 ticks, for jitter
+_COARSEST = 10.0  # longest tick, in periods
 
 
 class RepairedLog(NamedTuple):
-    """Rows of a log that count: their times in s or None, their numbers in the log, positions, forces, and notes."""
+    """The valid rows of a log, and notes on the repairs."""
 
-    clock: np.ndarray | None
-    row: np.ndarray
-    position: np.ndarray
-    force: np.ndarray
-    notes: list[str]
+    clock: np.ndarray | None  # times in s; None if only the period is given
+    row: np.ndarray  # row numbers in the log, counted from 0
+    position: np.ndarray  # m or rad, unwrapped
+    force: np.ndarray  # N or N m
+    notes: list[str]  # one clause per repair
 
 
 def repair_log(clock: np.ndarray | None, position: np.ndarray, force: np.ndarray, step: float) -> RepairedLog:
-    """Return the rows of a log that count, with times that grow and positions that are continuous.
+    """Return the valid rows of a log, with continuous times and unwrapped positions.
 
     Args:
-        clock: times in s, NaN where missing; None if only the period is known.
-        position, force: in SI units, NaN where missing.
-        step: of the encoder, 0 if unknown.
+        clock: times in s, NaN where missing; None if only the period is given.
+        position: positions in SI units, NaN where missing.
+        force: forces in SI units, NaN where missing.
+        step: encoder step in SI units, 0 if unknown.
+
+    Raises:
+        InputError: the times decrease without a rollover, too few rows have all three numbers, or the positions contain
+            too many glitches or wrap at an unknown modulus.
     """
     notes: list[str] = []
     if clock is not None:
@@ -69,9 +83,9 @@ def repair_log(clock: np.ndarray | None, position: np.ndarray, force: np.ndarray
     row = np.flatnonzero(np.all(np.isfinite(given), axis=0))
     if row.size < position.size:
         count = position.size - row.size
-        notes.append(f"left out {_count(count, 'row')} without a number, the first in row {_first_gap(row)}")
+        notes.append(f"left out {_count(count, 'row')} with missing numbers, the first is row {_first_gap(row)}")
     if row.size < 2:
-        raise InputError("time, position, force: fewer than two rows have a number in each; check the columns")
+        raise InputError("time, position, force: fewer than two rows have numbers in all columns; check the columns")
     clock = None if clock is None else clock[row]
     position, force = position[row], force[row]
     if clock is not None:
@@ -84,39 +98,41 @@ def repair_log(clock: np.ndarray | None, position: np.ndarray, force: np.ndarray
         if bad.size > _WILD * position.size:
             raise InputError(
                 f"position: {bad.size} of {position.size} samples are isolated glitches, the first is sample "
-                f"{row[bad[0]]}; check how the encoder is read"
+                f"{row[bad[0]]}; check the encoder readout"
             )
-        notes.append(f"left out {_count(bad.size, 'glitch', 'es')} of the position, the first at sample {row[bad[0]]}")
+        notes.append(f"left out {_count(bad.size, 'position glitch', 'es')}, the first at sample {row[bad[0]]}")
         clock = None if clock is None else clock[kept]
         row, position, force = row[kept], position[kept], force[kept]
     if modulus:
-        # Without glitches, whose sides may lie a modulus apart.
+        # Count wraps after the removal of glitches, because a glitch may hide a wrap.
         count = int(np.count_nonzero(np.round(np.diff(position) / modulus)))
-        size = f"{with_unit(modulus, 'm', 6)}{' (360 deg)' if is_rotary() and np.isclose(modulus, 2 * np.pi) else ''}"
-        notes.append(f"the position wraps at {size}, {_count(count, 'time')}, and was continued")
+        turn = "360 deg, " if is_rotary() and np.isclose(modulus, 2 * np.pi) else ""
+        size = with_unit(modulus, "m", 6)
+        notes.append(f"the position wraps at {size} ({turn}{_count(count, 'time')}) and was unwrapped")
         position = unwrap(position, modulus)
     return RepairedLog(clock, row, position, force, notes)
 
 
 def _count(number: int, noun: str, ending: str = "s") -> str:
+    """Return a number with its noun in the singular or plural."""
     return f"{number:,} {noun}{'' if number == 1 else ending}"
 
 
 def _first_gap(row: np.ndarray) -> int:
-    """Return the first row that is missing, counted from 0."""
+    """Return the number of the first row that is missing among the sorted rows."""
     late = np.flatnonzero(row != np.arange(row.size))
     return int(late[0]) if late.size else row.size
 
 
 def _unroll(clock: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Return times that go on where the clock rolled over; raise `InputError` for times that fall otherwise."""
-    known = np.flatnonzero(np.isfinite(clock))
-    steps = np.diff(clock[known])
+    """Return the times without the rollovers of the clock; raise `InputError` if the times decrease otherwise."""
+    timed = np.flatnonzero(np.isfinite(clock))
+    steps = np.diff(clock[timed])
     falls = np.flatnonzero(steps < 0)
     if not falls.size:
         return clock
     if falls.size == steps.size:
-        raise InputError("time: it falls in every row; the rows are in reverse order: reverse the file")
+        raise InputError("time: the times decrease from row to row; reverse the order of the rows")
     usual = float(np.median(steps[steps > 0]))
     jumps = steps[falls]
     fitting = {
@@ -125,20 +141,27 @@ def _unroll(clock: np.ndarray, notes: list[str]) -> np.ndarray:
     if not fitting:
         k = int(falls[0])
         raise InputError(
-            f"time: it falls back by {with_unit(-float(jumps[0]), 's')} after sample {known[k]}, as of two records in "
-            "one file or of rows out of order; give each record as a file of its own"
+            f"time: the time decreases by {with_unit(-float(jumps[0]), 's')} after sample {timed[k]}; sort the rows, "
+            "or save each record to a separate file"
         )
-    # The one that leaves the most usual step.
+    # Choose the rollover after which the step is closest to the usual one.
     name, span = min(fitting.items(), key=lambda item: abs(float(np.median(jumps)) + item[1] - usual))
     unrolled = clock.copy()
-    unrolled[known[1:]] += span * np.cumsum(steps < 0)
-    # Rows without a time stay without.
-    notes.append(f"the time rolls over {_count(falls.size, 'time')}, as {name} does, and was continued")
+    # Missing times stay NaN.
+    unrolled[timed[1:]] += span * np.cumsum(steps < 0)
+    notes.append(f"the time rolls over ({_count(falls.size, 'time')}) like {name} and was unwrapped")
     return unrolled
 
 
 def _pair(clock: np.ndarray, position: np.ndarray, force: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Return the force of each row of the position, of a table in which each has rows of its own."""
+    """Return the forces at the times of the positions if the log has separate rows for positions and forces.
+
+    Each position is paired with the nearest force in time. If most rows have both numbers, the forces are returned
+    unchanged.
+
+    Raises:
+        InputError: too many positions have no force within ``_PAIRED`` periods.
+    """
     timed = np.isfinite(clock)
     places, forces = (np.flatnonzero(timed & np.isfinite(column)) for column in (position, force))
     both = np.intersect1d(places, forces).size
@@ -150,44 +173,50 @@ def _pair(clock: np.ndarray, position: np.ndarray, force: np.ndarray, notes: lis
     nearest = forces[after - nearer]
     apart = clock[nearest] - clock[places]
     far = np.abs(apart) > _PAIRED * period
-    if np.mean(far) > _WILD:
+    if np.mean(far) > _UNPAIRED:
         raise InputError(
-            f"position, force: {places.size} rows have the one and {forces.size} the other, at other times; log both "
-            "in one row at every sample"
+            f"position, force: {places.size} rows have a position and {forces.size} rows a force, at different times; "
+            "log both in each row"
         )
     paired = np.full(force.size, np.nan)
     paired[places[~far]] = force[nearest[~far]]
     middle = float(np.median(apart))
     notes.append(
-        f"position and force have rows of their own, {with_unit(abs(middle), 's', 3)} apart, and were paired by time; "
-        "the delay counts from the position"
+        f"position and force are in separate rows, {with_unit(abs(middle), 's', 3)} apart, and were paired by time; "
+        "the delay starts at the time of the position"
     )
     return paired
 
 
 def _drop_repeated(clock: np.ndarray, position: np.ndarray, force: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Return the rows to keep: one for each time, unless the clock is coarser than the samples."""
+    """Return a mask of the rows to keep: the first row of each time, or all rows if the clock is coarse.
+
+    The clock is coarse if more than a share ``_TWICE`` of the rows repeat the previous time.
+    """
     again = np.append(False, np.diff(clock) == 0)
     same = again & np.append(False, (np.diff(position) == 0) & (np.diff(force) == 0))
     count = int(again.sum())
     if count and count <= max(1.0, _TWICE * clock.size):
-        twice = "that repeats the one before" if same.sum() == count else "that repeats the time of the one before"
-        notes.append(f"left out {_count(count, 'row')} {twice}, the first in row {int(np.argmax(again))}")
+        rows = _count(count, "repeated row") if same.sum() == count else f"{_count(count, 'row')} with a repeated time"
+        notes.append(f"left out {rows}, the first is row {int(np.argmax(again))}")
         return ~again
     return np.ones(clock.size, bool)
 
 
 def find_modulus(position: np.ndarray, step: float) -> float:
-    """Return the modulus at which the encoder, or its counter, wraps; 0 if it does not."""
+    """Return the modulus at which the positions wrap, 0 if they do not.
+
+    A modulus is accepted if the unwrapped positions are smooth at more than half of the wraps.
+    """
     for modulus in _list_moduli(position, step):
-        # Jumps of glitches are no wraps.
+        # Exclude glitches, because their jumps are not wraps.
         places = position[~find_glitches(unwrap(position, modulus), modulus)]
         events = np.flatnonzero(np.round(np.diff(places) / modulus))
         if not events.size:
             continue
         bends = np.abs(np.diff(unwrap(places, modulus), 2))
         typical = float(np.quantile(bends, 0.99)) if bends.size else 0.0
-        # The bends before and after each wrap.
+        # The larger second difference before or after each wrap.
         around = np.maximum(*(np.append(bends, 0.0)[np.clip(events - k, 0, bends.size)] for k in (0, 1)))
         smooth = around <= np.maximum(_SMOOTH * typical, _NEAR_WRAP * modulus)
         if smooth.mean() > 0.5:
@@ -196,13 +225,17 @@ def find_modulus(position: np.ndarray, step: float) -> float:
 
 
 def unwrap(position: np.ndarray, modulus: float) -> np.ndarray:
-    """Return positions that go on where they wrap."""
+    """Return the unwrapped positions, in which every step is shorter than half the modulus."""
     return position - modulus * np.append(0.0, np.cumsum(np.round(np.diff(position) / modulus)))
 
 
 def _list_moduli(position: np.ndarray, step: float) -> Iterator[float]:
-    """Yield the moduli at which positions of this span may wrap: a turn, powers of two of the step, then the jumps'."""
-    # Isolated glitches do not count.
+    """Yield candidates for the modulus at which the positions wrap, most plausible first.
+
+    The candidates are one turn of a rotary axis, the smallest power of two of encoder steps that covers the span (at
+    least 2^8), and the modulus measured from the jumps.
+    """
+    # The median removes isolated glitches from the span.
     places = _filter_median(position, _REACH)
     span, largest = float(np.ptp(places)), float(np.abs(np.diff(position)).max(initial=0.0))
     moduli = [2.0 * np.pi] if is_rotary() and span <= 2.0 * np.pi * (1.0 + 1e-9) + step else []
@@ -215,13 +248,18 @@ def _list_moduli(position: np.ndarray, step: float) -> Iterator[float]:
 
 
 def _measure_modulus(moves: np.ndarray, span: float, step: float) -> float:
-    """Return the modulus of a counter that ends at any number, by its jumps; 0 without jumps of one size.
+    """Return the modulus of a counter with an arbitrary range, measured from its jumps; 0 if they differ in size.
+
+    Args:
+        moves: differences of successive positions.
+        span: range of the positions.
+        step: encoder step, 0 if unknown.
 
     Raises:
-        InputError: jumps of one size in both directions, whose size is not known to a step of the encoder.
+        InputError: the jumps have the same size, but do not determine the modulus to a whole number of encoder steps.
     """
     inner = np.flatnonzero(np.abs(moves[1:-1]) > _SPAN * span) + 1 if span else np.zeros(0, int)
-    # A jump after a jump is a glitch.
+    # Keep only jumps between small steps, because two successive jumps are a glitch.
     inner = inner[(np.abs(moves[inner - 1]) < _NEAR_WRAP * span) & (np.abs(moves[inner + 1]) < _NEAR_WRAP * span)]
     if inner.size < 2:
         return 0.0
@@ -233,15 +271,18 @@ def _measure_modulus(moves: np.ndarray, span: float, step: float) -> float:
     if step > 0 and error < 0.2 * step:
         return step * round(float(np.mean(sizes)) / step)
     raise InputError(
-        f"position: it jumps by {with_unit(middle, 'm', 3)} {inner.size} times, as an encoder that wraps at an unknown "
-        "count; give its counts and a resolution such as '4000 counts/rev', or unwrap it"
+        f"position: {inner.size} jumps by {with_unit(middle, 'm', 3)} indicate an encoder that wraps at an unknown "
+        "count; unwrap it, or log counts and specify a resolution such as '4000 counts/rev'"
     )
 
 
 def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
-    """Return a mask of isolated positions, up to 3 in a row, that leave the motion and return to it at once.
+    """Return a mask of glitches: up to 3 successive positions far from the running median, between normal positions.
 
-    Positions that were unwrapped return up to whole moduli.
+    Args:
+        position: positions, possibly unwrapped.
+        modulus: the modulus that was used for unwrapping, 0 for none. After a glitch the unwrapped positions may be off
+            by multiples of the modulus.
     """
     bends = np.abs(np.diff(position, 2))
     moving = bends[bends > 0]
@@ -249,7 +290,8 @@ def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
     if position.size < 4 * _REACH or not moving.size:
         return wild
     off = np.abs(position - _filter_median(position, _REACH))
-    # The encoder's step bounds bends of a slow motion; a glitch moves the median of a fast one by some samples.
+    # Add encoder steps because slow motion has hardly any other second differences, and the motion of three samples
+    # because a glitch shifts the median.
     speed = _filter_median(np.abs(np.diff(position, prepend=position[0])), _REACH)
     far = off > _FAR * float(np.quantile(moving, 0.9)) + _STEPS * float(moving.min()) + 3.0 * speed
     for first in np.flatnonzero(far & ~np.append(False, far[:-1])):
@@ -268,24 +310,24 @@ def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
 
 
 def _filter_median(values: np.ndarray, reach: int) -> np.ndarray:
-    """Return the running median over ``reach`` samples to both sides."""
+    """Return the running median over ``reach`` samples on each side."""
     padded = np.pad(values, reach, mode="edge")
     return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1), axis=-1)
 
 
 class EvenTimes(NamedTuple):
-    """Samples in whole periods by a clock coarser than they are: their places, the clock's tick in s, and a note."""
+    """Samples at even times whose timestamps were rounded to the ticks of a coarse clock."""
 
-    place: np.ndarray
-    tick: float
-    note: str
+    place: np.ndarray  # time of each sample, in periods after the first sample
+    tick: float  # s
+    note: str  # for the user
 
 
 def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
-    """Return the places of even samples whose times were cut to ticks, as to milliseconds; None for another clock.
+    """Return samples at even times if the timestamps are such times rounded to ticks, e.g. to 1 ms; None otherwise.
 
     Raises:
-        InputError: the times are whole ticks of a loop that logs only some of its samples.
+        InputError: the ticks are the periods of a loop that logs only some of its samples.
     """
     steps = np.diff(clock)
     mean = float(np.median(steps))
@@ -295,7 +337,7 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
         return None
     window = min(64, clock.size - 1)
     period = float(np.median((clock[window:] - clock[:-window]) / window))
-    # Between gaps no step is longer than a period and a tick.
+    # A step longer than one period plus one tick is a gap.
     begins = np.append(0, np.flatnonzero(steps > period + 1.01 * tick) + 1)
     ends = np.append(begins[1:], clock.size)
     longest = int(np.argmax(ends - begins))
@@ -307,11 +349,11 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
         return None
     place, late = np.zeros(clock.size), np.zeros(clock.size)
     for first, last in zip(begins, ends, strict=True):
-        own = np.arange(last - first)
-        middle = float(np.mean(clock[first:last] - period * own))
-        place[first:last] = own + (np.round((middle - start) / period) if first != begins[longest] else 0.0)
+        offset = np.arange(last - first)
+        middle = float(np.mean(clock[first:last] - period * offset))
+        place[first:last] = offset + (np.round((middle - start) / period) if first != begins[longest] else 0.0)
         late[first:last] = clock[first:last] - period * place[first:last]
-    # A few long steps may be missing samples; many in a regular row are those of cut times.
+    # Require several unusual steps, because a few may be missing samples.
     usual = np.median(steps)
     odd = int(np.sum(np.abs(steps - usual) > 0.5 * tick))
     allowed = 1.0 + (0.1 if odd >= _MANY_ODD else 0.02)
@@ -319,33 +361,34 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
         if odd >= _FEW_ODD and period > 1.5 * tick:
             _refuse_left_out(steps, tick)
         return None
+    # Clocks are rounded to a power of ten. Any other tick is the period of the loop.
     if not np.isclose(np.log10(tick), np.round(np.log10(tick)), rtol=0, atol=1e-3) and period > 1.5 * tick:
         _refuse_left_out(steps, tick)
     ticks, apart = with_unit(tick, "s", 3), with_unit(period, "s")
-    note = f"times are whole multiples of {ticks} and were read as even samples, {apart} apart"
+    note = f"the times are rounded to {ticks} and were replaced by even times, {apart} apart"
     return EvenTimes(place - place[0], tick, note)
 
 
 def _refuse_left_out(steps: np.ndarray, tick: float) -> None:
-    """Raise `InputError` for times of a loop that logs some of its samples only."""
+    """Raise `InputError` if all steps are 1 to 20 ticks: the times of a loop that logs only some of its samples."""
     counts = np.round(steps / tick)
     if counts.min() >= 1 and counts.max() <= 20 and np.allclose(steps / tick, counts, atol=0.02):
         low, high = (plain(float(end), 1) for end in (counts.min(), counts.max()))
         raise InputError(
-            f"time: samples are {low} to {high} periods of {with_unit(tick, 's')} apart: the log leaves out samples of "
+            f"time: samples are {low} to {high} periods of {with_unit(tick, 's')} apart, so the log omits samples of "
             "the loop; log every sample, or every second one"
         )
 
 
 def refuse_repeated(clock: np.ndarray) -> NoReturn:
-    """Raise `InputError` for a clock that stands still over samples, with its cause."""
+    """Raise `InputError` for repeated times, with the likely cause."""
     steps = np.diff(clock)
     k = int(np.argmin(steps))
     if np.mean(steps == 0) > 0.5:
         raise InputError(
-            "time: most samples have the time of the one before: it has too few digits; give its second column too, as "
-            "1:s+2:ns, or the rate in its place"
+            "time: most samples repeat the previous time, so the column has too few digits; also give the column with "
+            "the rest of the time, as 1:s+2:ns, or the rate instead"
         )
     raise InputError(
-        f"time: sample {k + 1} has the time of sample {k}; log each sample once, or give the rate in its place"
+        f"time: sample {k + 1} repeats the time of sample {k}; log each sample once, or give the rate instead"
     )

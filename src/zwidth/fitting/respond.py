@@ -43,8 +43,8 @@ _PIECES, _LONGEST, _COHERENT = 8, 1 << 13, 0.1
 _OVERLAP = 1.06
 # A motion of fewer steps of the encoder is not seen as it is.
 _STEPS = 20
-# Missing samples that are interpolated, as a share, and the longest step over them in samples.
-_FILLED, _LONGEST_GAP = 0.002, 4
+_FILLED = 0.002  # largest share of missing samples that are interpolated
+_LONGEST_GAP = 4  # longest step across missing samples, in samples
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class ResponseEstimate:
         records: stretches of one periodic force that count, or pieces of a force that does not repeat.
         noise: of one sampled position in m, where the force repeats.
         doubts: sentences on what makes the response doubtful.
-        notes: how the logs were read and what was repaired in them, a sentence each.
+        notes: interpretations of the columns of the logs and repairs of their rows, one clause each.
     """
 
     device: MeasuredDevice
@@ -90,8 +90,8 @@ def respond(
         force: that the program commanded, in N: of that sample. `zwidth.excite` makes one.
         cycle: period of the force in s; found from the force where left out, which must repeat itself exactly for that.
         resolution: step of the encoder in m; found from the positions where left out.
-        rotary: whether the position is an angle in rad and the force a torque in N m; the response is in rad/(N m)
-            then.
+        rotary: True if the position is an angle in rad and the force a torque in N m. The response is then in
+            rad/(N m).
 
     Returns:
         ResponseEstimate: ``device``, with a deviation of 4.5 standard errors; ``period``, ``coherence``, ``cycle``,
@@ -119,12 +119,12 @@ def respond(
         '409 lines from 5 stretches'
     """
     with use_kind(rotary):
-        found = _respond(time, position, force, cycle, resolution)
-        return replace(found, device=replace(found.device, rotary=rotary))
+        estimate = _respond(time, position, force, cycle, resolution)
+        return replace(estimate, device=replace(estimate.device, rotary=rotary))
 
 
 def _respond(time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any, resolution: Any) -> ResponseEstimate:
-    """Return the response in units of the kind of device in question."""
+    """Estimate the response as in `respond`, with the units of the current kind of device, linear or rotary."""
     logs, places, period, _, notes = read_logs(time, position, force, resolution=resolution)
     notes = list(notes)
     logs = tuple(_fill(log, place, k, notes) for k, (log, place) in enumerate(zip(logs, places, strict=True), start=1))
@@ -150,18 +150,28 @@ def _respond(time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any,
 
 
 def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> Recording:
-    """Return a log with every sample, few missing ones interpolated; raise `InputError` for more."""
+    """Return a log without gaps: a few missing samples are interpolated.
+
+    Args:
+        log: the log, without its missing samples.
+        place: index of each sample, in sampling periods after the first one.
+        number: number of the log, for messages.
+        notes: receives a note on the interpolated samples.
+
+    Raises:
+        InputError: more than a share ``_FILLED`` of the samples is missing, or a gap is too long.
+    """
     missing = int(place[-1]) + 1 - place.size
     if not missing:
         return log
     if missing > _FILLED * place.size or np.diff(place).max() > _LONGEST_GAP:
         gap = int(np.argmax(np.diff(place)))
         raise InputError(
-            f"time: log {number} lacks {missing} samples, most of them after sample {gap}; record every sample, or "
-            "give what lies before and after a gap as two logs"
+            f"time: {missing} samples of log {number} are missing, most of them after sample {gap}; record every "
+            "sample, or pass the parts before and after the gap as two logs"
         )
     every = np.arange(place[-1] + 1)
-    # The force of a missing sample is taken for that of the sample before.
+    # The force of the previous sample stands in for that of a missing sample.
     force = log.force[np.searchsorted(place, every, side="right") - 1]
     from scipy.interpolate import CubicSpline
 
@@ -170,9 +180,10 @@ def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> R
 
 
 def respond_to_logs(motions: Sequence[LoggedMotion], period: float | None, cycle: Any = None) -> ResponseEstimate:
-    """`respond` of logs that are read."""
-    found = respond(**join_logs(motions, period), cycle=cycle)
-    return replace(found, notes=(*dict.fromkeys(note for motion in motions for note in motion.notes), *found.notes))
+    """Estimate the response with `respond` from logs that were read from files, and add the notes on their columns."""
+    estimate = respond(**join_logs(motions, period), cycle=cycle)
+    notes = dict.fromkeys(note for motion in motions for note in motion.notes)
+    return replace(estimate, notes=(*notes, *estimate.notes))
 
 
 def find_nominal_limit(scene: Scene) -> StiffestWall:

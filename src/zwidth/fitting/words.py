@@ -1,4 +1,4 @@
-"""A fit in words: for people, and as a configuration."""
+"""Print a fit: as a summary with details, and as a configuration in YAML."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from zwidth.words.quantities import FIELDS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 from zwidth.words.status import Status
 
-NEAR_ROUNDING = 1.1  # residuals over those of an encoder's rounding that count as equal
+NEAR_ROUNDING = 1.1  # residuals below this multiple of the encoder's quantization noise are as expected
 
 SYMBOLS = {
     "mass": "m",
@@ -49,45 +49,46 @@ def spell(name: str, value: float, digits: int = 4) -> str:
 
 @in_own_units
 def summarize_fit(fit: DeviceFit) -> list[tuple[str, str]]:
-    """Return the answer of a fit as labels and texts: the wall to set with its reason, then the device."""
-    found = fit.recommended
-    rows = [("NO WALL", found.reason)]
+    """Return the summary of a fit as pairs of label and text: the recommended wall with its reason, then the device."""
+    recommended = fit.recommended
+    rows = [("NO WALL", recommended.reason)]
     if fit.is_doubted:
         rows = [("NO WALL", "resolve the warnings first, then record again")]
-    elif found.status == Status.OK:
-        limit = found.scene.safe_limit
-        cause = limit.reason.partition("; ")[0] if limit is not None and found.is_held_back else ""
-        rows = [("SET", found.spell_wall()), ("", ": ".join(filter(None, (found.spell_requirement(), cause))))]
+    elif recommended.status == Status.OK:
+        limit = recommended.scene.safe_limit
+        cause = limit.reason.partition("; ")[0] if limit is not None and recommended.is_held_back else ""
+        reason = ": ".join(filter(None, (recommended.spell_requirement(), cause)))
+        rows = [("SET", recommended.spell_wall()), ("", reason)]
     rows += [("", ""), *_describe_device(fit)]
-    known = math.isfinite(fit.stiffness_max)
-    rows.append(("K_max", _spell_estimate(fit, "stiffness_max") if known else "open: see the warnings"))
+    determined = math.isfinite(fit.stiffness_max)
+    rows.append(("K_max", _spell_estimate(fit, "stiffness_max") if determined else "open: see the warnings"))
     rows.append(("fit", _describe_residuals(fit)))
-    if found.status == Status.OK:
-        rows.append(("margins", f"{found.spell_margins()}; passive: {found.spell_passive()}"))
-        rows += [("CAUTION", caution) for caution in found.cautions]
+    if recommended.status == Status.OK:
+        rows.append(("margins", f"{recommended.spell_margins()}; passive: {recommended.spell_passive()}"))
+        rows += [("CAUTION", caution) for caution in recommended.cautions]
     trouble = [f"{Status(fit.status).name}: {name_trouble(fit)}"] if fit.status != Status.OK else []
     rows += [("WARNING", text) for text in (*trouble, *fit.doubts)] or [("warnings", "none")]
     rows += [("note", note) for note in fit.notes]
     if fit.next is not None:
         rows.append(("next", _describe_next(fit)))
-    elif found.status == Status.OK and found.is_held_back and fit.motions:
+    elif recommended.status == Status.OK and recommended.is_held_back and fit.motions:
         rigid = _assume_rigid(fit)
-        gain = "" if rigid is None else f" (up to {spell('stiffness', rigid.stiffness)} if nothing is hidden)"
+        gain = "" if rigid is None else f" (up to {spell('stiffness', rigid.stiffness)} without hidden resonances)"
         rows.append(("next", f"for a stiffer wall{gain} {advise_record(fit)}"))
     return rows
 
 
 def _assume_rigid(fit: DeviceFit) -> Recommendation | None:
-    """Return the wall to set if the device has no further parts; None if it is the same wall, or none exists."""
+    """Return the recommended wall for a device without undetected resonances; None if it is no other wall."""
     limit = limit_walls(fit, rigid=True)
     if limit == fit.scene.safe_limit:
         return None
-    found = replace(fit.scene, safe_limit=limit).recommend()
-    return found if found.status == Status.OK else None
+    recommended = replace(fit.scene, safe_limit=limit).recommend()
+    return recommended if recommended.status == Status.OK else None
 
 
 def _describe_device(fit: DeviceFit) -> list[tuple[str, str]]:
-    """Return the rows of the fitted parameters with their intervals."""
+    """Return pairs of label and text for the fitted parameters, with their 95 % confidence intervals."""
     symbols = SYMBOLS | ({"mass": "J"} if is_rotary() else {}) | {"delay": "delay"}
     texts = [
         f"{symbols[name]}{' = ' if name != 'delay' else ' '}{_spell_estimate(fit, name)}" for name in fit.numbers[:3]
@@ -101,14 +102,14 @@ def _describe_device(fit: DeviceFit) -> list[tuple[str, str]]:
         *owner, last = name.split(".")
         label = "actuator" if owner[0] == "actuator" else "resonance"
         text = f"{last.replace('_', ' ')} {_spell_estimate(fit, name)}"
-        # All parameters of one part share a line.
+        # Join the parameters of one part into one line. Each resonance starts with its frequency.
         new = rows[-1][0] != label or last == "frequency"
         rows = [*rows, (label, text)] if new else [*rows[:-1], (label, f"{rows[-1][1]}, {text}")]
     return rows
 
 
 def _spell_estimate(fit: DeviceFit, name: str) -> str:
-    """Return a value with its 95 % interval."""
+    """Return a fitted value with its 95 % confidence interval."""
     if not math.isfinite(fit.value_of(name)):
         return "open"
     interval = fit.intervals[name]
@@ -123,46 +124,52 @@ def _spell_estimate(fit: DeviceFit, name: str) -> str:
 
 
 def _describe_residuals(fit: DeviceFit) -> str:
-    """Return the size of the residuals and their cause."""
+    """Return the size of the residuals, compared with the quantization noise of the encoder."""
     if isinstance(fit.noise, tuple):
         return f"noise of K and f {' and '.join(f'{plain(100 * share, 2)} %' for share in fit.noise)}"
     size = f"residuals of {spell('position', fit.noise, 3)}"
     if not fit.resolution:
         return size
     expected = fit.noise < NEAR_ROUNDING * fit.resolution / math.sqrt(12.0)
-    return f"{size}, {'as expected of' if expected else 'with'} an encoder of {spell('position', fit.resolution, 3)}"
+    step = spell("position", fit.resolution, 3)
+    return f"{size}, {'as expected for an encoder step of' if expected else 'with an encoder step of'} {step}"
 
 
 def _describe_next(fit: DeviceFit) -> str:
-    """Return the next experiment with walls, and the standard error of K_max after it."""
+    """Return the most informative next experiment with walls, and the expected standard error of K_max after it."""
     step = fit.next
-    assert step is not None, "only walls name a next experiment"
+    assert step is not None, "only fits to walls at the onset of instability propose a next experiment"
     B, K = spell("damping", step.virtual_damping, 3), spell("stiffness", step.stiffness, 3)
     text = f"raise K at B = {B}, to about {K} and {with_unit(step.frequency, 'Hz', 3)}"
     if math.isfinite(fit.stiffness_error + step.error_afterwards):
         errors = [spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards)]
-        text += f": the standard error of K_max falls from {' to '.join(errors)}"
+        text += f": decreases the standard error of K_max from {' to '.join(errors)}"
     return text
 
 
 @in_own_units
 def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
-    """Return the labels and texts that `summarize_fit` leaves out."""
+    """Return the details that `summarize_fit` omits, as pairs of label and text.
+
+    Args:
+        fit: the fit.
+        source: name of the log, or number of walls, for the first line.
+    """
     rows = [("fitted to", source)]
     count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
     gaps = sum(int(np.count_nonzero(np.diff(motion.time) > 1.5 * fit.period)) for motion in fit.motions)
     if gaps:
         where = "a gap" if gaps == 1 else f"each of {gaps} gaps"
-        rows.append(("of it", f"{count:,} of {total:,} samples: after {where} the first ones depend on unknown forces"))
+        rows.append(("used", f"{count:,} of {total:,} samples: the first ones after {where} depend on unknown forces"))
     elif any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
-        rows.append(("of it", f"{count:,} of {total:,} samples, the first ones; more would only narrow the errors"))
+        rows.append(("used", f"{count:,} of {total:,} samples, from the start; more would only reduce the errors"))
     if math.isfinite(fit.virtual_damping):
         B, error = (spell("damping", value) for value in (fit.virtual_damping, fit.virtual_damping_error))
         rows.append(("at K_max", f"B = {B} (standard error {error})"))
     for name in ("friction", "offset"):
         if name in fit.errors and not math.isfinite(fit.errors[name]):
             rows.append(
-                (name, f"{_spell(fit, name)}, uncertain: this log does not separate friction and constant force")
+                (name, f"{_spell(fit, name)}, uncertain: the log does not distinguish friction from a constant force")
             )
         elif name == "offset" and name in fit.errors:
             rows.append((name, f"{_spell_estimate(fit, name)}, a constant force"))
@@ -175,7 +182,7 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
         return rows
     rows.append(("safe limit", fit.scene.safe_limit.describe()))
     if (wall := _assume_rigid(fit)) is not None:
-        kind = "no further parts" if fit.is_structured else "a rigid device"
+        kind = "no further resonances" if fit.is_structured else "a rigid device"
         rows.append(("assuming", f"{kind}: {wall.spell_wall()}; {wall.spell_requirement()}"))
     return rows
 
@@ -229,9 +236,9 @@ def _write_part(fit: DeviceFit, name: str) -> str:
 def _write_limit(fit: DeviceFit) -> list[str]:
     """Return the safe limit as lines of YAML."""
     limit = fit.scene.safe_limit
-    assert limit is not None, "a fit has one"
+    assert limit is not None, "the scene of a fit has a safe limit"
     lines = [
-        "  # Of this loop. Measure again after a change of the device, its timing or its velocity estimate.",
+        "  # Valid for this loop only: measure again after changes to the device, the timing or the velocity estimate.",
         "  safe_limit:",
         f"    stiffness: {float(limit.stiffness)!r} {unit_of('stiffness')}",
         f"    virtual_damping: {float(limit.virtual_damping)!r} {unit_of('damping')}",
@@ -243,7 +250,13 @@ def _write_limit(fit: DeviceFit) -> list[str]:
 
 @in_own_units
 def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> list[str]:
-    """Return a configuration for `zwidth run`: the fitted device with the origin of every value, and its safe limit."""
+    """Return a configuration for `zwidth run`, as lines of YAML: the fitted scene with its safe limit.
+
+    Args:
+        fit: the fit.
+        source: name of the log, or number of walls, for the first comment.
+        period_given: whether the user specified the period; otherwise a fit to a log derives it from the times.
+    """
     origin = "as given" if period_given or not fit.motions else "from the times of the log"
     lines = [
         f"# Fitted to {source}: {_between(fit, 'stiffness_max')} for K_max.",
@@ -263,7 +276,7 @@ def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> l
         inside = ", ".join(f"{name}: {json.dumps(value).strip(chr(34))}" for name, value in section.items())
         lines.append(f"  {key}: {{{inside}}} # as given")
     lines += _write_limit(fit)
-    lines += ["studies:", "  - kind: recommend # the wall to set on this device", "    name: recommended"]
+    lines += ["studies:", "  - kind: recommend # the recommended wall for this device", "    name: recommended"]
     if fit.friction and math.isfinite(fit.errors["friction"]):
         friction = f"{round_number(fit, 'friction')!r} {unit_of('friction')}, {_between(fit, 'friction')}"
         lines.append(f"# For studies of kind simulate: coulomb: {friction}.")

@@ -57,7 +57,7 @@ class KnownDevice:
         resolution: one step of the position sensor, in m or rad.
         counts: of the encoder on the motor's shaft; transmissions are not published with them.
         period: of the loop it was measured or used in, in s.
-        delay: of that loop, from a sample to its force, in s or in periods.
+        delay: delay of that loop from a sample to the force that it causes, in s or in periods.
         force: the largest, in N.
         stiffness_limit: the largest in use, in N/m: what a library sets or notes name, no measured boundary.
         damping_limit: likewise, in N s/m.
@@ -116,14 +116,16 @@ class KnownDevice:
         return Device(**numbers, rotary=self.rotary)
 
     def to_timing(self, *, period: Any = None, rate: Any = None, delay: Any = None) -> Timing:
-        """Return a `zwidth.Timing` with the published period and delay; 0 if no delay is published.
+        """Return a `zwidth.Timing` with the published period and delay; the delay is 0 if none is published.
 
         Args:
-            period: yours, or ``rate``, in place of the published one or if none is published.
-            delay: yours, in place of the published one. A delay published in periods stays in periods.
+            period: sampling period that replaces the published one; required if neither ``rate`` nor a published
+                period is available.
+            rate: sampling rate, in place of ``period``.
+            delay: delay that replaces the published one. A delay published in periods stays in periods.
 
         Raises:
-            InputError: the period is neither published nor given.
+            InputError: no period is published, and neither ``period`` nor ``rate`` is passed.
 
         Example:
             >>> import zwidth
@@ -137,7 +139,7 @@ class KnownDevice:
         return Timing(period=period, rate=rate, delay=0.0 if delay is None else delay)
 
     def list_missing(self, given: Collection[str]) -> list[str]:
-        """Return which of mass and damping are neither published nor among the names given."""
+        """Return the parameters, out of mass and damping, that are neither published nor in ``given``."""
         return [name for name in ("mass", "damping") if name not in given and getattr(self, name) is None]
 
     def _chosen(self, name: str, given: Any) -> Any:

@@ -1,7 +1,12 @@
-"""Polynomials with exact rational coefficients, highest power first, and their roots to the last digit of float64.
+"""Compute with polynomials that have exact rational coefficients, and compute their roots to full float64 accuracy.
 
-Binary floats are exact integers over powers of 2. Products, greatest common divisors and characteristic polynomials are
-computed with integers, roots by Aberth's iteration in decimal arithmetic whose precision doubles until it suffices.
+Every float is an integer over a power of 2, and therefore an exact fraction. Products, greatest common divisors and
+characteristic polynomials are exact. Roots are computed by Aberth's iteration in decimal arithmetic, whose precision is
+doubled until the error bounds of all roots are small enough.
+
+References:
+    Aberth 1973, Math. Comp. 27, 339-344 (simultaneous iteration for all roots). Yun 1976, SYMSAC, 26-35 (square-free
+    factorization).
 """
 
 from __future__ import annotations
@@ -16,23 +21,23 @@ import numpy as np
 from zwidth.words.errors import InputError
 
 Polynomial: TypeAlias = tuple[Fraction, ...]
-"""Exact coefficients, highest power first; empty for 0."""
+"""Exact coefficients, highest power first, without leading zeros; empty for the zero polynomial."""
 
-DIGITS = tuple(50 << k for k in range(6))  # precisions in decimal digits, tried in order
-STEPS = 400  # Aberth steps; about 10 suffice from the eigenvalues of the companion matrix
-ACCURATE = Decimal("1e-22")  # relative error bound of a root right to float64
-EXPONENT = 10**9  # largest exponent of decimals
+DIGITS = tuple(50 << k for k in range(6))  # working precisions in decimal digits, tried in this order
+STEPS = 400  # largest number of Aberth steps; about 10 suffice from the eigenvalues of the companion matrix
+ACCURATE = Decimal("1e-22")  # required relative error bound of a root, well below the float64 resolution of 1e-16
+EXPONENT = 10**9  # largest magnitude of decimal exponents, so that no intermediate result overflows
 
 
 class Complex(NamedTuple):
-    """A complex decimal."""
+    """A complex number with decimal parts."""
 
     real: Decimal
     imag: Decimal
 
 
 def trim(coefficients: Any) -> Polynomial:
-    """Return the polynomial of numbers without leading zeros."""
+    """Return exact coefficients without leading zeros."""
     exact = [Fraction(value) if isinstance(value, Fraction | int) else Fraction(float(value)) for value in coefficients]
     first = next((k for k, value in enumerate(exact) if value), len(exact))
     return tuple(exact[first:])
@@ -55,13 +60,13 @@ def subtract(one: Polynomial, other: Polynomial) -> Polynomial:
 
 
 def differentiate(polynomial: Polynomial) -> Polynomial:
-    """Return the derivative."""
+    """Return the derivative of a polynomial."""
     size = len(polynomial) - 1
     return trim([value * (size - k) for k, value in enumerate(polynomial[:-1])])
 
 
 def shift(polynomial: Polynomial) -> Polynomial:
-    """Return p(1 - x)."""
+    """Return the polynomial p(1 - x)."""
     values = list(polynomial)
     for k in range(1, len(values)):
         for j in range(1, len(values) - k + 1):
@@ -71,7 +76,7 @@ def shift(polynomial: Polynomial) -> Polynomial:
 
 
 def divide(top: Polynomial, bottom: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Return quotient and remainder."""
+    """Return the quotient and the remainder of a polynomial division."""
     rest, quotient = list(top), []
     while len(rest) >= len(bottom):
         factor = rest[0] / bottom[0]
@@ -81,10 +86,10 @@ def divide(top: Polynomial, bottom: Polynomial) -> tuple[Polynomial, Polynomial]
 
 
 def find_common_factor(one: Polynomial, other: Polynomial) -> Polynomial:
-    """Return the monic greatest common divisor."""
+    """Return the monic greatest common divisor of two polynomials, by Euclid's algorithm."""
     a, b = _to_integers(one), _to_integers(other)
     while b:
-        # Pseudo-remainders: integers without fractions, divided by their common factor.
+        # Compute pseudo-remainders, which have integer coefficients. Division by their common factor keeps them small.
         while len(a) >= len(b):
             a = [x * b[0] - a[0] * y for x, y in zip(a, b + [0] * (len(a) - len(b)), strict=True)][1:]
         first = next((k for k, value in enumerate(a) if value), len(a))
@@ -93,108 +98,123 @@ def find_common_factor(one: Polynomial, other: Polynomial) -> Polynomial:
 
 
 def _to_integers(polynomial: Polynomial) -> list[int]:
-    """Return a multiple with integer coefficients."""
+    """Return the integer coefficients of a multiple of a polynomial, without a common factor."""
     scale = lcm(*(value.denominator for value in polynomial))
     return _without_content([int(value * scale) for value in polynomial])
 
 
 def _without_content(values: list[int]) -> list[int]:
+    """Return integers divided by their greatest common divisor."""
     common = gcd(*values)
     return [value // common for value in values] if common > 1 else values
 
 
 def characteristic_polynomial(matrix: np.ndarray) -> Polynomial:
-    """Return det(s - A) of a square matrix of fractions, by the method of Faddeev and LeVerrier."""
+    """Return det(s I - A) for a square matrix A of fractions, by the Faddeev-LeVerrier algorithm."""
     size = len(matrix)
     scale = lcm(1, *(value.denominator for value in matrix.ravel()))
     exact = np.array([[int(value * scale) for value in row] for row in matrix], object)
     one = np.array([[int(i == j) for j in range(size)] for i in range(size)], object)
-    found, power = [1], one
+    coefficients, power = [1], one
     for k in range(1, size + 1):
         product = exact @ power
-        found.append(-int(np.trace(product)) // k)
-        power = product + found[-1] * one
-    return tuple(Fraction(value, scale**k) for k, value in enumerate(found))
+        coefficients.append(-int(np.trace(product)) // k)
+        power = product + coefficients[-1] * one
+    return tuple(Fraction(value, scale**k) for k, value in enumerate(coefficients))
 
 
 def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
-    """Return all roots to the last digits, or 1 less each of them; equal ones as often as they occur."""
+    """Return all roots of a polynomial to full float64 accuracy, repeated according to their multiplicity.
+
+    Args:
+        polynomial: the polynomial.
+        offsets: return 1 - root for each root, which stays accurate for roots near 1.
+    """
     rest = shift(polynomial) if offsets else polynomial
-    found = []
+    roots: list[complex] = []
     for times, factor in enumerate(_split_by_multiplicity(rest), start=1):
         while len(factor) > 1 and factor[-1] == 0:
-            factor, found = factor[:-1], [*found, *[0j] * times]
-        found += [root for root in _simple_roots(factor) for _ in range(times)]
-    return np.array(found, complex)
+            factor, roots = factor[:-1], [*roots, *[0j] * times]
+        roots += [root for root in _simple_roots(factor) for _ in range(times)]
+    return np.array(roots, complex)
 
 
 def _split_by_multiplicity(polynomial: Polynomial) -> list[Polynomial]:
-    """Return square-free polynomials of the roots that occur once, twice, and so on (Yun 1976)."""
+    """Return the square-free factorization: polynomials with the roots of multiplicity 1, 2, and so on (Yun 1976)."""
     parts = []
     slope = differentiate(polynomial)
     common = find_common_factor(polynomial, slope) if slope else polynomial
     left, over = divide(polynomial, common)[0], divide(slope, common)[0]
     while len(left) > 1:
         over = subtract(over, differentiate(left))
-        own = find_common_factor(left, over) if over else left
-        parts.append(own)
-        left, over = divide(left, own)[0], divide(over, own)[0] if over else over
+        part = find_common_factor(left, over) if over else left
+        parts.append(part)
+        left, over = divide(left, part)[0], divide(over, part)[0] if over else over
     return parts
 
 
 def _simple_roots(polynomial: Polynomial) -> list[complex]:
-    """Return the roots of a square-free polynomial without root at 0."""
+    """Return the roots of a square-free polynomial that has no root at 0."""
     if len(polynomial) < 2:
         return []
     for digits in DIGITS:
         with localcontext(Context(prec=digits, Emax=EXPONENT, Emin=-EXPONENT)):
             exact = [Decimal(value.numerator) / Decimal(value.denominator) for value in polynomial]
             roots, errors = iterate_roots(exact)
-            # Two roots nearer than their errors may be a real pair or a complex one.
+            # Increase the precision while errors are large, because a close pair of roots may then be real or complex.
             if all(error <= ACCURATE * size(root) for root, error in zip(roots, errors, strict=True)):
                 return _pair_up(roots, errors)
-    raise InputError("device: its poles or zeros are too close to each other; leave out what hardly moves the position")
+    raise InputError("device: some poles or zeros are too close together; remove modes that hardly move the output")
 
 
 def _pair_up(roots: list[Complex], errors: list[Decimal]) -> list[complex]:
-    """Return the roots of a real polynomial as floats, exactly real or in exact conjugate pairs."""
-    found = []
+    """Return the roots of a real polynomial as floats, exactly real or in exact conjugate pairs.
+
+    Args:
+        roots: approximate roots.
+        errors: bounds on the errors of the roots. An imaginary part below the bound is 0.
+    """
+    pairs = []
     for root, error in zip(roots, errors, strict=True):
         real, imag = (0.0 if abs(part) <= error else float(part) for part in root)
         if imag >= 0:
-            found += [complex(real, imag), complex(real, -imag)] if imag else [complex(real, 0.0)]
-    return found
+            pairs += [complex(real, imag), complex(real, -imag)] if imag else [complex(real, 0.0)]
+    return pairs
 
 
 def size(value: Complex) -> Decimal:
-    """Return the magnitude."""
+    """Return the magnitude of a complex number."""
     return (value.real * value.real + value.imag * value.imag).sqrt()
 
 
 def _times(a: Complex, b: Complex) -> Complex:
+    """Return the product of two complex numbers."""
     return Complex(a.real * b.real - a.imag * b.imag, a.real * b.imag + a.imag * b.real)
 
 
 def _inverse(a: Complex) -> Complex:
+    """Return the reciprocal of a complex number."""
     square = a.real * a.real + a.imag * a.imag
     return Complex(a.real / square, -a.imag / square)
 
 
 def iterate_roots(coefficients: list[Decimal]) -> tuple[list[Complex], list[Decimal]]:
-    """Return the roots of a real polynomial in the precision of the context, and bounds of their errors.
+    """Return the roots of a real polynomial in the precision of the decimal context, and bounds on their errors.
 
-    A disk of radius ``n |p/p'|`` around an approximation contains a root. Where rounding errors dominate p, the bound
-    includes them.
+    For a polynomial p of degree n, the disk of radius ``n |p/p'|`` around an approximate root contains a root. The
+    bound includes the rounding error of p.
     """
     order = len(coefficients) - 1
-    # Starting values from the companion matrix, in units of the geometric mean of the roots.
+    # Start from the eigenvalues of the companion matrix. Scale by the geometric mean of the roots, which keeps the
+    # coefficients within the range of floats.
     unit = ((abs(coefficients[-1] / coefficients[0])).ln() / order).exp() if coefficients[-1] else Decimal(1)
     scaled = [value / coefficients[0] / unit**k for k, value in enumerate(coefficients)]
     with np.errstate(all="ignore"):
         start = np.roots([float(value) for value in scaled]).astype(complex)
     if start.size != order or not np.isfinite(start).all():
         start = np.exp(1j * (0.7 + 2.0 * np.pi * np.arange(order) / order))
-    # Off the real line: two real values may have to become a pair. Off each other: equal values would divide by 0.
+    # Perturb the starting values: real values may have to become a conjugate pair, and equal values cause a division
+    # by 0.
     start = start * (1.0 + 1e-9 * np.exp(2.4j * np.arange(order)))
     roots = [Complex(Decimal(value.real), Decimal(value.imag)) for value in start.tolist()]
     unit_error = Decimal(10) ** (6 - getcontext().prec)
@@ -220,7 +240,7 @@ def iterate_roots(coefficients: list[Decimal]) -> tuple[list[Complex], list[Deci
 
 
 def _newton(coefficients: list[Decimal], x: Complex) -> tuple[Complex, Decimal]:
-    """Return p/p' at x, and a bound of its magnitude with the rounding error of p."""
+    """Return the Newton step p/p' at x, and a bound on its magnitude that includes the rounding error of p."""
     value, slope, largest = Complex(Decimal(0), Decimal(0)), Complex(Decimal(0), Decimal(0)), Decimal(0)
     far = size(x)
     for coefficient in coefficients:

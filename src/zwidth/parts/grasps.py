@@ -1,4 +1,4 @@
-"""Reference grasps: hands that hold a device, with which a recommended wall is checked."""
+"""Reference grasps: models of a hand on the device, used to check the stability of recommended walls."""
 
 from __future__ import annotations
 
@@ -10,25 +10,27 @@ from zwidth.parts.operator import Operator
 from zwidth.words.quantities import POSITIVE
 
 HAND = Operator(**Operator.usual["rigid"])
-SPRINGS = {"soft": 1e3, "firm": 10e3}  # N/m
-DAMPERS = {"light": 1.0, "medium": 5.0, "strong": 20.0}  # N s/m
-# From the axis of a rotary device to the hand, in m. Light damping destabilizes narrow ranges of the radius.
+SPRINGS = {"soft": 1e3, "firm": 10e3}  # N/m; coupling stiffness between hand and device
+DAMPERS = {"light": 1.0, "medium": 5.0, "strong": 20.0}  # N s/m; coupling damping between hand and device
+# Distances in m of the hand from the axis of a rotary device. They are closely spaced because a grasp with light
+# damping may make a wall unstable only in a narrow range of distances.
 RADII = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.032, 0.04, 0.05, 0.063, 0.08, 0.1)
 
 
 def reference_grasps(radius: float | str | None = None) -> dict[str, Operator]:
-    """Return the grasps with which a recommended wall is checked.
+    """Return the grasps that are used to check the stability of recommended walls.
 
-    One hand (0.554 kg, 6.45 N s/m and 135 N/m to ground, measured in one trial) holds the device by a spring of 1 kN/m
-    (soft) or 10 kN/m (firm) and a damper of 1, 5 or 20 N s/m (light, medium, strong damping). The springs and dampers
-    are assumed, as in the example configuration ``operator``.
+    The hand is a mass of 0.554 kg with a damper of 6.45 N s/m and a spring of 135 N/m to ground (measured in one
+    trial). It is coupled to the device by a spring of 1 kN/m (soft) or 10 kN/m (firm) and a damper of 1, 5 or 20 N s/m
+    (light, medium or strong damping). The coupling parameters are assumptions, as in the example configuration
+    ``operator``.
 
     Args:
-        radius: distance of the hand from the axis of a rotary device, in m, > 0; its mass, dampers and springs are
-            multiplied by the radius squared. None for a linear device.
+        radius: distance of the hand from the axis of a rotary device, in m, > 0. All masses, dampers and springs of the
+            grasp are multiplied by the squared radius. None for a linear device.
 
     Returns:
-        A dict of six `zwidth.Operator` by name, such as "soft, light damping".
+        A dictionary of six `zwidth.Operator`; the keys are names such as "soft, light damping".
 
     References:
         Sci. Rep. 5:18004 (2015), Fig. 3 (the hand).
@@ -50,6 +52,6 @@ def reference_grasps(radius: float | str | None = None) -> dict[str, Operator]:
 
 
 def list_grasps(rotary: bool) -> list[tuple[str, Operator]]:
-    """Return the reference grasps of a linear device with their names, or of a rotary one at each of the radii."""
+    """Return pairs of name and grasp: six for a linear device, six per radius in ``RADII`` for a rotary device."""
     radii = RADII if rotary else (None,)
     return [each for radius in radii for each in reference_grasps(radius).items()]

@@ -52,9 +52,9 @@ class LinearDevice(WholeDevice):
     """A device as any strictly proper linear system from commanded force (N) to sensed position (m).
 
     Every question about walls is answered of it; its numbers are taken as exact. Nothing is known of bodies: a hand,
-    friction, starts and energies of motions are for `Device`. Only walls with B >= 0 count for the stiffest wall and
-    for recommendations: B < 0 would cancel damping of the model that the device may not have. `Scene.max_stiffness`
-    with ``negative_damping=True`` includes them.
+    friction, starts and energies of motions are for `Device`. The stiffest wall and recommendations are restricted to
+    B >= 0, because B < 0 would cancel modeled damping that the real device may not have. Walls with B < 0 are included
+    in `Scene.max_stiffness` with ``negative_damping=True``.
 
     Args:
         system: matrices ``(A, B, C)``, coefficients ``(numerator, denominator)`` with the highest power first, as text
@@ -177,7 +177,7 @@ def _refuse_stuck(roots: np.ndarray, letter: str) -> None:
 
 
 def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
-    """Return numerator and denominator of matrices, coefficients or roots."""
+    """Return the numerator and denominator of a system given by matrices, coefficients or roots."""
     if hasattr(given, "A") and hasattr(given, "C"):
         given = (given.A, given.B, given.C, given.D)
     elif hasattr(given, "num") and hasattr(given, "den"):
@@ -193,35 +193,39 @@ def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
     size = len(A)
     if np.shape(A) != (size, size) or np.size(B) != size or np.size(C) != size or np.any(D):
         raise ValueError("matrices of one input and one output without feedthrough")
-    rate, push, seen = (_as_fractions(part) for part in (A, np.ravel(B), np.ravel(C)))
-    bottom = characteristic_polynomial(rate)
-    # C adj(s - A) B by the lemma of the determinant.
-    return subtract(characteristic_polynomial(rate - np.outer(push, seen)), bottom), bottom
+    dynamics, inputs, outputs = (_as_fractions(part) for part in (A, np.ravel(B), np.ravel(C)))
+    bottom = characteristic_polynomial(dynamics)
+    # The numerator C adj(s I - A) B is det(s I - A + B C) - det(s I - A), by the matrix determinant lemma.
+    top = subtract(characteristic_polynomial(dynamics - np.outer(inputs, outputs)), bottom)
+    return top, bottom
 
 
 def _as_fractions(values: Any) -> np.ndarray:
-    """Return an array of exact fractions of floats."""
+    """Return an array of floats as exact fractions."""
     floats = np.asarray(values, float)
     return np.array([Fraction(value) for value in floats.ravel().tolist()], object).reshape(floats.shape)
 
 
 def _expand(roots: Any) -> Polynomial:
-    """Return the monic polynomial of real roots and conjugate pairs."""
-    known: Any = np.asarray(roots, complex).ravel()
-    found: Polynomial = (Fraction(1),)
-    for root in known[known.imag >= 0].tolist():
+    """Return the monic polynomial with the given roots; raise `ValueError` if a complex root has no conjugate."""
+    values: Any = np.asarray(roots, complex).ravel()
+    product: Polynomial = (Fraction(1),)
+    for root in values[values.imag >= 0].tolist():
         real, imag = Fraction(root.real), Fraction(root.imag)
-        if root.imag and np.sum(known == root.conjugate()) != np.sum(known == root):
+        if root.imag and np.sum(values == root.conjugate()) != np.sum(values == root):
             raise ValueError("a root without its conjugate")
         factor = (Fraction(1), -2 * real, real * real + imag * imag) if root.imag else (Fraction(1), -real)
-        found = multiply(found, factor)
-    if len(found) - 1 != known.size:
+        product = multiply(product, factor)
+    if len(product) - 1 != values.size:
         raise ValueError("a root without its conjugate")
-    return found
+    return product
 
 
 def _reduce(top: Polynomial, bottom: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Return both without common factors, as sums of responses have them: a response shows no hidden mode."""
+    """Return numerator and denominator without their common factors, because canceled modes do not affect the response.
+
+    Sums of responses, for example, have common factors.
+    """
     if not top or len(top) >= len(bottom):
         return top, bottom
     common = find_common_factor(top, bottom)

@@ -62,7 +62,7 @@ class MeasuredDevice(WholeDevice):
         response: complex, in m/N, one for each line.
         deviation: the radius in m/N, of each line or of all, in which the true response lies; None where it is taken as
             it stands. With one, answers hold for every response in the band.
-        rotary: whether the response is of an angle to a torque: then it and the deviation are in rad/(N m).
+        rotary: True if the response is from a torque to an angle. Response and deviation are then in rad/(N m).
 
     Raises:
         InputError: lines do not grow, there are too few, a number is not finite, shapes differ.
@@ -144,8 +144,8 @@ class MeasuredDevice(WholeDevice):
             file: a text with commas, semicolons, tabs or blanks, a preamble or a line of units, packed or not; ``.npz``
                 or ``.mat``. With a column ``frequency [Hz]`` or ``[rad/s]``; and ``real [m/N]`` and ``imag [m/N]``, or
                 ``magnitude`` in m/N, mm/N, um/N or dB and ``phase`` in deg or rad, or complex numbers under
-                ``response``; and, where it is known, ``deviation [m/N]``. With rad/(N m) or deg/(N m) in place of m/N
-                the device is rotary.
+                ``response``; and, where it is known, ``deviation [m/N]``. Units of rad/(N m) or deg/(N m) in place of
+                m/N define a rotary device.
         """
         return cls(*_read_table(file))
 
@@ -180,7 +180,11 @@ def _as_line(name: str, values: Any, kind: type) -> np.ndarray:
 
 
 def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, bool]:
-    """Return Hz, the response in m/N, its deviation or None, and whether both are in rad/(N m) of a rotary device.
+    """Read a table of a frequency response.
+
+    Returns:
+        The frequencies in Hz; the response and its deviation in m/N, or in rad/(N m) for a rotary device, with None for
+        the deviation if the table has none; and whether the device is rotary.
 
     Raises:
         InputError: a column is missing, or a unit is unknown.
@@ -220,7 +224,7 @@ def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
     if "deviation" in columns:
         size, turns = _compliance(file, "deviation", units["deviation"])
         if turns != rotary:
-            raise InputError(f"{file}: response and deviation have units of different axes; write both in one")
+            raise InputError(f"{file}: response and deviation mix linear and rotary units; use one unit for both")
         band = columns["deviation"] * size
     return hertz, answer * scale, band, rotary
 
@@ -235,7 +239,10 @@ def _size(file: Path, name: str, unit: str, dimension: Dimension, known: tuple[s
 
 
 def _compliance(file: Path, name: str, unit: str) -> tuple[float, bool]:
-    """Return one of a unit in m/N or rad/(N m), of decibels that of their reference, and whether it is rotary."""
+    """Return the factor that converts a unit of compliance to m/N or rad/(N m), and whether the unit is rotary.
+
+    For decibels the factor is that of the reference unit, m/N by default.
+    """
     decibels = _DECIBELS.fullmatch(unit) if name == "magnitude" else None
     unit = (decibels[1] if decibels else unit) or "m/N"
     angular = _ANGULAR_COMPLIANCE.in_base("1", 0, unit)

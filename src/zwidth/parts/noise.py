@@ -1,4 +1,4 @@
-"""Noise of a velocity estimate due to the resolution of the position sensor."""
+"""Compute the noise of a velocity estimate that is caused by the quantization of the position."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ import numpy as np
 from zwidth.parts.state_space import estimate_matrices
 from zwidth.parts.velocity import Estimate, Velocity
 
-DOUBLINGS = 60  # each doubles the length of the impulse response summed; time constants of 1e15 periods are covered
+DOUBLINGS = 60  # doublings of the number of summed terms; 2^60 terms cover time constants of 1e15 periods
 
 
 def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> float:
-    """Return the standard deviation in m/s of a velocity estimate of quantized positions.
+    """Return the standard deviation in m/s of a velocity that is estimated from quantized positions.
 
-    The quantization error is nearly white with variance ``Q^2/12`` (Widrow, Kollar 2008, chapter 5). An estimate F(z)
-    with impulse response f_k amplifies the variance by ``sum f_k^2``.
+    The quantization error is approximately white with variance ``Q^2/12``, where Q is the resolution (Widrow, Kollar
+    2008, chapter 5). A velocity filter with the impulse response f_k multiplies the variance by ``sum f_k^2``.
     """
     estimate = velocity.estimate(period)
     return resolution / period * math.sqrt(_sum_squared_response(estimate) / 12.0)
 
 
 def _sum_squared_response(estimate: Estimate) -> float:
-    """Return the sum of the squared impulse response for T = 1."""
+    """Return the sum of the squared impulse response of a velocity estimate for T = 1."""
     if estimate.window and not estimate.zeros.size and not estimate.poles.size:
         return 2.0 * (float(estimate.gain) / estimate.window) ** 2
     A, B, C, D, _ = estimate_matrices(estimate)
-    # The controllability Gramian sum A^k B B' A'^k, by doubling the number of its terms (Smith 1968).
+    # Compute the controllability Gramian, sum A^k B B' A'^k, by Smith's method (1968): each step doubles the number of
+    # summed terms.
     gramian, power = B @ B.T, A
     for _ in range(DOUBLINGS):
         added = power @ gramian @ power.T

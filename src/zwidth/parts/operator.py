@@ -55,7 +55,7 @@ class Operator(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.rigid:
-            # The mass is in its SI unit now, in that of a rotary device if any other number is.
+            # Check the mass after its conversion to SI, with rotary units if any parameter has a rotary unit.
             with use_kind(getattr(self, "rotary", is_rotary())):
                 check_number("operator.mass", self.mass, allowed=POSITIVE)
         # Which number JAX holds, nobody can ask.

@@ -44,7 +44,7 @@ class Parts(Protocol):
 AnyScene = TypeVar("AnyScene", bound=Parts)
 
 _BARE = ("device", "timing", "wall")
-# Whole parts without parameters of their own.
+# Parts that are replaced only as a whole, because they have no paths to single parameters.
 _WHOLE = ("safe_limit",)
 # The parts that a scene need not have, in the order in which it is described; those of the device are fields of it.
 PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator}
@@ -101,7 +101,7 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
         # Period and rate are one thing; what was given last counts.
         changed["timing"].setdefault("period", None)
     if "timing" in changed:
-        # A delay given in periods stays in periods.
+        # Pass a delay in its original unit, so that a delay in periods stays in periods if the period changes.
         changed["timing"].setdefault("delay", scene.timing.span)
     if isinstance(scene.wall, NoWall):
         parts["wall"] = VirtualWall(0.0)

@@ -1,4 +1,4 @@
-"""The stiffest wall that measurements of a device support, with the reason and the warnings of the measurement."""
+"""Represent the safe limit: the stiffest wall that measurements of a device support, with reason and warnings."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from zwidth.parts.checks import Part
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import name_wall
 
-ROUNDING = 5e-4  # relative; a wall printed with four digits still lies within the limit
+ROUNDING = 5e-4  # relative tolerance, so that the limit allows a wall that is rounded to four digits
 
 
 @dataclass(frozen=True, repr=False)
 class SafeLimit(Part):
     """The stiffest wall that measurements of a device support.
 
-    A wall lies within the limit if its stiffness K' is at most K and its virtual damping lies between B K'/K and B:
-    it is softer than the limit at the same damping, or scaled down from it, or between the two.
+    The limit is a wall (K, B). It allows a wall (K', B') if K' <= K and B' is between B K'/K and B. The two extremes
+    are the limit with reduced stiffness only, and the limit with stiffness and damping reduced by the same factor.
 
     Args:
         stiffness: K in N/m, >= 0; 0 if no wall is supported.
         virtual_damping: B in N s/m.
-        reason: the cause of the limit, and the measurement that would raise it.
-        warnings: what is wrong with the measurement, one sentence each.
+        reason: the reason of the limit, and the measurement that can raise it.
+        warnings: faults of the measurement, one sentence each.
 
     Example:
         >>> import zwidth
@@ -41,37 +41,37 @@ class SafeLimit(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.stiffness >= 0:
-            raise InputError(f"safe_limit.stiffness: got {self.stiffness!r}; it must be 0 or more, 0 for no wall")
+            raise InputError(f"safe_limit.stiffness: got {self.stiffness!r}; it must be >= 0 (0: no wall is allowed)")
         if not isinstance(self.reason, str):
-            raise InputError(f"safe_limit.reason: got {self.reason!r}; write a text")
+            raise InputError(f"safe_limit.reason: got {self.reason!r}; it must be a string")
         texts = (self.warnings,) if isinstance(self.warnings, str) else self.warnings
         if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
-            raise InputError(f"safe_limit.warnings: got {self.warnings!r}; write a list of texts")
+            raise InputError(f"safe_limit.warnings: got {self.warnings!r}; it must be a list of strings")
         object.__setattr__(self, "warnings", tuple(texts))
 
     @property
     def forbids_all(self) -> bool:
-        """True if no wall lies within the limit."""
+        """True if the limit allows no wall."""
         return self.stiffness == 0
 
     def dampings(self, stiffness: float) -> tuple[float, float] | None:
-        """Return the least and the largest damping within the limit at a stiffness; None if there is none."""
+        """Return the smallest and the largest allowed damping at a stiffness; None if no damping is allowed."""
         if self.forbids_all or not 0 <= stiffness <= (1.0 + ROUNDING) * self.stiffness:
             return None
         scaled = min(stiffness / self.stiffness, 1.0) * self.virtual_damping
         return min(scaled, self.virtual_damping), max(scaled, self.virtual_damping)
 
     def allows(self, stiffness: float, virtual_damping: float) -> bool:
-        """Return True if a wall lies within the limit."""
+        """Return True if the limit allows a wall."""
         ends = self.dampings(stiffness)
         slack = ROUNDING * abs(self.virtual_damping)
         return ends is not None and ends[0] - slack <= virtual_damping <= ends[1] + slack
 
     def warn(self, text: str) -> SafeLimit:
-        """Return the limit with one more warning."""
+        """Return the limit with an additional warning."""
         return self if text in self.warnings else replace(self, warnings=(*self.warnings, text))
 
     def describe(self) -> str:
-        """Return the limit and its reason in one sentence."""
+        """Return a one-line description of the limit and its reason."""
         wall = "no wall is supported" if self.forbids_all else name_wall(self.stiffness, self.virtual_damping)
         return f"{wall}: {self.reason}" if self.reason else wall

@@ -21,7 +21,7 @@ class Timing(Part):
     Args:
         period: T in s, > 0; or give the rate.
         delay: t_d, from a sample to the moment its force acts, in s, >= 0, whole periods or not; or exactly in
-            periods, as "1.5 periods". A delay given in periods stays in periods if the period changes.
+            periods, as "1.5 periods". If the period changes, a delay given in periods keeps its number of periods.
         delay_model: "held" (exact for every delay) or "fractional_power" (the paper's z^(1+d), boundary and
             ridge only).
         rate: 1/T in Hz, > 0, in place of the period.
@@ -36,7 +36,7 @@ class Timing(Part):
     delay: Any = 0.0
     delay_model: DelayModel = "held"
     rate: Any = None
-    # A delay given in periods: the quotient of its seconds and the period may have a rounding error.
+    # Store a delay given in periods, because its quotient in seconds over the period may have a rounding error.
     _periods: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
@@ -54,23 +54,23 @@ class Timing(Part):
         check_choice("delay_model", self.delay_model, DELAY_MODELS)
 
     def __repr__(self) -> str:
-        """Return a call that creates this timing, with the delay in the unit in which it was given."""
+        """Return an expression that creates this timing, with the delay in its original unit, seconds or periods."""
         text = super().__repr__()
         return text if self._periods is None else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
 
     @property
     def in_periods(self) -> bool:
-        """True if the delay was given in periods, so that it stays in periods if the period changes."""
+        """True if the delay was given in periods. It then keeps its number of periods if the period changes."""
         return self._periods is not None
 
     @property
     def span(self) -> Any:
-        """The delay in the unit in which it was given: a `Span` in periods, or a number of seconds."""
+        """The delay in its original unit: a `Span` in periods, or a number of seconds."""
         return self.delay if self._periods is None else Span(self._periods, "periods")
 
     @property
     def kept_delay(self) -> str:
-        """The delay that stays the same if the period changes, as "1 period" or "1.000 ms"."""
+        """The delay that stays constant if the period changes, as text: "1 period" or "1.000 ms"."""
         if self._periods is None:
             return with_unit(float(self.delay), "s")
         return spell_periods(self._periods)

@@ -52,7 +52,7 @@ class Estimate:
 
     @property
     def is_difference(self) -> bool:
-        """Whether the estimate is the difference of two successive samples times a gain."""
+        """True if the estimate is the difference of two successive samples, multiplied by a gain."""
         window = self.window == 1 and not self.lag and not np.size(self.zeros) and not np.size(self.poles)
         coefficients = not self.window and self.lag == 1 and not np.size(self.poles)
         return window or (coefficients and np.size(self.zeros) == 1 and bool(np.all(np.equal(self.zeros, 0))))
@@ -188,9 +188,11 @@ class VelocityFilter(Part):
     """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
 
     Args:
-        numerator: coefficients, highest power first, in 1/s; or a list of them, one for each section in series.
-        denominator: likewise, of at least the numerator's degree (a filter cannot see the future), stable. Sections
-            keep the poles of a filter of high order, which the rounding errors of its coefficients move.
+        numerator: coefficients in 1/s, highest power first; or a list of sections in series, each with its
+            coefficients.
+        denominator: likewise. Its degree must be at least that of the numerator (a causal filter), and its poles must
+            be inside the unit circle. Use sections for filters of high order, because the rounding errors of a single
+            polynomial's coefficients move the poles.
 
     Example:
         >>> import zwidth
@@ -212,31 +214,31 @@ class VelocityFilter(Part):
         top, bottom = (sum(len(section) - 1 for section in part) for part in self._sections)
         if top > bottom:
             raise InputError(
-                f"velocity.numerator: degree {top} above the denominator's {bottom} needs samples of the future; "
-                "multiply the denominator by z"
+                f"velocity.numerator: its degree {top} exceeds that of the denominator, {bottom}, so the filter needs "
+                "future samples; multiply the denominator by z"
             )
         self._check_poles()
 
     def _check_poles(self) -> None:
-        """Refuse poles on or outside the unit circle."""
+        """Raise `InputError` if a pole is on or outside the unit circle, with the likely cause."""
         poles = self._roots[1]
         largest = np.max(np.abs(1.0 - poles), initial=0.0)
         if largest < 1.0:
             return
         got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
-        # An integrator has one pole at z = 1; rounding errors move several that are next to it.
+        # A single pole at z = 1 is an integrator. Rounding errors of the coefficients move several poles near z = 1.
         slow = np.abs(poles) < _NEXT_TO_ONE
         if np.sum(slow) != 1 and any(_is_rounding(section) for section in self._sections[1]):
-            cause = "Cause: rounding of the coefficients; give sections in series (scipy.signal: output='sos')"
+            cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"
         elif np.any(poles[slow] == 0):
-            cause = "Integral action: give controller times sampled device as one LinearDevice (K = 1)"
+            cause = "Integral action: model controller and sampled device in series as one LinearDevice (K = 1)"
         else:
             cause = "Check the coefficients: highest power first"
         raise InputError(got + cause)
 
     @property
     def _sections(self) -> tuple[Any, Any]:
-        """The coefficients of the sections of numerator and denominator."""
+        """The sections of the numerator and of the denominator, each a tuple of coefficients."""
         both: Any = self.numerator, self.denominator
         top, bottom = (part if isinstance(part[0], tuple) else (part,) for part in both)
         return top, bottom
@@ -260,7 +262,8 @@ class VelocityFilter(Part):
         for section in bottoms:
             gain = gain / section[0]
         if hasattr(period, "mid"):
-            # Exact coefficients have exact zeros at z = 1, which rounded roots lose.
+            # Compute the roots as balls from the exact coefficients, because rounded roots would lose exact zeros at
+            # z = 1.
             exact = (np.concatenate([_ball_offsets(section) for section in part]) for part in (tops, bottoms))
             return Estimate(0, gain, 0, *exact)
         zeros, poles, lag = self._roots
@@ -311,13 +314,13 @@ def name_estimate(velocity: Velocity) -> str:
         if type(velocity) is part:
             return kind
     raise InputError(
-        f"velocity: got {type(velocity).__name__}, a class that a configuration cannot name; use one of "
+        f"velocity: got {type(velocity).__name__}, which is not available in configurations; use one of "
         f"{', '.join(ESTIMATES)}"
     )
 
 
 def is_plain(velocity: Velocity, period: Any) -> bool:
-    """Return whether an estimate is the difference of two samples over the loop's period and has no parameters."""
+    """Return whether an estimate is the backward difference over the period of the loop, without any parameters."""
     if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
         return False
     estimate = velocity.estimate(period)
@@ -339,21 +342,22 @@ def _ratio(period: Any, coded: Any) -> Any:
     return 1.0 if coded is None else period / coded
 
 
-# The estimates are computed in floats, in JAX arrays and in balls of python-flint (``flint.arb``).
+# The estimates are evaluated with floats, JAX arrays and balls of python-flint (``flint.arb``). The next functions
+# provide operations that differ between these types.
 
 
 def _pi(like: Any) -> Any:
-    """Return pi in the arithmetic of a number."""
+    """Return pi as a number of the same type as the argument."""
     return like.pi() if hasattr(like, "pi") else np.pi
 
 
 def _as_complex(value: Any) -> Any:
-    """Return an array as complex numbers; balls convert themselves."""
+    """Return an array with complex dtype. Arrays of balls are returned unchanged, because balls convert themselves."""
     return value if value.dtype == object else value + 0j
 
 
 def _unit_vectors(angles: np.ndarray) -> np.ndarray:
-    """Return ``e^(j angle)`` of each angle."""
+    """Return ``e^(j angle)`` for each angle."""
     if angles.dtype != object:
         return np.exp(1j * angles)
     import flint
@@ -362,7 +366,7 @@ def _unit_vectors(angles: np.ndarray) -> np.ndarray:
 
 
 def _ball_offsets(coefficients: tuple[Any, ...]) -> np.ndarray:
-    """Return the roots of a polynomial with exact coefficients as balls, by their offsets from 1."""
+    """Return 1 - root for the roots of a polynomial with exact coefficients, as balls."""
     import flint
 
     exact = flint.fmpq_poly([flint.arb(value).fmpq() for value in reversed(coefficients)])
@@ -370,15 +374,20 @@ def _ball_offsets(coefficients: tuple[Any, ...]) -> np.ndarray:
     return np.array([flint.acb(root) for root, times in found for _ in range(times)], object)
 
 
-_NEXT_TO_ONE = 1e-2  # distance from z = 1 of poles that rounding errors of coefficients can move to it
+_NEXT_TO_ONE = 1e-2  # largest distance from z = 1 of poles that rounding errors of the coefficients can move there
 
 
 def _read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
-    """Return the coefficients of one polynomial, or of several in series, without leading zeros."""
+    """Return the coefficients of the sections without leading zeros; raise `InputError` for other values.
+
+    Args:
+        name: "numerator" or "denominator", for messages.
+        given: coefficients of one polynomial, or a list of sections with their coefficients.
+    """
     try:
         rows = list(given) if np.ndim(given) or any(map(np.ndim, given)) else [given]
     except ValueError:
-        # Sections of different lengths.
+        # NumPy raises this error for sections of different lengths.
         rows = list(given)
     except TypeError:
         rows = [given]
@@ -388,22 +397,23 @@ def _read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
         try:
             values = np.atleast_1d(np.asarray(row, float))
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"velocity.{name}: a list of real coefficients is needed") from error
+            raise InputError(f"velocity.{name}: got {given!r}; it must be a list of real coefficients") from error
         values = np.trim_zeros(values, "f") if values.ndim == 1 else values
         if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
             raise InputError(
-                f"velocity.{name}: got {given!r}; a list of finite coefficients, highest power first, not all 0, is "
-                "needed"
+                f"velocity.{name}: got {given!r}; it must be a list of finite coefficients, highest power first, not "
+                "all 0"
             )
         sections.append(tuple(values.tolist()))
     return tuple(sections)
 
 
 def _is_rounding(coefficients: tuple[float, ...]) -> bool:
-    """Return whether rounding errors of the coefficients can move the largest root to or over the unit circle."""
+    """Return whether rounding errors of the coefficients alone can explain the roots on or outside the unit circle."""
     roots = 1.0 - _offsets(np.trim_zeros(np.array(coefficients), "b"))
     on = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))
-    # A polynomial within rounding errors of this one has a root there on the circle.
+    # If the polynomial is this small at a point of the circle, another one whose coefficients differ only by rounding
+    # errors has a root exactly there.
     noise = 4.0 * len(coefficients) * np.finfo(float).eps * np.abs(coefficients).sum()
     return bool(on.size and len(coefficients) > 2 and np.all(np.abs(np.polyval(coefficients, on)) <= noise))
 

@@ -1,4 +1,4 @@
-"""Times as texts: of a calendar, ISO 8601, of a day, and durations with their unit, as "0.001 sec"."""
+"""Read times in text form: ISO 8601 dates and times, times of day, and durations such as "0.001 sec"."""
 
 from __future__ import annotations
 
@@ -7,40 +7,44 @@ from contextlib import suppress
 
 import numpy as np
 
-# 2024-05-01T12:00:00.001, also with a blank or a time zone; or the time of a day alone.
+# Optional date, time of day, optional time zone: 2024-05-01T12:00:00.001Z, with T or a blank before the time.
 CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?(\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?)(Z|[+-]\d\d:?\d\d)?")
-_DAY = "1970-01-01T"
-_BATCH = 20_000  # texts converted together; texts take much memory
-# Durations as MATLAB's timetables write them.
+_DAY = "1970-01-01T"  # date assumed for times of day without a date
+_BATCH = 20_000  # texts converted at once; limits the memory
+# Durations in the format of MATLAB timetables.
 _DURATION = re.compile(r"([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s+(sec|min|hr)")
-_SECONDS = {"sec": 1.0, "min": 60.0, "hr": 3600.0}
+_SECONDS = {"sec": 1.0, "min": 60.0, "hr": 3600.0}  # units of durations, in s
 
 
 def read_duration(cell: str) -> str:
-    """Return the seconds of a duration such as "0.001 sec", as a text; any other cell unchanged."""
+    """Return a duration such as "0.001 sec" in seconds, as text without unit. Any other cell is returned unchanged."""
     match = _DURATION.fullmatch(cell)
     return cell if match is None else repr(float(match[1]) * _SECONDS[match[2]])
 
 
 def is_time(text: str) -> bool:
-    """Return whether a text is a time of the calendar or of a day."""
+    """Return whether a text is a date with a time, or a time of day."""
     with suppress(ValueError):
         return read_clock(np.array([text])).size == 1
     return False
 
 
 def read_clock(texts: np.ndarray) -> np.ndarray:
-    """Return the seconds since the first of several times; raise `ValueError` if a text is no time."""
+    """Return the seconds that have passed since the first of several times.
+
+    Raises:
+        ValueError: a text is not a time, or the time zones differ.
+    """
     days, zones = [], set()
     for part in np.array_split(texts, 1 + texts.size // _BATCH):
-        found = [match for text in part.tolist() if (match := CLOCK.fullmatch(text.strip()))]
-        zones |= {match[3] for match in found}
-        if len(found) < part.size or len(zones) > 1:
-            raise ValueError("no time, or another zone")
-        days.append(np.array([(match[1] or _DAY) + match[2].replace(",", ".") for match in found], "datetime64[ns]"))
+        matches = [match for text in part.tolist() if (match := CLOCK.fullmatch(text.strip()))]
+        zones |= {match[3] for match in matches}
+        if len(matches) < part.size or len(zones) > 1:
+            raise ValueError("not a time, or a different time zone")
+        days.append(np.array([(match[1] or _DAY) + match[2].replace(",", ".") for match in matches], "datetime64[ns]"))
     return to_seconds(np.concatenate(days))
 
 
 def to_seconds(times: np.ndarray) -> np.ndarray:
-    """Return seconds since the first of `numpy.datetime64`; NaN for no time."""
+    """Return the seconds between the first and each of several `numpy.datetime64`; NaN for NaT."""
     return (times - times[0]) / np.timedelta64(1, "s") if times.size else times.astype(float)

@@ -57,12 +57,12 @@ class TracedDelayError(ZwidthError, TypeError):
     """A traced delay where the number of poles, hence an array shape, depends on its value."""
 
 
-# Names in use for quantities that have another name here.
+# Common names of quantities, and the names of the corresponding fields.
 SYNONYMS = {"weight": "mass", "inertia": "mass", "frequency": "rate", "latency": "delay", "dead_time": "delay"}
 
 
 def how_to_install(extra: str) -> str:
-    """Return the command that adds an optional dependency to this installation."""
+    """Return the command that installs an optional dependency in the current environment."""
     import sys
     from pathlib import Path
 

@@ -50,12 +50,12 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
 
 
 def spell_periods(count: float) -> str:
-    """Return a count of sampling periods with its noun: ``1 period``, ``0.7 periods``."""
+    """Return a number of sampling periods as text: ``1 period``, ``0.7 periods``."""
     return f"{short(float(f'{count:.6g}'))} period{'' if count == 1 else 's'}"
 
 
 def spell_short(value: float, unit: str, digits: int = 3) -> str:
-    """Return a quantity with its unit, without trailing zeros: ``1 mm``, ``349 mrad``."""
+    """Return a quantity with its unit, rounded and without trailing zeros: ``1 mm``, ``349 mrad``."""
     number, space, name = with_unit(value, unit, digits).partition(" ")
     return f"{float(number):g}{space}{name}" if math.isfinite(value) else number
 

@@ -23,7 +23,7 @@ _PLAUSIBLE = {
     "time_constant": (1e-7, 5.0),
     "resolution": (1e-10, 0.01),
 }
-# The step of a rotary encoder in rad: from 32 bits per turn to 6 steps per turn.
+# Plausible steps of rotary encoders in rad, from 32 bits per turn to 6 steps per turn.
 _STEP_ANGLE = (1e-9, 1.1)
 # Kinds of quantities with another name.
 _OF_UNIT = {"N s/m": "damping", "N/m": "spring", "s": "period", "kg": "mass"}

@@ -96,17 +96,17 @@ class Parameter:
 
     @property
     def own_words(self) -> str:
-        """The name for the kind of device in question: a rotary one has an inertia."""
+        """The name for the current kind of device: "inertia" replaces "mass" for rotary devices."""
         return self.words.replace("mass", "inertia") if is_rotary() else self.words
 
     @property
     def own_symbol(self) -> str:
-        """The symbol for the kind of device in question, in mathtext."""
+        """The symbol for the current kind of device, in mathtext: J replaces m for rotary devices."""
         return re.sub(r"^m(?=_|$)", "J", self.symbol) if is_rotary() else self.symbol
 
     @property
     def axis_label(self) -> str:
-        """The label of an axis: name, symbol and definition for the kind of device in question."""
+        """The label of a figure axis: name, symbol and definition for the current kind of device."""
         definition = f" = {self.definition}" if self.definition else ""
         definition = definition.replace("/m", "/J") if is_rotary() else definition
         return f"{self.own_words}  ${self.own_symbol}{definition}$"
@@ -273,10 +273,10 @@ CHOICES = {
 }
 
 OF_LOGS = {
-    "time": "Column of the time: its header, or HEADER:ms; of two columns HEADER:s+HEADER:ns. Default: by its name.",
+    "time": "Time column: its header, or HEADER:ms; HEADER:s+HEADER:ns for two columns. Default: by the headers.",
     "position": "Column of the position: its header, or HEADER:mm, :counts, :deg.",
     "force": "Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.",
-    "resolution": "One count of the encoder, as 0.03mm, 0.09deg or '4000 counts/rev'.",
+    "resolution": "Encoder step, as 0.03mm, 0.09deg or '4000 counts/rev'.",
     "motor_constant": "What an ampere of a force in A makes, as 5N/A.",
 }
 """What stands in the columns of a log, and what counts and amperes stand for."""

@@ -46,12 +46,12 @@ class Method(IntEnum):
 
 
 class RidgeKind(IntEnum):
-    """Kind of the optimum at the stiffest wall."""
+    """Kind of optimum at the stiffest stable wall."""
 
     SMOOTH = 0
     CORNER = 1
     NO_DAMPING = 2  # of a scene where only B >= 0 counts: the end of the row B = 0
-    NONE = 3  # no stiffest wall: see the status
+    NONE = 3  # no stiffest wall exists; the status contains the reason
 
 
 _MESSAGES = {

@@ -32,11 +32,11 @@ _DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
 _FRACTION = re.compile(r"[-+]?[0-9]*([.,])[0-9]+(?:[eE][-+]?[0-9]+)?")
 # Lines that may stand above the numbers.
 _PREAMBLE = 500
-_LABVIEW = "***End_of_Header***"
+_LABVIEW = "***End_of_Header***"  # last line of each of the two headers of a LabVIEW file
 _REMARK = re.compile(r"\s*[#%]+\s*")
 _SEPARATOR = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 _BLANKS = re.compile(r"\s+(?![\[(])")
-# Cells without a number, in lower case.
+# Contents of cells, in lower case, that denote a missing number.
 _MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-")
 
 
@@ -45,7 +45,8 @@ class NamedColumns:
     """Columns of a file, whose numbers are read when they are asked for."""
 
     heads: list[str]  # their names, perhaps with units
-    # Columns at some places, of a kind: float or complex. All finite, or NaN for cells without a number if gaps=True.
+    # Return the columns with the given indices as arrays of the given type, float or complex (float by default). With
+    # gaps=True, missing numbers are NaN; otherwise they raise an error.
     numbers: Callable[..., list[np.ndarray]]
     nameless: str = ""  # says so where the names are 1, 2, ...
 
@@ -253,7 +254,7 @@ def _count_numbers(cells: list[str]) -> int:
 
 
 def _holds_sample(row: list[str]) -> bool:
-    """Return whether a row has two numbers or more, or one and empty cells, as of a sparse table."""
+    """Return whether a row is a sample: two numbers or more, or one number and otherwise empty cells (sparse table)."""
     numbers = _count_numbers(row)
     return numbers >= 2 or (numbers == 1 and len(row) > 2 and sum(map(bool, row)) == 1)
 
@@ -271,7 +272,7 @@ def _read_number(text: str, kind: type) -> Any:
 
 def _lay_out(lines: list[str]) -> _Layout:
     """Find the first lines of numbers, by the separator that leaves the least text in them, and what is above."""
-    # LabVIEW has two headers, whose lines hold numbers as well.
+    # Skip the headers of LabVIEW files, because their lines contain numbers as well.
     headers = [k for k, line in enumerate(lines[:_PREAMBLE]) if line.startswith(_LABVIEW)]
     first = headers[-1] + 1 if headers else 0
     held = [k for k in range(first, min(len(lines), _PREAMBLE)) if lines[k].strip()]
@@ -292,12 +293,12 @@ def _lay_out(lines: list[str]) -> _Layout:
     _, begin, separator = best
     width = len(_trim(_split(lines[begin], separator)))
     above = [k for k in reversed(held) if k < begin]
-    # LabVIEW names a column of remarks, which is empty in the samples.
+    # LabVIEW adds the name of a column of comments, which the samples lack.
     if above and (heads := _split(lines[above[0]], separator))[-1:] == ["Comment"] and len(heads) == width + 1:
         return _Layout(above[0], None, begin, separator)
     cells = len(_split(lines[begin], separator))
     named = [k for k in above if len(_trim(_split(lines[k], separator))) == width]
-    # Of a sample with empty cells at its end the names are as many as its cells.
+    # If the first sample ends with empty cells, compare the number of names with that of all its cells.
     named = named or [k for k in above if len(_split(lines[k], separator)) == cells]
     if not named:
         plain = [k for k in above if holds_data(lines[k])]
@@ -351,7 +352,20 @@ def _read_each(
     kind: type,
     gaps: bool,
 ) -> list[np.ndarray]:
-    """Read columns cell by cell; raise `InputError` for the first cell that holds no number, unless it is empty."""
+    """Read columns cell by cell.
+
+    Args:
+        file: path of the table, for messages.
+        lines: lines of the table.
+        layout: first line of the samples, and the separator.
+        heads: headers of all columns.
+        places: indices of the columns to read.
+        kind: float or complex.
+        gaps: return NaN for missing numbers.
+
+    Raises:
+        InputError: a cell contains no number and is not a missing number, or a line has too many cells.
+    """
     separator, found = layout.separator, [[] for _ in places]
     if separator == " ":
         rows = ((k + 1, lines[k].split()) for k in range(layout.begin, len(lines)) if lines[k].strip())

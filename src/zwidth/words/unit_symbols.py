@@ -1,7 +1,8 @@
-"""Units as people write them: products and quotients of symbols, as a size in SI units and exponents.
+"""Parse unit expressions: products, quotients and powers of unit symbols, with SI prefixes.
 
-``N m/deg``, ``mNm/°``, ``N*m*s / rad``, ``kgf/cm`` and ``ozf in`` are such expressions. A prefix that is a power of ten
-stays apart from other factors, because shifting a decimal exponent rounds once: 0.3 ms is the float64 of 0.0003.
+Examples are ``N m/deg``, ``mNm/°``, ``N*m*s / rad``, ``kgf/cm`` and ``ozf in``. The result is the conversion factor to
+SI and the exponents of kg, m, s and rad. Powers of ten are stored separately from other factors, because a shift of the
+decimal exponent has a single rounding error: 0.3 ms is exactly the float64 of 0.0003.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ Exponents = tuple[int, int, int, int]
 
 
 class UnitSize(NamedTuple):
-    """One of a unit in SI units: ``factor * 10**power``, with its exponents."""
+    """The size of a unit: its conversion factor to SI is ``factor * 10**power``."""
 
     power: int
     factor: float
@@ -26,13 +27,15 @@ class UnitSize(NamedTuple):
 
     @property
     def value(self) -> float:
+        """The conversion factor to SI."""
         return float(f"1e{self.power}") * self.factor
 
 
+# SI prefixes and their powers of ten; u stands for micro.
 _PREFIXES = {"": 0, "n": -9, "u": -6, "μ": -6, "m": -3, "c": -2, "d": -1, "k": 3, "M": 6}
 _MASS, _LENGTH, _TIME, _ANGLE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
 _FORCE, _PER_TIME = (1, 1, -2, 0), (0, 0, -1, 0)
-# Symbol: power of ten, further factor, exponents, admissible prefixes.
+# For each symbol: power of ten, further factor, exponents, and the allowed prefixes.
 _SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
     "m": (0, 1.0, _LENGTH, "nuμmck"),
     "g": (-3, 1.0, _MASS, "uμmk"),
@@ -54,31 +57,39 @@ _SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
     **dict.fromkeys(("deg", "°", "degree", "degrees"), (0, math.pi / 180, _ANGLE, "")),
     **dict.fromkeys(("rev", "turn", "turns", "revolution", "revolutions"), (0, 2 * math.pi, _ANGLE, "")),
 }
+# The sizes of all symbols with their allowed prefixes.
 _READINGS = {
     prefix + symbol: UnitSize(power + _PREFIXES[prefix], factor, exponents)
     for symbol, (power, factor, exponents, prefixes) in _SYMBOLS.items()
     for prefix in ("", *prefixes)
 }
-_LONGEST = max(map(len, _READINGS))
-# Mass units that stand for forces in products, as in "oz in" or "kg cm": their own exponents fit no torque.
-_GRAVITY = 9.80665
+_LONGEST = max(map(len, _READINGS))  # characters of the longest symbol with its prefix
+_GRAVITY = 9.80665  # m/s^2, standard gravity
+# Mass units that stand for forces, as in "oz in" or "kg cm": as masses they would not yield a torque.
 _WEIGHT = re.compile(r"(?<![A-Za-z])(kg|g|lb|oz)(?![A-Za-z])|^(kg|g)(?=[cm]?m)")
+# Symbols and an exponent, as in "m^2", "m**2" or "m2".
 _POWER = re.compile(r"(.*?)(?:\^|\*\*)?(-?[1-4])?", re.DOTALL)
+# A denominator that is a quotient, as in "N m/(rad/s)".
 _DIVIDED_RATE = re.compile(r"/\(([^()/]+)/([^()/]+)\)")
 
 
 def normalize_symbols(text: str) -> str:
-    """Return a unit with one spelling of the micro sign, the degree sign, the minus sign and of superscripts."""
+    """Return a unit with normalized characters: micro sign, degree sign, minus sign and superscripts."""
     text = text.replace("º", "°").replace("˚", "°").replace("−", "-")
     return unicodedata.normalize("NFKC", text)
 
 
 @lru_cache(maxsize=1024)
 def measure_unit(text: str, exponents: Exponents | None = None) -> UnitSize | None:
-    """Return the size of a unit of these exponents, or of any; None if it has none or more than one size.
+    """Return the size of a unit; None if the unit is unknown or ambiguous.
 
-    Symbols that stand close together may be read in two ways, "ms" as milliseconds or as metre seconds: the exponents
-    decide. Without exponents the reading with the fewest symbols counts.
+    Adjacent symbols may have two interpretations: "ms" are milliseconds or metre seconds. The exponents decide between
+    them.
+
+    Args:
+        text: the unit.
+        exponents: required exponents of kg, m, s and rad. None to allow all; the interpretation with the fewest symbols
+            is then returned.
     """
     sizes = [size for size in _read(normalize_symbols(text)) if exponents in (None, size.exponents)]
     if exponents is None:
@@ -90,27 +101,27 @@ def measure_unit(text: str, exponents: Exponents | None = None) -> UnitSize | No
 
 
 def _read_weights(text: str, exponents: Exponents) -> UnitSize | None:
-    """Return the size with kg, g, lb and oz taken as forces, as in "oz in" or "kg/mm"; None if that does not fit."""
+    """Return the size of a unit if kg, g, lb or oz denotes a weight, as in "oz in"; None if the exponents differ."""
     text = normalize_symbols(text)
     mass = _WEIGHT.search(text)
-    # A mass is not taken for a force by itself: "2 kg" may be a mass by mistake.
+    # Exclude plain forces, because "2 kg" in place of a force may be a mass by mistake.
     if mass is None or exponents[1] == 1:
         return None
-    found = [size for size in _read(f"{text[: mass.start()]}N {text[mass.end() :]}") if size.exponents == exponents]
-    if not found:
+    sizes = [size for size in _read(f"{text[: mass.start()]}N {text[mass.end() :]}") if size.exponents == exponents]
+    if not sizes:
         return None
     weight = _READINGS[mass[0]]
-    return found[0]._replace(power=found[0].power + weight.power, factor=found[0].factor * weight.factor * _GRAVITY)
+    return sizes[0]._replace(power=sizes[0].power + weight.power, factor=sizes[0].factor * weight.factor * _GRAVITY)
 
 
 def _read(text: str) -> list[UnitSize]:
-    """Return every size that a unit may have, fewest symbols first."""
+    """Return the sizes of all interpretations of a unit, ordered by increasing number of symbols; at most 64."""
     text = re.sub(r"\s*/\s*", "/", text.strip())
-    # "N m/(rad/s)" is "N m s/rad".
+    # Replace "N m/(rad/s)" by "N m s/rad".
     if inverse := _DIVIDED_RATE.search(text):
         text = f"{text[: inverse.start()]} {inverse[2]}/{inverse[1]}{text[inverse.end() :]}"
     text = re.sub(r"/\(([^()/]+)\)", r"/\1", text)
-    found = [UnitSize(0, 1.0, (0, 0, 0, 0))]
+    sizes = [UnitSize(0, 1.0, (0, 0, 0, 0))]
     for k, part in enumerate(text.split("/")):
         atoms = [atom for atom in re.split(r"[\s*·⋅.]+|-(?=[A-Za-z])", re.sub(r"\*\*", "^", part)) if atom]
         if k == 0 and atoms == ["1"]:
@@ -119,19 +130,19 @@ def _read(text: str) -> list[UnitSize]:
             return []
         sign = -1 if k else 1
         for atom in atoms:
-            found = [_join(size, other, sign) for size in found for other in _read_run(atom)][:64]
-    return found
+            sizes = [_join(size, other, sign) for size in sizes for other in _read_run(atom)][:64]
+    return sizes
 
 
 def _read_run(atom: str) -> Iterator[UnitSize]:
-    """Yield the sizes of symbols that stand close together, as "mNm"; an exponent belongs to the last one."""
+    """Yield the sizes of adjacent symbols, as in "mNm", and of a single one; an exponent belongs to the last symbol."""
     match = _POWER.fullmatch(atom)
     letters, power = (match[1], int(match[2] or 1)) if match else (atom, 1)
-    # Longest symbols first, so that the fewest symbols come first.
+    # Try long symbols first, so that interpretations with few symbols come first.
     for length in range(min(len(letters), _LONGEST), 0, -1):
         first = _READINGS.get(letters[:length])
         rest = letters[length:]
-        # A metre directly before a newton is a milli.
+        # An m directly before N is the prefix milli, not a metre.
         if first is None or (letters[:length] == "m" and rest.startswith("N")):
             continue
         if not rest:
@@ -142,12 +153,13 @@ def _read_run(atom: str) -> Iterator[UnitSize]:
 
 
 def _raise_to(size: UnitSize, power: int) -> UnitSize:
+    """Return the power of a unit."""
     kg, m, s, rad = size.exponents
     return UnitSize(size.power * power, size.factor**power, (kg * power, m * power, s * power, rad * power))
 
 
 def _join(first: UnitSize, second: UnitSize, sign: int) -> UnitSize:
-    """Return the product of two units, or their quotient where the sign is -1."""
+    """Return the product of two units, or their quotient if the sign is -1."""
     (a, b, c, d), (e, f, g, h) = first.exponents, second.exponents
     exponents = (a + sign * e, b + sign * f, c + sign * g, d + sign * h)
     return UnitSize(first.power + sign * second.power, first.factor * second.factor**sign, exponents)

@@ -1,7 +1,7 @@
-"""Quantities with a unit, as ``10 kN/m``; a number alone is in the SI base unit of its field.
+"""Read quantities with units, such as ``10 kN/m``. Numbers without a unit are in the SI unit of their field.
 
-The units of a dimension that messages list are in tables; any other product or quotient of the same dimension, as
-``N/um`` or ``ozf in``, is read by `zwidth.words.unit_symbols`.
+The usual units of each dimension, which messages list, are in tables. `zwidth.words.unit_symbols` reads any other unit
+of the same dimension, such as ``N/um`` or ``ozf in``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ _QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-
 # One way only to match a run of digits: a second one costs quadratic time on a long run that fails in the end.
 _NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
 
-# The digits at the start of a quantity, with separators of thousands and a decimal sign.
+# The leading number of a quantity, with thousands separators and a decimal separator; and an integer with thousands
+# separators.
 _DIGITS = re.compile(r"\s*[-+]?[0-9][0-9.,'’_\u00a0\u2009\u202f ]*[0-9](?![0-9])")
 _GROUPED = re.compile(r"[1-9][0-9]{0,2}(?:(?P<mark>[.,'’_\u00a0\u2009\u202f ])[0-9]{3})(?:(?P=mark)[0-9]{3})*")
 
@@ -52,17 +53,17 @@ class Dimension:
 
     @cached_property
     def exponents(self) -> Exponents | None:
-        """Exponents of kg, m, s and rad; None of a ratio."""
+        """Exponents of kg, m, s and rad; None for ratios."""
         size = measure_unit(self.base)
         return None if size is None else size.exponents
 
     def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
-        """Return a number of a unit in the base unit; None if the unit is of another dimension."""
+        """Return ``mantissa * 10**exponent`` units in the base unit; None for a unit of another dimension."""
         own = next((name for name in self.units if _canonical(name) == _canonical(unit)), None)
         if own in self.factors:
             return float(f"{mantissa}e{exponent}") * self.factors[own]
         if own is not None:
-            # Shifting the decimal exponent rounds once: 0.3 ms is exactly the float64 of 0.0003.
+            # Shift the decimal exponent, because a product would round twice: 0.3 ms is exactly the float64 of 0.0003.
             return float(f"{mantissa}e{exponent + self.powers[own]}")
         size = measure_unit(unit, self.exponents) if self.exponents and unit else None
         return None if size is None else float(f"{mantissa}e{exponent + size.power}") * size.factor
@@ -112,7 +113,7 @@ _OTHER_KIND = {one: other for pair in ROTARY.items() for one, other in (pair, pa
 
 PERIOD_WORDS = ("periods", "period")
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
-"""Units of a position that its encoder's resolution translates."""
+"""Units of encoder positions, which are converted with the resolution of the encoder."""
 
 
 def find_dimension(unit: str) -> Dimension:
@@ -126,7 +127,7 @@ def find_other(dimension: Dimension) -> Dimension | None:
 
 
 def tell_kind(value: Any) -> bool | None:
-    """Return whether a text is a number with a unit of a rotary device; None if the text has no such unit."""
+    """Return True for a quantity with a unit of a rotary device, False for that of a linear device, None otherwise."""
     if not isinstance(value, str):
         return None
     match = _QUANTITY.fullmatch(_drop_separators(value, strict=False))
@@ -135,7 +136,7 @@ def tell_kind(value: Any) -> bool | None:
         return True
     size = measure_unit(unit) if unit else None
     if size is None:
-        # An unknown unit per angle is of no linear device.
+        # Classify unknown units by their denominator: units per angle are rotary.
         return True if _canonical(unit).endswith(("/rad", "/deg", "/°", "/turn", "/rev")) else None
     return _KIND_OF_EXPONENTS.get(size.exponents, True if size.exponents[3] else None)
 
@@ -193,10 +194,17 @@ _KIND_OF_EXPONENTS = {
 
 
 def _drop_separators(text: str, *, strict: bool = True) -> str:
-    """Return a quantity with a decimal point and no separators of thousands; `UnusableValueError` if ambiguous.
+    """Return a quantity with a decimal point and without thousands separators.
 
-    "1.000,5 N/m" and "1,000.5 N/m" are 1000.5 N/m, "1,5 N/m" is 1.5 N/m; "1,000 N/m" may be either. A point alone is a
-    decimal point always.
+    "1.000,5 N/m" and "1,000.5 N/m" are 1000.5 N/m, and "1,5 N/m" is 1.5 N/m. "1,000 N/m" is ambiguous. A single point
+    is always the decimal point.
+
+    Args:
+        text: the quantity.
+        strict: raise an error for ambiguous numbers; otherwise return the text unchanged.
+
+    Raises:
+        UnusableValueError: the number is ambiguous, or its separators are not thousands separators.
     """
     text = normalize_symbols(text.strip())
     match = _DIGITS.match(text)
@@ -215,26 +223,26 @@ def _drop_separators(text: str, *, strict: bool = True) -> str:
             return text
         ways = " or ".join(repr(f"{sign}{way}{rest}") for way in (plain_digits + fraction, f"{whole}.{fraction}"))
         raise UnusableValueError(
-            f"got {describe(text)}", "its comma may be decimal or separate thousands", f"write {ways}"
+            f"got {describe(text)}", "the comma is ambiguous: decimal or thousands separator", f"write {ways}"
         )
     if whole.isdigit() or grouped or (_GROUPED.fullmatch(number) and not decimal):
         return f"{sign}{plain_digits}{'.' if decimal else ''}{fraction}{rest}"
     if not strict:
         return text
     raise UnusableValueError(
-        f"got {describe(text)}", "its digits are not in groups of three", "write 1000.5 as '1000.5'"
+        f"got {describe(text)}", "its digits are not in groups of three", "omit thousands separators, as '1000.5'"
     )
 
 
 def _last(number: str, mark: str) -> int:
-    """Return the place of the last separator other than a mark, -1 without any."""
+    """Return the index of the last separator other than ``mark``, -1 if there is none."""
     return max((k for k, sign in enumerate(number) if not sign.isdigit() and sign != mark), default=-1)
 
 
 def _read_counts(mantissa: str, unit: str) -> tuple[float, Dimension] | None:
-    """Return one count of an encoder in rad or m, and its dimension; None for another unit.
+    """Return the encoder step in rad or m that a number of counts defines, and its dimension; None for other units.
 
-    "2000 counts/rev" and "14 bit" are steps of an angle, "50 counts/mm" is a step of a length.
+    "2000 counts/rev" and "14 bit" define steps in rad, "50 counts/mm" defines a step in m.
     """
     number = float(mantissa)
     if unit.lower() in ("bit", "bits", "-bit") and 1 <= number <= 64 and number.is_integer():
@@ -252,7 +260,7 @@ def _read_counts(mantissa: str, unit: str) -> tuple[float, Dimension] | None:
 
 
 def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> tuple[float, str]:
-    """Return the number in the base unit and that unit, or the number and "periods"."""
+    """Return a quantity in the base unit and that unit, or a number of periods and "periods"; see `read_quantity`."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
     units = (*dimension.units, *PERIOD_WORDS) if periods else dimension.units
@@ -263,7 +271,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
         allowed, remedy = "it must be a number without a unit", f"write a number, as {dimension.example}"
     text = _drop_separators(text)
     if looks_like_number(text) and not looks_like_number(str(value)):
-        raise UnusableValueError(got, "a number without a unit has no separators", f"write {text}")
+        raise UnusableValueError(got, "numbers without a unit have no separators", f"write {text}")
     if looks_like_number(text):
         raise UnusableValueError(
             f"got the text {describe(value)}", allowed, f"drop the quotes (it is then in {dimension.base})"
@@ -282,7 +290,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
         step = _read_counts(number, f"{unit}/rev" if counts and unit.lower() in COUNTS else unit)
         if step is not None:
             if step[1] is not dimension:
-                _refuse_kind(got, dimension, "write the step of the encoder as a length, or as '50 counts/mm'")
+                _refuse_kind(got, dimension, "write the encoder step as a length, or as '50 counts/mm'")
             return step[0], dimension.base
     if dimension is RATIO:
         raise UnusableValueError(got, allowed, remedy)
@@ -299,7 +307,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
 
 
 def _refuse_kind(got: str, dimension: Dimension, remedy: str) -> NoReturn:
-    """Raise `UnusableValueError` for a unit of a rotary device in a linear one, or the reverse."""
+    """Raise `UnusableValueError` for a rotary unit in a linear device or a linear unit in a rotary device."""
     this, that = ("rotary", "linear") if is_rotary() else ("linear", "rotary")
     names = ", ".join(dimension.units)
     raise UnusableValueError(
@@ -307,36 +315,47 @@ def _refuse_kind(got: str, dimension: Dimension, remedy: str) -> NoReturn:
     )
 
 
-def _find_same_letters(unit: str, known: Sequence[str]) -> str:
-    """Return the question for the known unit that a misspelled unit stands for, "" if the magnitude could differ.
+def _find_same_letters(unit: str, candidates: Sequence[str]) -> str:
+    """Return a question that suggests the unit which a misspelled one stands for, "" if there is none.
 
-    Only the case of letters, except the prefixes m and M, and the spelling of symbols of three letters or more differ.
+    The suggestion has the same magnitude for certain: the two differ only in the case of letters other than m and M,
+    which may be prefixes, or in the spelling of symbols of three letters or more.
     """
 
     def fold(name: str) -> str:
+        """Return a unit in lower case except for m and M."""
         return "".join(sign if sign in "mM" else sign.lower() for sign in _canonical(name).replace(" ", ""))
 
     def split(name: str) -> list[str]:
         return re.split(r"([ /])", _canonical(name))
 
     def misspells(name: str) -> bool:
+        """Return whether the unit differs from a correct one only by the spelling of symbols of 3 letters or more."""
         pairs = list(zip(split(unit), split(name), strict=False))
         if len(split(unit)) != len(split(name)):
             return False
         others = [(one, other) for one, other in pairs if one != other]
         return all(len(other) > 2 and one[:1] == other[0] and resembling(one, [other]) for one, other in others)
 
-    same = [name for name in known if fold(name) == fold(unit)]
-    same = same or ([] if measure_unit(unit) else [name for name in known if misspells(name)])
+    same = [name for name in candidates if fold(name) == fold(unit)]
+    same = same or ([] if measure_unit(unit) else [name for name in candidates if misspells(name)])
     return f"did you mean {same[0]!r}?" if same else ""
 
 
 def read_quantity(
     value: Any, dimension: Dimension, allowed: Range = ANY, *, periods: bool = False, counts: bool = False
 ) -> tuple[float, str]:
-    """Return a quantity in its base unit or, if allowed, in "periods"; and that unit.
+    """Return a quantity in its base unit, and that unit.
 
-    With ``counts`` a number of counts, as "2000 counts", is the step of an encoder with so many counts per revolution.
+    Args:
+        value: a number in the base unit, or a text with a number and a unit.
+        dimension: dimension of the quantity.
+        allowed: range of the quantity.
+        periods: allow numbers of sampling periods. These are returned unchanged, with the unit "periods".
+        counts: allow counts per revolution: "2000 counts" is the step of an encoder with 2000 counts per revolution.
+
+    Raises:
+        UnusableValueError: the value is no quantity of this dimension, or out of range.
     """
     amount, unit = _parse(value, dimension, periods=periods, counts=counts)
     check_range(amount, allowed, unit)

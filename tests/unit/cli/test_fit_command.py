@@ -187,9 +187,9 @@ def test_what_is_not_ok_is_told_first():
     first, *others = run(*arguments).splitlines()
     assert not any(line.startswith("SET ") for line in others)
     assert first == "NO WALL    resolve the warnings first, then record again"
-    assert "WARNING    UNREACHABLE: the delay is at the end of the range searched" in others
+    assert "WARNING    UNREACHABLE: the delay is at the end of the search range" in others
     text = run(*arguments, "--yaml")
-    assert 'reason: "the delay is at the end of the range searched"' in text
+    assert 'reason: "the delay is at the end of the search range"' in text
     assert "    stiffness: 0.0 N/m\n" in text
     result = CliRunner().invoke(cli, ["fit", *arguments, "--code", "c"])
     assert result.exit_code == 2

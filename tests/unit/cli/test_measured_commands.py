@@ -193,7 +193,7 @@ def test_a_rotary_device_is_measured_from_the_file_to_play_to_the_safe_wall(tmp_
     given = [tmp_path / "log.csv", "--resolution", "2000 counts", "--save", tmp_path / "r.csv"]
     found = json.loads(call("respond", *given, "--figure", tmp_path / "r.png", "--json"))
     assert found["rotary"]
-    assert any("wraps at 6.28319 rad (360 deg)" in note for note in found["notes"])
+    assert any("wraps at 6.28319 rad (360 deg, " in note for note in found["notes"])
     # The true device has no other delay than the hold.
     true = knob.max_stiffness().stiffness
     assert 0 < found["safe_wall"]["stiffness"] < true
@@ -210,7 +210,7 @@ def test_a_rotary_device_is_measured_from_the_file_to_play_to_the_safe_wall(tmp_
     second = call("excite", *loop, "--response", tmp_path / "r.csv", "--out", tmp_path / "second.csv")
     assert "N m/rad" in second
     mixed = ["excite", "--rate", "1 kHz", "--force", "1 N", "--resolution", "10 um", "--response", tmp_path / "r.csv"]
-    assert "--response is of another kind" in CliRunner().invoke(cli, [*map(str, mixed)]).output
+    assert "--response is that of a rotary device" in CliRunner().invoke(cli, [*map(str, mixed)]).output
     config = tmp_path / "knob.yaml"
     scene = "{device: r.csv, rate: 1 kHz}"
     config.write_text(f"version: 1\nname: knob\nscene: {scene}\nstudies: [{{kind: recommend, name: r}}]\n")

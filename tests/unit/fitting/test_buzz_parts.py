@@ -142,7 +142,7 @@ def test_a_lag_and_a_resonance_that_explain_walls_alike_leave_no_wall_to_set():
     assert fit.status == Status.UNDECIDED
     (rival, *_) = fit.rivals
     assert rival.parts is not None
-    assert "another device fits as well" in " ".join(fit.doubts)
+    assert "another device fits equally well" in " ".join(fit.doubts)
     assert np.isnan([fit.stiffness_max, fit.safe_wall().stiffness]).all()
     assert fit.recommended.status == Status.UNREACHABLE
     assert fit.as_dict()["rivals"][0]["parts"] == rival.parts

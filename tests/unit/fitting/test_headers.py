@@ -51,11 +51,11 @@ def test_a_commanded_force_is_preferred_and_a_measured_position(tmp_path):
 
 def test_whole_numbers_without_a_unit_are_counts(tmp_path):
     file = write(tmp_path, "t_ms,angle,torque_Nm", "0,16000,1\n1,16100,2\n2,90,3\n")
-    with pytest.raises(InputError, match="position: it is in counts; give the resolution"):
+    with pytest.raises(InputError, match="position: it is in counts; specify the resolution"):
         read_log(file, {})
     found = read_log(file, {}, resolution="14 bit")
     np.testing.assert_allclose(found.position, 2 * np.pi / 2**14 * np.array([16000, 16100, 90]), rtol=1e-15)
-    with pytest.raises(InputError, match="more than a radian or a metre per count; give counts as '16384 counts/rev'"):
+    with pytest.raises(InputError, match="write counts per turn as '16384 counts/rev'"):
         read_log(file, {}, resolution="16384")
 
 
@@ -73,14 +73,14 @@ def test_an_epoch_without_a_unit_is_read_by_its_magnitude(tmp_path):
     found = read_log(write(tmp_path, "time,x [mm],F [N]", table), {})
     assert found.time is not None
     np.testing.assert_allclose(np.diff(found.time), 1e-3, rtol=1e-3)
-    assert "time has no unit and is read in ns, by its magnitude as a time since 1970" in found.notes
+    assert "the time has no unit and is read in ns since 1970, according to its magnitude" in found.notes
 
 
 def test_a_unit_that_contradicts_the_header_is_noted(tmp_path):
     file = write(tmp_path, "t_ms,x_mm,Applied Force (kg)")
     found = read_log(file, {"force": "Applied Force (kg):N"})
     assert found.force.tolist() == [2.0, -1.0, 4.0]
-    assert "force is read in N, as asked, although the header has kg" in found.notes
+    assert "the force is read in N, as specified, although its header has kg" in found.notes
 
 
 def test_the_header_of_labview_is_read(tmp_path):

@@ -60,7 +60,7 @@ def test_a_resonance_is_found_with_its_numbers_and_written_into_the_scene(tmp_pa
     resonance = dict(summarize_fit(fit))["resonance"]
     assert resonance.startswith(f"frequency {fit.value_of('modes.0.frequency'):.2f} Hz (95 %: ")
     assert "damping ratio" in resonance
-    assert dict(detail_fit(fit, "a log"))["assuming"].startswith("no further parts: K = ")
+    assert dict(detail_fit(fit, "a log"))["assuming"].startswith("no further resonances: K = ")
     (tmp_path / "scene.yaml").write_text("\n".join(write_scene(fit, "a log")))
     section: Any = zwidth.load_config(tmp_path / "scene.yaml").scene
     (written,) = section.modes

@@ -220,14 +220,19 @@ TIMES = PERIOD * np.arange(200)
             FORCE[:195],
             "log 1 has 39 samples without a gap",
         ),
-        (TIMES[::-1], PLACES, FORCE, "time: it falls in every row; the rows are in reverse order"),
-        (np.roll(TIMES, 60), PLACES, FORCE, "falls back by 199.0 ms after sample 59, as of two records in one file"),
-        (np.floor(TIMES), PLACES, FORCE, "time: most samples have the time of the one before: it has too few digits"),
+        (TIMES[::-1], PLACES, FORCE, "time: the times decrease from row to row; reverse the order of the rows"),
+        (np.roll(TIMES, 60), PLACES, FORCE, "the time decreases by 199.0 ms after sample 59; sort the rows"),
+        (
+            np.floor(TIMES),
+            PLACES,
+            FORCE,
+            "time: most samples repeat the previous time, so the column has",
+        ),
         (TIMES, PLACES, 0.0 * FORCE + 2, "it is 2.000 N all the time"),
         (TIMES, 0.0 * PLACES, FORCE, "position: it never changes"),
         (TIMES, PLACES, -FORCE, "runs away"),
         (TIMES, PLACES[:-1], FORCE, "shapes differ"),
-        (TIMES, np.full(200, np.nan), FORCE, "position: it holds no number"),
+        (TIMES, np.full(200, np.nan), FORCE, "position: it contains no number"),
         (TIMES[:30], PLACES[:30], np.resize([1.0, -1.0], 30), "record longer"),
         (TIMES, np.random.default_rng(0).standard_normal(200), FORCE, "does not follow"),
         ([PERIOD, PERIOD], [PLACES], [FORCE, FORCE], "give each log all three"),
@@ -322,5 +327,5 @@ def test_of_a_long_log_the_beginning_is_fitted_and_that_is_said(monkeypatch):
     assert (known[0], known.size) == (22, known[-1] - 21)
     assert 400 <= known.size < 500
     assert abs(fit.mass - 0.1) < 4 * fit.errors["mass"]
-    assert dict(detail_fit(fit, "a log"))["of it"].startswith(f"{known.size} of 900 samples")
-    assert "of it" not in dict(detail_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))
+    assert dict(detail_fit(fit, "a log"))["used"].startswith(f"{known.size} of 900 samples")
+    assert "used" not in dict(detail_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))

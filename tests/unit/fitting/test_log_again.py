@@ -130,9 +130,9 @@ def test_what_lies_before_and_behind_a_gap_is_fitted_as_two_logs():
     np.testing.assert_allclose(motion.time, clock[kept], rtol=1e-9, atol=1e-12)
     both = np.concatenate([each.modelled for each in apart.motions])
     np.testing.assert_allclose(motion.modelled[(motion.time < 0.1495) | (motion.time > 0.1905)], both, rtol=1e-9)
-    said = dict(detail_fit(fit, "log"))["of it"]
-    assert said == "315 of 379 samples: after each of 2 gaps the first ones depend on unknown forces"
-    with pytest.raises(InputError, match="log 1 lacks 21 samples, most of them after sample 169"):
+    said = dict(detail_fit(fit, "log"))["used"]
+    assert said == "315 of 379 samples: the first ones after each of 2 gaps depend on unknown forces"
+    with pytest.raises(InputError, match="21 samples of log 1 are missing, most of them after sample 169"):
         zwidth.respond(clock[kept], position[kept], force[kept])
 
 

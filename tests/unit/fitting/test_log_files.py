@@ -164,8 +164,8 @@ REFUSED = {
     "objects": (lambda opened: np.save(opened, np.array([{}, 1], dtype=object)), "it holds objects"),
     "no column": (lambda opened: np.savez(opened, a=1.0), "a (); give a column of numbers for each"),
     "lengths": (lambda opened: np.savez(opened, t=TIME, x=PLACE[:2], F=FORCE), "'t' 3, 'x' 2, 'F' 3; save them"),
-    "no number": (lambda opened: np.savez(opened, t=TIME, x=3 * [np.nan], F=FORCE), "no cell of column 'x' holds"),
-    "no names": (lambda opened: np.save(opened, np.eye(3)), "its columns have no names; add a line such as"),
+    "no number": (lambda opened: np.savez(opened, t=TIME, x=3 * [np.nan], F=FORCE), "column 'x' contains no number"),
+    "no names": (lambda opened: np.save(opened, np.eye(3)), "its columns have no names; add a header such as"),
 }
 
 

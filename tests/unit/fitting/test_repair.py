@@ -40,14 +40,14 @@ def leave_out(cells, places):
 
 
 FILES = {
-    "a wrapped encoder": (write("t_s,enc_counts,tau_Nm", rows(SECONDS, WRAPPED)), "wraps at 6.28319 rad (360 deg), "),
+    "a wrapped encoder": (write("t_s,enc_counts,tau_Nm", rows(SECONDS, WRAPPED)), "wraps at 6.28319 rad (360 deg, "),
     "around zero": (
         write("t_s,enc_counts,tau_Nm", rows(SECONDS, np.mod(KNOB.reading + 8192, KNOB.counts) - 8192)),
-        "wraps at 6.28319 rad (360 deg), ",
+        "wraps at 6.28319 rad (360 deg, ",
     ),
     "a clock that rolls over": (
         write("micros,raw_angle,torque_mNm", [[t, c, f"{1e3 * float(f):.3f}"] for t, c, f in rows(MICROS, WRAPPED)]),
-        "the time rolls over 1 time, as a 32-bit counter of microseconds does",
+        "the time rolls over (1 time) like a 32-bit counter of microseconds and was unwrapped",
     ),
     "seconds and nanoseconds": (
         write(
@@ -61,18 +61,18 @@ FILES = {
     ),
     "empty cells": (
         write("t_s,enc_counts,tau_Nm", leave_out(rows(SECONDS, KNOB.reading), {100, 101, 900})),
-        "left out 3 rows without a number, the first in row 100",
+        "left out 3 rows with missing numbers, the first is row 100",
     ),
     "a doubled row": (
         write(
             "t_s,enc_counts,tau_Nm",
             [row for k, row in enumerate(rows(SECONDS, KNOB.reading)) for _ in range(1 + (k == 40))],
         ),
-        "left out 1 row that repeats the one before, the first in row 41",
+        "left out 1 repeated row, the first is row 41",
     ),
     "glitches": (
         write("t_s,enc_counts,tau_Nm", rows(SECONDS, [WILD.get(k, c) for k, c in enumerate(KNOB.reading)])),
-        "left out 3 glitches of the position, the first at sample 200",
+        "left out 3 position glitches, the first at sample 200",
     ),
     "an outer join": (
         write(
@@ -87,11 +87,11 @@ FILES = {
                 )
             ],
         ),
-        "position and force have rows of their own, 200 µs apart, and were paired by time",
+        "position and force are in separate rows, 200 µs apart, and were paired by time",
     ),
     "durations": (
         write("Time,enc_counts,tau_Nm", rows([f"{t:.6f} sec" for t in TIME], KNOB.reading)),
-        "columns by their names",
+        "columns identified by their headers",
     ),
 }
 
@@ -114,7 +114,7 @@ def test_notes_reach_the_printed_result_json_and_yaml(tmp_path):
     for option in ([], ["--json"], ["--yaml"]):
         result = CliRunner().invoke(cli, ["fit", str(file), "--resolution", "16384 counts", *option])
         assert result.exit_code == 0, result.output
-        assert "wraps at 6.28319 rad (360 deg)" in " ".join(result.stdout.split())
+        assert "wraps at 6.28319 rad (360 deg, " in " ".join(result.stdout.split())
 
 
 def test_milliseconds_of_another_rate_are_even_samples():
@@ -123,7 +123,7 @@ def test_milliseconds_of_another_rate_are_even_samples():
     fit = zwidth.fit_log(time, knob.step * knob.reading, knob.torque, rotary=True)
     assert fit.period == pytest.approx(1.25e-3, rel=1e-5)
     assert knob.holds(fit, 2.0)
-    assert "times are whole multiples of 1.00 ms and were read as even samples, 1.250 ms apart" in fit.notes
+    assert "the times are rounded to 1.00 ms and were replaced by even times, 1.250 ms apart" in fit.notes
     # One missing sample of a loop at 1 kHz is a gap, not a slower loop.
     kept = np.arange(KNOB.reading.size) != 700
     fit = zwidth.fit_log(TIME[kept], (KNOB.step * KNOB.reading)[kept], KNOB.torque[kept], rotary=True)
@@ -132,7 +132,7 @@ def test_milliseconds_of_another_rate_are_even_samples():
 
 def test_a_log_that_leaves_out_samples_is_refused_with_the_cause():
     time = np.cumsum(np.where(np.arange(400) % 5 < 3, 700e-6, 1050e-6))
-    with pytest.raises(InputError, match=r"samples are 2 to 3 periods of 350\.0 µs apart: the log leaves out samples"):
+    with pytest.raises(InputError, match=r"samples are 2 to 3 periods of 350\.0 µs apart, so the log omits samples"):
         zwidth.fit_log(time, KNOB.reading[:400], KNOB.torque[:400])
 
 
@@ -183,8 +183,8 @@ def swing(torque, weight=0.0, spring=0.0):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        ({"weight": 0.06}, "gravity moves it, with a torque of up to|a spring or gravity of about"),
-        ({"spring": 0.05}, "a spring or gravity of about 5.* mN m/rad moves it"),
+        ({"weight": 0.06}, "gravity also moves the device, with a torque of up to|a spring or gravity of about"),
+        ({"spring": 0.05}, "a spring or gravity of about 5.* mN m/rad also moves the device"),
     ],
 )
 def test_gravity_and_springs_are_named_and_not_the_sign_of_the_force(parts, words):

@@ -44,9 +44,9 @@ def test_a_limit_of_no_stiffness_allows_no_wall():
 @pytest.mark.parametrize(
     "given, words",
     [
-        ({"stiffness": -1}, "it must be 0 or more"),
-        ({"stiffness": 1, "warnings": 3}, "write a list of texts"),
-        ({"stiffness": 1, "reason": 3}, "write a text"),
+        ({"stiffness": -1}, "it must be >= 0"),
+        ({"stiffness": 1, "warnings": 3}, "it must be a list of strings"),
+        ({"stiffness": 1, "reason": 3}, "it must be a string"),
         ({"stiffness": "1 kg"}, "got '1 kg'"),
     ],
 )

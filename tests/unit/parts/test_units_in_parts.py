@@ -122,9 +122,9 @@ def test_a_rotary_hand_with_a_coupling_is_given_in_units():
     [
         (lambda: zwidth.Device(mass="70 gramm"), "mass: got '70 gramm'; the units allowed are kg, g, mg"),
         (lambda: SCENE.is_stable("10 kN", 40), "stiffness: got '10 kN'; the units allowed are N/m"),
-        (lambda: SCENE.is_stable("10,000 N/m", 40), "separate thousands; write '10000 N/m' or '10.000 N/m'"),
+        (lambda: SCENE.is_stable("10,000 N/m", 40), "thousands separator; write '10000 N/m' or '10.000 N/m'"),
         (lambda: zwidth.Device(mass="10,000"), "mass: got '10,000'; .* write '10000' or '10.000'"),
-        (lambda: zwidth.Device(mass="0,1"), "a number without a unit has no separators; write 0.1$"),
+        (lambda: zwidth.Device(mass="0,1"), "numbers without a unit have no separators; write 0.1$"),
         (lambda: zwidth.Timing("1 ms", rate="1 kHz"), "timing: both are given; give either the period"),
         (lambda: zwidth.Device(mass="0.07"), r"mass: got the text '0.07'; .*drop the quotes \(it is then in kg\)"),
         (lambda: zwidth.Device(mass="-70 g"), "mass: got -0.07 kg; it must be greater than 0 kg"),

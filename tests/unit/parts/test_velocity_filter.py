@@ -14,7 +14,7 @@ DEVICE, TIMING = zwidth.Device(0.1, 10), zwidth.Timing(PERIOD, PERIOD)
 @pytest.mark.parametrize("order, cutoff", [(8, 2.0), (8, 20.0), (6, 1.0), (4, 0.5)])
 def test_rounded_coefficients_are_named_and_sections_accepted(order, cutoff):
     top, bottom = scipy.signal.butter(order, cutoff, fs=1 / PERIOD)
-    with pytest.raises(InputError, match="Cause: rounding of the coefficients; give sections in series"):
+    with pytest.raises(InputError, match="Cause: rounding errors of the coefficients; use sections in series"):
         zwidth.VelocityFilter(np.convolve(top, [1 / PERIOD, -1 / PERIOD]), np.append(bottom, 0.0))
     sos = scipy.signal.butter(order, cutoff, fs=1 / PERIOD, output="sos")
     sections = zwidth.VelocityFilter([[1 / PERIOD, -1 / PERIOD], *sos[:, :3]], [[1, 0], *sos[:, 3:]])
@@ -44,7 +44,7 @@ def test_an_integrator_is_refused_with_what_contains_it():
     period = 1e-3
     # F = (1 - 1/z)/T + 200 T/(1 - 1/z), over z (z - 1).
     top = np.polyadd(np.array([1.0, -2.0, 1.0]) / period, 200.0 * period * np.array([1.0, 0.0, 0.0]))
-    with pytest.raises(InputError, match="Integral action: give controller times sampled device as one LinearDevice"):
+    with pytest.raises(InputError, match="Integral action: model controller and sampled device in series as one"):
         zwidth.VelocityFilter(top, [1.0, -1.0, 0.0])
     device = period**2 / 0.2 * np.array([1.0, 1.0]), np.array([1.0, -2.0, 1.0])
     controller = np.polyadd(1e3 * np.array([1.0, -1.0, 0.0]), 10.0 * top), np.array([1.0, -1.0, 0.0])

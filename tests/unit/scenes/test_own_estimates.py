@@ -111,7 +111,7 @@ def test_coefficients_of_the_plain_difference_count_as_it():
 def test_a_class_of_a_user_has_no_name_in_configurations():
     from zwidth.parts.paths import spell_estimate
 
-    with pytest.raises(InputError, match="got Weak, a class that a configuration cannot name"):
+    with pytest.raises(InputError, match="got Weak, which is not available in configurations"):
         spell_estimate(Weak())
 
 

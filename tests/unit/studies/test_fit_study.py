@@ -146,7 +146,7 @@ def test_an_answer_that_is_not_ok_begins_with_that(monkeypatch):
     outcome = study_of(log={"csv": "fit_log.csv", "resolution": "0.03 mm"}, max_delay="1 ms").compute(None, True)
     assert outcome.table["status"].tolist() == ["UNREACHABLE"]
     assert outcome.answer[1] == "NO WALL: resolve the warnings first, then record again"
-    assert "WARNING: UNREACHABLE: the delay is at the end of the range searched" in outcome.answer
+    assert "WARNING: UNREACHABLE: the delay is at the end of the search range" in outcome.answer
 
 
 def test_records_of_two_devices_do_not_agree(monkeypatch):

@@ -167,9 +167,9 @@ def test_a_suggestion_has_the_same_magnitude(dimension, text, meant):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("1,000 N/m", "may be decimal or separate thousands; write '1000 N/m' or '1.000 N/m'"),
+        ("1,000 N/m", "the comma is ambiguous: decimal or thousands separator; write '1000 N/m' or '1.000 N/m'"),
         ("1,00,0.5 N/m", "not in groups of three"),
-        ("1,5", "has no separators; write 1.5"),
+        ("1,5", "have no separators; write 1.5"),
     ],
 )
 def test_separators_that_may_mean_two_numbers_are_refused(text, words):
