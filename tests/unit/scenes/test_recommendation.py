@@ -136,7 +136,7 @@ def test_what_no_wall_has_is_said_and_leaves_no_wall():
     assert found.status == Status.UNREACHABLE
     assert np.isnan(found.stiffness)
     assert found.verdict is None
-    reason = "no wall keeps passivity, however soft; without damping of the device no wall is passive"
+    reason = "no wall, however soft, has passivity; without physical damping no wall is passive"
     assert (found.reason, found.lines()) == (reason, (f"no wall: {reason}",))
     known = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert known["recommended"]["stiffness"] is None
