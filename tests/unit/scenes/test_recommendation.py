@@ -271,7 +271,7 @@ def test_grasps_that_destabilize_a_wall_are_named_with_a_wall_that_none_destabil
     assert not held.is_stable(found.stiffness, found.virtual_damping)
     assert [name for name, stable in found.grasps.items() if not stable] == ["firm, light damping"]
     K, B = re.search(
-        r"in the hand \(firm, light damping\); K = (.*?), B = (.*?) is stable in all", found.cautions[1]
+        r"in the hand \(firm, light damping\); K = (.*?), B = (.*?) is stable in every grasp", found.cautions[1]
     ).groups()
     assert all(scene.replace(operator=grasp).is_stable(K, B) for grasp in zwidth.reference_grasps().values())
     assert all(scene.recommend().grasps.values())
