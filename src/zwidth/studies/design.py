@@ -73,7 +73,7 @@ class DesignStudy(ComputedStudy):
     kind: Literal["design"]
 
     device: PhysicalDevice
-    """Device in SI units. A delay stays in the unit, seconds or periods, in which it is given."""
+    """Device in SI units. A delay given in periods keeps its number of periods if the period changes."""
 
     find: Parameter
     """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
@@ -149,7 +149,7 @@ class DesignStudy(ComputedStudy):
 
     @property
     def _name(self) -> str:
-        """The parameter in words: a rotary device has an inertia."""
+        """Name of the parameter: "inertia" for the mass of a rotary device."""
         return "inertia" if self.find == "mass" and is_rotary() else self.find
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
