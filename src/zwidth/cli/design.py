@@ -79,9 +79,9 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
 
     With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given;
     or the virtual damping with which a wall of --stiffness settles fastest. With --tolerance: the share of devices on
-    which the wall (--stiffness, --virtual-damping) is stable, the stiffness that 99 % of them bear, and, for uniform
-    tolerances of a rigid device, what is proved for every one of them. SCENE.yaml (or the folder of a run) supplies
-    parameters not given as options; options override it.
+    which the wall (--stiffness, --virtual-damping) is stable, the stiffness up to which 99 % of them are stable,
+    and, for uniform tolerances of a rigid device, a wall certified to be stable on all of them. SCENE.yaml
+    (or the folder of a run) supplies parameters not given as options; options override it.
     """
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")
@@ -140,7 +140,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     else:
         values = [crossing.value for crossing in needed.crossings]
         text = f"{spell_enough(needed.value, needed.enough, values, unit)}"
-        # One or two of them are printed.
+        # Subtract the one or two crossings that the text already contains.
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
@@ -223,4 +223,4 @@ def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[s
     stiffness, most = (with_unit(round_safely(result[name], "below"), "N/m") for name in ("stiffness", "stiffness_max"))
     damping = with_unit(result["virtual_damping"], "N s/m", DIGITS)
     text = f"every device is stable with K = {stiffness} at B = {damping}; {most}, each with its best B"
-    return result, [line("proved", text)]
+    return result, [line("certified", text)]

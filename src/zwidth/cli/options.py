@@ -70,7 +70,9 @@ def get_told() -> dict[str, Any]:
 
 
 def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, counts: bool = False) -> Parsed:
-    """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`.
+    """Return the type of an option whose value is a number in an SI unit, or a number with a unit.
+
+    With ``periods`` the value is a duration, which may also be given in sampling periods, and becomes a `Span`.
 
     With ``counts`` the number is the step of an encoder, which may also be given as "2000 counts".
     """

@@ -70,7 +70,7 @@ _FIGURE_SIZE = Parsed(
 @click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
 @click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size of the studies' figures in inches, as 7x4.5, or width, as 85mm.")
-@click.option("--dpi", type=_DPI, help="Dots per inch of the studies' figures.")
+@click.option("--dpi", type=_DPI, help="Resolution of the studies' figures, in dots per inch.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
 def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi: int | None, **options: Any) -> None:
     """Run the studies of a CONFIG file.
@@ -229,7 +229,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 )
 @click.option("--format", "formats", multiple=True, type=click.Choice(("png", "svg", "pdf")), default=("png", "svg"),
               help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
-@click.option("--dpi", type=_DPI, help="Dots per inch.")
+@click.option("--dpi", type=_DPI, help="Resolution in dots per inch.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size in inches, as 7x4.5, or width, as 85mm.")
 @click.option(
     "--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib, as one with 'svg.fonttype: none'."

@@ -33,7 +33,7 @@ _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 def draw_limit_cycles(
     arrays: Mapping[str, np.ndarray], edges: Table, bounds: tuple[float, float], axes: style.AnyAxes | None = None
 ) -> np.ndarray:
-    """Draw the amplitude of limit cycles over two parameters, a panel per condition.
+    """Draw the amplitude of limit cycles over two parameters, one panel per condition.
 
     White: at rest. Hatched: amplitude above the upper bound. Line: stability boundary of the linear theory.
 
@@ -97,7 +97,7 @@ def draw_limit_cycle_curves(
     family: str = "",
     axes: style.AnyAxes | None = None,
 ) -> np.ndarray:
-    """Draw amplitude (above) and frequency (below) of limit cycles over one parameter, a column per condition.
+    """Draw amplitude (above) and frequency (below) of limit cycles over one parameter, one column per condition.
 
     Gap in a curve: at rest, or amplitude above the upper bound. Text in a panel: curves without any limit cycle.
     Vertical line: stability boundary of the linear theory.

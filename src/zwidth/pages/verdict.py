@@ -105,8 +105,9 @@ def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
 
 
 def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> str:
+    """Return the stable intervals of K or B, ``name``, in words."""
     if not intervals:
-        return f"no {name} at this {other}"
+        return f"no stable {name} at this {other}"
     spelled = []
     for ends in intervals:
         low, high = tell_apart(*ends, unit)

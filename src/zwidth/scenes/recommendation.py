@@ -139,18 +139,18 @@ class Recommendation:
         return {} if self.status != Status.OK else judge_grasps(self.scene)
 
     def code(self, language: Literal["c", "python"] = "c") -> str:
-        """The wall with its velocity estimate as the difference equations of a control loop.
+        """Return the wall and its velocity estimate as source code for a control loop.
 
         Args:
             language: "c" (C99 without any library) or "python".
 
         Returns:
-            A text: a state, a function that begins at rest and one that turns a position in m, positive into the wall,
-            into the force on the device in N, once a period. Forces are those of `zwidth.simulate` with
-            ``contact="unilateral"`` but for rounding.
+            Source code with a state, a function that initializes it at rest, and a function to call once per period,
+            which converts the position in m, positive into the wall, to the force on the device in N. The forces equal
+            those of `zwidth.simulate` with ``contact="unilateral"``, except for rounding errors.
 
         Raises:
-            InputError: there is no wall, or no such language.
+            InputError: no wall is recommended, or the language is unknown.
         """
         if self.status != Status.OK:
             raise InputError(f"code: there is no wall: {self.reason}")

@@ -42,7 +42,7 @@ def _describe_limit(limit: SafeLimit | None, stiffness: float, virtual_damping: 
         return []
     texts = [f"Safe limit: {limit.describe()}", *(f"Warning: {text}" for text in limit.warnings)]
     if not limit.allows(stiffness, virtual_damping):
-        texts.insert(0, "WARNING: this wall is beyond the safe limit; it may be unstable.")
+        texts.insert(0, "WARNING: this wall exceeds the safe limit; it may be unstable.")
     # Replace character sequences that would end the comment or start an escape, because the texts come from a file.
     plain_texts = (text.replace("*/", "* /").replace('"', "'").replace("\\", "/") for text in texts)
     return [line for text in plain_texts for line in textwrap.wrap(text, _COLUMNS)]

@@ -38,7 +38,7 @@ MAX_STEPS = 60  # root-finding steps on log K, bisections included; 8 usually su
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
 _EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
-OTHER_DAMPING = "B differs from that of the stiffest wall, because this share of K_max is unstable with it"
+OTHER_DAMPING = "B differs from that of the stiffest wall, because with that B this share of K_max is unstable"
 
 Slack = Callable[[float, Any], dict[str, np.ndarray]]
 

@@ -217,7 +217,8 @@ class DesignStudy(ComputedStudy):
         elif needed.enough == "everywhere":
             yield f"{wanted}: any {self._name} from {low} to {high} is enough"
         elif len(needed.crossings) > 1:
-            yield f"{wanted}: K_max passes it at {len(needed.crossings)} values of {self._name}; the nearest is given"
+            count = len(needed.crossings)
+            yield f"{wanted}: K_max crosses this value at {count} values of {self._name}; the nearest is reported"
 
     def _trace(self, nominal: Scene, low: float, high: float) -> dict[str, np.ndarray]:
         """K_max over the parameter; NaN where a value is refused or no wall is stable."""

@@ -206,7 +206,7 @@ function download(blob, kind) {
 }
 async function save(kind) {
   const name = by("figure").value;
-  by("copied").textContent = by(name).offsetParent === null ? "simulate a hit first" : document.body.matches(".busy") ? "not yet: it is being computed"
+  by("copied").textContent = by(name).offsetParent === null ? "simulate a hit first" : document.body.matches(".busy") ? "not saved: the computation is still running"
     : document.body.matches(".stale") ? "not saved: an input is invalid; correct it, or press Escape in its field" : "";
   if (by("copied").textContent) return;
   if (kind === "csv") return void (inputs.data = { json: [JSON.stringify({ serial: ++serial, csv: name })] });
