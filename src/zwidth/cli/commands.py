@@ -123,8 +123,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
-        what = "no wall with K > 0 is stable on this device" if none else "K_max of this device could not be computed"
-        raise click.UsageError(f"{what}: {explain_missing(scene, wall.status)}")
+        fault = "no wall with K > 0 is stable on this device" if none else "K_max of this device could not be computed"
+        raise click.UsageError(f"{fault}: {explain_missing(scene, wall.status)}")
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
     if isinstance(scene.device, Device):
@@ -150,8 +150,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
         }
-        at = f"B = {with_unit(named['virtual_damping'], 'N s/m')}, {with_unit(named['frequency'], 'Hz')}"
-        top = f"{spell_stiffness(named['stiffness_max'])} at {at} ({kind.replace('_', ' ')} optimum)"
+        place = f"B = {with_unit(named['virtual_damping'], 'N s/m')}, {with_unit(named['frequency'], 'Hz')}"
+        top = f"{spell_stiffness(named['stiffness_max'])} at {place} ({kind.replace('_', ' ')} optimum)"
         lines = [
             words.line("K_max", top),
             *lines,

@@ -287,8 +287,8 @@ def _make_scene(given: dict[str, Any], instead: str) -> Scene:
     device = given.pop("device", None)
     published = device if isinstance(device, KnownDevice) else None
     timed = {"period", "rate"} & given.keys() or (published and published.period)
-    known = {"--mass or --device": device or "mass" in given, "--rate or --period": timed}
-    missing = [flags for flags, there in known.items() if not there]
+    requirements = {"--mass or --device": device or "mass" in given, "--rate or --period": timed}
+    missing = [flags for flags, given_any in requirements.items() if not given_any]
     if published:
         _check_published(published, given, missing)
     if missing:

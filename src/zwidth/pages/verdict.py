@@ -126,9 +126,9 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
     used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
     lines = [line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
     if verbose:
-        kind, at = verdict.ridge_kind.replace("_", " "), with_unit(verdict.ridge_frequency, "Hz")
+        kind, frequency = verdict.ridge_kind.replace("_", " "), with_unit(verdict.ridge_frequency, "Hz")
         normalized = f"; alpha_max {plain(verdict.alpha_max)}, beta {plain(verdict.beta_at_max)}"
-        lines.append(line("", f"{kind} optimum at {at}{normalized if isinstance(scene.device, Device) else ''}"))
+        lines.append(line("", f"{kind} optimum at {frequency}{normalized if isinstance(scene.device, Device) else ''}"))
     return lines
 
 
@@ -152,13 +152,13 @@ def decay_lines(verdict: Assessment) -> list[str]:
         return []
     constant, frequency = verdict.time_constant, verdict.frequency
     label = "growth" if constant < 0 else "decay"
-    at = f" at {with_unit(frequency, 'Hz')}" if frequency else ""
+    place = f" at {with_unit(frequency, 'Hz')}" if frequency else ""
     if isnan(constant):
-        text = f"below numerical resolution{at}: close to the stability boundary, or poles of equal magnitude"
+        text = f"below numerical resolution{place}: close to the stability boundary, or poles of equal magnitude"
     elif not isfinite(constant):
-        text = f"none{at}"
+        text = f"none{place}"
     else:
-        text = f"time constant {with_unit(abs(constant), 's')}{at}"
+        text = f"time constant {with_unit(abs(constant), 's')}{place}"
     return [line(label, f"{text} ({spell_radius(verdict.spectral_radius)})")]
 
 
@@ -231,8 +231,8 @@ def _list_hands(found: Recommendation) -> list[str]:
     labels = {name: stable for name, stable in found.grasps.items() if name != "released"}
     if not labels:
         return []
-    at = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if is_rotary() else ""
+    radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if is_rotary() else ""
     unstable = [name for name, stable in labels.items() if not stable]
     if not unstable:
-        return [line("in a hand", f"stable in all {COUNTS[len(labels)]} reference grasps{at}")]
-    return [line("in a hand", f"stable in {len(labels) - len(unstable)} of {len(labels)} reference grasps{at}")]
+        return [line("in a hand", f"stable in all {COUNTS[len(labels)]} reference grasps{radii}")]
+    return [line("in a hand", f"stable in {len(labels) - len(unstable)} of {len(labels)} reference grasps{radii}")]

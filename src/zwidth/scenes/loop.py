@@ -177,8 +177,8 @@ class LinearLoop:
         damper = self.roots.as_damper()
         if damper is None:
             return LinearLoop.column(self, 0.0)
-        found = bound_intervals(Boundary.trace(damper), np.zeros(1))
-        return np.stack([found.low[0], found.high[0]], -1)
+        intervals = bound_intervals(Boundary.trace(damper), np.zeros(1))
+        return np.stack([intervals.low[0], intervals.high[0]], -1)
 
     def explain(self, alpha: float, beta: float) -> list[str]:
         """What keeps a wall undecided, a sentence each: nothing, where there is a model."""

@@ -200,10 +200,11 @@ class SceneOptima(SceneAnswers):
     def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
         """Return the stiffest stable wall connected to K = 0, and the kind of its optimum.
 
-        K_max is ``sup {K : some B is stable}`` over the pieces of the stable set that are connected to K = 0 by paths of
-        stable walls. All other pieces are `islands`. If the device is unstable without a wall, no piece may be connected
-        to K = 0; then the piece with the softest stable walls counts. With parts the stable set may be inclined near its
-        tip, so that no softer wall is stable at the damping of the stiffest; `recommend` returns a wall to set.
+        K_max is ``sup {K : some B is stable}`` over the pieces of the stable set that are connected to K = 0 by paths
+        of stable walls. All other pieces are `islands`. If the device is unstable without a wall, no piece may be
+        connected to K = 0; then the piece with the softest stable walls counts. With parts the stable set may be
+        inclined near its tip, so that no softer wall is stable at the damping of the stiffest; `recommend` returns a
+        wall to set.
 
         Args:
             negative_damping: whether walls with B < 0 count. By default they count only for a `Device` with the
@@ -246,9 +247,10 @@ class SceneOptima(SceneAnswers):
         Returns:
             ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
             "operator.mass", ...) in N/m per SI unit, each with all others held fixed (the delay in seconds or in
-            periods, as it was given); ``status``, NOT_CONVERGED if a derivative is NaN; without a K_max all are NaN. Whole numbers and coefficients of a filter have none. At
-            zero they are those of a little more, as at a whole delay of a linear system without inertia; of all others
-            both sides agree there.
+            periods, as it was given); ``status``, NOT_CONVERGED if a derivative is NaN; without a K_max all
+            are NaN. Whole numbers and coefficients of a filter have no derivative. At a value of zero, and at an
+            integer delay of a linear system without inertia, the derivatives are one-sided, for an increase; for all
+            others both sides agree.
 
         Numerics:
             Closed form for a rigid device; otherwise implicit derivatives of the conditions that bind, some ms a

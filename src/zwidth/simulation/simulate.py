@@ -196,7 +196,7 @@ def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
     import jax
 
     name = getattr(force, "__name__", repr(force))
-    programs, found = [], None
+    programs, result = [], None
     with compute_concretely(), jax.numpy_rank_promotion("allow"):
         try:
             hash(force)
@@ -208,7 +208,7 @@ def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
                 # A value kept from an earlier trace appears as an additional input.
                 if len(trace.jaxpr.in_avals) != 3:
                     raise _refuse_memory(name)
-                found = trace.out_info
+                result = trace.out_info
                 programs.append(trace.lower().as_text())
         except InputError:
             raise
@@ -222,9 +222,9 @@ def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
             ) from error
     if programs[0] != programs[1]:
         raise _refuse_memory(name)
-    kind = getattr(found, "dtype", np.dtype(object)).kind
-    if getattr(found, "shape", None) not in ((), (2,)) or kind not in "if":
-        raise InputError(f"force: the law returns {found} for two simulations; one force in N for each is needed")
+    kind = getattr(result, "dtype", np.dtype(object)).kind
+    if getattr(result, "shape", None) not in ((), (2,)) or kind not in "if":
+        raise InputError(f"force: the law returns {result} for two simulations; one force in N for each is needed")
     return TracedLaw(force, programs[0])
 
 

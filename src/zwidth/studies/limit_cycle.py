@@ -123,8 +123,8 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         if widest <= silence:
             low, high = (with_unit(end, "m") for end in (silence, widest))
             name = "silence" if self.widest is None else "widest"
-            what = f"got silence {low}, widest {high}"
-            yield (name,), problem(what, "silence must be less than widest", "raise widest or lower silence")
+            received = f"got silence {low}, widest {high}"
+            yield (name,), problem(received, "silence must be less than widest", "raise widest or lower silence")
         found = [list(each.find_clashes(scene)) for each in self.list_circumstances()]
         for index, (condition, faults) in enumerate(zip(self.conditions, found, strict=True)):
             for path, what in faults:

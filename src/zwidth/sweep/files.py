@@ -121,8 +121,8 @@ def lock_folder(folder: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         who = content(holder).decode(errors="replace")
-        what = f"another run is writing to this folder{who and f' ({who})'}"
-        raise StoreBusyError(f"out: {folder}: {what}; wait until it ends, stop that process, or {ELSEWHERE}") from None
+        fault = f"another run is writing to this folder{who and f' ({who})'}"
+        raise StoreBusyError(f"out: {folder}: {fault}; wait until it ends, stop that process, or {ELSEWHERE}") from None
     except OSError as error:
         # Continue without a lock if the file system has none: each file of a store is still either complete or absent.
         if error.errno not in _NO_LOCKS:

@@ -185,9 +185,9 @@ class Store:
         """Return the names of damaged coordinate files, and those of the description if its two copies differ."""
         places = ((name, len(dims)) for name, (dims, *_) in self.plan.grid.coordinates().items())
         names = ["/".join((name, "c", *["0"] * count)) for name, count in places]
-        found = [name for name in names if self.find_fault(self.path / name)]
+        damaged = [name for name in names if self.find_fault(self.path / name)]
         first, second = (content(self.path / name) for name in _DESCRIPTIONS)
-        return found if first == second else [*_DESCRIPTIONS, *found]
+        return damaged if first == second else [*_DESCRIPTIONS, *damaged]
 
     def restore(self, names: list[str]) -> None:
         """Write such files again; they follow from the store's attributes."""
