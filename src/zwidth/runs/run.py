@@ -32,7 +32,7 @@ AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 
 @dataclass(frozen=True)
 class StudyResult:
-    """How one study went.
+    """Outcome of one study in a run.
 
     States: "done"; "kept", computed by an earlier run; "failed"; "open", a sweep stopped before its last chunk.
     """

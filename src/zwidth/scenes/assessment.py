@@ -349,7 +349,7 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
 
 
 def _can_sample_faster(scene: SceneOptima) -> bool:
-    """Return whether the scene can be computed at twice the rate; coefficients in z hold for one rate only."""
+    """Return whether the scene is defined at twice the rate; a model given in z holds for one rate only."""
     if isinstance(scene.velocity, VelocityFilter) or getattr(scene.device, "dt", None) is not None:
         return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1

@@ -78,7 +78,7 @@ def _advise_margins(recommendation: Any) -> str:
 
 
 def judge_grasps(scene: Any) -> dict[str, bool]:
-    """Return the stability of a wall in each reference grasp, by name, and released if the scene has an operator."""
+    """Return the stability of a wall in each reference grasp, by name, and without the scene's operator if any."""
     if not isinstance(scene.device, Device):
         return {}
     held = list_grasps(bool(scene.device.rotary))

@@ -173,7 +173,7 @@ class LinearLoop:
         return stable_dampings(self.boundary, float(*nan_beyond(WALL_RANGE, alpha)))
 
     def dampers(self) -> np.ndarray:
-        """Return the intervals of beta, shape (n, 2), in which all poles of a pure damper but z = 1 are stable."""
+        """Return the beta intervals, shape (n, 2), in which all poles of a damper but z = 1 lie inside the circle."""
         damper = self.roots.as_damper()
         if damper is None:
             return LinearLoop.column(self, 0.0)
@@ -207,7 +207,7 @@ class LinearLoop:
         return curve.alpha, curve.beta
 
     def least_stiffness(self, least: float) -> float | None:
-        """Return the smallest stable alpha of a device that is unstable without a wall; None for other devices."""
+        """Return the alpha below which no wall is stable, for a device unstable without a wall; None for others."""
         softest = self.border.find_softest(least) if self.roots.device_is_unstable else 0.0
         return softest if softest > 0 else None
 

@@ -192,7 +192,7 @@ class Recommendation:
         return at_end or self.limited_by == "safe_limit"
 
     def spell_margins(self) -> str:
-        """Return the margins of the wall in words, each rounded down."""
+        """Return the margins of the wall in words, each rounded conservatively."""
         verdict = self.verdict
         if verdict is None:
             return "none"

@@ -150,7 +150,7 @@ def _list_candidates(experiment: Experiment, cause: str) -> list[_Candidates]:
     if not isinstance(scene.device, LinearDevice):
         least = hardware.coulomb or (K * Q if cause == "quantization" else hardware.max_force) / SPAN
         candidates.append(_Candidates("coulomb", least * factors, True))
-    # Without friction no K or B helps, because an external force of K Q/2 keeps the encoder reading changing.
+    # Without friction no K or B helps, because under an external force of K Q/2 the encoder reading never settles.
     if cause == "quantization" and not hardware.static:
         return [each.round() for each in candidates]
     if K > 0:

@@ -32,11 +32,11 @@ LONG_DELAY = 50.0  # sampling periods; with a longer delay one trial takes secon
 class Hardware(NamedTuple):
     """Encoder, friction and motor of a device, in SI units."""
 
-    resolution: float
-    coulomb: float
-    static: float
-    max_force: float
-    max_rate: float
+    resolution: float  # step of the encoder; 0 for an ideal sensor
+    coulomb: float  # Coulomb friction
+    static: float  # static friction
+    max_force: float  # largest force of the motor; infinite for none
+    max_rate: float  # largest rate of change of the commanded force; infinite for none
 
 
 class Starts(NamedTuple):
@@ -53,8 +53,8 @@ class SustainedMotion(NamedTuple):
     """The sustained motion of largest amplitude in each trial: one-dimensional arrays of equal length."""
 
     amplitude: np.ndarray  # 0 if every response of the trial comes to rest
-    frequency: np.ndarray
-    outcome: np.ndarray
+    frequency: np.ndarray  # in Hz; NaN if the motion has no frequency
+    outcome: np.ndarray  # code of `MotionKind`
     certified: np.ndarray  # bool; no response of the trial has the outcome UNCLEAR
 
 
@@ -64,8 +64,8 @@ class Experiment(NamedTuple):
     scene: Any
     hardware: Hardware
     starts: Starts
-    periods: int
-    decay: float  # length of the simulation, in time constants of the linear loop
+    periods: int  # length of a simulation, in sampling periods
+    decay: float  # length of a simulation, in time constants of the linear loop
 
     @property
     def present(self) -> dict[str, float]:

@@ -98,12 +98,12 @@ class Wanted(NamedTuple):
 class WallChoice(NamedTuple):
     """The stiffest wall with the required margins, or the reason why none exists."""
 
-    stiffness: float  # in N/m; NaN without a wall
-    damping: float  # in N s/m
+    stiffness: float  # in N/m; NaN if no wall exists
+    damping: float  # virtual damping in N s/m; NaN if no wall exists
     limit: str  # active requirement: a field of `Wanted`, or "safe_limit"
     status: Status
-    reason: str = ""
-    note: str = ""
+    reason: str = ""  # reason why no wall exists
+    note: str = ""  # remark on the choice
 
 
 def measure_slack(scene: SceneOptima, wanted: Wanted) -> Slack:
