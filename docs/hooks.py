@@ -20,7 +20,7 @@ _TOKEN = re.compile(
     r"(?P<word>[a-z]+'s\b)|(?P<name>[A-Za-z]+\d*(?:_(?:\w+|\((?=[^()]*\))[^()]*\)))?'{0,2})|(?P<number>\d+(?:\.\d+)?)|(?P<space>\s+)"
     r"|(?P<sign><=|>=|!=|->|\.\.\.|\S)"
 )
-# Pygments takes a comment in the output of a command for the prompt of root.
+# Lines of output that start with #, which Pygments highlights as a root prompt.
 _COMMENT = re.compile(r'^<span class="gp"># ?</span>(.*)$', re.MULTILINE)
 _TAG = re.compile(r"<[^>]*>")
 # Brackets of one size: taller ones would part the lines.
@@ -153,7 +153,7 @@ def _lay(block: re.Match[str]) -> str:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Name the language of examples with prompts, so that prompts and output have classes of their own."""
+    """Set the language of doctest examples to pycon, so that prompts and output have separate CSS classes."""
     return markdown.replace("```python\n>>> ", "```pycon\n>>> ")
 
 

@@ -88,8 +88,8 @@ def main() -> None:
         _draw_delays(axes[0, 1], [Lobe(DELTA, d) for d in DELAYS])
         for ax in axes.flat:
             ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
-            ax.set_xlabel(style.ALPHA_LABEL)
-        axes[0, 0].set_ylabel(style.BETA_LABEL)
+            ax.set_xlabel(style.label_quantity("alpha"))
+        axes[0, 0].set_ylabel(style.label_quantity("beta"))
         figure.savefig(out, metadata={"Date": None})
         if out != TARGET:
             figure.savefig(out.with_suffix(".png"), dpi=style.PNG_DPI, metadata={"Software": None})

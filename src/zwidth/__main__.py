@@ -7,10 +7,10 @@ import os
 
 def main() -> None:
     """Run the command line and exit."""
-    # OpenBLAS reads this when NumPy is loaded. Large work runs on every processor in threads of zwidth; for small
-    # matrices several OpenBLAS threads are slower than one, several times on a busy machine.
+    # OpenBLAS reads this variable when NumPy is loaded. Its matrices here are small: on a busy machine several OpenBLAS
+    # threads take several times as long as one. zwidth starts its own threads for large arrays.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Skip the collection at exit, a tenth of the time of a short command: the process ends anyway.
+    # Skip the garbage collection at exit, because it takes a tenth of the time of a short command.
     atexit.register(gc.freeze)
     from zwidth.cli import main as run
 

@@ -18,7 +18,7 @@ class Knob(NamedTuple):
     period: float
     counts: int
     torque: np.ndarray
-    count: np.ndarray  # continuous, as of an encoder that does not wrap
+    reading: np.ndarray  # in counts, unwrapped
 
     @property
     def step(self) -> float:

@@ -81,7 +81,9 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError) as error:
         if isinstance(value, list | tuple) and is_traced(*value):
-            raise InputError(f"{name}: got a list of values that JAX traces; join them by jax.numpy.stack") from None
+            raise InputError(
+                f"{name}: got a list of values that JAX traces; combine them with jax.numpy.stack"
+            ) from None
         raise InputError(
             f"{name}: got {value!r}, a real number or a rectangular array of real numbers is needed"
         ) from error
@@ -126,10 +128,9 @@ def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
 
 
 def broadcast_traced(arguments: Mapping[str, ArrayLike]) -> list[Any]:
-    """Convert arguments inside a transformation to arrays of one shape in the ambient precision.
+    """Convert the arguments of a traced call to arrays of one shape in JAX's default float type.
 
-    A traced argument does not change the types that the others may have: they are converted and checked as in a direct
-    call.
+    Arguments that are not traced may have the same types as in a direct call, and are checked in the same way.
     """
     import jax.numpy as jnp
 
@@ -142,13 +143,13 @@ def broadcast_traced(arguments: Mapping[str, ArrayLike]) -> list[Any]:
 
 
 def _as_ambient(name: str, value: ArrayLike, dtype: Any) -> Any:
-    """Convert one argument to the ambient precision, NumPy's values by NumPy."""
+    """Convert one argument to ``dtype``, with NumPy unless it is a JAX array."""
     if not is_jax(value):
         with np.errstate(over="ignore"):
             return as_float64(name, value).astype(dtype, copy=False)
     if value.dtype.kind == "c":
         raise InputError(f"{name}: got complex numbers; real numbers are needed")
-    # Outside of jit each operation of JAX on a concrete value compiles a program: convert only if necessary.
+    # Convert only if the type differs, because outside jit JAX compiles a program for each operation.
     return value if value.dtype == dtype else value.astype(dtype)
 
 

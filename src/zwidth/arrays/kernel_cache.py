@@ -1,4 +1,4 @@
-"""Compiled kernels kept between runs, in a folder of the user's cache."""
+"""The persistent cache of compiled kernels, a folder in the user's cache directory."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ class KernelCache(NamedTuple):
 
 
 def use_compilation_cache(folder: str | Path | None = None) -> KernelCache:
-    """Keep compiled kernels between processes, so that only the first one compiles.
+    """Store compiled kernels on disk, so that later processes load them instead of compiling them again.
 
-    The command line does so by itself; in Python it is one call, before or after JAX is imported. To empty the cache,
-    delete the folder. Do so if JAX warns of an error while reading it: a killed process or a full disk can leave an
-    incomplete entry, which JAX ignores and does not replace.
+    Commands use the cache by default. In Python call this function once, before or after importing JAX.
+
+    To empty the cache, delete the folder. Also delete it if JAX warns of an error while reading the cache: a killed
+    process or a full disk can leave an incomplete entry, which JAX neither uses nor replaces.
 
     Args:
-        folder: where to keep them; where it is left out, what JAX's own variable JAX_COMPILATION_CACHE_DIR says, or
-            else ``zwidth/jax`` in the user's cache folder ($XDG_CACHE_HOME or ~/.cache).
+        folder: folder of the cache. Default: the value of JAX's environment variable JAX_COMPILATION_CACHE_DIR, or
+            ``zwidth/jax`` in the user's cache directory ($XDG_CACHE_HOME or ~/.cache).
 
     Returns:
-        KernelCache: ``folder``; ``nbytes``, its size now. A kernel takes 10 to 500 kB; nothing is ever removed.
+        KernelCache: ``folder``; ``nbytes``, its current size. A kernel takes 10 to 500 kB. Entries are never removed.
 
     Example:
         >>> import zwidth

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,7 +36,7 @@ class SafeLimit(Part):
     stiffness: Any
     virtual_damping: Any = 0.0
     reason: str = ""
-    warnings: tuple[str, ...] = ()
+    warnings: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()

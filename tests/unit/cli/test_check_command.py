@@ -152,7 +152,9 @@ def test_each_remedy_of_an_unstable_wall_makes_it_stable_as_it_is_printed(wall, 
     told = re.findall(r"^(?:remedy    |          ) (?:or )?(.*? (?:at most|at least|from) .*)", out, re.MULTILINE)
     assert len(told) >= 2
     for remedy in told:
-        name, _, ends = re.fullmatch(r"(.*?) (at most|at least|from) (.*)", remedy).groups()
+        parts = re.fullmatch(r"(.*?) (at most|at least|from) (.*)", remedy)
+        assert parts is not None
+        name, _, ends = parts.groups()
         flag = "--" + REMEDIES.get(name.split()[0], name)
         for end in ends.partition(" (")[0].split(" to "):
             changed = (
@@ -246,8 +248,7 @@ def test_encoder_friction_and_motor_are_simulated():
         zwidth.Timing(rate="1 kHz", delay="0.7 periods"),
         velocity=zwidth.LowPass(cutoff="100 Hz"),
     )
-    hardware = {"resolution": "0.0005 rev", "coulomb": "0.1 mN m"}
-    found = zwidth.diagnose(scene, "0.3 N m/rad", "1.4 mN m s/rad", **hardware)
+    found = zwidth.diagnose(scene, "0.3 N m/rad", "1.4 mN m s/rad", resolution="0.0005 rev", coulomb="0.1 mN m")
     out = run("check", *wall, *knob, *given).stdout
     assert "simulated  LIMIT CYCLE: " in out
     assert f"to stop it: {found.advise()}" in " ".join(out.split())

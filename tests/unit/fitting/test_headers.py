@@ -35,6 +35,7 @@ def test_columns_are_found_by_words(head, scales, rotary, tmp_path):
     found = read_log(write(tmp_path, head), {})
     columns = np.array([[0, 1, 2], [1, 3, 2], [2, -1, 4]], float)
     for column, expected, scale in zip((found.time, found.position, found.force), columns, scales, strict=True):
+        assert column is not None
         np.testing.assert_allclose(column, expected * scale, rtol=1e-12)
     assert found.rotary == rotary
 

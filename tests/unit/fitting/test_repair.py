@@ -14,8 +14,8 @@ from zwidth.words.rotation import use_kind
 from zwidth.words.status import Status
 
 KNOB = make_knob(3)
-ROWS = range(KNOB.count.size)
-TIME = KNOB.period * np.arange(KNOB.count.size)
+ROWS = range(KNOB.reading.size)
+TIME = KNOB.period * np.arange(KNOB.reading.size)
 
 
 def write(head, cells, separator=","):
@@ -28,7 +28,7 @@ def rows(time, count, torque="{:.6f}"):
 
 
 SECONDS = [f"{t:.6f}" for t in TIME]
-WRAPPED = np.mod(KNOB.count, KNOB.counts)
+WRAPPED = np.mod(KNOB.reading, KNOB.counts)
 LATE = 2**32 - 700_000
 MICROS = [str((LATE + round(1e6 * t)) % 2**32) for t in TIME]
 STAMPS = [1_700_000_000_900_000_000 + round(1e9 * t) for t in TIME]
@@ -42,7 +42,7 @@ def leave_out(cells, places):
 FILES = {
     "a wrapped encoder": (write("t_s,enc_counts,tau_Nm", rows(SECONDS, WRAPPED)), "wraps at 6.28319 rad (360 deg), "),
     "around zero": (
-        write("t_s,enc_counts,tau_Nm", rows(SECONDS, np.mod(KNOB.count + 8192, KNOB.counts) - 8192)),
+        write("t_s,enc_counts,tau_Nm", rows(SECONDS, np.mod(KNOB.reading + 8192, KNOB.counts) - 8192)),
         "wraps at 6.28319 rad (360 deg), ",
     ),
     "a clock that rolls over": (
@@ -54,24 +54,24 @@ FILES = {
             "stamp.sec,stamp.nanosec,enc_counts,tau_Nm",
             [
                 [str(s // 10**9), str(s % 10**9), c, f]
-                for s, (_, c, f) in zip(STAMPS, rows(SECONDS, KNOB.count), strict=True)
+                for s, (_, c, f) in zip(STAMPS, rows(SECONDS, KNOB.reading), strict=True)
             ],
         ),
         "time 'stamp.sec' + 'stamp.nanosec'",
     ),
     "empty cells": (
-        write("t_s,enc_counts,tau_Nm", leave_out(rows(SECONDS, KNOB.count), {100, 101, 900})),
+        write("t_s,enc_counts,tau_Nm", leave_out(rows(SECONDS, KNOB.reading), {100, 101, 900})),
         "left out 3 rows without a number, the first in row 100",
     ),
     "a doubled row": (
         write(
             "t_s,enc_counts,tau_Nm",
-            [row for k, row in enumerate(rows(SECONDS, KNOB.count)) for _ in range(1 + (k == 40))],
+            [row for k, row in enumerate(rows(SECONDS, KNOB.reading)) for _ in range(1 + (k == 40))],
         ),
         "left out 1 row that repeats the one before, the first in row 41",
     ),
     "glitches": (
-        write("t_s,enc_counts,tau_Nm", rows(SECONDS, [WILD.get(k, c) for k, c in enumerate(KNOB.count)])),
+        write("t_s,enc_counts,tau_Nm", rows(SECONDS, [WILD.get(k, c) for k, c in enumerate(KNOB.reading)])),
         "left out 3 glitches of the position, the first at sample 200",
     ),
     "an outer join": (
@@ -79,7 +79,7 @@ FILES = {
             "__time,/imu/z,/joint/enc_counts,/cmd/effort_Nm",
             [
                 cells
-                for k, (_, c, f) in enumerate(rows(SECONDS, KNOB.count))
+                for k, (_, c, f) in enumerate(rows(SECONDS, KNOB.reading))
                 for cells in (
                     [f"{TIME[k]:.6f}", "", c, ""],
                     [f"{TIME[k] + 1e-4:.6f}", "9.81", "", ""],
@@ -90,7 +90,7 @@ FILES = {
         "position and force have rows of their own, 200 µs apart, and were paired by time",
     ),
     "durations": (
-        write("Time,enc_counts,tau_Nm", rows([f"{t:.6f} sec" for t in TIME], KNOB.count)),
+        write("Time,enc_counts,tau_Nm", rows([f"{t:.6f} sec" for t in TIME], KNOB.reading)),
         "columns by their names",
     ),
 }
@@ -119,21 +119,21 @@ def test_notes_reach_the_printed_result_json_and_yaml(tmp_path):
 
 def test_milliseconds_of_another_rate_are_even_samples():
     knob = make_knob(5, period=1.25e-3)
-    time = 1e-3 * np.floor(1e3 * knob.period * np.arange(knob.count.size) + 0.3)
-    fit = zwidth.fit_log(time, knob.step * knob.count, knob.torque, rotary=True)
+    time = 1e-3 * np.floor(1e3 * knob.period * np.arange(knob.reading.size) + 0.3)
+    fit = zwidth.fit_log(time, knob.step * knob.reading, knob.torque, rotary=True)
     assert fit.period == pytest.approx(1.25e-3, rel=1e-5)
     assert knob.holds(fit, 2.0)
     assert "times are whole multiples of 1.00 ms and were read as even samples, 1.250 ms apart" in fit.notes
     # One missing sample of a loop at 1 kHz is a gap, not a slower loop.
-    kept = np.arange(KNOB.count.size) != 700
-    fit = zwidth.fit_log(TIME[kept], (KNOB.step * KNOB.count)[kept], KNOB.torque[kept], rotary=True)
+    kept = np.arange(KNOB.reading.size) != 700
+    fit = zwidth.fit_log(TIME[kept], (KNOB.step * KNOB.reading)[kept], KNOB.torque[kept], rotary=True)
     assert (fit.period, fit.notes) == (pytest.approx(1e-3, rel=1e-12), ())
 
 
 def test_a_log_that_leaves_out_samples_is_refused_with_the_cause():
     time = np.cumsum(np.where(np.arange(400) % 5 < 3, 700e-6, 1050e-6))
     with pytest.raises(InputError, match=r"samples are 2 to 3 periods of 350\.0 µs apart: the log leaves out samples"):
-        zwidth.fit_log(time, KNOB.count[:400], KNOB.torque[:400])
+        zwidth.fit_log(time, KNOB.reading[:400], KNOB.torque[:400])
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -141,7 +141,7 @@ def test_repairs_are_right(seed):
     """Random knobs, encoders and glitches: a position that is kept is the true one but for whole turns."""
     rng = np.random.default_rng(seed)
     knob = make_knob(seed, samples=800, counts=int(rng.choice([1000, 2000, 4096, 16384, 65536])))
-    count, turns = knob.count, rng.random() < 0.7
+    count, turns = knob.reading, rng.random() < 0.7
     if turns:
         count = np.mod(count + int(rng.integers(0, knob.counts)), knob.counts)
     wild = np.sort(rng.choice(np.arange(10, 790), 2, replace=False)) if rng.random() < 0.5 else np.zeros(0, int)
@@ -150,7 +150,7 @@ def test_repairs_are_right(seed):
     count[wild] = np.mod(count[wild] + rng.integers(knob.counts // 3, 2 * knob.counts // 3, wild.size), knob.counts)
     with use_kind(True):
         found = repair_log(None, knob.step * count, knob.torque, knob.step)
-    away = found.position - knob.step * knob.count[found.row]
+    away = found.position - knob.step * knob.reading[found.row]
     away = np.delete(away, np.flatnonzero(np.isin(found.row, wild)))
     assert np.ptp(away) < 1e-9
     assert set(range(800)) - set(found.row.tolist()) <= set(wild.tolist())
@@ -160,9 +160,9 @@ def test_no_smooth_motion_has_glitches():
     rng = np.random.default_rng(0)
     for seed in range(40):
         knob = make_knob(seed, samples=600)
-        assert not find_glitches(knob.step * knob.count).any()
+        assert not find_glitches(knob.step * knob.reading).any()
         noise = 10 ** rng.uniform(-6, -2)
-        assert not find_glitches(knob.step * knob.count + noise * rng.standard_normal(600)).any()
+        assert not find_glitches(knob.step * knob.reading + noise * rng.standard_normal(600)).any()
 
 
 def push(seed, count=3000, size=0.03, hold=45):

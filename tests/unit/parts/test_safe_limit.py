@@ -59,14 +59,17 @@ def test_a_limit_in_rotary_units_belongs_to_a_rotary_device():
     with pytest.raises(zwidth.InputError, match="safe_limit"):
         SCENE.replace(safe_limit=zwidth.SafeLimit("484 N m/rad"))
     rotary = zwidth.Scene(zwidth.Device("60 g cm^2", "0.02 mN m s/rad"), TIMING)
-    assert rotary.replace(safe_limit=zwidth.SafeLimit("484 mN m/rad")).safe_limit.stiffness == 0.484
+    limit = rotary.replace(safe_limit=zwidth.SafeLimit("484 mN m/rad")).safe_limit
+    assert limit is not None
+    assert limit.stiffness == 0.484
 
 
 @pytest.mark.parametrize("change", [{"mass": 0.1}, {"rate": 2e3}, {"velocity": zwidth.LowPass(cutoff=100)}])
 def test_a_changed_loop_keeps_the_limit_and_warns(change):
-    changed = SCENE.replace(**change).replace(**change)
-    assert changed.safe_limit.allows(484, 1.13)
-    (warning,) = changed.safe_limit.warnings
+    limit = SCENE.replace(**change).replace(**change).safe_limit
+    assert limit is not None
+    assert limit.allows(484, 1.13)
+    (warning,) = limit.warnings
     assert warning.startswith(f"{next(iter(change))} changed after the safe limit was measured")
     assert SCENE.replace(stiffness=1e3, virtual_damping=2).safe_limit == LIMIT
 

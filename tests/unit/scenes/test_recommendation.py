@@ -239,6 +239,7 @@ def test_the_default_asks_for_margins():
         assert margins.phase_margin >= 30
         assert margins.gain_margin >= 2
         assert found.stiffness <= 0.75 * found.stiffest.stiffness
+        assert found.verdict is not None
         assert not find_thin(found.verdict, scene.timing.period)
         assert all(stable for name, stable in found.grasps.items() if name.startswith("soft"))
     # Any wish replaces the defaults.
@@ -251,13 +252,16 @@ def test_a_wall_on_the_brink_carries_a_caution_with_a_remedy_that_holds():
         for wanted in wishes:
             found = scene.recommend(**wanted)
             assert found.cautions, wanted
-            asked, cost = re.search(r"ask for (.*?) \((?:costs|gains) (\S+) %", found.cautions[0]).groups()
+            match = re.search(r"ask for (.*?) \((?:costs|gains) (\S+) %", found.cautions[0])
+            assert match is not None
+            asked, cost = match.groups()
             more = dict(wanted)
             for name, value in re.findall(r"--(\S+) ([\d.]+)", asked):
                 more[name.replace("-", "_")] = float(value)
             if "without" in asked:
                 del more["passive"]
             again = scene.recommend(**more)
+            assert again.verdict is not None
             assert not find_thin(again.verdict, scene.timing.period)
             assert abs(1 - again.stiffness / found.stiffness) == pytest.approx(float(cost) / 100, abs=0.006)
 
@@ -270,9 +274,10 @@ def test_grasps_that_destabilize_a_wall_are_named_with_a_wall_that_none_destabil
     held = scene.replace(operator=zwidth.Operator(**hand))
     assert not held.is_stable(found.stiffness, found.virtual_damping)
     assert [name for name, stable in found.grasps.items() if not stable] == ["firm, light damping"]
-    K, B = re.search(
-        r"in the hand \(firm, light damping\); K = (.*?), B = (.*?) is stable in every grasp", found.cautions[1]
-    ).groups()
+    wall = r"in the hand \(firm, light damping\); K = (.*?), B = (.*?) is stable in every grasp"
+    match = re.search(wall, found.cautions[1])
+    assert match is not None
+    K, B = match.groups()
     assert all(scene.replace(operator=grasp).is_stable(K, B) for grasp in zwidth.reference_grasps().values())
     assert all(scene.recommend().grasps.values())
 

@@ -76,7 +76,7 @@ class Border:
 
     @property
     def _upright(self) -> float:
-        """The one damping of all pole pairs, if two lines bound the stable walls next to it; else NaN."""
+        """The damping of a lossless loop if exactly two crossing lines bound its stable walls; otherwise NaN."""
         return self.boundary.lossless if len(self.boundary.lines) == 2 else np.nan
 
     def _first_rows(self) -> np.ndarray:
@@ -223,9 +223,10 @@ class Border:
 
     @cached_property
     def main(self) -> frozenset[int]:
-        """The pieces that contain soft walls, as sets do, too, that narrow towards K = 0.
+        """Indices of the pieces of the stable set that are connected to K = 0.
 
-        A device unstable by itself may have none: then the piece with the softest stable walls, with B > 0 if possible.
+        A piece that narrows to a point at K = 0 counts as connected. If no piece is, because the device is unstable
+        without a wall: the piece that contains the softest stable wall, among the pieces with B > 0 if any exist.
         """
         ends: dict[int, list[float]] = {}
         damped = {edge.piece for edge in self.edges if edge.beta[-1] > 0}
@@ -238,7 +239,7 @@ class Border:
         return frozenset([min(stiff, key=lambda piece: (piece not in damped, np.min(ends[piece])))])
 
     def find_softest(self, least: float) -> float:
-        """Return the lowest alpha of the stable walls with dampings above ``least`` that `main` contains."""
+        """Return the lowest alpha on the edges of the `main` pieces at dampings of at least ``least``; NaN if none."""
         walls = [edge.alpha[edge.beta >= least] for edge in self.soft_edges(least)]
         return float(min((alpha.min() for alpha in walls if alpha.size), default=np.nan))
 

@@ -41,7 +41,7 @@ _SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
 _PROBE = 1e-6
 # A pole that leaves a zero on the circle along it, to such a share, goes where that way bends to.
 _ALONG = 1e-9
-_SAME_ROW = 1e-12  # relative difference of two dampings below which they are equal but for rounding errors
+_SAME_ROW = 1e-12  # dampings with a smaller relative difference are equal up to rounding errors
 # Pairs of rows and arcs that are looked at in one go: what they need stays in caches.
 _BLOCK = 1 << 17
 
@@ -65,7 +65,7 @@ class Boundary:
     lines: tuple[CrossingLine, ...]
     infinite: np.ndarray  # angles at which the curve runs to infinity
     limits: dict[float, tuple[float, float]]  # alpha and beta where it has no point of its own, NaN where it has no end
-    lossless: float  # the damping of all pole pairs on the circle, if it is the same at every angle; else NaN
+    lossless: float  # damping of a lossless loop (`find_lossless`); NaN for all other loops
 
     @classmethod
     def trace(cls, loop: LoopRoots) -> Boundary:
@@ -87,7 +87,7 @@ class Boundary:
         return cls(loop, w, tuple(arcs), tuple(lines), poles, limits, lossless)
 
     def are_lossless(self, beta: np.ndarray) -> np.ndarray:
-        """Return whether every pole of walls with these dampings has its reciprocal as another pole: none is stable."""
+        """Return whether dampings equal that of a lossless loop, at which no wall is stable (`find_lossless`)."""
         with np.errstate(invalid="ignore"):
             return np.abs(beta - self.lossless) <= _SAME_ROW * np.abs(self.lossless)
 
@@ -282,29 +282,41 @@ class Boundary:
         return held
 
     def count_below(self, beta: np.ndarray) -> np.ndarray | int:
-        """Return the number of poles outside far below every crossing of rows (docs/theory/scenes.md, V14)."""
+        """Return the number of poles outside the circle for alpha below all crossings (docs/theory/scenes.md, V14).
+
+        Args:
+            beta: dampings of lines of constant B.
+        """
         return self._count_far(-1.0, beta)
 
     def count_above(self, beta: np.ndarray) -> np.ndarray | int:
-        """Return the same far above: the crossings of every row must lead from `count_below` to it."""
+        """Return the number of poles outside the circle for alpha above all crossings.
+
+        On every line of constant B the poles that cross account for the difference from `count_below`.
+
+        Args:
+            beta: dampings of lines of constant B.
+        """
         return self._count_far(1.0, beta)
 
     def _count_far(self, side: float, beta: np.ndarray) -> np.ndarray | int:
         less, more = self._far_counts[side]
-        # One number for the whole plane, unless the curve is a row of its own.
+        # Only in a lossless loop does the number of poles depend on the damping.
         return less if less == more else np.where(beta > self.lossless, more, less)
 
     @cached_property
     def _far_counts(self) -> dict[float, tuple[int, int]]:
-        """Poles outside far below (-1) and far above (1), for dampings below and above that of a lossless loop."""
+        """Poles outside at alpha -> -inf (key -1) and +inf (key 1): for beta below and above the lossless damping."""
         return {side: (self._far_outside(side, -1.0), self._far_outside(side, 1.0)) for side in (-1.0, 1.0)}
 
     def _far_outside(self, side: float, more: float) -> int:
-        """Return the count where the wall's spring dominates: poles at the device's zeros, the others at infinity.
+        """Return the number of poles outside the unit circle as |alpha| -> inf.
+
+        Poles then approach the zeros of the device; the remaining poles go to infinity.
 
         Args:
-            side: the sign of alpha.
-            more: the sign of the damping in addition to that of a lossless loop.
+            side: sign of alpha.
+            more: sign of beta minus the lossless damping; has no effect if the loop is not lossless.
         """
         loop = self.loop
         depth, on = depths(loop.zeros), are_on_circle(loop.zeros)
@@ -316,7 +328,8 @@ class Boundary:
             power = -side / (rest.value * (1j * at.z) ** times)
             x = power ** (1.0 / times) * np.exp(2j * np.pi * np.arange(times) / times)
             if np.isfinite(self.lossless):
-                # The spring moves the pole along the circle, and damping off it: x (1 - beta F/alpha).
+                # alpha moves the pole along the circle. Only excess damping moves it off the circle: x becomes
+                # x (1 - (beta - lossless) F/alpha).
                 leaving += int(np.sum(side * more * loop.estimate.jet(at).value.imag * x.real > 0))
                 continue
             bend = -(rest.slope / rest.value + 0.5j * times) * x * x / times

@@ -93,7 +93,7 @@ def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_
     unit = period * period / exact.mass
     whole = chain.whole + (1 if chain.d > chain.whole else 0)
     waiting = flint.arb_poly([0] * whole + device.coeffs())
-    # F(1) = 0 exactly of a difference, and of a zero at z = 1 without rounding error.
+    # F(1) is exactly 0 if F is a windowed difference, or if one of its zeros is exactly z = 1.
     rest = chain.free and (estimate.window > 0 or any(offset == 0 for offset in np.asarray(estimate.zeros).tolist()))
     return waiting * bottom, answer * bottom * unit, answer * top * (unit / period), rest
 
@@ -115,11 +115,11 @@ def _exact(part: Any) -> Any:
 
 
 def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -> tuple[float, np.ndarray]:
-    """The gain of the sampled response of a linear device, and ``1 - z`` of its zeros, right to float64."""
-    # What the aliases of fast poles leave of slow zeros is not to be had in floats.
+    """Return the gain of the sampled response of a linear device, and ``1 - z`` of its zeros, to float64 accuracy."""
+    # Use balls, because float64 does not resolve slow zeros next to the aliases of fast poles.
     import flint
 
-    # A device that answers a constant force with 0 at rest has a zero at z = 1 exactly.
+    # A zero at s = 0 (no static response to a constant force) becomes a zero at exactly z = 1.
     still = device.system.numerator[-1] == 0
     for bits in BITS:
         with flint.ctx.workprec(bits):
@@ -140,7 +140,9 @@ def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -
                 if roots is not None and all(root.rel_accuracy_bits() > _FLOAT_BITS for root in roots):
                     zeros = [complex(root) for root in roots] + [0j] * still
                     return float(coefficients[-1]), np.array(zeros, complex)
-    raise InputError("device: its zeros between samples cannot be told from each other; leave out what hardly answers")
+    raise InputError(
+        "device: zeros of the sampled response cannot be computed to float64 accuracy; remove modes of tiny response"
+    )
 
 
 def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
@@ -178,16 +180,16 @@ def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
 
 
 def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
-    """Return the velocity estimate in balls; in floats, taken as exact, if its code computes in floats only."""
+    """Return the velocity estimate in balls, or in floats, taken as exact, if its class supports only floats."""
     try:
         return exact.velocity.estimate(exact.timing.period)
     except (ArithmeticError, AttributeError, TypeError, ValueError):
-        # A class of a user may call functions of ``math``.
+        # Estimates defined by users may call functions of ``math``, which accept only floats.
         return velocity.estimate(period)
 
 
 def _estimate_polynomials(estimate: Estimate) -> tuple[flint.arb_poly, flint.arb_poly]:
-    """Return numerator and denominator of F for T = 1."""
+    """Return the numerator and the denominator of the velocity estimate F, for T = 1."""
     import flint
 
     z, turns = flint.arb_poly([0, 1]), estimate.window + estimate.lag
@@ -199,7 +201,7 @@ def _estimate_polynomials(estimate: Estimate) -> tuple[flint.arb_poly, flint.arb
 
 
 def _expand(offsets: Any) -> flint.arb_poly:
-    """Return the real polynomial of roots given by their offsets from 1, in conjugate pairs."""
+    """Return the real monic polynomial of roots in conjugate pairs, given as offsets ``1 - z``."""
     import flint
 
     found = flint.acb_poly([1])

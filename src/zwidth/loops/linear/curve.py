@@ -189,38 +189,38 @@ def cut_arcs(
     return arcs
 
 
-# Relative to the terms of Im(q - beta F) and their conditioning: damping ratios below this are zero but for rounding.
-_LOSSLESS = 1e-12
-# Angles below this show the rounding error of the poles of a free device at z = 1, not damping.
-_SHOWS_DAMPING = 1e-2
+# Tests for a lossless loop
+_LOSSLESS_ERROR = 1e-12  # of Im(q - beta F), relative to its terms and their conditioning; smaller values are 0
+_LOSSLESS_ANGLE = 1e-2  # rad; at smaller angles, rounding errors of poles at z = 1 dominate Im(q - beta F)
 
 
 def find_lossless(loop: LoopRoots, w: np.ndarray, here: CurvePoints, damping: float) -> float:
-    """Return the damping at which ``q - beta F`` is real on the whole circle, NaN if none exists.
+    """Return the damping at which the loop is lossless, or NaN.
 
-    With this damping every pole z has the pole 1/z: that of an undamped joint in semi-implicit Euler, where it is 0.
+    A loop is lossless if ``q - beta F`` is real on the whole unit circle. Then the reciprocal of every pole is also a
+    pole, so no wall with this damping is stable. Example: an undamped joint in semi-implicit Euler, at beta = 0.
 
     Args:
         loop: the loop without its wall.
-        w: nodes of the curve.
-        here: the curve at the nodes.
-        damping: the damping of the curve at z = 1, the only candidate in addition to 0.
+        w: angles of the nodes of the curve.
+        here: points of the curve at the nodes.
+        damping: beta of the curve at z = 1. The only candidates are this value and 0.
     """
-    shows = w >= _SHOWS_DAMPING
+    shows = w >= _LOSSLESS_ANGLE
     before, here = circle(w[shows]).before[:, None], CurvePoints(*(values[shows] for values in here))
     roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
     with np.errstate(all="ignore"):
-        # Next to a root the rounding error of the root itself counts.
+        # Conditioning: near a root, the relative error is proportional to 1/distance.
         near = 1.0 + (np.abs(roots) / np.abs(before + roots)).sum(1)
         for beta in (0.0, damping):
             rest = np.abs((here.beta - beta) * here.fall) / (here.size * near)
-            if np.all(np.nan_to_num(rest, nan=0.0) <= _LOSSLESS):
+            if np.all(np.nan_to_num(rest, nan=0.0) <= _LOSSLESS_ERROR):
                 return beta
     return np.nan
 
 
 def level_arc(w: np.ndarray, here: CurvePoints, beta: float) -> Arc:
-    """Return the curve of a loop whose pole pairs are on the circle at one damping alone: an arc that no row meets."""
+    """Return the curve of a lossless loop: one arc of constant damping, which no line of constant B crosses."""
     blank, level = np.full(w.size + 2, np.nan), np.full(w.size + 2, beta)
     alpha = np.concatenate([[np.nan], here.alpha, [np.nan]])
     return Arc(np.concatenate([[0.0], w, [np.pi]]), level, alpha, blank, blank, blank, 2.0)

@@ -162,13 +162,13 @@ def _enclose_difference(low: np.ndarray, high: np.ndarray, offset: complex) -> t
 
 
 def find_needed_damping(condition: PassivityCondition, alpha: float, beta: float) -> float:
-    """Return the largest damping required at any frequency, certified to a relative 1e-13; NaN if not finite."""
+    """Return the largest damping required at any frequency, certified to a relative 1e-13; NaN for non-finite input."""
     if not (np.isfinite(alpha) and np.isfinite(beta)):
         return np.nan
     stiff = max(alpha + beta * condition.spring, 0.0)
     w = np.concatenate([[0.0], np.geomspace(1e-6, 1e-2, 24), np.linspace(1e-2, np.pi, _NODES)[1:]])
     values = condition.needed(stiff, beta, w)
-    # Intervals: both ends of each, and what they need.
+    # Both ends of each interval of angles, and the damping required at each end.
     ends, needs = np.stack([w[:-1], w[1:]]), np.stack([values[:-1], values[1:]])
     best, most = float(values.max()), values
     for _ in range(_ROUNDS):

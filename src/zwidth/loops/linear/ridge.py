@@ -35,7 +35,7 @@ from zwidth.words.types import Array
 _MEETS, _NEAR = 1e-8, 1e-5
 # Steps to a corner at most, and the one, as a share of beta, after which it is reached.
 _STEPS, _ARRIVED = 4, 1e-15
-_ON_ROW = 1e-9  # share of the width of the stable set within which a damping is that of the lossless row
+_ON_ROW = 1e-9  # tolerance of the lossless damping, relative to the width of the stable set in beta
 # By what share rounding may make a row's wall stiffer.
 _ABOVE = 1e-7
 # Rows next to a ridge, as shares of the plane, one of which must reach nearly as high.
@@ -79,15 +79,15 @@ class BoundRidge(NamedTuple):
 def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     """The stiffest stable wall with alpha > 0 or None; ArithmeticError where the rows contradict what was found."""
     least = -np.inf if negative_damping else 0.0
-    # Along the edge of a real pole that does not depend on B, corners differ by rounding: the most damping counts.
-    # The end of an edge has no angle; the crossing of the row through it has one.
+    # On an edge that does not depend on B, corners differ in alpha only by rounding errors: prefer the largest beta,
+    # then the crossing on a line of constant B, because the end of an edge has no angle.
     tops = sorted(_tops(border, least), key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta, math.isnan(top.w)))
     # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
     top = next((top for top in tops if _is_reached(border, top, least)), None)
     found = None if top is None else _describe(border, top, least)
     lossless = border.boundary.lossless
     if found is not None and abs(found.beta - lossless) <= _ON_ROW * border.width:
-        # Rounding errors of the corner would leave a damping with which walls only seem to decay.
+        # At exactly this damping no wall decays. With the rounding error of the corner some would appear to decay.
         found = found._replace(beta=lossless)
     highest = border.find_highest(least)
     if highest > (0.0 if found is None else found.alpha) * (1.0 + _ABOVE):

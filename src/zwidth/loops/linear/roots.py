@@ -53,18 +53,22 @@ class LoopRoots:
 
     @property
     def device_is_unstable(self) -> bool:
-        """Whether the device without a wall has a pole outside the unit circle."""
+        """True if the device has a pole outside the unit circle without a wall."""
         return bool(np.any((depths(self.poles) < 0) & ~are_on_circle(self.poles)))
 
     def as_damper(self) -> LoopRoots | None:
-        """Return the loop at K = 0 with B in place of K, without its pole at z = 1; None if it has none there."""
+        """Return the loop at K = 0, with the damping B as its gain in place of K.
+
+        A pole of the device at z = 1 cancels against the zero of the velocity estimate there. Return None if either
+        does not exist.
+        """
         f = self.estimate
         free, still = np.flatnonzero(self.poles == 0), np.flatnonzero(f.zeros == 0)
         if not free.size or not (f.window or still.size):
             return None
-        # F/(z - 1): a window of n samples has its other zeros at the n-th roots of 1.
+        # Zeros of F/(z - 1) for a window of n samples: the n-th roots of 1 without 1 itself, as offsets 1 - z.
         turns = 2.0 * np.pi * np.arange(1, f.window) / max(f.window, 1)
-        # Exactly -1 as a zero of the device may be.
+        # For z = -1 the offset is exactly 2, as for a device with a zero at exactly z = -1.
         window = np.where(turns == np.pi, 2.0, -2j * np.sin(0.5 * turns) * np.exp(0.5j * turns))
         lag = self.lag + f.lag + f.window
         velocity = f.zeros if f.window else np.delete(f.zeros, still[0])

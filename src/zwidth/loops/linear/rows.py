@@ -146,7 +146,7 @@ def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     room = np.minimum(met[k] - between[k], between[k + 1] - met[k])
     beside = np.minimum(_BESIDE * np.abs(met[k]), 0.5 * room)
     wrong = (label(met[k] - beside) != stable[k]) | (label(met[k] + beside) != stable[k + 1])
-    # On a lossless row itself no wall is stable.
+    # The lossless damping is exact and needs no refinement.
     wrong &= met[k] != boundary.lossless
     k, low, high = k[wrong], between[:-1][k[wrong]], between[1:][k[wrong]]
     # Twice: the last digit of a long way is not that of an end near 0.

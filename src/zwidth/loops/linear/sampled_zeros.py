@@ -1,8 +1,8 @@
-"""Zeros of a continuous linear system between samples, in decimal arithmetic whose precision doubles until it suffices.
+"""Zeros of a linear system ``x' = A x + B u`` after zero-order-hold discretization, if python-flint is not installed.
 
-The response of ``x' = A x + B u`` to a held force is discretized by a matrix exponential. The resolvent gives the
-numerator by the method of Faddeev and LeVerrier. `zwidth.loops.linear.certified.prove_zeros` does the same with error
-bounds, if python-flint is installed; here two precisions must agree.
+A matrix exponential discretizes the system, and the Faddeev-LeVerrier algorithm computes the numerator of its transfer
+function. Both use decimal arithmetic. The precision is doubled until two successive results agree. With python-flint,
+`zwidth.loops.linear.certified.prove_zeros` computes the same zeros with error bounds.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from zwidth.parts.exact_polynomials import DIGITS, EXPONENT, Complex, Polynomial
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.words.errors import InputError
 
-AGREES = 1e-17  # relative difference of gain and zeros at two precisions that are right to float64
-NO_TERM = 3  # a leading coefficient of less than this share of the digits is the rounding error of 0
+AGREES = 1e-17  # largest relative difference between results of two precisions; a tenth of float64's resolution
+# With n decimal digits, leading coefficients below 10^(-2n/NO_TERM) of the largest are rounding errors of 0.
+NO_TERM = 3
 
 
 def find_sampled_zeros(device: LinearDevice, period: float, fraction: float) -> tuple[float, np.ndarray]:
-    """Return the leading coefficient of the sampled numerator in SI units, and ``1 - z`` of its zeros.
+    """Return the leading coefficient of the discretized numerator, in SI units, and ``1 - z`` of its zeros.
 
     Args:
-        device: the system, continuous in time.
-        period: T in s.
-        fraction: the part of the delay beyond whole periods, in periods.
+        device: the continuous-time system.
+        period: sampling period T in s.
+        fraction: fractional part of the delay, in periods.
     """
     before: tuple[Decimal, list[Any]] | None = None
     for digits in DIGITS:
@@ -37,11 +38,13 @@ def find_sampled_zeros(device: LinearDevice, period: float, fraction: float) -> 
             if found is not None and before is not None and _agree(before, found):
                 return float(found[0]), np.array([complex(*map(float, zero)) for zero in found[1]], complex)
             before = found
-    raise InputError("device: its zeros between samples cannot be told from each other; leave out what hardly answers")
+    raise InputError(
+        "device: zeros of the sampled response cannot be computed to float64 accuracy; remove modes of tiny response"
+    )
 
 
 def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> bool:
-    """Return whether two precisions lead to the same numbers."""
+    """Return whether gain and zeros of two precisions differ by at most `AGREES`."""
     (gain, zeros), (gain2, zeros2) = one, other
     if len(zeros) != len(zeros2) or abs(gain - gain2) > Decimal(AGREES) * abs(gain2):
         return False
@@ -56,7 +59,7 @@ def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> 
 
 
 def _zeros_at(device: LinearDevice, period: float, fraction: float, digits: int) -> Any:
-    """Return gain and zeros in the precision of the context; None if the numerator is below it."""
+    """Return gain and zeros in the context's precision, or None if all coefficients are rounding errors."""
     bottom, top = (_as_decimals(part) for part in (device.system.denominator, device.system.numerator))
     late = 1 - Decimal(fraction)
     step, full, seen = _discretize(bottom, top, Decimal(period))
@@ -71,17 +74,18 @@ def _zeros_at(device: LinearDevice, period: float, fraction: float, digits: int)
         response = response[1:]
     if not response:
         return None
-    # p(1 - x). A device that answers a constant force with 0 at rest has a zero at z = 1 exactly.
+    # The polynomial in x = 1 - z.
     order = len(response) - 1
     shifted = [
         (-1) ** power * sum(response[order - k] * comb(k, power) for k in range(power, order + 1))
         for power in range(order, -1, -1)
     ]
+    # A zero at s = 0 (no static response to a constant force) becomes a zero at exactly z = 1.
     still = device.system.numerator[-1] == 0
     if still:
         shifted = shifted[:-1]
     zeros, _ = iterate_roots(shifted) if len(shifted) > 1 else ([], [])
-    # In conjugate pairs to the last digit.
+    # Make conjugate pairs exact, and drop imaginary parts that are rounding errors.
     real = Decimal(10) ** (-digits // 3)
     pairs = [zero for zero in zeros if zero.imag > real * size(zero)]
     flat = [Complex(zero.real, Decimal(0)) for zero in zeros if abs(zero.imag) <= real * size(zero)]
@@ -100,10 +104,10 @@ def _as_decimal(value: Fraction) -> Decimal:
 
 
 def _discretize(bottom: list[Decimal], top: list[Decimal], time: Decimal) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return transition, response to a unit force held for a time, and the row of the output."""
+    """Return the transition matrix, the state after a unit force held for ``time``, and the row of the output."""
     order = len(bottom) - 1
     monic = [value / bottom[0] for value in bottom]
-    # In a unit of time in which no coefficient is large.
+    # Scale time so that all coefficients of the denominator are at most 1.
     unit = (
         max((abs(value).ln() / k).exp() for k, value in enumerate(monic) if k and value) if any(monic[1:]) else 1 / time
     )
@@ -113,14 +117,14 @@ def _discretize(bottom: list[Decimal], top: list[Decimal], time: Decimal) -> tup
     block[order - 1, :order] = [-monic[order - k] / unit ** (order - k) for k in range(order)]
     block[order - 1, order] = Decimal(1)
     whole = _exponential(block, time * unit)
-    # x_k is the k-th derivative over unit^k of the response of 1/denominator, in units of unit^-order.
+    # State x_k: the k-th derivative of the response of 1/denominator, times unit^(order - k).
     padded = [Decimal(0)] * (order - len(top)) + top
     seen = np.array([padded[order - 1 - k] / bottom[0] * unit**k / unit**order for k in range(order)], object)
     return whole[:order, :order], whole[:order, order], seen
 
 
 def _exponential(matrix: np.ndarray, time: Decimal) -> np.ndarray:
-    """Return ``exp(A t)`` by its Taylor series and squarings."""
+    """Return ``exp(A t)`` by its Taylor series with scaling and squaring."""
     digits = getcontext().prec
     norm = max(sum(map(abs, row)) for row in matrix) * time
     halvings = max(0, int((norm.ln() / Decimal(2).ln()).to_integral_value()) + 4) if norm > 0 else 0
@@ -138,7 +142,7 @@ def _exponential(matrix: np.ndarray, time: Decimal) -> np.ndarray:
 
 
 def _numerator(step: np.ndarray, push: np.ndarray, seen: np.ndarray) -> list[Decimal]:
-    """Return the coefficients of ``C adj(z - A) push``, highest power first."""
+    """Return the coefficients of ``seen adj(zI - step) push``, highest power first, by Faddeev-LeVerrier."""
     order = len(step)
     one = np.array([[Decimal(int(i == j)) for j in range(order)] for i in range(order)], object)
     power, found = one, []

@@ -30,7 +30,7 @@ from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.xp import is_traced, nan_with_nan_slopes
 
-# A harmless start for a lane without a ridge.
+# Finite starting values for a batch entry without a ridge.
 _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.NONE))
 
 
@@ -61,7 +61,7 @@ def trace_stiffest(scene: Any, negative: bool) -> RidgePoint:
     values = scene.parameters()
     paths = tuple(path for path in moving_paths(scene) if is_traced(values[path]))
     if not paths:
-        # Only the wall is traced, on which nothing depends.
+        # Only the wall is traced, and the ridge does not depend on it.
         paths = ("mass",)
     structure = structure_of(scene, paths, negative)
     return compiled_ridge(structure, *broadcast_traced({path: values[path] for path in paths}))

@@ -159,8 +159,8 @@ def spread(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def fold(array: np.ndarray) -> np.ndarray:
-    """Return the array with length 1 along every axis along which its values repeat."""
-    # The size before folding decides: a constant array is short after its first axis is folded.
+    """Return the array with every axis along which its values are constant reduced to length 1."""
+    # Decide by the size before folding, because folding one axis can make the array too small for a comparison.
     compare = array.size >= _WORTH_FOLDING
     for axis in range(array.ndim):
         if array.shape[axis] > 1 and _repeats(array, axis, compare):
@@ -169,13 +169,13 @@ def fold(array: np.ndarray) -> np.ndarray:
 
 
 def _repeats(array: np.ndarray, axis: int, compare: bool) -> bool:
-    """Return whether the values repeat along an axis, by strides and, if wanted, by comparison."""
+    """Return whether the values are constant along an axis: by the stride and, if ``compare``, by comparing values."""
     if array.strides[axis] == 0:
         return True
     if not compare:
         return False
     along = np.moveaxis(array, axis, 0)
-    # The last slice exposes most arrays that do not repeat.
+    # Compare the last slice first, because it differs in most arrays that are not constant.
     return bool(np.array_equal(along[0], along[-1]) and (along == along[0]).all())
 
 

@@ -40,39 +40,40 @@ _NO_CROSSOVER = -1e-3
 def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Margins:
     """Return the gain, phase, delay and modulus margin of a wall, with their frequencies.
 
-    Of the open loop ``L = N(z) (alpha z + beta (z - 1))/(z^(2+n) (z - 1)(z - c))``, d = n + f, see `char_poly`:
+    The open loop is ``L = N(z) (alpha z + beta (z - 1))/(z^(2+n) (z - 1)(z - c))``, d = n + f, see `char_poly`.
 
-    - ``gain_margin``: the factor by which stiffness and virtual damping together may grow; below 1 the factor to which
-      they must fall. A smaller gain was never seen to harm a stable wall.
-    - ``phase_margin``: the least turn of L, in degrees, that moves a pole to the unit circle: for a stable wall the
-      phase of L at the gain crossover above -180 degrees; for an unstable wall the same modulo 360 degrees, as a
-      negative number. The wall is stable if and only if it is positive (and ``beta > -delta``).
-    - ``delay_margin``: how many periods more of delay the wall bears, with the fraction held as the hardware does it;
-      the first loss counts, though a still longer delay may be borne again.
-    - ``modulus_margin``: the least distance of L from -1, the inverse of the largest sensitivity.
+    - ``gain_margin``: the factor on both stiffness and virtual damping at which the loop becomes unstable. Of an
+      unstable wall: the factor below 1 at which it becomes stable. No stable wall is known that becomes unstable with
+      a smaller gain.
+    - ``phase_margin``: the phase of L at the gain crossover plus 180 degrees. Of an unstable wall: the negative
+      distance of this sum from the nearest multiple of 360 degrees. The wall is stable if and only if the phase
+      margin is positive (and ``beta > -delta``).
+    - ``delay_margin``: the additional delay, in periods, at which the loop first becomes unstable, with held fractional
+      delays. A still longer delay may be stable again.
+    - ``modulus_margin``: the smallest distance of L from -1, which is the inverse of the peak sensitivity.
 
     Args:
         alpha: normalized stiffness, > 0.
         beta: normalized virtual damping.
         delta: normalized physical damping, >= 0.
-        d: delay in periods, >= 0, whole or not (held). All four broadcast.
+        d: delay in periods, >= 0, integer or fractional (held). All four broadcast.
 
     Returns:
         Margins of the broadcast shape: ``gain_margin`` (a factor), ``phase_margin`` (degrees), ``delay_margin``
-        (periods), ``modulus_margin``, and ``phase_crossover``, ``gain_crossover``, ``modulus_frequency`` in radians a
-        period, at most pi; ``omega/(2 pi T)`` is in Hz. NaN where alpha <= 0 or out of range.
-        An unstable wall has no margins in the usual sense: ``gain_margin`` is below 1, the factor to which K and B must
-        fall, and 0 (with a NaN ``phase_crossover``) if no factor gives a stable wall; ``phase_margin`` is in [-180, 0];
-        ``delay_margin`` is 0, because no delay can be added; ``phase_margin`` and ``gain_crossover`` are NaN if
-        ``|L|`` is above 1 at every frequency, ``phase_margin`` also if beta <= -delta, where it decides nothing.
+        (periods), ``modulus_margin``, and ``phase_crossover``, ``gain_crossover``, ``modulus_frequency`` in rad per
+        sample, at most pi; ``omega/(2 pi T)`` is in Hz. NaN if alpha <= 0 or an argument is out of range.
+        Of an unstable wall ``gain_margin`` is below 1, and 0 (with a NaN ``phase_crossover``) if no factor makes the
+        wall stable; ``phase_margin`` is between -180 and 0 degrees; ``delay_margin`` is 0. ``phase_margin`` and
+        ``gain_crossover`` are NaN if ``|L|`` is above 1 at every frequency. ``phase_margin`` is also NaN if
+        beta <= -delta, because stability then does not depend on the phase.
 
     Numerics:
-        Phase margin and gain crossover are in closed form, the others are found to about 1e-14, at a cost that does not
-        grow with d. The fraction of the delay is sampled 64 times a period, closest to whole delays, and the lowest
-        place that the samples show is looked for: a strongly damped device may bear less for a moment just before a
-        whole delay. Traceable: `jit`, `vmap`, `grad`. A margin that is NaN has NaN derivatives; where it is one of
-        those of which `jax.jacrev` takes all at a time, so have the wall's others, unlike in `jax.jacfwd` or one by
-        one.
+        Phase margin and gain crossover are in closed form. The other margins are computed to about 1e-14, at a cost
+        independent of d. For the delay margin, fractional delays are sampled 64 times per period, most densely near
+        integer delays, and the lowest loss of stability between the samples is refined: with strong damping a wall may
+        be unstable only in a short interval below an integer delay. Traceable: `jit`, `vmap`, `grad`. A margin that is
+        NaN has NaN derivatives. `jax.jacrev` of several margins then returns NaN for all margins of the wall;
+        `jax.jacfwd` does not.
 
     References:
         Landau 1990 (modulus margin); python-control's `stability_margins`, which calls them gm, pm, sm, wpc, wgc, wms.
@@ -110,7 +111,7 @@ def margins_kernel(
         delay = xp.where(stable, _delay_margin(tuple(wall), lag, lead, xp), 0.0)
     if with_modulus:
         distance, closest = modulus(alpha, beta, here)
-    # Only the sign of an unstable wall's phase is fixed: turns by 360 degrees are the same turn.
+    # Phases that differ by 360 degrees are equivalent: reduce the phase margin of an unstable wall to [-180, 0].
     turns = 2.0 * np.pi * xp.round(frozen(phase, xp) / (2.0 * np.pi))
     phase = xp.where(stable, phase, -xp.abs(phase - turns))
     decided = nan_with_nan_slopes(crosses & (beta > -delta), alpha, beta, delta, d)

@@ -154,10 +154,10 @@ def alpha_max(
             optimistix; "auto" is "newton".
 
     Returns:
-        RidgePoint with arrays of the broadcast shape: ``alpha``; ``beta``, the damping that goes with it; ``omega``,
-        the frequency in radians a period at which the loop then oscillates; ``kind``, 0 smooth or 1 corner (a double
-        pole at z = -1), a code of `zwidth.RidgeKind`; ``status``, see `zwidth.Status`. If the status is not 0, numbers
-        are NaN and ``kind`` is 3 (NONE).
+        RidgePoint with arrays of the broadcast shape: ``alpha``, the maximum stiffness; ``beta``, the virtual damping
+        at the maximum; ``omega``, the frequency of the oscillation there, in rad per sample; ``kind``, a code of
+        `zwidth.RidgeKind`: 0 for a smooth maximum, 1 for a corner (a double pole at z = -1); ``status``, see
+        `zwidth.Status`. If the status is not 0, ``alpha``, ``beta`` and ``omega`` are NaN and ``kind`` is 3 (NONE).
 
     Numerics:
         alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable in delta and d, also

@@ -33,28 +33,28 @@ def spectral_radius(
     accuracy: float | None = None,
     delay: DelayModel = "held",
 ) -> Array:
-    """Return the spectral radius of the loop: the modulus of its largest pole.
+    """Return the spectral radius of the loop: the modulus of its dominant pole.
 
-    ``max |z|`` over ``P(z) = 0``, see `zwidth.char_poly`; the loop is stable where it is below 1. One period multiplies
-    a slowly decaying motion by it.
+    The spectral radius is ``max |z|`` over ``P(z) = 0``, see `zwidth.char_poly`. The loop is stable if it is below 1.
+    A response decays by this factor per period, after faster components have decayed.
 
     Args:
         alpha: normalized stiffness K T^2/m.
         beta: normalized virtual damping B T/m.
         delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast.
-        method: "newton" (and "auto") finds the outermost pole and proves each value by counts of the poles inside
-            a circle, at a cost that does not grow with d; "companion" computes all poles.
-        accuracy: relative error to compute to, 1e-9 by default, at least 1e-12. It holds for poles apart from others.
-            Where two poles nearly meet the radius is ill-conditioned: rounding the coefficients moves it by up to
-            1e-8, whatever the accuracy (2.8e-9 was seen near a double pole at z = -1). On a large map (alpha along
-            one axis, beta along another) or line a larger accuracy is quicker, at long delays above all, and errors
-            are nearly as large in places; single walls keep most digits. "companion" takes any.
+        d: delay in periods, >= 0, integer or fractional, also mixed in one array. All four broadcast.
+        method: "newton" (and "auto") computes the dominant pole and certifies each value by counting the poles inside
+            a circle, at a cost independent of d; "companion" computes all poles.
+        accuracy: largest relative error, 1e-9 by default, at least 1e-12. If two poles nearly coincide, the radius is
+            ill-conditioned: rounding errors of the coefficients then change it by up to 1e-8, whatever the accuracy
+            (2.8e-9 was observed near a double pole at z = -1). On large grids (alpha along one axis, beta along the
+            other) and lines, a larger value saves time, mostly at long delays, and errors come close to it at some
+            points; single walls are more accurate than required. Has no effect on "companion".
         delay: only "held" has poles.
 
     Returns:
-        Array of the broadcast shape: below 1 exactly where `zwidth.is_stable` says so. NaN for a point out of range,
-        and where no error bound could be proved (some walls with multiple poles).
+        Array of the broadcast shape: below 1 if and only if `zwidth.is_stable` returns True. NaN for a point out of
+        range, and if no error bound could be certified (some walls with multiple poles).
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, a name is unknown,
@@ -62,12 +62,12 @@ def spectral_radius(
         TracedDelayError: d is traced with method "companion".
 
     Numerics:
-        Float64 when called directly, maps and up to 262,144 other walls without JAX; the ambient precision inside
-        `jit`, where d may be traced, and a radius within rounding of 1 may lie on either side of it. On a map a Taylor
-        series serves a cell of walls (`loops.rigid.pole_map`); its terms fall faster than the bound that is proved of
-        them. Derivatives are those of the outermost pole, of every order up to the second; NaN where it is a multiple
-        one. Near a k-fold pole the radius is known to about 1e-16^(1/k), whatever the accuracy. `decay_rate`
-        resolves how slowly a loop decays that is stable by less than 1e-16.
+        Direct calls compute in float64; grids and up to 262,144 other walls are computed without JAX. Inside `jit`
+        the function computes in JAX's default float type, d may be traced, and a radius within rounding error of 1
+        may be on either side of 1. On grids, one Taylor series with a certified bound serves a cell of walls
+        (`loops.rigid.pole_map`). Derivatives are those of the dominant pole, up to the second order; NaN if this pole
+        is a multiple one. Near a k-fold pole the error of the radius is about 1e-16^(1/k), whatever the accuracy. If
+        the radius is within 1e-16 of 1, use `decay_rate`.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).

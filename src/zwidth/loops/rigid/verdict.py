@@ -37,25 +37,26 @@ def is_stable(
     method: StabilityMethod = "auto",
     delay: DelayModel = "held",
 ) -> Array:
-    """Tell which walls are stable: every pole strictly inside the unit circle.
+    """Return whether each wall is stable: all poles are strictly inside the unit circle.
 
-    ``P(z) = 0`` only for ``|z| < 1``, see `zwidth.char_poly`.
+    Poles are the roots of ``P(z)``, see `zwidth.char_poly`.
 
     Args:
         alpha: normalized stiffness K T^2/m.
         beta: normalized virtual damping B T/m.
         delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast; axes along which an argument
-            does not vary cost nothing: for a map pass alpha of shape (1, N) and beta of shape (M, 1).
-        method: "crossover" asks for the phase where the loop gain is one, in closed form; "companion" computes all
-            poles; "certified" never guesses (`zwidth.decide_stability` names the points it leaves open). "auto" is
-            "crossover", which on a map of one device compares alpha with the end of its row, the same closed form.
+        d: delay in periods, >= 0, integer or fractional, also mixed in one array. All four broadcast. Axes along which
+            an argument is constant cost nothing: for a grid pass alpha of shape (1, N) and beta of shape (M, 1).
+        method: "crossover" evaluates the phase at the gain crossover, in closed form; "companion" computes all poles;
+            "certified" returns True only with a certificate (`zwidth.decide_stability` returns the status of undecided
+            points). "auto" is "crossover". On a grid of one device it compares alpha with the stability limit at each
+            beta, by the same closed form.
         delay: only "held" has poles.
 
     Returns:
-        Boolean array of the broadcast shape, maybe read-only. False for an unstable wall, and also for input that
-        is NaN, infinite, negative where it must not be, or out of range: `zwidth.decide_stability` returns the status
-        that distinguishes them.
+        Boolean array of the broadcast shape, possibly read-only. False for unstable walls and for invalid input (NaN,
+        infinite, out of range, or negative if the argument must not be). To distinguish them, use the status that
+        `zwidth.decide_stability` returns.
 
     Raises:
         InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, or a name is
