@@ -65,10 +65,9 @@ from .scenes.assessment import assess as assess
 from .scenes.assessment import assess_many as assess_many
 from .scenes.assessment import limits_of as limits_of
 from .scenes.diagnosis import Diagnosis as Diagnosis
-from .scenes.diagnosis import Hardware as Hardware
-from .scenes.diagnosis import Remedy as Remedy
 from .scenes.diagnosis import diagnose as diagnose
 from .scenes.recommendation import Recommendation as Recommendation
+from .scenes.remedies import Remedy as Remedy
 from .scenes.robust import Interval as Interval
 from .scenes.robust import RobustStiffness as RobustStiffness
 from .scenes.robust import RobustWall as RobustWall
@@ -81,6 +80,7 @@ from .scenes.stiffness import sensitivities as sensitivities
 from .scenes.tolerances import Tolerance as Tolerance
 from .scenes.tolerances import ToleranceEstimate as ToleranceEstimate
 from .scenes.tolerances import simulate_tolerances as simulate_tolerances
+from .scenes.trials import Hardware as Hardware
 from .simulation.result import Motion as Motion
 from .simulation.result import MotionKind as MotionKind
 from .simulation.simulate import simulate as simulate

@@ -119,7 +119,7 @@ def test_the_badge_is_stale_while_an_entry_is_wrong(page, entry, says):
     assert page.get_attribute("#mass", "aria-invalid") == "true"
     assert (page.input_value("#mass"), page.inner_text("#word"), page.is_visible("#stale")) == (entry, badge, True)
     page.click("[data-save=png]")
-    assert page.inner_text("#copied") == "not saved: an entry is not valid; correct it, or press Escape in its field"
+    assert page.inner_text("#copied") == "not saved: an input is invalid; correct it, or press Escape in its field"
     page.press("#mass", "Escape")
     settle(page, "document.getElementById('mass').value === '100'")
     with page.expect_download() as saved:

@@ -91,7 +91,7 @@ def test_a_folder_in_which_a_run_computes_is_refused_until_it_is_killed(config, 
     for words in (["--resume"], ["--overwrite"]):
         assert main_of("run", config, "--out", tmp_path, *words) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith(f"Error: out: {tmp_path}: another run computes in this folder (process {process.pid} ")
+        assert line.startswith(f"Error: out: {tmp_path}: another run is writing to this folder (process {process.pid} ")
     assert flags(tmp_path) == before
     kill_group(process)
     assert main_of("run", config, "--out", tmp_path, "--resume") == 0

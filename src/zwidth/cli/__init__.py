@@ -62,7 +62,7 @@ def _report(message: str) -> None:
 
 
 def _format_fault(error: click.ClickException) -> str:
-    """Return the message of a fault in the arguments, its option first, or with the command whose help lists them."""
+    """Return the message for invalid arguments, preceded by the option or followed by the command that shows help."""
     message = error.format_message()
     if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
         return re.sub(r"^Invalid value for '?(.*?)'?: ", r"\1: ", message, count=1)

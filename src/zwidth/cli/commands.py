@@ -60,11 +60,11 @@ def cli() -> None:
 @verbose_option
 @json_option
 def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) -> None:
-    """Judge one wall: stable, passive, its margins; for an unstable wall, the changes that make it stable.
+    """Assess one wall: stability, margins and passivity; for an unstable wall, the changes that stabilize it.
 
-    With --resolution, --friction or --max-force also simulate the wall, to find limit cycles and saturation. It needs
-    --stiffness, --mass (or --device) and --rate (or --period); damping and delay are 0 if not given.
-    SCENE.yaml (or the folder of a run) supplies what no option gives; options override it.
+    With --resolution, --friction or --max-force the wall is also simulated, to find limit cycles and saturation.
+    Required: --stiffness, --mass (or --device) and --rate (or --period); damping and delay default to 0. SCENE.yaml (or
+    the folder of a run) supplies parameters not given as options; options override it.
     """
     from zwidth.pages.verdict import check_lines
     from zwidth.scenes.assessment import assess, limits_of
@@ -102,12 +102,13 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
 def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as_json: bool) -> None:
     """Print the stiffest stable wall of a device.
 
-    Only B >= 0 counts with a velocity filter, a linear system or a measured response: there a negative B may cancel
-    damping that exists in the model alone. Scene.max_stiffness(negative_damping=True) in Python includes B < 0.
+    With a velocity filter, a linear system or a measured response only walls with B >= 0 count, because a negative B
+    may cancel damping that exists only in the model. In Python, Scene.max_stiffness(negative_damping=True) includes
+    B < 0.
 
-    The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
-    would change is printed as well. `zwidth recommend` says which softer wall to set. SCENE.yaml (or the folder of a
-    run) supplies what no option gives; options override it.
+    The device is given by --delta and --d, or by its physical parameters and parts; with the latter the sensitivity of
+    K_max to each parameter is also printed. `zwidth recommend` recommends a softer wall to set. SCENE.yaml (or the
+    folder of a run) supplies parameters not given as options; options override it.
     """
     from zwidth.pages.verdict import spell_device
     from zwidth.scenes.assessment import name_kind
@@ -122,8 +123,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
-        what = "no wall with K > 0 is stable on this device" if none else "K_max of this device was not found"
-        raise click.UsageError(f"{what}: {explain_missing(scene, wall.status)}")
+        fault = "no wall with K > 0 is stable on this device" if none else "K_max of this device could not be computed"
+        raise click.UsageError(f"{fault}: {explain_missing(scene, wall.status)}")
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
     if isinstance(scene.device, Device):
@@ -149,8 +150,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
         }
-        at = f"B = {with_unit(named['virtual_damping'], 'N s/m')}, {with_unit(named['frequency'], 'Hz')}"
-        top = f"{spell_stiffness(named['stiffness_max'])} at {at} ({kind.replace('_', ' ')} optimum)"
+        place = f"B = {with_unit(named['virtual_damping'], 'N s/m')}, {with_unit(named['frequency'], 'Hz')}"
+        top = f"{spell_stiffness(named['stiffness_max'])} at {place} ({kind.replace('_', ' ')} optimum)"
         lines = [
             words.line("K_max", top),
             *lines,
@@ -322,9 +323,9 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 
 @cli.command(**show_example("recommend --phase-margin 30", OF_SCENE))
 @scene_options(wall=False)
-@click.option("--stiffness-fraction", type=SHARE, help="At most this share of K_max.  [default: 75%]")
-@click.option("--gain-margin", type=_FACTOR, help="At least this factor on K and B together.  [default: 2]")
-@click.option("--phase-margin", type=_DEGREES, help="At least so many degrees.  [default: 30]")
+@click.option("--stiffness-fraction", type=SHARE, help="Largest share of K_max.  [default: 75%]")
+@click.option("--gain-margin", type=_FACTOR, help="Smallest gain margin, a factor on K and B together.  [default: 2]")
+@click.option("--phase-margin", type=_DEGREES, help="Smallest phase margin, in degrees.  [default: 30]")
 @click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
 @hardware_options
 @beyond_safe_option
@@ -343,16 +344,15 @@ def recommend(
 ) -> None:
     """Recommend the wall to set: the stiffest one with the required margins.
 
-    The defaults hold if no requirement is given; any requirement replaces all of them. With --resolution, --friction or
-    --max-force also simulate the wall, to find limit cycles and saturation. A hand (--operator-...) is part
-    of the device: the wall is then checked without it as well. It needs --mass (or --device) and --rate (or
-    --period); damping and delay are 0 if not given. SCENE.yaml (or the folder of a run) supplies what no option gives;
-    options override it.
+    Any given requirement replaces all defaults. With --resolution, --friction or --max-force the wall is also
+    simulated, to find limit cycles and saturation. A hand (--operator-...) counts as part of the device; the wall is
+    then also checked without it. Required: --mass (or --device) and --rate (or --period); damping and delay default to
+    0. SCENE.yaml (or the folder of a run) supplies parameters not given as options; options override it.
     """
     from zwidth.pages.verdict import recommend_lines
 
     if code and as_json:
-        raise click.UsageError("give --code or --json: each has all of the output")
+        raise click.UsageError("give only one of --code or --json: each replaces the whole output")
     found = scene.recommend(**wanted)
     wrote = []
     if figure is not None:
@@ -364,8 +364,8 @@ def recommend(
         return
     notes = [*words.coded_period_notes(scene), *found.notes]
     diagnosis = diagnose_wall(found.scene, hardware) if found.status == Status.OK else None
-    told = [] if diagnosis is None else words.diagnosis_lines(diagnosis)
-    lines = () if as_json else recommend_lines(found, silent=find_silent(), hardware=told, verbose=verbose)
+    simulated = [] if diagnosis is None else words.diagnosis_lines(diagnosis)
+    lines = () if as_json else recommend_lines(found, silent=find_silent(), hardware=simulated, verbose=verbose)
     result = found.as_dict() | {"notes": notes} if as_json else {}
     if as_json and diagnosis is not None:
         result["diagnosis"] = diagnosis.as_dict()

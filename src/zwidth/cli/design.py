@@ -38,7 +38,7 @@ from zwidth.words.status import Status
 
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
-_TRIED = 41  # values of a parameter among which the best reachable is found
+_TRIED = 41  # values of a parameter tried to find the largest K_max in its range
 _BOX = ("mass", "damping", "period", "delay")
 
 
@@ -79,15 +79,15 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
 
     With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given;
     or the virtual damping with which a wall of --stiffness settles fastest. With --tolerance: the share of devices on
-    which the wall (--stiffness, --virtual-damping) is stable, the stiffness that 99 % of them bear, and, for uniform
-    tolerances of a rigid device, what is proved for every one of them. SCENE.yaml (or the folder of a run) supplies
-    what no option gives; options override it.
+    which the wall (--stiffness, --virtual-damping) is stable, the stiffness up to which 99 % of them are stable,
+    and, for uniform tolerances of a rigid device, a wall certified to be stable on all of them. SCENE.yaml
+    (or the folder of a run) supplies parameters not given as options; options override it.
     """
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")
     shares, uniform = tolerances, drawn["distribution"] == "uniform"
     provable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
-    # A box of periods and delays in s does not hold a delay in periods.
+    # The certificate assumes independent intervals of period and delay, but a delay in periods varies with the period.
     provable = provable and not ("period" in shares and scene.timing.in_periods)
     parts = {
         "required": _require(scene, find) if find is not None else None,
@@ -96,7 +96,7 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
     }
     told = {name: part for name, part in parts.items() if part is not None}
     lines = [line for _, said in told.values() for line in said]
-    result = {name: found for name, (found, _) in told.items()}
+    result = {name: values for name, (values, _) in told.items()}
     tell(result, lines, as_json, LABEL)
     if result.get("required", {}).get("status", "OK") != "OK":
         raise SystemExit(EXIT_FAILED)
@@ -118,7 +118,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     wanted = float(scene.wall.stiffness)
     needed = scene.required(path, wanted, within=within)
     if path == "delay" and needed.status == Status.UNREACHABLE and within is None:
-        # A stiffness that needs hardly any delay lies below the range.
+        # Extend the default range downwards, because a large stiffness may require a very short delay.
         needed = scene.required(path, wanted, within=(1e-4 * present, needed.range[1]))
     result = {"parameter": path, "value": needed.value, "unit": own_unit(unit), "enough": needed.enough}
     result["status"] = Status(needed.status).name
@@ -140,7 +140,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     else:
         values = [crossing.value for crossing in needed.crossings]
         text = f"{spell_enough(needed.value, needed.enough, values, unit)}"
-        # One or two of them are printed.
+        # Subtract the one or two crossings that the text already contains.
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
@@ -148,14 +148,14 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
 
 
 def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, float]:
-    """Return the value of a parameter with the largest K_max in a range, and that K_max; 0 if none was found."""
-    known = {}
+    """Return the value of a parameter with the largest K_max in a range, and that K_max; both 0 if none is stable."""
+    maxima = {}
     for value in [*([0.0] if path == "delay" else []), *np.geomspace(*ends, _TRIED).tolist()]:
         with suppress(InputError):
             top = scene.replace(**{path: value}).max_stiffness()
-            known[value] = float(top.stiffness) if top.status == Status.OK else 0.0
-    value = max(known, key=lambda value: known[value], default=0.0)
-    return {"value": value, "stiffness": known.get(value, 0.0)}
+            maxima[value] = float(top.stiffness) if top.status == Status.OK else 0.0
+    value = max(maxima, key=lambda value: maxima[value], default=0.0)
+    return {"value": value, "stiffness": maxima.get(value, 0.0)}
 
 
 def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
@@ -223,4 +223,4 @@ def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[s
     stiffness, most = (with_unit(round_safely(result[name], "below"), "N/m") for name in ("stiffness", "stiffness_max"))
     damping = with_unit(result["virtual_damping"], "N s/m", DIGITS)
     text = f"every device is stable with K = {stiffness} at B = {damping}; {most}, each with its best B"
-    return result, [line("proved", text)]
+    return result, [line("certified", text)]

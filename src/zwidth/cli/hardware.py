@@ -1,4 +1,4 @@
-"""Options of encoder, friction and motor, with which a wall is simulated."""
+"""Command-line options of the encoder, friction and motor for simulations of a wall."""
 
 from __future__ import annotations
 
@@ -15,16 +15,22 @@ if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
 
 _HARDWARE = (
-    ("--resolution", "resolution", "m", POSITIVE, "Step of the encoder, in m; or '2000 counts' of a revolution."),
+    (
+        "--resolution",
+        "resolution",
+        "m",
+        POSITIVE,
+        "Step of the encoder, in m, or '2000 counts' per revolution.",
+    ),
     ("--friction", "coulomb", "N", NOT_NEGATIVE, "Coulomb friction of the device, in N."),
-    ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N; --friction if left out."),
+    ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N. Default: --friction."),
     ("--max-force", "max_force", "N", POSITIVE, "Largest force of the motor, in N."),
-    ("--max-rate", "max_rate", "N/s", POSITIVE, "Largest rate of the commanded force, in N/s."),
+    ("--max-rate", "max_rate", "N/s", POSITIVE, "Largest rate of change of the commanded force, in N/s."),
 )
 
 
 def hardware_options(command: Command) -> Command:
-    """Add the options of encoder, friction and motor; the command receives those given as ``hardware``."""
+    """Add the options of encoder, friction and motor; the command receives the given ones as a dict ``hardware``."""
 
     @wraps(command)
     def with_hardware(**given: Any) -> Any:
@@ -41,7 +47,7 @@ def hardware_options(command: Command) -> Command:
 
 
 def diagnose_wall(scene: Scene, hardware: dict[str, Any]) -> Any:
-    """Return the `zwidth.diagnose` of a wall with the hardware that options give; None without any."""
+    """Return the `zwidth.diagnose` result of a wall with the given hardware; None if no hardware option is given."""
     if not hardware:
         return None
     from zwidth.scenes.diagnosis import diagnose

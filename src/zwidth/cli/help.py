@@ -1,4 +1,4 @@
-"""Help of commands: options in groups, and an example at the end."""
+"""Help texts of commands: options listed in groups, and an example at the end."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from typing import Any
 
 import click
 
+# Options of a complete scene, for examples.
 OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
 
-OWN = "This command"
-# Groups of options by the beginnings of their names; all others are the command's own.
+OWN = "This command"  # heading of the options that belong to no other group
+# Option groups: each heading with the prefixes of its options.
 GROUPS = {
     "Wall": ("--stiffness", "--virtual-damping"),
     "Device": ("--device", "--mass", "--damping"),
@@ -21,14 +22,14 @@ GROUPS = {
     "Further parts of the device": ("--coupling-", "--actuator-", "--modes-"),
     "Output": ("--figure", "--code", "--verbose", "--json", "--help"),
 }
-EXACT = ("--stiffness", "--delay")  # other options begin with these as well
+EXACT = ("--stiffness", "--delay")  # whole names instead of prefixes, because options of other groups start with them
 
 
 class GroupedCommand(click.Command):
-    """A command whose help lists its options in groups."""
+    """Command whose help lists its options in groups."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options, a section for each group."""
+        """Write the options, one section per group."""
         rows: dict[str, list[tuple[str, str]]] = {name: [] for name in GROUPS}
         for option in self.get_params(ctx):
             if isinstance(option, click.Option) and (record := option.get_help_record(ctx)) is not None:
@@ -40,14 +41,14 @@ class GroupedCommand(click.Command):
 
 
 def _find_group(flag: str) -> str:
-    """Return the group of an option."""
-    for name, beginnings in GROUPS.items():
-        if any(flag == each or (each not in EXACT and flag.startswith(each)) for each in beginnings):
+    """Return the heading of the group that contains an option."""
+    for name, prefixes in GROUPS.items():
+        if any(flag == each or (each not in EXACT and flag.startswith(each)) for each in prefixes):
             return name
     return OWN
 
 
 def show_example(command: str, *more: str) -> dict[str, Any]:
-    """Return the arguments of a command's declaration that group its options and end its help with an example."""
+    """Return arguments for ``cli.command`` that group the options in the help and append an example."""
     example = "\b\nExample:\n" + " \\\n    ".join((f"  zwidth {command}", *more))
     return {"cls": GroupedCommand, "epilog": example}

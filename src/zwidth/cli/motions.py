@@ -1,4 +1,4 @@
-"""Commands in the time domain: one simulated motion, and the diagnosis of a wall that oscillates."""
+"""Time-domain commands: `zwidth simulate` for one response, `zwidth diagnose` for a wall that oscillates."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import ANY, POSITIVE
 
 TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
-FEWEST_PERIODS, MOST_PERIODS = 300, 20_000
-DEFAULT_DEPTH = 1e-3  # displacement of a held device in m or rad, without an encoder
-DEFAULT_STEPS = 50  # the same in steps of the encoder
-APPROACH = 2.0  # periods before contact at which a hit begins
+FEWEST_PERIODS = 300  # shortest default length of a simulation, in sampling periods
+MOST_PERIODS = 20_000  # longest default length of a simulation, in sampling periods
+DEFAULT_DEPTH = 1e-3  # m or rad; default depth from which the device is released, if no encoder is given
+DEFAULT_STEPS = 50  # default depth in encoder steps, if an encoder is given
+APPROACH = 2.0  # sampling periods of motion before contact in a simulated hit
 
 _WALL = "--stiffness '10 kN/m' --virtual-damping '40 N s/m'"
 _LIMITS = "--resolution '20 um' --friction '50 mN'"
@@ -40,29 +41,32 @@ _LIMITS = "--resolution '20 um' --friction '50 mN'"
 @hardware_options
 @json_option
 def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
-    """Find out why a device oscillates on a wall, and what stops it.
+    """Find the cause of a device's oscillation on a wall, and the changes that stop it.
 
-    The causes are: linear instability, steps of the encoder, limits of the motor. It needs --stiffness, --mass (or
-    --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies what no option gives.
+    Possible causes: linear instability, steps of the encoder, limits of the motor. Required: --stiffness, --mass (or
+    --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters not given as options.
     """
     from zwidth.scenes.diagnosis import diagnose as find_cause
 
-    found = find_cause(scene, **hardware)
-    remedy = found.advise()
-    words.tell(
-        found.as_dict(), [row(found.word, found.explain()), *([row("to stop it", remedy)] if remedy else [])], as_json
-    )
+    diagnosis = find_cause(scene, **hardware)
+    remedy = diagnosis.advise()
+    lines = [row(diagnosis.word, diagnosis.explain()), *([row("to stop it", remedy)] if remedy else [])]
+    words.tell(diagnosis.as_dict(), lines, as_json)
 
 
 @cli.command(**show_example("simulate --hit '0.1 m/s'", _WALL, OF_SCENE))
 @scene_options(wall=True)
-@click.option("--hit", type=quantity_type("m/s", POSITIVE), help="Hit the wall from outside at this speed, in m/s.")
+@click.option("--hit", type=quantity_type("m/s", POSITIVE), help="Speed of a hit on the wall from outside, in m/s.")
 @click.option("--push", type=quantity_type("N", ANY), help="Constant external force, in N, positive into the wall.")
 @click.option(
-    "--hold", type=quantity_type("m", ANY), help="Release the device at rest at this depth in the wall, in m."
+    "--hold", type=quantity_type("m", ANY), help="Depth in the wall at which the device is released at rest, in m."
 )
 @hardware_options
-@click.option("--duration", type=quantity_type("s", POSITIVE, periods=True), help="Length, in s or as '500 periods'.")
+@click.option(
+    "--duration",
+    type=quantity_type("s", POSITIVE, periods=True),
+    help="Simulated time, in s or as '500 periods'.",
+)
 @figure_option
 @json_option
 def simulate(
@@ -75,11 +79,12 @@ def simulate(
     figure: Path | None,
     as_json: bool,
 ) -> None:
-    """Simulate a hit, a push or a release of the device on one wall.
+    """Simulate a hit on a wall, a constant push, or the release of the device in the wall.
 
-    A hit meets a wall on one side of its surface; otherwise the wall acts on both sides. Without --hit, --push and
-    --hold the device is released 1 mm (1 mrad, 50 steps of the encoder) deep. It needs --stiffness, --mass (or
-    --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies what no option gives.
+    In a hit the wall is unilateral; otherwise it is bilateral. Without --hit, --push and --hold the device is released
+    at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. Required: --stiffness,
+    --mass (or --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters not given as
+    options.
     """
     from zwidth.scenes.diagnosis import diagnose as find_cause
     from zwidth.simulation.ending import describe_ending
@@ -117,23 +122,23 @@ def simulate(
 def _choose_start(
     scene: Any, hit: float | None, push: float | None, hold: float | None, hardware: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the initial conditions of a motion, as arguments of `zwidth.simulate`."""
+    """Return the initial conditions of a simulation, as arguments of `zwidth.simulate`."""
     if hit is not None and hold is not None:
-        raise InputError("--hold: given together with --hit; a device is released inside, or comes from outside")
+        raise InputError("--hold: given together with --hit; give only one of them, a hit starts outside the wall")
     if hit is not None:
         before = -APPROACH * hit * scene.timing.period
         return {"start_position": before, "start_velocity": hit, "push": push or 0.0, "contact": "unilateral"}
     if hold is None and push is None:
         depth = DEFAULT_STEPS * hardware["resolution"] if "resolution" in hardware else DEFAULT_DEPTH
         if isinstance(scene.device, LinearDevice):
-            # A linear system starts at rest at 0; an external force displaces it.
+            # Displace a linear system by an external force, because it always starts at rest at 0.
             return {"push": depth * float(scene.wall.stiffness)}
         hold = depth
     return {"start_position": hold or 0.0, "push": push or 0.0}
 
 
 def _choose_length(scene: Any) -> int:
-    """Return how many periods show the slowest decay of the linear loop."""
+    """Return the number of periods needed to show the slowest decay of the linear loop."""
     dominant = scene.loop.slowest(float(scene.alpha), float(scene.beta))
     rate = abs(float(dominant.rate))
     return int(min(max(TIME_CONSTANTS / rate, FEWEST_PERIODS), MOST_PERIODS)) if 0 < rate < math.inf else MOST_PERIODS

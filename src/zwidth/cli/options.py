@@ -44,8 +44,7 @@ _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.r
 # What a device that is given as a whole holds already.
 _HELD = ("operator", "coupling", "actuator", "modes")
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
-# Parameters of a rigid device.
-_BARE = {"mass", "damping"}
+_BARE = {"mass", "damping"}  # parameters of a rigid device
 _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
@@ -66,14 +65,16 @@ class Parsed(click.ParamType):
 
 
 def get_told() -> dict[str, Any]:
-    """Return the texts of options of the running command whose units are those of one kind of device."""
+    """Return the option values of the running command whose units imply a linear or a rotary device."""
     return click.get_current_context().meta.get(_TOLD, {})
 
 
 def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, counts: bool = False) -> Parsed:
-    """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`.
+    """Return the type of an option whose value is a number in an SI unit, or a number with a unit.
 
-    With ``counts`` it is the step of an encoder, also as "2000 counts".
+    With ``periods`` the value is a duration, which may also be given in sampling periods, and becomes a `Span`.
+
+    With ``counts`` the number is the step of an encoder, which may also be given as "2000 counts".
     """
 
     def read(text: str) -> Any:
@@ -124,9 +125,9 @@ def flag_of(path: str) -> str:
 def _add_option(command: Command, path: str) -> Command:
     if path == "device":
         words = (
-            "A published device of `zwidth devices`, with its period and delay: other options supply or replace its "
-            "parameters. Or, in place of mass, damping and all parts, a transfer function 'NUM / DEN', coefficients in "
-            "s as '1 / 0.1 10 0', or FILE.csv (.npz, .mat), a measured response."
+            "A published device of `zwidth devices`, with its period and delay; other options add or replace "
+            "parameters. Or, in place of mass, damping and all parts: a transfer function 'NUM / DEN' by its "
+            "coefficients in s, such as '1 / 0.1 10 0', or a measured response FILE.csv (.npz, .mat)."
         )
         return click.option("--device", metavar="NAME", help=words)(command)
     if path in CHOICES:
@@ -142,10 +143,10 @@ def _add_option(command: Command, path: str) -> Command:
 
 
 def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
-    """Add the options of a scene, with or without its wall, and the file that may supply it.
+    """Add the options of a scene, with or without its wall, and the argument for a scene file.
 
-    The command receives a `zwidth.Scene` as ``scene``; None if ``instead`` names other options and no option of a
-    scene is given.
+    The command receives a `zwidth.Scene` as ``scene``, or None if ``instead`` names alternative options and no scene
+    option is given.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
     take = _take_options("scene", (*bare, *_PARTS), lambda given: build_scene(given, instead, wall=wall))
@@ -156,7 +157,7 @@ def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Comma
 def _take_options(
     name: str, paths: Sequence[str], make: Callable[[dict[str, Any]], Any]
 ) -> Callable[[Command], Command]:
-    """Add the options of some parameters; the command receives the object made from them under ``name``."""
+    """Add the options of the parameters ``paths``; the command receives ``make(values)`` as its argument ``name``."""
 
     def decorate(function: Command) -> Command:
         @wraps(function)
@@ -173,7 +174,7 @@ def _take_options(
                     from zwidth.parts.devices import read_device
 
                     known["device"] = read_device(known["device"])
-                    # A device given on the command line replaces the one of the file.
+                    # Ignore the kind of the file's device, because the option --device replaces it.
                     told = context.meta.get(_TOLD, {}) | {"--device": known["device"]}
                 with use_kind(bool(find_kind(told))):
                     return function(**{name: make(known)}, **given)
@@ -203,13 +204,13 @@ period_options = _take_options("period", ("period", "rate"), _read_period)
 
 
 def warn_implausible(given: dict[str, Any]) -> None:
-    """Write a line on the error stream for each value in SI units, by path, that lies far from any device."""
+    """Write a warning to the error stream for each value, in SI units by path, that is implausible for a device."""
     for line in list_doubts(given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
         click.echo(f"zwidth: {line}", err=True)
 
 
 def read_scene_file(path: Path) -> Scene:
-    """Return the scene of a configuration file or of the run in a folder, after printing its warnings."""
+    """Return the scene of a configuration file, or of the run in a folder; write its warnings to the error stream."""
     from zwidth.runs.record import find_config
     from zwidth.studies.document import load_config, load_scene
 
@@ -220,9 +221,9 @@ def read_scene_file(path: Path) -> Scene:
 
 
 def build_scene(given: dict[str, Any], instead: str = "", *, wall: bool = False) -> Scene | None:
-    """Return the scene that options describe, by path; ``given["scene"]`` supplies what they leave out.
+    """Return the scene described by options, given by path; ``given["scene"]`` supplies all other parameters.
 
-    Return None if no option is given and other options may stand ``instead``.
+    Return None if no option is given and ``instead`` names alternative options.
     """
     if not given and instead:
         return None
@@ -241,7 +242,7 @@ def build_scene(given: dict[str, Any], instead: str = "", *, wall: bool = False)
 
 
 def _change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Return the scene of a file with the parameters that options give in place of its own."""
+    """Return the scene of a file with the parameters given as options replaced."""
     from zwidth.parts.devices import KnownDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
@@ -253,7 +254,7 @@ def _change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
         same = "kind" not in own and own.keys() <= {item.name for item in fields(scene.velocity)}
         kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
         if own.keys() & _ONE_OF_TWO:
-            # A low-pass takes its cutoff or its time constant: the one that is given replaces the other.
+            # Drop both, because a low-pass filter takes either a cutoff or a time constant.
             kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
         changes["velocity"] = _make_velocity({**kept, **own})
     parts = {} if device else find_parts(scene)
@@ -275,19 +276,19 @@ def _change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
         if not str(error).startswith("parameter: "):
             raise
         flags = ", ".join(map(flag_of, sorted(_BARE & given.keys())))
-        raise click.UsageError(f"{flags}: the device of the file is given as a whole; change it there") from None
+        raise click.UsageError(f"{flags}: the file gives the device as a whole; change it in the file") from None
 
 
 def _make_scene(given: dict[str, Any], instead: str) -> Scene:
-    """Return the scene that options alone describe."""
+    """Return the scene described by options only, without a scene file."""
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
 
     device = given.pop("device", None)
     published = device if isinstance(device, KnownDevice) else None
     timed = {"period", "rate"} & given.keys() or (published and published.period)
-    known = {"--mass or --device": device or "mass" in given, "--rate or --period": timed}
-    missing = [flags for flags, there in known.items() if not there]
+    requirements = {"--mass or --device": device or "mass" in given, "--rate or --period": timed}
+    missing = [flags for flags, given_any in requirements.items() if not given_any]
     if published:
         _check_published(published, given, missing)
     if missing:
@@ -315,7 +316,7 @@ def _make_scene(given: dict[str, Any], instead: str) -> Scene:
 
 
 def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
-    """Raise an error that lists the options that must supply what is not published of a device."""
+    """Raise an error that lists the options required for the unpublished parameters of a device."""
     remedies = {"mass": "--mass", "damping": "--damping (0 if unknown)"}
     flags = [*(remedies[name] for name in device.list_missing(given)), *more]
     if flags:
@@ -342,7 +343,7 @@ def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _make_velocity(given: dict[str, Any]) -> Any:
-    """Return the velocity estimate of some options, by the names of its fields."""
+    """Return the velocity estimate described by options, given by field name."""
     kind = given.pop("kind", None)
     if kind is None:
         low = {"cutoff", "time_constant"} & set(given)
@@ -359,12 +360,12 @@ def _make_velocity(given: dict[str, Any]) -> Any:
 
 figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
 beyond_safe_option = click.option("--beyond-safe", is_flag=True, help="Ignore the safe limit of a fitted scene.")
-verbose_option = click.option("--verbose", is_flag=True, help="Print everything that is known.")
+verbose_option = click.option("--verbose", is_flag=True, help="Print all results.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 
 
 def find_silent() -> frozenset[str]:
-    """Return the names among damping and delay that are 0 because neither an option nor a file gives a value."""
+    """Return which of damping and delay are 0 because neither an option nor a file gives a value."""
     given = click.get_current_context().params
     if given.get("scene_file") is not None:
         return frozenset()

@@ -70,7 +70,7 @@ _FIGURE_SIZE = Parsed(
 @click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
 @click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size of the studies' figures in inches, as 7x4.5, or width, as 85mm.")
-@click.option("--dpi", type=_DPI, help="Dots per inch of the studies' figures.")
+@click.option("--dpi", type=_DPI, help="Resolution of the studies' figures, in dots per inch.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
 def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi: int | None, **options: Any) -> None:
     """Run the studies of a CONFIG file.
@@ -229,7 +229,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 )
 @click.option("--format", "formats", multiple=True, type=click.Choice(("png", "svg", "pdf")), default=("png", "svg"),
               help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
-@click.option("--dpi", type=_DPI, help="Dots per inch.")
+@click.option("--dpi", type=_DPI, help="Resolution in dots per inch.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size in inches, as 7x4.5, or width, as 85mm.")
 @click.option(
     "--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib, as one with 'svg.fonttype: none'."
@@ -255,7 +255,7 @@ def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, *
 
 
 @cli.command()
-@click.option("--quick", is_flag=True, help="Few delays and small maps: one to three minutes on two cores.")
+@click.option("--quick", is_flag=True, help="Use few delays and small maps; takes one to three minutes on two cores.")
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
@@ -285,7 +285,7 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
 
 @contextmanager
 def reporter() -> Iterator[Callable[[StudyEvent], None]]:
-    """Yield a callback for `zwidth.run` that reports progress on stderr: a bar on a terminal, else occasional lines."""
+    """Yield a callback for `zwidth.run` that reports progress on stderr: a bar on a terminal, otherwise lines."""
     printed, template = time.monotonic(), "%(label)s  [%(bar)s]  %(info)s"
     options: dict[str, Any] = {"show_eta": False, "item_show_func": lambda state: state, "bar_template": template}
     shown: Any = nullcontext()
@@ -305,7 +305,7 @@ def reporter() -> Iterator[Callable[[StudyEvent], None]]:
                 line = f"{done}/{total} done"
             lines = list(_lines(event))
             if bar is not None:
-                # Lines replace the bar, which is drawn again below them.
+                # Erase the bar before each line; `render_progress` draws it again below the lines.
                 lines = [f"\r\033[K{text}" for text in lines]
                 bar.label, bar.pos, bar.length, bar.current_item = f"{event.name} ({event.kind})", done, total, state
             elif line and (due or time.monotonic() - printed >= _SECONDS_BETWEEN_LINES):

@@ -122,7 +122,7 @@ class ResponseSection(PartSection, what="a response"):
     """The radius in which the true response lies, in m/N."""
 
     rotary: bool = False
-    """Whether the response is of an angle to a torque, in rad/(N m)."""
+    """Set to true if the response is that of an angle to a torque, in rad/(N m)."""
 
     @classmethod
     def read(cls, file: str) -> ResponseSection:

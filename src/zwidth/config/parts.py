@@ -149,21 +149,21 @@ ModeSection: Any = make_section(Mode, "mode", "a mode")
 
 
 class SafeLimitSection(PartSection, what="a safe limit"):
-    """The stiffest wall that measurements of the device support."""
+    """Stiffest wall that measurements of the device support."""
 
     part = SafeLimit
 
     stiffness: Annotated[float, Quantity("N/m", NOT_NEGATIVE)]
-    """Stiffness of that wall, in N/m or with a unit; 0 if no wall is supported."""
+    """Stiffness of the wall, in N/m or with a unit; 0 if the measurements support no wall."""
 
     virtual_damping: Annotated[float, Quantity("N s/m")] = 0.0
-    """Virtual damping of that wall, in N s/m or with a unit."""
+    """Virtual damping of the wall, in N s/m or with a unit."""
 
     reason: str = ""
-    """The cause of the limit."""
+    """Reason for the limit."""
 
     warnings: list[str] = Field(default=[])
-    """What is wrong with the measurement."""
+    """Warnings about the measurements."""
 
 
 def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Strict]:

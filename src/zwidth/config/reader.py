@@ -88,7 +88,7 @@ def tells_rotary(data: Any, key: str = "") -> bool:
         return any(tells_rotary(each, key) for each in data)
     if key == "device" and isinstance(data, str):
         if data.endswith(SUFFIXES):
-            # A table that cannot be read is refused where its section is checked.
+            # Ignore an unreadable table here, because the validation of its section reports the error.
             with suppress(InputError):
                 return MeasuredDevice.read(find_file(data)).rotary
             return False

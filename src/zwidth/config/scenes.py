@@ -124,7 +124,7 @@ class PhysicalDevice(_PhysicalPlant, what="a device"):
     """Name of the device in legends."""
 
     safe_limit: SafeLimitSection | None = None
-    """The stiffest wall that measurements of the device support."""
+    """Stiffest wall that measurements of the device support."""
 
 
 class SimulatedDevice(PhysicalDevice):
@@ -184,7 +184,7 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
     """How a delay that is not whole is modeled."""
 
     safe_limit: SafeLimitSection | None = None
-    """The stiffest wall that measurements of the device support."""
+    """Stiffest wall that measurements of the device support."""
 
     @cached_property
     def _scene(self) -> Scene:

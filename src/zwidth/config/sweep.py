@@ -207,7 +207,7 @@ class SweepStudy(_Parts, HeldStudy):
             return raw
         given = _list_given(axes)
         if given & set(PHYSICAL):
-            # Mixed keys are one fault: what the scene supplies would add others.
+            # Add nothing from the scene to mixed keys, because it would cause further errors in addition to the mixing.
             if not isinstance(scene, PhysicalScene) or given & set(NORMALIZED):
                 return raw
             supplied: dict[str, Any] = {"delay": str(scene.delay)}

@@ -52,7 +52,7 @@ class Quantity:
     periods: bool = False  # whether it is a length of time, in s or in sampling periods: a `Span`
     remedy: str = ""  # what helps where another number is given
     turns: bool = True  # whether it is an angle, a torque, ... where the device is rotary
-    counts: bool = False  # whether it is the step of an encoder, also as "2000 counts"
+    counts: bool = False  # the quantity is an encoder step, which may also be given as "2000 counts"
 
     def read(self, value: Any) -> Any:
         """A value of a configuration in the unit."""

@@ -21,7 +21,7 @@ from zwidth.words.quantities import FIELDS
 AXES = {
     header(name, FIELDS[name].unit): FIELDS[name] for name in ("stiffness", "virtual_damping", "resolution", "coulomb")
 }
-"""The parameters of the axes of these figures, by their columns."""
+"""Parameters that may be an axis of these figures, by column name."""
 # Up to so many points of a curve are seen one by one.
 _FEW = 12
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
@@ -33,14 +33,14 @@ _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 def draw_limit_cycles(
     arrays: Mapping[str, np.ndarray], edges: Table, bounds: tuple[float, float], axes: style.AnyAxes | None = None
 ) -> np.ndarray:
-    """Draw the amplitude of limit cycles over two parameters, a panel per condition.
+    """Draw the amplitude of limit cycles over two parameters, one panel per condition.
 
-    White: at rest; hatched: wider than the upper bound; line: boundary of the linear theory.
+    White: at rest. Hatched: amplitude above the upper bound. Line: stability boundary of the linear theory.
 
     Args:
         arrays: what the npz file of a limit_cycle study holds.
         edges: columns condition, number and those of the two parameters; nothing where there is no linear boundary.
-        bounds: least and largest amplitude of a limit cycle, in m.
+        bounds: smallest and largest amplitude counted as a limit cycle, in m.
         axes: Axes of yours, one for each condition.
     """
     across, along = names = [name for name in AXES if name in arrays]
@@ -78,7 +78,7 @@ def draw_limit_cycles(
     edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.6}
     handles: list[Any] = [
         Patch(facecolor="white", label="at rest", **edge),
-        Patch(**_BEYOND, label=f"wider than {spell_short(bounds[1], 'm')}"),
+        Patch(**_BEYOND, label=f"larger than {spell_short(bounds[1], 'm')}"),
     ]
     handles += [style.line("boundary of the linear theory", width=1.2, color=style.VERMILION)] if edges else []
     style.legend(panels, handles, outside=axes is None, ncols=3)
@@ -97,15 +97,15 @@ def draw_limit_cycle_curves(
     family: str = "",
     axes: style.AnyAxes | None = None,
 ) -> np.ndarray:
-    """Draw amplitude (above) and frequency (below) of limit cycles over one parameter, a column per condition.
+    """Draw amplitude (above) and frequency (below) of limit cycles over one parameter, one column per condition.
 
-    A gap: at rest, or wider than the upper bound; the panel names a curve without a limit cycle. A vertical line:
-    boundary of the linear theory.
+    Gap in a curve: at rest, or amplitude above the upper bound. Text in a panel: curves without any limit cycle.
+    Vertical line: stability boundary of the linear theory.
 
     Args:
         arrays: what the npz file of a limit_cycle study holds.
         edges: columns condition, number and the parameter; nothing where there is no linear boundary.
-        bounds: least and largest amplitude of a limit cycle, in m.
+        bounds: smallest and largest amplitude counted as a limit cycle, in m.
         family: the name of the parameter that has a curve for each of its values; "" where there is none.
         axes: Axes of yours, those of the amplitudes first.
     """
@@ -146,17 +146,17 @@ def draw_limit_cycle_curves(
                 ax.set_ylabel(words)
     handles = [style.line(look["label"], look["linestyle"], color=look["color"]) for look in looks]
     boundary = [style.line("boundary of the linear theory", width=1.0, color=style.VERMILION)] if edges else []
-    gap = style.line(f"gap: at rest, or wider than {spell_short(bounds[1], 'm')}", "")
+    gap = style.line(f"gap: at rest, or larger than {spell_short(bounds[1], 'm')}", "")
     style.legend(panels, [*(handles if family else boundary), gap], outside=axes is None, ncols=4)
     return panels
 
 
 def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest: np.ndarray, widest: str) -> None:
-    """Write into a panel the curves without a limit cycle, and the reason."""
+    """Write into a panel which curves have no limit cycle, and why."""
     reasons: dict[str, list[str]] = {}
     for look, cycle, still in zip(looks, cycles, rest, strict=True):
         if not cycle.any():
-            wide = f"wider than {widest}"
+            wide = f"larger than {widest}"
             reason = (
                 f"{'at rest' if still.all() else wide} everywhere"
                 if still.all() or not still.any()

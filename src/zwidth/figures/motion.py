@@ -16,11 +16,13 @@ _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": 
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
 # A force is held until the next one.
 _HELD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}
-_CUT = 8.0  # a motion that grows without bound is cut at this many times the smallest width
-_GROWTH = (
-    1.5  # ratio of the last quarter to the rest, above which a motion grows without bound; 4/3 at constant velocity
-)
-_WINDOW = 3.0  # time shown of motions that all leave the wall, in times until the last contact ends
+# Axis limit if a motion grows without bound, as a multiple of the smallest motion's largest value.
+_CLIP = 8.0
+# Growth criterion: ratio of the largest value in the last quarter to that before. A motion of constant velocity, which
+# must not count as growing, has 4/3.
+_GROWTH = 1.5
+# Length of the time axis if all motions leave the wall, as a multiple of the end of the last contact.
+_WINDOW = 3.0
 _MOST_PANELS = 6
 _ENERGIES = {
     "energy_J": ("energy of the bodies", style.BLACK, style.SOLID),
@@ -117,8 +119,8 @@ def _read_responses(table: Table) -> list[Any]:
 def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the position of every motion over time and the force of the wall; thin: the bodies behind links.
 
-    Motions that all leave the wall are shown until three times the end of the last contact. A motion that grows without
-    bound is cut at eight times the width of the smallest.
+    If all motions leave the wall, the time axis ends at three times the end of the last contact. A motion that grows
+    without bound is clipped at eight times the largest value of the smallest motion.
 
     Args:
         table: columns of a simulate study.
@@ -213,7 +215,7 @@ def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
 
 
 def _trim(motions: list[Any]) -> list[Any]:
-    """Cut motions that all leave the wall, so that their contacts fill a third of the time axis."""
+    """Truncate motions that all leave the wall, so that their contacts fill a third of the time axis."""
     ends = []
     for each in motions:
         contact = np.asarray(each.contact) > 0
@@ -238,7 +240,7 @@ def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[f
     finite = [each[np.isfinite(each)] for each in values]
     largest = [float(np.abs(each).max(initial=0.0)) for each in finite]
     growing = any(_grows(np.abs(each)) for each in values)
-    most = _CUT * min((size for size in largest if size > 0), default=1.0) if growing else max(largest, default=1.0)
+    most = _CLIP * min((size for size in largest if size > 0), default=1.0) if growing else max(largest, default=1.0)
     low = min(float(np.clip(each.min(initial=0.0), -most, 0.0)) for each in finite)
     high = max(float(np.clip(each.max(initial=0.0), 0.0, most)) for each in finite)
     factor, unit = style.si_unit((low, high), unit)
@@ -247,7 +249,7 @@ def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[f
 
 
 def _grows(sizes: np.ndarray) -> bool:
-    """Return whether a motion grows without bound, of its absolute values over time."""
+    """Return whether a motion grows without bound, from its absolute values over time."""
     early, late = np.split(sizes, [3 * sizes.size // 4])
     return not np.all(np.isfinite(sizes)) or bool(late.max(initial=0.0) > _GROWTH * early.max(initial=0.0) > 0)
 

@@ -35,7 +35,7 @@ _FINITE_IF_STABLE = ("settling_time", "delay_margin")
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 # Beyond this multiple of the smallest, a output that grows without end has one color.
 _STEEP = 100.0
-LEAST_POSITIVE = 1e-300  # values below have no place on a logarithmic scale
+LEAST_POSITIVE = 1e-300  # smallest value shown on a logarithmic scale
 # A color bar of fewer decades than this has 2 and 5 between them.
 _FEW_TICKS = 1000.0
 # A region that fills less of its panel than this has no room for labels.
@@ -48,13 +48,13 @@ _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "whi
 
 
 class ColorScale(NamedTuple):
-    """The colors of an output: those of a colormap from one value to another, and its end colors outside."""
+    """Mapping of an output's values to colors; values outside [low, high] have the color of the nearer end."""
 
-    colormap: str  # of matplotlib
-    low: float
-    high: float
+    colormap: str  # name in matplotlib
+    low: float  # value of the first color
+    high: float  # value of the last color
     logarithmic: bool
-    extend: Literal["neither", "min", "max", "both"]  # the ends of the color bar with an arrow: values lie outside
+    extend: Literal["neither", "min", "max", "both"]  # ends of the color bar with an arrow, because values lie outside
 
 
 class Panel(NamedTuple):
@@ -283,11 +283,11 @@ def _name_colormap(output: Output) -> str:
 
 
 def choose_scale(output: Output, finite: np.ndarray) -> ColorScale:
-    """Choose the colors of an output, in figures and reports alike, by its finite values."""
+    """Choose the color scale of an output from its finite values, for figures and reports."""
     finite = finite[finite >= LEAST_POSITIVE] if output.logarithmic else finite
     least, most = _range(finite) or ((1.0, 10.0) if output.logarithmic else (0.0, 1.0))
     if output.look == "diverging":
-        # The bad side has the range of the good one, if there is one: values outside have one color.
+        # Both sides get the range of the favorable side, if it has values; values beyond it share one color.
         sides = [output.center - least, most - output.center]
         good, bad = sides if output.below else reversed(sides)
         span = max(good if good > 0 else bad, 1e-6)

@@ -205,7 +205,7 @@ def draw_stable_set(
     beyond, most = 0.28 * max(1.0, 5.6 / wide), max(rows[names[0]], default=np.nan) * factors[0]
     rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
     for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
-        # Rounded down, K is stable as it is read.
+        # Round K down, so that the printed wall is stable.
         read = round_safely(wall[0], "below", digits), wall[1]
         wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
         which = kind.split()[0]

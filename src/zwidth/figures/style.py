@@ -43,7 +43,7 @@ STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED, (0, (11.0, 2.5)), (0, (6.0, 1.8, 1
 # What tells curves apart whose line styles have a meaning of their own.
 MARKERS = ("o", "s", "^", "v", "P", "X", "*")
 
-# Units as texts write them, where datasets follow UDUNITS.
+# Spelling of units in labels, where it differs from that of datasets (UDUNITS).
 _WRITTEN = {"1": "", "degree": "degrees", "g cm^2": "g cm$^2$"}
 
 # Of a whole number there is nothing between its values.
@@ -54,7 +54,7 @@ AnyAxes: TypeAlias = Axes | Sequence[Axes] | np.ndarray
 WIDTH = 7.0  # inches: both columns of a journal page
 DECADES = 3000.0  # from so many times its least value on, an axis of stiffnesses has powers of ten only
 PNG_DPI = 180
-LIGHTEST = 0.6  # of viridis, for curves and their names: contrast 3:1 to white
+LIGHTEST = 0.6  # position in viridis of the lightest curve color; contrast 3:1 against white
 # Values closer together than this have but one or two of 1, 2 and 5 among them.
 _FEW = 5.0
 # How far an axis goes on either side of a single value.
@@ -65,7 +65,7 @@ _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"
 
 _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
 Size: TypeAlias = tuple[float, float | None]
-# What a user's style sheet changes of it, and the size and the dots per inch of new figures that a user wants.
+# The user's settings: changes of the house style by a style sheet, size of new figures, and dots per inch.
 _wanted: ContextVar[tuple[Any, Size | None, float | None]] = ContextVar("wanted", default=((), None, None))
 # Narrower, in inches, panels stand below each other: beside each other their labels would have no room.
 _ONE_COLUMN = 5.0
@@ -81,7 +81,7 @@ def house_style() -> Iterator[None]:
 @contextmanager
 def style_sheet(file: Path | None = None, size: Size | None = None, dpi: float | None = None) -> Iterator[None]:
     """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given."""
-    # Of a size without a height type is as large as ever. A size or a resolution that is set already stays.
+    # A size without a height does not change the font size. A size or resolution set by an outer call has priority.
     changes, known, dots = _wanted.get()
     try:
         changes = changes if file is None else dict(rc_params_from_file(file, use_default_template=False))
@@ -121,14 +121,14 @@ def panels(given: AnyAxes | None, count: int, width: float, height: float, colum
 
 
 def label_quantity(name: str) -> str:
-    """Return the label of an axis of a normalized quantity, for the kind of device in question."""
+    """Return the axis label of a normalized quantity, for a linear or a rotary device."""
     if name != "alpha_max":
         return PARAMETERS[name].axis_label
     return rf"maximum stable stiffness  $\alpha_{{\max}} = K_{{\max}}T^2\!/{'J' if is_rotary() else 'm'}$"
 
 
 def write_unit(unit: str) -> str:
-    """Return a unit as labels and legends write it; "" for 1."""
+    """Return the spelling of a unit in labels and legends; "" for the unit 1."""
     return _WRITTEN.get(unit, unit)
 
 
@@ -268,7 +268,7 @@ def save(
         drawn: the figure, or Axes of it.
         stem: the files' name without its ending.
         formats: the endings, of "png", "svg" and "pdf".
-        dpi: dots per inch, also of maps within an SVG or a PDF; for PNG 180 if left out.
+        dpi: resolution in dots per inch, also of maps in SVG and PDF files. Default: 180 for PNG.
     """
     figure = figure_of(drawn)
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)

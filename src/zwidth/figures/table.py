@@ -46,7 +46,7 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
 
 def is_of_rotary(data: Any) -> bool:
-    """Return whether a dataset of a sweep has units of rotary devices."""
+    """Return whether a sweep's dataset contains units of rotary devices."""
     variables = getattr(data, "variables", {})
     return any(str(each.attrs.get("units", "")) in ROTARY.values() for each in variables.values())
 

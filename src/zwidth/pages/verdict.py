@@ -1,6 +1,6 @@
-"""The printed answers of `zwidth check` and `zwidth recommend`: the answer in the first line, then margins and advice.
+"""Printed results of `zwidth check` and `zwidth recommend`: the verdict in the first line, then margins and advice.
 
-The explorer shows the answer of `zwidth check` as well.
+The explorer also shows the result of `zwidth check`.
 """
 
 from __future__ import annotations
@@ -23,17 +23,20 @@ if TYPE_CHECKING:
     from zwidth.scenes.recommendation import Recommendation
     from zwidth.scenes.scene import Scene
 
-ROUNDED = 1e-12  # a smaller share of the dampings is their rounding error
-NOTEWORTHY = 1.005  # gains below this are left to --verbose
-LONG = 20  # characters of a heading that has a line of its own
-MARGINAL_DAMPER = "a pure damper: marginal only because no stiffness returns the free position (a pole at z = 1)"
+ROUNDED = 1e-12  # passivity margins below this fraction of the summed dampings are rounding errors
+NOTEWORTHY = 1.005  # smallest gain in stiffness printed without --verbose
+LONG = 20  # characters of the longest heading that is printed in the first line of its table
+MARGINAL_DAMPER = (
+    "a pure damper: marginal only because without stiffness no force restores the position (pole at z = 1)"
+)
 MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
+# Numbers of grasps in words, by value.
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
 @in_own_units
 def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
-    """Return device and timing in words; ``silent`` are the options that were not given."""
+    """Return device and timing in words; ``silent`` names the options that were not given."""
     device, timing = scene.device, scene.timing
 
     def name_default(name: str) -> str:
@@ -60,7 +63,7 @@ def check_lines(
     silent: frozenset[str] = frozenset(),
     verbose: bool = False,
 ) -> list[str]:
-    """Return the answer of `zwidth check` without its notes; None for the limits leaves out what takes a second."""
+    """Return the lines of `zwidth check` without notes; ``limits=None`` omits gains and remedies, which take longer."""
     wall, word = scene.wall, word_of(verdict).upper()
     K, B = spell_stiffness(wall.stiffness), with_unit(wall.virtual_damping, "N s/m")
     wall_words, device_words = f"K = {K}, B = {B}", spell_device(scene, silent)
@@ -78,7 +81,7 @@ def check_lines(
     if word == "UNSTABLE" and damper and dampings:
         lines.append(line("remedy", f"a pure damper: {_spell_intervals('B', dampings, 'N s/m', 'K')}"))
     elif word == "UNSTABLE" and limits is not None:
-        changes = [each.spell() for each in stabilize(scene)] or ["no change of a single parameter is known"]
+        changes = [each.spell() for each in stabilize(scene)] or ["no stabilizing change of one parameter was found"]
         lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
     lines += margin_lines(verdict)
     lines += decay_lines(verdict)
@@ -90,20 +93,21 @@ def check_lines(
 
 
 def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | None) -> str:
-    """Return the answer of `zwidth check` with its notes as one text, without color."""
+    """Return the lines of `zwidth check` and its notes as one folded text without color."""
     lines = [*check_lines(scene, verdict, limits), *(line("note", note) for note in scene_notes(scene))]
     return "\n".join(fold(lines))
 
 
 def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
-    """Return the stable intervals of K and of B next to the wall."""
+    """Return the stable intervals of K at the wall's B and of B at its K."""
     rooms = (("K", verdict.stable_stiffness, "N/m", "B"), ("B", dampings, "N s/m", "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
 
 
 def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> str:
+    """Return the stable intervals of K or B, ``name``, in words."""
     if not intervals:
-        return f"no {name} at this {other}"
+        return f"no stable {name} at this {other}"
     spelled = []
     for ends in intervals:
         low, high = tell_apart(*ends, unit)
@@ -114,22 +118,22 @@ def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> 
 
 
 def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]:
-    """Return the stiffest stable wall of the device and the share that this wall uses."""
+    """Return lines with the stiffest stable wall of the device and the share of its K used by this wall."""
     if not isfinite(verdict.stiffness_max):
-        none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response proves none"
+        none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
         return [line("K_max", none)]
     top = f"{spell_stiffness(verdict.stiffness_max)} at B = {with_unit(verdict.virtual_damping_at_max, 'N s/m')}"
     used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
     lines = [line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
     if verbose:
-        kind, at = verdict.ridge_kind.replace("_", " "), with_unit(verdict.ridge_frequency, "Hz")
+        kind, frequency = verdict.ridge_kind.replace("_", " "), with_unit(verdict.ridge_frequency, "Hz")
         normalized = f"; alpha_max {plain(verdict.alpha_max)}, beta {plain(verdict.beta_at_max)}"
-        lines.append(line("", f"{kind} optimum at {at}{normalized if isinstance(scene.device, Device) else ''}"))
+        lines.append(line("", f"{kind} optimum at {frequency}{normalized if isinstance(scene.device, Device) else ''}"))
     return lines
 
 
 def margin_lines(verdict: Assessment) -> list[str]:
-    """Return the margins of a stable wall."""
+    """Return the line with the margins of a stable wall; an empty list for other walls."""
     if not verdict.stable:
         return []
     gain, phase, late, least = (
@@ -143,23 +147,23 @@ def margin_lines(verdict: Assessment) -> list[str]:
 
 
 def decay_lines(verdict: Assessment) -> list[str]:
-    """Return the asymptotic decay or growth; nothing for a measured response, which has no poles."""
+    """Return the line with the time constant of decay or growth; an empty list without poles (measured response)."""
     if isnan(verdict.frequency):
         return []
     constant, frequency = verdict.time_constant, verdict.frequency
     label = "growth" if constant < 0 else "decay"
-    at = f" at {with_unit(frequency, 'Hz')}" if frequency else ""
+    place = f" at {with_unit(frequency, 'Hz')}" if frequency else ""
     if isnan(constant):
-        text = f"below numerical resolution{at}: next to the boundary or to poles of one size"
+        text = f"below numerical resolution{place}: close to the stability boundary, or poles of equal magnitude"
     elif not isfinite(constant):
-        text = f"none{at}"
+        text = f"none{place}"
     else:
-        text = f"time constant {with_unit(abs(constant), 's')}{at}"
+        text = f"time constant {with_unit(abs(constant), 's')}{place}"
     return [line(label, f"{text} ({spell_radius(verdict.spectral_radius)})")]
 
 
 def spell_passivity(scene: Scene, verdict: Assessment) -> str:
-    """Return the passivity of a wall in words; with a coupling a wall that misses the condition may be passive."""
+    """Return the passivity of a wall in words; with a coupling the condition is sufficient but not necessary."""
     stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
     if verdict.passive is None:
         return f"not known {find_obstacle(**vars(scene.device)).partition(':')[0]}"
@@ -170,17 +174,17 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
         return "on the limit: no physical damping to spare"
     if verdict.passive:
         return f"yes: {with_unit(round_safely(margin, 'below'), 'N s/m')} of physical damping to spare"
-    word = "no" if scene.device.coupling is None else "not proved"
+    word = "no" if scene.device.coupling is None else "not certified"
     return f"{word}: {with_unit(round_safely(-margin, 'above'), 'N s/m')} more physical damping needed"
 
 
 def gain_lines(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
-    """Return a table of the improvements of a device and their gains, those that matter unless ``verbose``."""
-    known = [limit for limit in limits if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY)]
-    if not known:
+    """Return a table of improvements of a device and their gains; small gains are omitted unless ``verbose``."""
+    shown = [limit for limit in limits if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY)]
+    if not shown:
         return []
-    width, rows = max(len(limit.words) for limit in known), []
-    for limit in known:
+    width, rows = max(len(limit.words) for limit in shown), []
+    for limit in shown:
         stiffness = with_unit(round_safely(limit.stiffness, "below"), "N/m")
         kept = f"; {limit.note}" if limit.note else ""
         rows.append(f"{limit.words:<{width}}  {stiffness}  (x {plain(limit.gain, 3)}{kept})")
@@ -197,7 +201,7 @@ def recommend_lines(
     hardware: Iterable[str] = (),
     verbose: bool = False,
 ) -> list[str]:
-    """Return the answer of `zwidth recommend` without its notes; ``hardware`` are the lines of a diagnosis."""
+    """Return the lines of `zwidth recommend` without notes; ``hardware`` contains the lines of a diagnosis."""
     scene, verdict = found.scene, found.verdict
     device = line("device", spell_device(scene, silent))
     if verdict is None:
@@ -223,12 +227,12 @@ def recommend_lines(
 
 
 def _list_hands(found: Recommendation) -> list[str]:
-    """Return the stability in the reference grasps."""
+    """Return the line with the stability in the reference grasps; an empty list if there are none."""
     labels = {name: stable for name, stable in found.grasps.items() if name != "released"}
     if not labels:
         return []
-    at = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if is_rotary() else ""
+    radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if is_rotary() else ""
     unstable = [name for name, stable in labels.items() if not stable]
     if not unstable:
-        return [line("in a hand", f"stable in all {COUNTS[len(labels)]} reference grasps{at}")]
-    return [line("in a hand", f"stable in {len(labels) - len(unstable)} of {len(labels)} reference grasps{at}")]
+        return [line("in a hand", f"stable in all {COUNTS[len(labels)]} reference grasps{radii}")]
+    return [line("in a hand", f"stable in {len(labels) - len(unstable)} of {len(labels)} reference grasps{radii}")]

@@ -1,4 +1,4 @@
-"""Printed answers: lines with labels, folding, JSON, and the words that several commands and the explorer share."""
+"""Printed results: labeled lines, folding, JSON, and phrases shared by several commands and the explorer."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from zwidth.scenes.diagnosis import Diagnosis
     from zwidth.scenes.scene import Scene
 
-WIDTH = 100  # columns of printed answers, at most
-LABEL = 11  # columns of the labels of an answer, with the space after them
-COLORS = {"STABLE": "green", "SET": "green", "UNSTABLE": "red", "NO WALL": "red"}  # of labels on a terminal
+WIDTH = 100  # maximum line length of printed results
+LABEL = 11  # columns reserved for a label, including one space after it
+# Colors of labels on a terminal.
+COLORS = {"STABLE": "green", "SET": "green", "UNSTABLE": "red", "NO WALL": "red"}
 COLORS |= dict.fromkeys(("MARGINAL", "UNDECIDED", "CAUTION"), "yellow")
-_NARROW = 60  # fewer columns have no room for labels
+_NARROW = 60  # smallest width with a separate column for labels
 _COLUMN = re.compile(r" {2,}")
 # A space within a quantity, as in "B = 3 N s/m"; after some words as well, where it does no harm.
 _BESIDE = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
@@ -40,7 +41,7 @@ def row(label: str, text: str) -> str:
 
 
 def line(label: str, text: str) -> str:
-    """Return a line of an answer, with its label."""
+    """Return a line of a printed result with its label."""
     return f"{label:<{LABEL - 1}} {text}"
 
 
@@ -50,9 +51,9 @@ def print_json(result: Any) -> None:
 
 
 def fold(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) -> Iterator[str]:
-    """Yield lines folded to a width, the rest of each indented; a number keeps its unit next to it.
+    """Yield lines wrapped to a width, continuation lines indented; no break separates a number from its unit.
 
-    A narrow width has no column for labels: the text next to it would be one word per line.
+    A narrow width has no separate column for labels, because the text would wrap after every word.
     """
     narrow = width < _NARROW
     wrap = textwrap.TextWrapper(max(width, 40), break_long_words=False, break_on_hyphens=False)
@@ -64,7 +65,7 @@ def fold(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) -> Itera
 
 
 def print_folded(lines: Iterable[str], indent: int = 24) -> None:
-    """Print lines for people: as wide as COLUMNS or the terminal, but no wider than 100 columns."""
+    """Print lines as wide as ``COLUMNS`` or the terminal, at most 100 columns, with colored labels."""
     width = shutil.get_terminal_size((WIDTH, 24)).columns
     for each in fold(lines, indent, min(width, WIDTH)):
         word = each[: LABEL - 1].rstrip()
@@ -81,7 +82,7 @@ def tell(result: Any, lines: Iterable[str], as_json: bool, indent: int = 24) -> 
 
 @in_own_units
 def part_lines(scene: Scene) -> list[str]:
-    """Return a line for each part of a scene in addition to a rigid device, from the motor outwards."""
+    """Return a line for each part of a scene apart from the rigid device, in order from the motor outwards."""
     lines = []
     velocity = type(scene.velocity).__name__
     parts, values = find_parts(scene), scene.parameters()
@@ -155,18 +156,18 @@ def scene_notes(scene: Scene) -> list[str]:
 
 
 def _compare_with_limit(scene: Scene) -> list[str]:
-    """Return the notes on the safe limit of a scene that has a wall: is the wall within, and the warnings."""
+    """Return the warnings of a scene's safe limit, preceded by a note if the wall exceeds the limit."""
     limit, wall = scene.safe_limit, scene.wall
     if limit is None or isinstance(wall, NoWall):
         return []
     if limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
         return list(limit.warnings)
-    return [f"this wall exceeds the safe limit: the true device may be unstable. {limit.describe()}", *limit.warnings]
+    return [f"this wall exceeds the safe limit: the real device may be unstable. {limit.describe()}", *limit.warnings]
 
 
 @in_own_units
 def diagnosis_lines(found: Diagnosis) -> list[str]:
-    """Return the result of a simulation with encoder, friction and motor, and the remedies if it oscillates."""
+    """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
     advice = found.advise()
     return [
         line("simulated", f"{found.word}: {found.explain()}"),

@@ -89,8 +89,8 @@ def draw_stores(
     # a figure.
     folder = Path(os.fsdecode(path))
     if (folder / RUN_FILE).is_file() and not any(folder.glob(f"*{SUFFIX}")):
-        remedy = "for another look run again: zwidth run CONFIG --overwrite --size 85mm --dpi 300"
-        raise StoreError(f"{folder}: holds no sweep, and the figures of its studies are drawn already; {remedy}")
+        remedy = "to change their look, run again: zwidth run CONFIG --overwrite --size 85mm --dpi 300"
+        raise StoreError(f"{folder}: contains no sweep; the figures of its studies exist already; {remedy}")
     stores = list_stores(folder)
     beside = folder.parent if stores == [folder] else folder
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))

@@ -41,7 +41,7 @@ RUN_FORMAT = 2
 _SEAL = "record_sha256"
 _MOVE = f"move it away, or {ELSEWHERE}"
 
-# Beside those that can change a result.
+# Recorded in addition to the packages that can change a result.
 _PACKAGES = ("scipy", "matplotlib", "optimistix", "jaxopt")
 
 # As `hidden_beside` calls what is not finished.
@@ -168,7 +168,7 @@ class Record:
         self._update({}, entry)
 
     def _update(self, about: dict[str, Any], entry: dict[str, Any] | None = None) -> None:
-        """Change the content and write it to the file."""
+        """Update the content, replacing the entry of the same study if ``entry`` is given, and write it to the file."""
         content = {**self.content, **about}
         studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
         content["studies"] = [*studies, *([] if entry is None else [entry])]

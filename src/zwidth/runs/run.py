@@ -32,10 +32,9 @@ AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 
 @dataclass(frozen=True)
 class StudyResult:
-    """How one study went.
+    """Outcome of one study in a run.
 
-    Its state is "done"; "kept", where an earlier run had done it; "failed"; or "open", a sweep that was stopped before
-    its last chunk.
+    States: "done"; "kept", computed by an earlier run; "failed"; "open", a sweep stopped before its last chunk.
     """
 
     name: str
@@ -139,7 +138,7 @@ def run(
         StoreExistsError: the folder holds a run, and neither ``resume`` nor ``overwrite`` is set; or it holds something
             else.
         StoreError: with ``resume``: a store is damaged, or the run was made from another configuration or release.
-        StoreBusyError: another run computes in the folder.
+        StoreBusyError: another run is writing to the folder.
         ResourceError: the results do not fit on the disk, or the workers not into memory.
         InputError: options that exclude each other, a folder that cannot be written, a scheduler that does not answer.
 
@@ -166,7 +165,7 @@ def run(
     if plans:
         check_installed()
     elif scheduler is not None:
-        raise InputError(f"scheduler: got {scheduler!r}, but no study of the configuration is a sweep; leave it out")
+        raise InputError(f"scheduler: got {scheduler!r}, but the configuration has no sweep; leave it out")
     # What does not fit, or not belong there, is refused before anything is made.
     Record(folder).check_free(text, overwrite=overwrite, going_on=resume)
     begun = {study.name for study in sweeps if store_path(folder, study).exists()}
@@ -369,4 +368,4 @@ def _check_options(workers: int | None, scheduler: str | None, *, resume: bool, 
     if workers is not None and workers < 1:
         raise InputError(f"workers: got {workers}; at least 1")
     if overwrite and resume:
-        raise InputError("overwrite: it starts again, resume goes on; give one of the two")
+        raise InputError("overwrite: given together with resume; give only one of them")

@@ -57,13 +57,13 @@ class SceneAnswers(SceneParts):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
     def _broadcast_walls(self, stiffness: Walls, virtual_damping: Walls) -> Sequence[Array]:
-        """Return alpha and beta of walls in SI units, as arrays of one shape."""
+        """Return alpha and beta of walls given in SI units, broadcast to a common shape."""
         walls = self.normalize_walls(stiffness, virtual_damping)
         self._check_traceable(*walls)
         return namespace(*walls).broadcast_arrays(*walls)
 
     def _check_traceable(self, *values: Any) -> None:
-        """Raise `InputError` if JAX traces a value and the loop has no closed form."""
+        """Raise `InputError` if JAX traces a value and the loop is not traceable."""
         if is_traced(*values) and not self.loop.traceable:
             raise InputError(
                 f"{self.traced_path or 'stiffness, virtual_damping'}: got a value that JAX traces, which needs a rigid "
@@ -199,14 +199,14 @@ class SceneAnswers(SceneParts):
         return self.loop.column(alpha) * self.units.virtual_damping
 
     def damper_range(self) -> np.ndarray:
-        """Return the intervals of the virtual damping B of a pure damper, K = 0.
+        """Return the intervals of B in which a pure damper (K = 0) is stable except for its pole at z = 1.
 
-        Without stiffness nothing pulls the position of a free device back: a pole stays at z = 1, so that `is_stable`
-        is False for every B. In these intervals all other poles lie inside the unit circle. A device with a spring to
-        ground has no such pole: then these are the intervals of `stable_damping` at K = 0.
+        With K = 0 no force restores the position of a free device: one pole stays at z = 1, so `is_stable` returns
+        False for every B. In the returned intervals all other poles lie inside the unit circle. A device with a spring
+        to ground has no such pole; its intervals equal those of `stable_damping` at K = 0.
 
         Returns:
-            Array (n, 2) in N s/m. The ends do not belong to the intervals.
+            Array of shape (n, 2) in N s/m. The intervals are open.
 
         Example:
             >>> import zwidth
@@ -282,8 +282,9 @@ class SceneAnswers(SceneParts):
 def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     """Return whether walls with B < 0 count.
 
-    By default they do if B acts on the difference of two samples of a `zwidth.Device`. Of a device given as a whole
-    system the damping is unknown: with B < 0 the wall would cancel damping of the model that may not exist.
+    By default they count for a `zwidth.Device` whose velocity is a positive multiple of the difference of two samples.
+    They do not count for a device given as a whole system: its true damping is unknown, so a wall with B < 0 would
+    cancel modeled damping that may not exist.
     """
     if negative_damping is None and isinstance(scene.device, WholeDevice):
         return False

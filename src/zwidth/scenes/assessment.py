@@ -1,4 +1,4 @@
-"""A verdict on one wall: stable, how far from the boundary, passive, and what is possible."""
+"""Assessment of one wall: stability, margins, passivity, and the limits of the device."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Assessment:
     delta: float  # the damping to ground of that mass in the same units
     d: float  # the delay in periods
     stable: bool | None  # every pole lies strictly inside the unit circle; None: a measured response leaves it open
-    marginal: bool  # poles on the circle, none outside: one at z = 1 (K = 0), or all of a sampled plant without damping
+    marginal: bool  # poles on the unit circle, none outside: one at z = 1 (K = 0), or all of a plant without damping
     spectral_radius: float  # the largest pole magnitude, 1 to rounding where the decay is very slow
     decay_rate: float  # of the slowest motion, in 1/s, with relative accuracy; negative for a growing one
     stable_stiffness: Intervals  # every stable interval of K at this B, in N/m
@@ -228,13 +228,13 @@ _STEPS = {
 
 @shown()
 class Limit(NamedTuple):
-    """An improvement of a scene and the stiffness that it gains."""
+    """An improvement of a scene and the stiffness gained by it."""
 
-    name: str  # of the part or parameter
-    words: str  # the improvement, such as "half the delay"
-    stiffness: float  # in N/m, with the improvement: K_max, or of a recommended wall under the same requirements
-    gain: float  # stiffness over the present one
-    note: str = ""  # the quantity that stays the same, such as "the delay stays 1 ms"
+    name: str  # name of the part or parameter
+    words: str  # the improvement in words, such as "half the delay"
+    stiffness: float  # in N/m: K_max, or K recommended under the same requirements, of the improved scene
+    gain: float  # ratio of that stiffness to the present one
+    note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
 
     def spell(self) -> str:
         """Return the improvement and its gain in words."""
@@ -244,22 +244,23 @@ class Limit(NamedTuple):
 
 
 class Improvement(NamedTuple):
-    """A scene with one thing improved."""
+    """A scene with one part or parameter improved."""
 
-    name: str
-    words: str
-    scene: SceneOptima
-    note: str = ""
+    name: str  # name of the part or parameter
+    words: str  # the improvement in words
+    scene: SceneOptima  # the improved scene
+    note: str = ""  # quantity that stays constant
 
 
 @of_scene
 def limits_of(scene: SceneOptima) -> list[Limit]:
     """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 
-    Each thing that the scene has is improved by itself, by a step that somebody can buy: twice the rate (the window the
-    same in seconds, the delay in the unit in which it was given; a delay given in seconds also with the same periods),
-    half the delay, a tenth more damping, a filter or an amplifier twice as fast (without a filter where twice its
-    cut-off is beyond half the rate), a window half as long, a link twice as stiff, or the structure behind the modes.
+    Each part and parameter of the scene is improved separately, by a step that is available in practice: twice the
+    rate, half the delay, 10 % more damping, a filter or an amplifier twice as fast, a window half as long, a coupling
+    twice as stiff, or a structure twice as stiff for the modes. At twice the rate the window keeps its length in
+    seconds and the delay stays constant in the unit in which it was given; a delay given in seconds is also evaluated
+    constant in periods. If twice the cutoff exceeds the Nyquist frequency, the filter is removed instead.
 
     Args:
         scene: a scene of plain numbers.
@@ -283,7 +284,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
 
 def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima], float]) -> list[Limit]:
-    """Return every improvement of a scene with its stiffness by ``measure``, the largest gain first, NaN last."""
+    """Return the gains of all improvements of a scene, largest first, NaN last; ``measure`` computes the stiffness."""
     found = []
     for name, words, improved, note in list_improvements(scene):
         stiffness = measure(improved)
@@ -293,12 +294,12 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
 
 @in_own_units
 def describe_islands(scene: SceneOptima) -> list[str]:
-    """Return a line for each island, and one if the device is unstable by itself."""
+    """Return one line for each island, and one line if the device is unstable without a wall."""
     lines = []
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:
         softest = with_unit(round_safely(least * scene.units.stiffness, "above"), "N/m")
-        lines.append(f"the device is unstable by itself: no wall softer than K = {softest} is stable")
+        lines.append(f"the device is unstable without a wall: no wall softer than K = {softest} is stable")
     for island in scene.islands():
         units = {"K": (island.stiffness, "N/m"), "B": (island.virtual_damping, "N s/m")}
         ends = (f"{name} from {' to '.join(tell_apart(*ends, u))}" for name, (ends, u) in units.items())
@@ -318,7 +319,7 @@ def _stiffness(scene: SceneOptima) -> float:
 
 
 def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
-    """Yield the scene with one thing improved, for each thing it has."""
+    """Yield the scene with one part or parameter improved, for each that it has."""
     timing = scene.timing
     slower = {"period": scene}
     if timing.delay and not timing.in_periods:
@@ -348,7 +349,7 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
 
 
 def _can_sample_faster(scene: SceneOptima) -> bool:
-    """Return whether twice the rate can be computed; coefficients in z are those of one rate alone."""
+    """Return whether the scene is defined at twice the rate; a model given in z holds for one rate only."""
     if isinstance(scene.velocity, VelocityFilter) or getattr(scene.device, "dt", None) is not None:
         return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
@@ -357,7 +358,7 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
 
 
 def _double_rate(scene: SceneOptima) -> SceneOptima:
-    """Return the scene at twice the rate, filter and window the same in seconds, the delay in its unit."""
+    """Return the scene at twice the rate: filter and window constant in seconds, the delay in its given unit."""
     changes: dict[str, float] = {"period": scene.timing.period / 2}
     if isinstance(scene.velocity, WindowedDifference):
         changes["velocity.samples"] = scene.velocity.samples * 2

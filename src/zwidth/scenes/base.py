@@ -138,7 +138,7 @@ class SceneParts(Part):
 
     @cached_property
     def traced_path(self) -> str | None:
-        """The path of a parameter that JAX traces, or None."""
+        """Path of the first parameter that JAX traces; None if JAX traces no parameter."""
         return next((path for path, value in list_parameters(self).items() if is_traced(value)), None)
 
     @property
@@ -181,7 +181,7 @@ class SceneParts(Part):
     @in_own_units
     def units(self) -> WallSI:
         """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
-        # Concrete numbers of JAX may have single precision only.
+        # Convert to Python floats, because concrete JAX numbers may have single precision.
         mass, period = (value if is_traced(value) else float(value) for value in (self.mass, self.timing.period))
         return WallSI(mass / period / period, mass / period)
 
@@ -198,7 +198,7 @@ class SceneParts(Part):
     def replace(self, **changes: Any) -> Self:
         """A new scene with one or several parameters changed; all others stay as they are, in SI units.
 
-        A delay given in periods stays in periods if the period changes.
+        A delay given in periods keeps its number of periods if the period changes.
 
         Args:
             **changes: by dotted path, as ``**{"velocity.cutoff": 50}``, ``period=5e-4`` or ``rate=2000``; or a whole
@@ -252,7 +252,7 @@ def of_scene(
 
 
 def require_numbers(kind: type[SceneParts], *, but: Collection[str]) -> None:
-    """Let all public methods of a class of scenes, except those in ``but``, refuse values that JAX traces."""
+    """Make the public methods of a scene class, except those in ``but``, raise `InputError` for traced values."""
     for name in dir(kind):
         method = inspect.getattr_static(kind, name)
         if inspect.isfunction(method) and not name.startswith("_") and name not in but:
@@ -270,7 +270,7 @@ def _of_numbers(method: Callable[Concatenate[Owner, Parameters], Result]) -> Cal
 
 
 def refuse_traced(question: str, scene: SceneParts, arguments: Mapping[str, Any]) -> None:
-    """Raise `InputError` if JAX traces a parameter of the scene or an argument."""
+    """Raise `InputError` if JAX traces a parameter of the scene or an argument of the method ``question``."""
     traced = scene.traced_path or next((name for name, value in arguments.items() if is_traced(value)), None)
     if traced is not None:
         raise InputError(
@@ -279,7 +279,7 @@ def refuse_traced(question: str, scene: SceneParts, arguments: Mapping[str, Any]
 
 
 def check_scene(scene: object, question: str = "this function") -> None:
-    """Refuse anything but a scene of numbers."""
+    """Raise `InputError` if an object is not a scene, or if JAX traces one of its parameters."""
     if not isinstance(scene, SceneParts):
         example = "zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3))"
         raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed, as {example}")

@@ -48,8 +48,8 @@ from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array, DelayModel
 from zwidth.words.xp import is_jax, is_traced, namespace, nan_beyond
 
-# Logarithm of the largest pole magnitude of a lossless loop below which all poles are on the circle but for rounding:
-# 1e-16^(1/2), as of two poles that meet there.
+# Largest log|z| of a lossless loop whose poles count as on the unit circle. A rounding error of 1e-16 moves a double
+# pole by its square root, about 1e-8.
 _ON_CIRCLE = 1e-7
 
 
@@ -74,7 +74,7 @@ class LinearLoop:
     # a stiffest wall takes some 10 to 50 ms.
     delay_models: ClassVar[tuple[DelayModel, ...]] = ("held",)
     draws: ClassVar[int] = 200
-    # Whether its questions about walls work inside jit, vmap and grad.
+    # Whether the methods that take walls work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
     # The most periods of window and delay that a search affords: its cost grows with their square.
     most_periods: ClassVar[float] = 128
@@ -173,19 +173,19 @@ class LinearLoop:
         return stable_dampings(self.boundary, float(*nan_beyond(WALL_RANGE, alpha)))
 
     def dampers(self) -> np.ndarray:
-        """Return the intervals of beta of pure dampers, shape (intervals, 2): all poles inside but the free z = 1."""
+        """Return the beta intervals, shape (n, 2), in which all poles of a damper but z = 1 lie inside the circle."""
         damper = self.roots.as_damper()
         if damper is None:
             return LinearLoop.column(self, 0.0)
-        found = bound_intervals(Boundary.trace(damper), np.zeros(1))
-        return np.stack([found.low[0], found.high[0]], -1)
+        intervals = bound_intervals(Boundary.trace(damper), np.zeros(1))
+        return np.stack([intervals.low[0], intervals.high[0]], -1)
 
     def explain(self, alpha: float, beta: float) -> list[str]:
         """What keeps a wall undecided, a sentence each: nothing, where there is a model."""
         return []
 
     def explain_limit(self) -> str:
-        """Return the reason for a stiffest wall that is not decided: empty, because a model decides every wall."""
+        """Return the reason for an undecided stiffest wall: "", because the stability of a model is always decided."""
         return ""
 
     def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
@@ -202,12 +202,12 @@ class LinearLoop:
         return self.border.islands(least)
 
     def critical_walls(self, w: Array) -> tuple[Array, Array]:
-        """Return alpha and beta of the walls that put a pole pair at the angles w, in (0, pi), on the unit circle."""
+        """Return alpha and beta of the walls that have a pole pair on the unit circle at the angles w in (0, pi)."""
         curve = curve_at(self.roots, w)
         return curve.alpha, curve.beta
 
     def least_stiffness(self, least: float) -> float | None:
-        """Return the alpha below which no wall of a device unstable by itself is stable; None for other devices."""
+        """Return the alpha below which no wall is stable, for a device unstable without a wall; None for others."""
         softest = self.border.find_softest(least) if self.roots.device_is_unstable else 0.0
         return softest if softest > 0 else None
 
@@ -379,7 +379,7 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
         stiffness, *slopes = stiffness_slopes(found, scene.mass, scene.timing.period, *values)
     per = dict(zip(("mass", "damping", "period", "delay"), slopes, strict=True))
     if scene.timing.in_periods and scene.timing.d:
-        # The delay grows with the period: dK/dT = dK/dT at fixed t_d + d dK/dt_d.
+        # A delay given in periods grows with T. Chain rule: dK/dT at fixed d is dK/dT at fixed t_d + d dK/dt_d.
         per["period"] = per["period"] + scene.timing.d * per["delay"]
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}

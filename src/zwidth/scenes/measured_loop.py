@@ -119,7 +119,7 @@ class MeasuredLoop(LinearLoop):
         return []
 
     def least_stiffness(self, least: float) -> None:
-        """None: a response without a model does not show the poles of its device."""
+        """Return None: a measured response without a model does not contain the poles of the device."""
 
     @cached_property
     def _tops(self) -> tuple[np.ndarray, np.ndarray]:
@@ -192,12 +192,12 @@ class MeasuredLoop(LinearLoop):
         return said
 
     def explain_limit(self) -> str:
-        """Return the reason why no wall is decided: what the wall with the fewest undecided points requires."""
+        """Return the reason why no wall is decided, from the wall with the fewest undecided frequencies."""
         rows = [(*self.walls.ends(beta), beta) for beta in self._tops[0].tolist()]
         walls = [(0.5 * (low + high), beta) for low, high, beta in rows if low < high]
-        count = f"the {self.scene.device.frequency.size} lines of the response decide no wall"
+        count = f"the {self.scene.device.frequency.size} frequencies of the response decide the stability of no wall"
         if not walls:
-            return f"{count}: begin lower, end higher, or reduce the deviation"
+            return f"{count}: extend the frequency range or reduce the deviation"
         alpha, beta = min(walls, key=lambda wall: np.count_nonzero(self.walls.doubts(*wall)))
         return "; ".join([count, *self.explain(float(alpha), float(beta))])
 

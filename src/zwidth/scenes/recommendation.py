@@ -1,4 +1,4 @@
-"""The wall to set on a device: the stiffest with the required margins, its risks, and improvements of the device."""
+"""Recommended wall of a device: the stiffest with the required margins, its cautions, and useful improvements."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ from zwidth.words.status import Status
 
 _UNITS = {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m"}
 _UNITS |= {"mass": "kg", "time": "s", "frequency": "Hz"}
+# Fields of `Assessment` repeated in the recommendation's dictionary.
 _JUDGED = (
     *("alpha", "beta", "virtual_damping_lower", "virtual_damping_upper", "spectral_radius", "passive"),
     *("passivity_margin", "time_constant", "frequency", "gain_margin", "phase_margin", "delay_margin"),
@@ -46,17 +47,17 @@ _JUDGED = (
 @shown(("stiffness", "virtual_damping", "limited_by", "status", "reason", "notes"))
 @dataclass(frozen=True)
 class Recommendation:
-    """A wall to set on a device; from `zwidth.Scene.recommend`.
+    """Wall recommended for a device, from `zwidth.Scene.recommend`.
 
     Attributes:
-        scene: the device with this wall as its own, for `zwidth.assess`, `zwidth.simulate` and pictures.
+        scene: the device with the recommended wall, for `zwidth.assess`, `zwidth.simulate` and figures.
         stiffest: the stiffest stable wall of the device.
-        wanted: what was asked of the wall.
-        limited_by: which of that allows no stiffer wall: "stiffness_fraction", "gain_margin", "phase_margin",
-            "passive" or "safe_limit", the limit of the scene; "" where there is no wall.
-        status: code of `zwidth.Status`; where it is not OK there is no wall to set.
-        reason: why there is none.
-        notes: what else to know, in sentences.
+        wanted: the requirements on the wall.
+        limited_by: the active requirement, which excludes every stiffer wall: "stiffness_fraction", "gain_margin",
+            "phase_margin", "passive", "soft_grasps" or "safe_limit"; "" if no wall is recommended.
+        status: code of `zwidth.Status`; no wall is recommended unless it is OK.
+        reason: the reason why no wall is recommended; "" otherwise.
+        notes: further remarks, one sentence each.
     """
 
     scene: Any
@@ -69,19 +70,20 @@ class Recommendation:
 
     @property
     def stiffness(self) -> float:
-        """K in N/m; NaN where there is no wall."""
+        """K in N/m; NaN if no wall is recommended."""
         return float(self.scene.wall.stiffness) if self.status == Status.OK else math.nan
 
     @property
     def virtual_damping(self) -> float:
-        """B in N s/m; NaN where there is no wall."""
+        """B in N s/m; NaN if no wall is recommended."""
         return float(self.scene.wall.virtual_damping) if self.status == Status.OK else math.nan
 
     @cached_property
     def read(self) -> tuple[float, float, int]:
-        """K and B as they are printed, and their digits: the fewest, from 4 on, with which the wall has what is wanted.
+        """K and B as printed, and their number of significant digits.
 
-        K is rounded down; of a tip that leans, or of a narrow column, B needs more digits than others.
+        The digits are the fewest, at least 4, with which the rounded wall still satisfies the requirements. K is
+        rounded down. More than 4 digits are needed if only a narrow range of B satisfies them.
         """
         slack = measure_slack(self.scene, self.wanted)
 
@@ -97,65 +99,65 @@ class Recommendation:
 
     @cached_property
     def verdict(self) -> Assessment | None:
-        """What `zwidth.assess` finds of the wall; None where there is none."""
+        """The result of `zwidth.assess` for the wall; None if no wall is recommended."""
         return assess(self.scene) if self.status == Status.OK else None
 
     @cached_property
     def steps(self) -> list[Limit]:
-        """The improvements of `zwidth.limits_of` that allow a stiffer wall under the same requirements, the best first.
+        """The improvements of `zwidth.limits_of` that allow a stiffer wall under the same requirements, best first.
 
-        Their stiffness is that of the wall recommended for the improved device, right to some 0.2 %. Within a safe
-        limit that allows no better wall, only a new measurement allows a stiffer one: the list is empty.
+        The stiffness of each is that of the wall recommended for the improved device, accurate to about 0.2 %. The list
+        is empty if the safe limit is active, because then only a new measurement allows a stiffer wall.
         """
         if self.status != Status.OK or self.is_held_back:
             return []
-        found = compute_gains(self.scene.replace(wall=NoWall()), self.stiffness, self._choose_again)
-        return [step for step in found if step.gain > 1.0]
+        steps = compute_gains(self.scene.replace(wall=NoWall()), self.stiffness, self._choose_again)
+        return [step for step in steps if step.gain > 1.0]
 
     def _choose_again(self, improved: SceneOptima) -> float:
-        """Return K of the wall recommended for another device under the same requirements; NaN without one."""
+        """Return K of the wall recommended for an improved device under the same requirements; NaN if none exists."""
         try:
             top = improved.max_stiffness()
             near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
             return choose_wall(improved, self.wanted, top, near, COARSE).stiffness
         except InputError:
-            # At twice the rate a long delay may be more periods than the model is computed for.
+            # Doubling the rate may turn a long delay into more periods than the model supports.
             return math.nan
 
     @cached_property
     def cautions(self) -> tuple[str, ...]:
-        """Thin margins of the wall and hands that destabilize it, each with its remedy, in sentences."""
+        """Sentences on small margins of the wall and on grasps that destabilize it, each with its remedy."""
         return () if self.verdict is None else list_cautions(self)
 
     @cached_property
     def grasps(self) -> dict[str, bool]:
-        """Stability of the wall in each of `zwidth.reference_grasps`, by name; empty for a device given as a whole.
+        """Stability of the wall in each of `zwidth.reference_grasps`, by name; empty unless the device is a `Device`.
 
-        A rotary device is held at radii of 10 to 100 mm. If the scene has an operator, "released" is the device
-        without it.
+        The grasps hold a rotary device at radii of 10 to 100 mm. If the scene has an operator, the entry "released" is
+        the stability without the operator.
         """
         return {} if self.status != Status.OK else judge_grasps(self.scene)
 
     def code(self, language: Literal["c", "python"] = "c") -> str:
-        """The wall with its velocity estimate as the difference equations of a control loop.
+        """Return the wall and its velocity estimate as source code for a control loop.
 
         Args:
             language: "c" (C99 without any library) or "python".
 
         Returns:
-            A text: a state, a function that begins at rest and one that turns a position in m, positive into the wall,
-            into the force on the device in N, once a period. Forces are those of `zwidth.simulate` with
-            ``contact="unilateral"`` but for rounding.
+            Source code with a state, a function that initializes it at rest, and a function to call once per period,
+            which converts the position in m, positive into the wall, to the force on the device in N. The forces equal
+            those of `zwidth.simulate` with ``contact="unilateral"``, except for rounding errors.
 
         Raises:
-            InputError: there is no wall, or no such language.
+            InputError: no wall is recommended, or the language is unknown.
         """
         if self.status != Status.OK:
             raise InputError(f"code: there is no wall: {self.reason}")
         return write_wall(self.scene, language)
 
     def lines(self) -> tuple[str, ...]:
-        """Return the wall, its margins and its cautions, a line each; or the reason why no wall exists."""
+        """Return lines with the wall, its margins and its cautions, or the reason why no wall is recommended."""
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
@@ -166,31 +168,31 @@ class Recommendation:
         return f"{self.spell_wall()}: {self.spell_limit()}", margins, *cautions
 
     def spell_wall(self) -> str:
-        """Return the wall to set in words."""
+        """Return the recommended wall in words."""
         K, B, digits = self.read
         return f"K = {spell_stiffness(K, digits)}, B = {with_unit(B, 'N s/m', digits)}"
 
     def spell_limit(self) -> str:
-        """Return the share of K_max and the requirement that allows no stiffer wall, in words."""
+        """Return, in words, the stiffness as a share of K_max and the active requirement."""
         largest = float(self.stiffest.stiffness)
         share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {spell_stiffness(largest)}"
         return share if self.limited_by == "stiffness_fraction" else f"{share}; {self.spell_requirement()}"
 
     def spell_requirement(self) -> str:
-        """Return the requirement that allows no stiffer wall, in words."""
+        """Return, in words, the active requirement, which limits the stiffness."""
         within = " within the safe limit" if self.limited_by != "safe_limit" and self.is_held_back else ""
         return f"limited by {self.wanted.spell(self.limited_by)}{within}"
 
     @property
     def is_held_back(self) -> bool:
-        """True if the safe limit allows no better wall: the stiffness is at the limit, or the virtual damping."""
+        """True if the safe limit is active: K or B of the wall lies on it."""
         limit = None if self.wanted.beyond_safe else self.scene.safe_limit
         ends = None if limit is None else limit.dampings(self.stiffness)
         at_end = ends is not None and any(math.isclose(self.virtual_damping, end, rel_tol=1e-3) for end in ends)
         return at_end or self.limited_by == "safe_limit"
 
     def spell_margins(self) -> str:
-        """Return the margins of the wall in words, rounded to the safe side."""
+        """Return the margins of the wall in words, each rounded conservatively."""
         verdict = self.verdict
         if verdict is None:
             return "none"
@@ -205,13 +207,13 @@ class Recommendation:
         return {True: "yes", False: "no", None: f"not known {obstacle}".rstrip()}[passive]
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it as plain JSON values in SI units, with the normalized ones beside them; None where not known."""
+        """Return all results as JSON values in SI units, with normalized values as well; None for unknown values."""
         scene, verdict, top = self.scene, self.verdict, self.stiffest
         judged = {} if verdict is None else verdict.as_dict()
         device = {name: value for name, value in scene.parameters().items() if name not in WALL}
         constant = math.nan if verdict is None or not verdict.stable else verdict.time_constant
         alpha, beta = scene.normalize_walls(top.stiffness, top.virtual_damping)
-        found = {
+        result = {
             "units": {name: own_unit(unit) for name, unit in _UNITS.items()},
             "device": {**device, "velocity": type(scene.velocity).__name__, "delta": float(scene.delta), "d": scene.d},
             "maximum": {
@@ -228,12 +230,12 @@ class Recommendation:
                 "limited_by": self.limited_by,
                 "stiffness": self.stiffness,
                 "virtual_damping": self.virtual_damping,
-                # As many as it takes to write it down.
+                # The number of significant digits with which K and B are printed.
                 "digits": None if verdict is None else self.read[2],
                 **{name: judged.get(name) for name in _JUDGED},
                 "stable": verdict is not None and verdict.stable,
                 "decay_time": float(decay_time(1.0 / np.float64(constant))),
-                # Of the response to a step, where one is drawn.
+                # Filled in by the recommend study if it computes a step response.
                 "settling_time": None,
             },
             "steps": [step._asdict() for step in self.steps],
@@ -243,21 +245,21 @@ class Recommendation:
             "notes": list(self.notes),
         }
         if self.limited_by == "stiffness_fraction":
-            # As it was given: the quotient may have another last digit.
-            found["recommended"]["stiffness_fraction"] = self.wanted.stiffness_fraction
-        return to_json(found)
+            # Repeat the value received, because the quotient may differ from it in the last digit.
+            result["recommended"]["stiffness_fraction"] = self.wanted.stiffness_fraction
+        return to_json(result)
 
 
 def _describe_limit(limit: SafeLimit | None, ignored: bool) -> list[str]:
-    """Return the notes on a safe limit: the limit with its reason, and its warnings."""
+    """Return the notes on a safe limit: one on the limit with its reason, and one for each warning."""
     if limit is None or (limit.forbids_all and not ignored):
-        # A limit that forbids all walls is the reason of the recommendation.
+        # No note if the limit forbids all walls, because the recommendation's reason already states it.
         return []
     return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe()}", *limit.warnings]
 
 
 class SceneAdvice(SceneOptima):
-    """The question of `zwidth.Scene` what to set."""
+    """Scene with the method `recommend`."""
 
     def recommend(
         self,
@@ -268,35 +270,36 @@ class SceneAdvice(SceneOptima):
         passive: bool = False,
         beyond_safe: bool = False,
     ) -> Recommendation:
-        """The stiffest wall that keeps some distance from trouble: the one to set on this device.
+        """Return the wall recommended for this device: the stiffest that satisfies the requirements.
 
         Args:
-            stiffness_fraction: at most this share of K_max, between 0 and 1.
-            gain_margin: at least this factor on stiffness and damping together, > 1.
-            phase_margin: at least so many degrees, > 0.
+            stiffness_fraction: largest K as a fraction of K_max, between 0 and 1.
+            gain_margin: smallest gain margin, a factor on K and B together, > 1.
+            phase_margin: smallest phase margin in degrees, > 0.
             passive: require a passive wall.
-            beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its stiffness is
-                at most ``stiffness_fraction`` (or 0.75) of the limit's.
+            beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its K is at most
+                ``stiffness_fraction`` (default 0.75) of the limit's stiffness.
 
-        Without any requirement these are the defaults: at most 0.75 of K_max, a gain margin of 2, a phase margin of 30
-        degrees, and stability in the soft reference grasps. Any requirement replaces all of them.
+        If no requirement is given, the defaults are a stiffness fraction of 0.75, a gain margin of 2, a phase margin of
+        30 degrees, and stability in the soft reference grasps. Any given requirement replaces all defaults.
 
         Returns:
             Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, the active requirement; ``cautions``,
-            thin margins and grasps that destabilize the wall; ``verdict``, the `zwidth.assess` of the wall; ``steps``,
-            improvements of the device that allow a stiffer wall under the same requirements; ``code("c")``, the wall
-            for a control loop. ``status`` is UNREACHABLE if no wall, however soft, satisfies the requirements.
+            small margins and grasps that destabilize the wall; ``verdict``, the `zwidth.assess` of the wall; ``steps``,
+            improvements of the device that allow a stiffer wall under the same requirements; ``code("c")``, the wall as
+            a program for a control loop. ``status`` is UNREACHABLE if no wall satisfies the requirements.
 
         Numerics:
-            A share of K_max alone is in closed form, with the damping of the stiffest wall where it is stable. Margins
-            take a search over K and B: each wall is judged by `margins` and `passivity_margin` themselves, and K lies
-            within 1e-4 of the largest that was found; 0.5 s for a rigid device, some seconds with other parts.
+            A stiffness fraction without other requirements needs no search: B is that of the stiffest wall if the wall
+            is stable with it. Required margins need a search over K and B, in which `margins` and `passivity_margin`
+            decide every wall; K is within 1e-4 of the largest value found. The search takes 0.5 s for a rigid device
+            and some seconds with other parts.
 
         Example:
             >>> import zwidth
             >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
-            >>> found = scene.recommend(phase_margin=30)
-            >>> print(f"{found.stiffness:.0f} N/m and {found.virtual_damping:.0f} N s/m")
+            >>> advice = scene.recommend(phase_margin=30)
+            >>> print(f"{advice.stiffness:.0f} N/m and {advice.virtual_damping:.0f} N s/m")
             8009 N/m and 33 N s/m
             >>> scene.recommend().limited_by
             'phase_margin'
@@ -307,11 +310,11 @@ class SceneAdvice(SceneOptima):
             raise InputError(f"passive: got True {obstacle}")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)
-        found = choose_wall(bare, wanted, top)
-        notes += [found.note] if found.note else []
+        choice = choose_wall(bare, wanted, top)
+        notes += [choice.note] if choice.note else []
         notes += _describe_limit(self.safe_limit, beyond_safe)
-        if found.status == Status.OK:
-            stiffness = check_number("stiffness", found.stiffness)
-            wall = VirtualWall(stiffness, check_number("virtual_damping", found.damping))
+        if choice.status == Status.OK:
+            stiffness = check_number("stiffness", choice.stiffness)
+            wall = VirtualWall(stiffness, check_number("virtual_damping", choice.damping))
             bare = bare.replace(wall=wall)
-        return Recommendation(bare, top, wanted, found.limit, found.status, found.reason, tuple(notes))
+        return Recommendation(bare, top, wanted, choice.limit, choice.status, choice.reason, tuple(notes))

@@ -27,14 +27,14 @@ class Scene(SceneAdvice):
             left out.
         velocity: how the velocity is estimated; the backward difference by default.
         operator: the hand, None where nobody holds the device.
-        safe_limit: the stiffest wall that measurements of the device support; `recommend` stays within it. A fit sets
-            it. It has no effect on verdicts and on the maximum stiffness.
+        safe_limit: stiffest wall that measurements of the device support, usually set by a fit. `recommend` respects
+            it; stability and maximum stiffness do not depend on it.
 
     Numerics:
-        Parameters and walls may be values that JAX traces. A rigid scene with the backward difference then computes
-        `boundary`, `is_passive`, `is_stable`, `margins`, `passivity_margin`, `poles` (not of a traced delay) and
-        `spectral_radius` inside ``jit``, ``vmap`` and ``grad``, every scene `max_stiffness`. All other methods raise
-        `InputError` there.
+        Parameters and walls may be values that JAX traces. Inside ``jit``, ``vmap`` and ``grad``, `max_stiffness` works
+        for every scene. For a rigid scene with the backward difference `boundary`, `is_passive`, `is_stable`,
+        `margins`, `passivity_margin`, `poles` (except with a traced delay) and `spectral_radius` work as well. All
+        other methods raise `InputError` for traced values.
 
     Example:
         >>> import zwidth
@@ -77,8 +77,8 @@ class Scene(SceneAdvice):
     """A method: `zwidth.simulate` of this scene, with all its arguments."""
 
 
-# Methods that work inside jit, vmap and grad: all of a rigid scene with the backward difference, of others
-# `max_stiffness` and those that only convert units.
+# Methods that work inside jit, vmap and grad: all for a rigid scene with the backward difference; for other scenes
+# only `max_stiffness` and the methods that convert units or replace parameters.
 TRACEABLE = (
     "boundary",
     "is_passive",

@@ -1,4 +1,4 @@
-"""Changes that make an unstable wall stable, one parameter at a time."""
+"""Ranges of single parameters in which the wall of a scene is stable."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from zwidth.words.formatting import round_safely, tell_apart, with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.showing import shown
 
-# The direction in which a parameter is searched, and the largest factor on it.
+# Parameters with their direction of search, 1 (increase) or -1 (decrease), and the largest factor of the change.
 DIRECTIONS = {
     "delay": (-1, 1e3),
     "rate": (1, 10.0),
@@ -28,9 +28,9 @@ DIRECTIONS = {
     "actuator.time_constant": (-1, 1e3),
     "coupling.stiffness": (1, 1e3),
 }
-POINTS = 14  # values of a parameter tried over its range
-HALVINGS = 14  # of the interval between two of them
-DIGITS = 4
+POINTS = 14  # values of a parameter tried, from the present one to the end of the search range
+HALVINGS = 14  # bisection steps between two tried values
+DIGITS = 4  # significant digits printed
 
 NAMES = {
     "stiffness": "K",
@@ -47,15 +47,15 @@ NAMES = {
 
 @shown()
 class StableRange(NamedTuple):
-    """A range of one parameter in which a wall is stable, with everything else unchanged."""
+    """A range of one parameter in which a wall is stable, all other parameters unchanged."""
 
     parameter: str  # dotted path
-    low: float  # SI units; -inf for no lower end
-    high: float  # inf for no upper end
-    note: str = ""
+    low: float  # in SI units; -inf if the range has no lower end
+    high: float  # in SI units; inf if the range has no upper end
+    note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
 
     def spell(self) -> str:
-        """Return the range in words, rounded inwards."""
+        """Return the range in words, both ends rounded into the range."""
         name, unit = NAMES.get(self.parameter, self.parameter), PARAMETERS[self.parameter].unit
         kept = f" ({self.note})" if self.note else ""
         if self.parameter == "velocity.samples":
@@ -71,47 +71,47 @@ class StableRange(NamedTuple):
 def stabilize(scene: SceneOptima) -> list[StableRange]:
     """Return the ranges of single parameters in which the wall of a scene is stable.
 
-    Stiffness and virtual damping come first, each with its stable interval next to the present value. Then follow
-    delay, rate, damping of the device, velocity filter, actuator and coupling, each in the direction that usually
-    helps, if a value within the range that is searched makes the wall stable.
+    The list starts with stiffness and virtual damping, each with the stable interval nearest to its present value.
+    Delay, rate, physical damping, velocity filter, actuator and coupling follow; each is searched in the direction that
+    usually stabilizes and omitted if no value in the searched range is stable.
     """
     K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
     row, column = (list(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
-    found = []
+    ranges = []
     if row:
         low, high = nearest_interval(tuple(row), K)
-        found.append(StableRange("stiffness", low if low > 0 or low >= K else -math.inf, high))
+        ranges.append(StableRange("stiffness", low if low > 0 or low >= K else -math.inf, high))
     if column:
-        found.append(StableRange("virtual_damping", *nearest_interval(tuple(column), B)))
+        ranges.append(StableRange("virtual_damping", *nearest_interval(tuple(column), B)))
     values = {**scene.parameters(), "rate": 1.0 / scene.timing.period}
     for path, (direction, factor) in DIRECTIONS.items():
         if path in values and (path != "delay" or values[path] > 0):
-            found += _search(scene, path, float(values[path]), direction, factor)
-    return found
+            ranges += _search(scene, path, float(values[path]), direction, factor)
+    return ranges
 
 
-def _search(scene: SceneOptima, path: str, now: float, direction: int, factor: float) -> list[StableRange]:
-    """Return the nearest stable range of one parameter in a direction, if any."""
+def _search(scene: SceneOptima, path: str, present: float, direction: int, factor: float) -> list[StableRange]:
+    """Return the stable range nearest to the present value in one direction; an empty list if there is none."""
 
     def holds(value: float) -> bool | None:
-        """Return the stability of the wall; None for a refused value, as a cutoff above the Nyquist frequency."""
+        """Return whether the wall is stable; None for an invalid value (a cutoff above the Nyquist frequency)."""
         try:
             return bool(scene.replace(**{path: value}).is_stable())
         except InputError:
             return None
 
     if path == "velocity.samples":
-        shorter: int | None = next((count for count in range(int(now) - 1, 0, -1) if holds(count)), None)
+        shorter: int | None = next((count for count in range(int(present) - 1, 0, -1) if holds(count)), None)
         return [] if shorter is None else [StableRange(path, -math.inf, shorter)]
-    start = now or 1e-3 * scene.units.virtual_damping
-    values = [now, *(start * np.geomspace(1.0, factor, POINTS)[1:] ** direction).tolist()]
+    start = present or 1e-3 * scene.units.virtual_damping
+    values = [present, *(start * np.geomspace(1.0, factor, POINTS)[1:] ** direction).tolist()]
     if path == "delay":
         values[-1] = 0.0
     stable = [holds(value) for value in values]
     if True not in stable:
         return []
     first = stable.index(True)
-    near = _bisect(holds, values[first], values[first - 1]) if first else now
+    near = _bisect(holds, values[first], values[first - 1]) if first else present
     beyond = stable.index(False, first) if False in stable[first:] else None
     far = _bisect(holds, values[beyond - 1], values[beyond]) if beyond else None
     note = f"the delay stays {scene.timing.kept_delay}" if path == "rate" and scene.timing.delay else ""
@@ -121,7 +121,7 @@ def _search(scene: SceneOptima, path: str, now: float, direction: int, factor: f
 
 
 def _bisect(holds: Callable[[float], bool | None], inside: float, outside: float) -> float:
-    """Return the value next to the end of a stable range, itself stable."""
+    """Return the stable value closest to the end of a stable range, by bisection."""
     for _ in range(HALVINGS):
         middle = 0.5 * (inside + outside)
         inside, outside = (middle, outside) if holds(middle) else (inside, middle)

@@ -40,7 +40,7 @@ class StiffestWall(NamedTuple):
 
 
 def explain_missing(scene: SceneAnswers, status: Any) -> str:
-    """Return the reason for a stiffest wall without numbers."""
+    """Return the reason why a scene has no stiffest wall, from the status of the search."""
     if status == Status.NO_BOUNDARY:
         return "no stiffness is stable at any damping"
     explained = scene.loop.explain_limit() if status == Status.UNDECIDED else ""
@@ -198,18 +198,19 @@ class SceneOptima(SceneAnswers):
     """The questions of `zwidth.Scene` that look for a wall, or for a device that bears it."""
 
     def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
-        """The stiffest stable wall that soft ones lead to, and what binds it.
+        """Return the stiffest stable wall connected to K = 0, and the kind of its optimum.
 
-        ``sup {K : some B is stable}`` over the pieces of the stable set that contain soft walls, down to K = 0: along a
-        path of stable walls K and B can rise to it. Walls apart from these are `islands`. A device unstable by itself
-        may have no stable soft walls: then the piece with the softest stable walls counts. With parts, a tip of the set
-        may lean, so that no softer wall is stable at the very damping of the stiffest: `recommend` says what to set.
+        K_max is ``sup {K : some B is stable}`` over the pieces of the stable set that are connected to K = 0 by paths
+        of stable walls. All other pieces are `islands`. If the device is unstable without a wall, no piece may be
+        connected to K = 0; then the piece with the softest stable walls counts. With parts the stable set may be
+        inclined near its tip, so that no softer wall is stable at the damping of the stiffest; `recommend` returns a
+        wall to set.
 
         Args:
-            negative_damping: whether walls with B < 0 count. By default they do for a `Device` with the backward
-                difference. With a filter a negative B is a lead compensator; with a `LinearDevice` or `MeasuredDevice`
-                it would cancel damping inside the model, which is unsafe: B >= 0 there unless True is given. What is a
-                piece does not depend on it: a path may lead through B < 0.
+            negative_damping: whether walls with B < 0 count. By default they count only for a `Device` with the
+                backward difference. With a filter a negative B is a lead compensator; with a `LinearDevice` or a
+                `MeasuredDevice` it would cancel damping of the model, which is unsafe. The pieces of the stable set do
+                not depend on this argument: a path may lead through B < 0.
 
         Returns:
             ``stiffness`` in N/m; ``virtual_damping`` in N s/m; ``frequency`` in Hz of the pole pair on the unit circle,
@@ -245,11 +246,11 @@ class SceneOptima(SceneAnswers):
 
         Returns:
             ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
-            "operator.mass", ...) in N/m per SI unit, each with all others held fixed (the delay in the unit, seconds
-            or periods, in which it was given); ``status``, NOT_CONVERGED where
-            one of them is NaN, as all are without a K_max. Whole numbers and coefficients of a filter have none. At
-            zero they are those of a little more, as at a whole delay of a linear system without inertia; of all others
-            both sides agree there.
+            "operator.mass", ...) in N/m per SI unit, each with all others held fixed (the delay in seconds or in
+            periods, as it was given); ``status``, NOT_CONVERGED if a derivative is NaN; without a K_max all
+            are NaN. Whole numbers and coefficients of a filter have no derivative. At a value of zero, and at an
+            integer delay of a linear system without inertia, the derivatives are one-sided, for an increase; for all
+            others both sides agree.
 
         Numerics:
             Closed form for a rigid device; otherwise implicit derivatives of the conditions that bind, some ms a

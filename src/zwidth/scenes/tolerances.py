@@ -57,8 +57,8 @@ def simulate_tolerances(
 ) -> ToleranceEstimate:
     """Draw devices within tolerances and judge the scene's wall on each of them.
 
-    The parameters are independent of each other; all that is not named is exact. A delay stays in the unit, seconds or
-    periods, in which it was given.
+    The parameters are independent of each other; all that is not named is exact. A delay given in periods keeps its
+    number of periods.
 
     Args:
         scene: nominal device, timing, parts, and the wall.

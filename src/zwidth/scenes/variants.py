@@ -65,7 +65,7 @@ class RigidVariants(Variants):
         with np.errstate(all="ignore"):
             self.rate = mass / self.period
             self.delta = damping / self.rate
-            # A delay given in periods does not change with the period.
+            # d depends on the period only if the delay was given in seconds.
             moving = {"delay"} if scene.timing.in_periods else {"delay", "period"}
             self.d = delay / self.period if moving & set(drawn) else np.full(self.count, float(scene.d))
 

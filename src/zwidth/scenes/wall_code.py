@@ -22,7 +22,7 @@ from zwidth.words.errors import check_choice
 from zwidth.words.formatting import name_wall, with_unit
 from zwidth.words.rotation import is_rotary, own_unit
 
-_COLUMNS = 100  # of a comment
+_COLUMNS = 100  # characters per line of a comment
 # A root is real whose imaginary part is no more of it than rounding.
 _ROUNDED = 1e-13
 
@@ -37,13 +37,13 @@ def _describe_call() -> tuple[str, str]:
 
 
 def _describe_limit(limit: SafeLimit | None, stiffness: float, virtual_damping: float) -> list[str]:
-    """Return the lines of a program's head on the safe limit of its wall."""
+    """Return the lines on the safe limit in the comment at the head of a program."""
     if limit is None:
         return []
     texts = [f"Safe limit: {limit.describe()}", *(f"Warning: {text}" for text in limit.warnings)]
     if not limit.allows(stiffness, virtual_damping):
-        texts.insert(0, "WARNING: this wall is beyond the safe limit; it may be unstable.")
-    # Texts of a file must not end the comment, nor escape a character.
+        texts.insert(0, "WARNING: this wall exceeds the safe limit; it may be unstable.")
+    # Replace character sequences that would end the comment or start an escape, because the texts come from a file.
     plain_texts = (text.replace("*/", "* /").replace('"', "'").replace("\\", "/") for text in texts)
     return [line for text in plain_texts for line in textwrap.wrap(text, _COLUMNS)]
 

@@ -1,7 +1,7 @@
-"""Search for the stiffest wall of a scene that keeps required margins.
+"""Search for the stiffest wall of a scene that satisfies requirements on its margins.
 
-``slack`` is the relative excess of a wall over each requirement: 0 on the limit, negative for too little, -1 for an
-unstable wall.
+The slack of a requirement is the relative excess over it: 0 at the limit, negative if the requirement is violated, -1
+for an unstable wall. The active requirement of a wall is the one that excludes every stiffer wall.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.status import Status
 from zwidth.words.units import to_float
 
-# Of a recommendation without any wish; docs/guides/my-device.md gives the reasons.
+# Default requirements if the user gives none. Reasons: docs/guides/my-device.md.
 DEFAULT_PHASE_MARGIN = 30.0  # degrees
 DEFAULT_GAIN_MARGIN = 2.0  # factor on K and B together, 6 dB
 
-SAMPLES = 18  # dampings tried at each stiffness; passive ones of a weakly damped device are few of the stable ones
-NEAR = 5.0  # relative accuracy of the best damping, in units of that of K
-LEAST = 1e-9  # least stiffness that is tried, relative to the largest allowed
-STEP_DOWN = 0.25  # ratio of two stiffnesses, until one has a wall with the margins
-FIRST_STEP = 0.9  # the same near a guess
-WIDTH = 4e-5  # half the bracket of log K at the end of the search
-COARSE = 1e-3  # the same for an improvement of the device, whose gain is printed with three digits
-HELD_SHARES = np.linspace(0.95, 0.05, 19)  # of K, tried if a soft grasp destabilizes the wall
-MAX_STEPS = 60  # bisections included; the bracket of log K ends after some 8
+SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive only in a small part of its stable range
+NEAR = 5.0  # tolerance of the best B over the tolerance of K
+LEAST = 1e-9  # smallest stiffness tried, relative to the largest allowed one
+STEP_DOWN = 0.25  # factor by which K is lowered until a wall satisfies the requirements
+FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
+WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
+COARSE = 1e-3  # the same for an improved device, because its gain is printed with 3 digits
+HELD_SHARES = np.linspace(0.95, 0.05, 19)  # fractions of K tried if a soft grasp destabilizes the wall
+MAX_STEPS = 60  # root-finding steps on log K, bisections included; 8 usually suffice
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
 _EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
-OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
+OTHER_DAMPING = "B differs from that of the stiffest wall, because with that B this share of K_max is unstable"
 
 Slack = Callable[[float, Any], dict[str, np.ndarray]]
 
@@ -46,12 +46,12 @@ Slack = Callable[[float, Any], dict[str, np.ndarray]]
 class Wanted(NamedTuple):
     """Requirements on a wall; None for no requirement."""
 
-    stiffness_fraction: float | None = None  # at most this share of K_max
-    gain_margin: float | None = None  # at least, a factor
-    phase_margin: float | None = None  # at least, in degrees
-    passive: bool = False
+    stiffness_fraction: float | None = None  # upper limit of K/K_max
+    gain_margin: float | None = None  # lower limit, as a factor
+    phase_margin: float | None = None  # lower limit, in degrees
+    passive: bool = False  # require passivity
     beyond_safe: bool = False  # ignore the safe limit of the scene
-    soft_grasps: bool = False  # stable in the soft ones of `zwidth.reference_grasps`
+    soft_grasps: bool = False  # require stability in the soft grasps of `zwidth.reference_grasps`
 
     @classmethod
     def check(
@@ -62,13 +62,13 @@ class Wanted(NamedTuple):
         passive: bool,
         beyond_safe: bool = False,
     ) -> Wanted:
-        """Return the requirements, the default ones if none is given; raise `InputError` for a wrong one."""
+        """Return the requirements, or the defaults if none is given; raise `InputError` for an invalid value."""
         ranges = {"stiffness_fraction": FRACTION, **RANGES}
         given = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
         for name, value in given.items():
             number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
             if value is not None and not (number and math.isfinite(to_float(value)) and ranges[name].holds(value)):
-                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, as {_EXAMPLES[name]}")
+                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, such as {_EXAMPLES[name]}")
         switches = {"passive": passive, "beyond_safe": beyond_safe}
         for name, value in switches.items():
             if not isinstance(value, bool | np.bool_):
@@ -79,7 +79,7 @@ class Wanted(NamedTuple):
         return cls(**given, passive=bool(passive), beyond_safe=bool(beyond_safe), soft_grasps=default)
 
     def spell(self, name: str) -> str:
-        """Return one requirement in words."""
+        """Return a requirement in words."""
         return {
             "stiffness_fraction": f"{100.0 * (self.stiffness_fraction or 1.0):.4g} % of K_max",
             "gain_margin": f"gain margin {self.gain_margin:g}" if self.gain_margin else "",
@@ -91,41 +91,41 @@ class Wanted(NamedTuple):
 
     @property
     def safe_share(self) -> float:
-        """The largest share of the stiffness of a safe limit."""
+        """Upper limit of K as a fraction of the safe limit's stiffness."""
         return self.stiffness_fraction or RECOMMENDED_SHARE
 
 
 class WallChoice(NamedTuple):
     """The stiffest wall with the required margins, or the reason why none exists."""
 
-    stiffness: float  # in N/m; NaN without a wall
-    damping: float  # in N s/m
-    limit: str  # the requirement that allows no stiffer wall, a field of `Wanted`, or "safe_limit"
+    stiffness: float  # in N/m; NaN if no wall exists
+    damping: float  # virtual damping in N s/m; NaN if no wall exists
+    limit: str  # active requirement: a field of `Wanted`, or "safe_limit"
     status: Status
-    reason: str = ""
-    note: str = ""
+    reason: str = ""  # reason why no wall exists
+    note: str = ""  # remark on the choice
 
 
 def measure_slack(scene: SceneOptima, wanted: Wanted) -> Slack:
-    """Return a function of K in N/m and B in N s/m that computes the slack of each requirement on margins."""
-    own = float(scene.device.damping)
+    """Return a function of K in N/m and B in N s/m that returns the slack of each requirement on margins."""
+    device_damping = float(scene.device.damping)
     asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
 
     def slack(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
         alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
-        stable, found = scene.loop.labels(alpha, beta), {}
+        stable, slacks = scene.loop.labels(alpha, beta), {}
         if asked:
             margins = scene.loop.margins(alpha, beta, asked)
             if wanted.gain_margin:
                 with np.errstate(all="ignore"):
-                    found["gain_margin"] = np.abs(np.log(margins.gain_margin)) / math.log(wanted.gain_margin) - 1.0
+                    slacks["gain_margin"] = np.abs(np.log(margins.gain_margin)) / math.log(wanted.gain_margin) - 1.0
             if wanted.phase_margin:
-                found["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
+                slacks["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
         if wanted.passive:
-            margin = np.asarray(scene.passivity_margin(stiffness, damping)) / (own or 1.0)
-            # A wall without any margin is not passive.
-            found["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
-        return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in found.items()}
+            margin = np.asarray(scene.passivity_margin(stiffness, damping)) / (device_damping or 1.0)
+            # A margin of exactly 0 must yield a negative slack, because such a wall is not passive.
+            slacks["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
+        return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in slacks.items()}
 
     return slack
 
@@ -138,20 +138,20 @@ def find_stiffest(
     width: float = WIDTH,
     safe: SafeLimit | None = None,
 ) -> tuple[float, float]:
-    """Return K and B of the stiffest wall with nonnegative slack; NaN if none was found.
+    """Return K and B of the stiffest wall whose slack is nonnegative; NaN if no wall was found.
 
     Args:
         scene: the scene.
-        slack: from `measure_slack`.
+        slack: function returned by `measure_slack`.
         most: largest K allowed, in N/m.
-        near: a guess of K, at which the search starts; without one it starts at ``most``.
-        width: relative accuracy of K.
-        safe: the limit within which the wall must lie.
+        near: initial guess of K in N/m; ``most`` if left out.
+        width: relative tolerance of K.
+        safe: safe limit that the wall must respect.
     """
-    unit, found = scene.units.virtual_damping, {}
+    unit, dampings = scene.units.virtual_damping, {}
 
     def best_slack(log_stiffness: float) -> float:
-        """Return the slack, at most 1, of the best damping for a stiffness."""
+        """Return the slack of a stiffness with its best damping, at most 1."""
         stiffness = math.exp(log_stiffness)
 
         def cost(beta: Any) -> np.ndarray:
@@ -166,8 +166,9 @@ def find_stiffest(
         ]
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
-            found[log_stiffness] = beta * unit
-        # A zero slack satisfies the requirement; false_position expects a positive value there.
+            dampings[log_stiffness] = beta * unit
+        # Replace zero by a small positive value, because zero slack satisfies the requirements and false_position
+        # requires opposite signs.
         return max(min(-lowest, 1.0), 1e-12 if lowest <= 0 else -1.0)
 
     top = math.log(most)
@@ -187,17 +188,17 @@ def find_stiffest(
     if low < high and at_high <= 0:
         ends = np.float64(low), np.float64(high), np.float64(at_low), np.float64(at_high)
         false_position(np.vectorize(best_slack, otypes=[float]), *ends, MAX_STEPS, width)
-    log_stiffness = max(found)
-    wall = most if log_stiffness == top else math.exp(log_stiffness), found[log_stiffness]
+    log_stiffness = max(dampings)
+    wall = most if log_stiffness == top else math.exp(log_stiffness), dampings[log_stiffness]
     if wall[0] == most:
         return wall
-    # Six digits to type in, if the slack allows them.
+    # Round to six digits, which are easier to type, if the rounded wall satisfies the requirements.
     short = float(f"{wall[0]:.6g}"), float(f"{wall[1]:.6g}")
     return short if min(map(float, slack(*short).values())) >= 0 else wall
 
 
 def _clip(intervals: list[tuple[float, float]], low: float, high: float) -> list[tuple[float, float]]:
-    """Return the parts of intervals that lie between two ends."""
+    """Return the intersections of intervals with [low, high]."""
     clipped = [(max(start, low), min(end, high)) for start, end in intervals]
     return [(start, end) for start, end in clipped if start <= end]
 
@@ -205,19 +206,19 @@ def _clip(intervals: list[tuple[float, float]], low: float, high: float) -> list
 def choose_wall(
     scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> WallChoice:
-    """Choose the stiffest wall of a scene, whose stiffest stable wall is known, that satisfies the requirements."""
-    found = _choose_free(scene, wanted, top, near, width)
-    if not wanted.soft_grasps or found.status != Status.OK or _is_stable_held(scene, found):
-        return found
-    for share in HELD_SHARES * (found.stiffness / float(top.stiffness)):
+    """Choose the stiffest wall of a scene that satisfies the requirements; ``top`` is its stiffest stable wall."""
+    choice = _choose_free(scene, wanted, top, near, width)
+    if not wanted.soft_grasps or choice.status != Status.OK or _is_stable_held(scene, choice):
+        return choice
+    for share in HELD_SHARES * (choice.stiffness / float(top.stiffness)):
         softer = _choose_free(scene, wanted._replace(stiffness_fraction=float(share)), top, None, width)
         if softer.status == Status.OK and _is_stable_held(scene, softer):
             return softer._replace(limit="soft_grasps")
-    return found
+    return choice
 
 
 def _is_stable_held(scene: SceneOptima, wall: WallChoice) -> bool:
-    """Return the stability of a wall in all soft reference grasps; True if a hand cannot be added to the scene."""
+    """Return whether a wall is stable in all soft reference grasps; True if the scene cannot have another operator."""
     if not isinstance(scene.device, Device) or scene.operator is not None:
         return True
     grasps = (grasp for name, grasp in list_grasps(bool(scene.device.rotary)) if name.startswith("soft"))
@@ -225,19 +226,19 @@ def _is_stable_held(scene: SceneOptima, wall: WallChoice) -> bool:
 
 
 def _choose_free(scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None, width: float) -> WallChoice:
-    """Choose the wall without regard to grasps."""
+    """Choose the wall by all requirements except stability in the soft grasps."""
     nan = math.nan
     if top.status != Status.OK:
         return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
-    most, binding = (wanted.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
+    most, active = (wanted.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
     safe = None if wanted.beyond_safe else scene.safe_limit
     if safe is not None:
         if safe.forbids_all:
             why = "; ".join(safe.warnings) or safe.reason or "the safe limit is 0"
             return WallChoice(nan, nan, "", Status.UNREACHABLE, f"no wall is safe: {why}")
-        # The reserve is the same for both limits.
+        # Apply the same fraction to the safe limit as to K_max, because both need the same reserve.
         share = wanted.safe_share * safe.stiffness
-        most, binding = (share, "safe_limit") if share < most else (most, binding)
+        most, active = (share, "safe_limit") if share < most else (most, active)
     usual, slack = choose_damping(scene, top, most), measure_slack(scene, wanted)
     if safe is not None:
         low, high = safe.dampings(most) or (usual, usual)
@@ -248,14 +249,14 @@ def _choose_free(scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: fl
         if math.isnan(stiffness):
             asked = " and ".join(map(wanted.spell, spare))
             undamped = wanted.passive and scene.device.damping == 0
-            why = "without damping of the device no wall is passive" if undamped else "ask for less"
-            return WallChoice(nan, nan, "", Status.UNREACHABLE, f"no wall keeps {asked}, however soft; {why}")
+            why = "without physical damping no wall is passive" if undamped else "relax a requirement"
+            return WallChoice(nan, nan, "", Status.UNREACHABLE, f"no wall, however soft, has {asked}; {why}")
         spare = slack(stiffness, damping)
-        limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else binding
+        limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else active
         return WallChoice(stiffness, damping, limit, Status.OK)
     if not np.all(scene.is_stable(most, usual)):
         share = most / float(top.stiffness)
-        reason = f"no wall of {share:g} of K_max was found to be stable; choose another share"
+        reason = f"no stable wall found at {100 * share:.4g} % of K_max; choose another stiffness fraction"
         return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
-    note = OTHER_DAMPING if usual != top.virtual_damping and binding == "stiffness_fraction" else ""
-    return WallChoice(most, usual, binding, Status.OK, note=note)
+    note = OTHER_DAMPING if usual != top.virtual_damping and active == "stiffness_fraction" else ""
+    return WallChoice(most, usual, active, Status.OK, note=note)

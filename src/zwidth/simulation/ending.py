@@ -1,4 +1,4 @@
-"""Final state of a motion in words, the same for studies, commands and the explorer."""
+"""Description of the final state of a simulated motion, for studies, commands and the explorer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WORDS = {
 
 @in_own_units
 def describe_ending(motion: Motion, index: Any = ()) -> str:
-    """Return the final state of a recorded motion, of one entry of a batch if an index is given."""
+    """Return the final state of a recorded motion in words; ``index`` selects one entry of a batch."""
     kind = MotionKind(int(motion.outcome[index]))
     if kind in (MotionKind.DIVERGED, MotionKind.INVALID):
         return _WORDS[kind]

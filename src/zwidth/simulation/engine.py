@@ -92,7 +92,7 @@ def control(lanes: Lanes, options: Options, program: Program, k: Array, sensed: 
         wanted = -(lanes.alpha * measured + lanes.beta * velocity)
     else:
         wanted = options.law(measured, velocity / lanes.period, k * lanes.period) / lanes.force
-        # A law has no surface: contact means that it commands a force.
+        # Contact of a force law means a nonzero force, because a law has no surface.
         touching &= wanted != 0
     wanted = jnp.where(touching, wanted, 0.0)
     wanted = jnp.where(lanes.pulling, wanted, jnp.minimum(wanted, 0.0))

@@ -102,10 +102,10 @@ class Motion:
         trend: the peak-to-peak position in the second half of the tail over that in the first.
         frequency: of the motion in the tail, in Hz; NaN at rest and where the velocity does not turn twice there.
         penetration: the largest position at a sample, in m, at least 0.
-        bounces: number of samples at which contact ends. A bilateral wall is always in contact; a law is in contact
-            while it commands a force that is not 0.
-        impact_velocity: velocity at the first sample at which contact begins, in m/s; NaN if none begins after the
-            first sample.
+        bounces: number of samples at which contact ends. A bilateral wall is always in contact; a force law is in
+            contact while its force is nonzero.
+        impact_velocity: velocity at the first sample at which contact begins, in m/s; NaN if no contact begins after
+            the first sample.
         energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
         outcome: a code of `zwidth.MotionKind`, what becomes of the motion, the hand pushing on as in the tail
             (docs/theory/simulation.md, T7). Proved: REST, no body moves more than 1e-9 of the widest motion in the

@@ -83,9 +83,10 @@ def simulate(
         virtual_damping: B in N s/m. Neither means each scene's own wall, as for `zwidth.Scene.is_stable`.
         force: a law in place of the wall's spring and damper: a function of the measured position (m), the estimated
             velocity (m/s) and the time of the sample (s; without jitter), arrays of one value a simulation, written
-            with `jax.numpy`, that returns the force on the device in N. It is compiled once: it must not keep values
-            between calls, and needs ``jnp.where`` in place of ``if``. It is sampled, held and delayed as the wall's
-            is. Nothing can be proved of a law, so the outcome is UNCLEAR or DIVERGED.
+            with `jax.numpy`, that returns the force on the device in N. The law is compiled once, so it
+            must not keep values between calls and must use ``jnp.where`` in place of ``if``. Its force is sampled, held
+            and delayed like that of a wall. The outcome is UNCLEAR or DIVERGED, because no certificate exists for a
+            law.
         periods: how many sampling periods, >= 1.
         substeps: instants recorded in each period, >= 1.
         start_position: in m; of all bodies, or by their names in `Motion`, as ``{"position": 0, "hand_position":
@@ -188,26 +189,26 @@ def _refuse_bodies(known: list[Any], which: np.ndarray, name: str, values: np.nd
 
 
 def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
-    """Return the law as it is now; refuse a law given together with a wall, with memory, or that JAX cannot trace."""
+    """Return the traced law; raise `InputError` if a wall is also given or the law has memory or cannot be traced."""
     if stiffness is not None or virtual_damping is not None:
         raise InputError("force: got a law and a stiffness or damping; write both into the law, or leave it out")
     # What JAX is needed for begins here.
     import jax
 
     name = getattr(force, "__name__", repr(force))
-    programs, found = [], None
+    programs, result = [], None
     with compute_concretely(), jax.numpy_rank_promotion("allow"):
         try:
             hash(force)
-            # Twice: a law with memory differs the second time, or fails on a value that it kept from the first.
+            # Trace twice, because a law with memory yields another program or an error in the second trace.
             for _ in range(2):
-                # A new function each time, because JAX keeps the numbers that a function it knows read at first.
-                own = jax.jit(lambda position, velocity, time: force(position, velocity, time))
-                trace = own.trace(*[jax.ShapeDtypeStruct((2,), float)] * 3)
-                # A value kept from an earlier trace is one input more.
+                # Wrap the law in a new function, because JAX would reuse constants cached for a known function.
+                fresh = jax.jit(lambda position, velocity, time: force(position, velocity, time))
+                trace = fresh.trace(*[jax.ShapeDtypeStruct((2,), float)] * 3)
+                # A value kept from an earlier trace appears as an additional input.
                 if len(trace.jaxpr.in_avals) != 3:
                     raise _refuse_memory(name)
-                found = trace.out_info
+                result = trace.out_info
                 programs.append(trace.lower().as_text())
         except InputError:
             raise
@@ -221,17 +222,17 @@ def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
             ) from error
     if programs[0] != programs[1]:
         raise _refuse_memory(name)
-    kind = getattr(found, "dtype", np.dtype(object)).kind
-    if getattr(found, "shape", None) not in ((), (2,)) or kind not in "if":
-        raise InputError(f"force: the law returns {found} for two simulations; one force in N for each is needed")
+    kind = getattr(result, "dtype", np.dtype(object)).kind
+    if getattr(result, "shape", None) not in ((), (2,)) or kind not in "if":
+        raise InputError(f"force: the law returns {result} for two simulations; one force in N for each is needed")
     return TracedLaw(force, programs[0])
 
 
 def _refuse_memory(name: str) -> InputError:
-    """Return the error for a law whose force depends on earlier calls."""
+    """Return the error for a force law that depends on earlier calls."""
     return InputError(
-        f"force: the law {name} keeps values between calls; it may use position, velocity, time and constants only, "
-        "because it is compiled once"
+        f"force: the law {name} keeps values between calls; it is compiled once, so use only position, velocity, time "
+        "and constants"
     )
 
 

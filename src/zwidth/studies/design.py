@@ -73,7 +73,7 @@ class DesignStudy(ComputedStudy):
     kind: Literal["design"]
 
     device: PhysicalDevice
-    """Device in SI units. A delay stays in the unit, seconds or periods, in which it is given."""
+    """Device in SI units. A delay given in periods keeps its number of periods if the period changes."""
 
     find: Parameter
     """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
@@ -149,7 +149,7 @@ class DesignStudy(ComputedStudy):
 
     @property
     def _name(self) -> str:
-        """The parameter in words: a rotary device has an inertia."""
+        """Name of the parameter: "inertia" for the mass of a rotary device."""
         return "inertia" if self.find == "mass" and is_rotary() else self.find
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -217,7 +217,8 @@ class DesignStudy(ComputedStudy):
         elif needed.enough == "everywhere":
             yield f"{wanted}: any {self._name} from {low} to {high} is enough"
         elif len(needed.crossings) > 1:
-            yield f"{wanted}: K_max passes it at {len(needed.crossings)} values of {self._name}; the nearest is given"
+            count = len(needed.crossings)
+            yield f"{wanted}: K_max crosses this value at {count} values of {self._name}; the nearest is reported"
 
     def _trace(self, nominal: Scene, low: float, high: float) -> dict[str, np.ndarray]:
         """K_max over the parameter; NaN where a value is refused or no wall is stable."""

@@ -109,7 +109,7 @@ class FigureLook(Strict, what="the look of figures"):
     """Kind of file; PNG and SVG where left out."""
 
     dpi: Annotated[float, Quantity(allowed=Range(10, 2400))] | None = None
-    """Dots per inch of PNG, and of maps within SVG and PDF; 180 for PNG if left out."""
+    """Resolution in dots per inch of PNG files and of the maps in SVG and PDF files. Default: 180 for PNG."""
 
     @property
     def formats(self) -> tuple[str, ...]:
@@ -138,7 +138,7 @@ class Config(Strict, what="a configuration"):
     """Device, timing and wall that supply what a study leaves out."""
 
     figure: FigureLook | None = None
-    """Width, kind and resolution of the figures of studies; `zwidth figures` has options for those of sweeps."""
+    """Width, format and resolution of the studies' figures; for sweeps use the options of `zwidth figures`."""
 
     studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""
@@ -267,17 +267,17 @@ def load_config(path: str | bytes | os.PathLike[str]) -> Config:
 
 
 def load_scene(path: str | bytes | os.PathLike[str]) -> Scene:
-    """Return the scene of a configuration file: device, timing, parts and wall, without the studies.
+    """Return the scene of a configuration file: device, timing, parts and wall; its studies are ignored.
 
     Args:
-        path: the file, as for `zwidth.load_config`.
+        path: path of the file, as in `zwidth.load_config`.
 
     Returns:
-        A `zwidth.Scene` in SI units; its wall is absent if the file gives neither stiffness nor virtual damping.
+        A `zwidth.Scene` in SI units; without a wall if the file gives neither stiffness nor virtual damping.
 
     Raises:
-        ConfigError: the file cannot be read or has faults.
-        InputError: the file has no section ``scene``, or a normalized one.
+        ConfigError: the file cannot be read or is invalid.
+        InputError: the file has no section ``scene``, or its scene is normalized.
 
     Example:
         >>> import pathlib, tempfile

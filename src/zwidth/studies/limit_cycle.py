@@ -1,4 +1,4 @@
-"""The limit_cycle study: amplitude and frequency of limit cycles over one or two parameters and several conditions."""
+"""Study "limit_cycle": amplitude and frequency of limit cycles over one or two parameters, for several conditions."""
 
 from __future__ import annotations
 
@@ -31,11 +31,10 @@ _COLUMNS = {known.name: column for column, known in AXES.items()}
 _OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
 # So many values of a list are curves, and more are a plane.
 _MOST_CURVES = 6
-WIDEST = {
-    False: 1e-3,
-    True: math.radians(20.0),
-}  # default largest amplitude of linear and of rotary devices, in m and rad
-WIDEST_STEPS = 10.0  # the same in steps of the encoder
+# Default of the largest amplitude that counts as a limit cycle, by "is rotary": in m for a linear, in rad for a rotary
+# device.
+WIDEST = {False: 1e-3, True: math.radians(20.0)}
+WIDEST_STEPS = 10.0  # lower bound of that default, in encoder steps
 
 
 # All that the study sets for every condition may be set for one; what is not is None.
@@ -100,11 +99,11 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
     """What each panel has of its own, beside what the study sets for all; one panel where left out."""
 
     silence: Annotated[float, Quantity("m", POSITIVE)] = 1e-6
-    """Amplitude below which a motion is at rest, in m or rad or with a unit."""
+    """Amplitude below which a motion counts as at rest, in m or rad or with a unit."""
 
     widest: Annotated[float, Quantity("m", POSITIVE)] | None = None
-    """Largest amplitude of a limit cycle, in m or rad or with a unit; wider motions are counted and drawn apart.
-    1 mm if left out (20 deg of a rotary device), or 10 steps of the encoder if these are more."""
+    """Largest amplitude still counted as a limit cycle, in m or rad or with a unit; larger motions are counted and
+    plotted separately. Default: 1 mm (20 deg for a rotary device) or 10 encoder steps, whichever is larger."""
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
@@ -124,8 +123,8 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         if widest <= silence:
             low, high = (with_unit(end, "m") for end in (silence, widest))
             name = "silence" if self.widest is None else "widest"
-            what = f"got silence {low}, widest {high}"
-            yield (name,), problem(what, "silence is less than widest", "raise widest or lower silence")
+            received = f"got silence {low}, widest {high}"
+            yield (name,), problem(received, "silence must be less than widest", "raise widest or lower silence")
         found = [list(each.find_clashes(scene)) for each in self.list_circumstances()]
         for index, (condition, faults) in enumerate(zip(self.conditions, found, strict=True)):
             for path, what in faults:
@@ -143,7 +142,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         ]
 
     def bound_amplitudes(self, scene: Scene) -> tuple[float, float]:
-        """Return the least and the largest amplitude of a limit cycle, in SI units."""
+        """Return the smallest and the largest amplitude counted as a limit cycle, in SI units."""
         if self.widest is not None:
             return self.silence, self.widest
         steps = [self.resolution, *(each.resolution or 0.0 for each in self.conditions)]
@@ -184,7 +183,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
             draw = partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
         low, high = (spell_short(bound, "m") for bound in bounds)
         rest = f"at rest: an amplitude below {low} in the last quarter of {self.duration}"
-        notes.append(f"{rest}; limit cycle: from {low} to {high}")
+        notes.append(f"{rest}; limit cycle: amplitude from {low} to {high}")
         return Outcome(
             arrays=arrays,
             figures={"": draw},
@@ -214,11 +213,11 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
 
 
 def describe_outcomes(motion: Any, stable: np.ndarray, bounds: tuple[float, float]) -> str:
-    """Return how many of the linearly stable and unstable walls are at rest, in a limit cycle, or wider than it."""
+    """Return in words how many linearly stable and unstable walls are at rest, in a limit cycle, or above its bound."""
     wide = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > bounds[1])
     rest = ~wide & (motion.amplitude < bounds[0])
     known = motion.status == Status.OK
-    ends = {"at rest": rest, "in a limit cycle": ~rest & ~wide, f"wider than {spell_short(bounds[1], 'm')}": wide}
+    ends = {"at rest": rest, "in a limit cycle": ~rest & ~wide, f"larger than {spell_short(bounds[1], 'm')}": wide}
     words = []
     for name, kind in {"linearly stable ": 1, "linearly unstable ": 0, "": -1}.items():
         those = known & (stable == kind)

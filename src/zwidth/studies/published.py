@@ -37,8 +37,8 @@ MASSIE_SALISBURY = 3.5e3
 # The delays of Fig. 5, and of Fig. 10 as far as they are whole.
 SLOPE_DELAYS = (0.0, 1.0, 2.0, 4.0)
 FIG10_DELAYS = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
-LINEAR_WITHIN = 0.1  # relative distance of d alpha_max/d delta from its limit g that counts as linear
-FILTER_LAG = 0.05  # s: lag of the velocity filter that section VIII cites
+LINEAR_WITHIN = 0.1  # largest relative difference between d alpha_max/d delta and its limit g that counts as linear
+FILTER_LAG = 0.05  # s; lag of the velocity filter, cited in section VIII
 _LINE = "delta above which the line appears for d = 0"
 _LINEAR = (
     f"delta above which alpha_max is linear: derivative within {100 * LINEAR_WITHIN:g} % of g, all curves of Fig. 10"
@@ -47,7 +47,7 @@ _LINEAR = (
 
 @dataclass(frozen=True)
 class Comparison:
-    """A number as the paper prints it, and as the library computes it; None if the paper cites it from another one."""
+    """A number printed in the paper, and its computed value; None if the paper cites the number from another paper."""
 
     quantity: str
     where: str
@@ -57,7 +57,7 @@ class Comparison:
 
     @property
     def agrees(self) -> bool | None:
-        """Agreement within half a unit of the last printed digit; None for a cited number."""
+        """True if both agree within half a unit of the last printed digit; None for a cited number."""
         if self.computed is None:
             return None
         if not np.isfinite(self.computed):
@@ -77,7 +77,7 @@ class Sharpened:
 
 
 def published_numbers() -> list[Comparison]:
-    """Compare every number that the paper prints, except those that it sets (section VIII, figure parameters)."""
+    """Compare all numbers printed in the paper except its inputs (parameters of section VIII and of the figures)."""
     deltas = [float(normalize(mass=MASS, damping=damping, period=PERIOD).delta) for damping in DAMPINGS]
     ridge = [_ridge(delta, DELAY_FACTOR) for delta in deltas]
     columns = (
@@ -106,9 +106,9 @@ def published_numbers() -> list[Comparison]:
 
 
 def _with_lag() -> str:
-    """Return the effect of the cited lag on the undamped device of section VIII."""
+    """Return, in words, the effect of the cited filter lag on K_max of the undamped device of section VIII."""
     scene = Scene(Device(MASS), Timing(period=PERIOD, delay=DELAY_FACTOR * PERIOD))
-    # The mean of n differences lags by n/2 periods.
+    # Use a window of 2 lag/T differences, because the mean of n differences lags by n/2 periods.
     walls = [scene, scene.replace(velocity=WindowedDifference(round(2 * FILTER_LAG / PERIOD)))]
     before, after = (wall.max_stiffness() for wall in walls)
     with use_kind(False):
@@ -137,18 +137,18 @@ def line_appears() -> float:
 
 
 def linear_from() -> float:
-    """Return the delta above which the derivative of alpha_max of each curve of Fig. 10 is within 10 % of its limit g.
+    """Return the delta above which d alpha_max/d delta is within 10 % of its limit g for every curve of Fig. 10.
 
-    Delays between whole periods are fractional powers, as in the paper.
+    Noninteger delays are modeled as fractional powers of z, as in the paper.
     """
     delays = np.array(FIG10_DELAYS)
     limit = np.asarray(stiffness_slope(delays, delay="fractional_power"))
 
     def excess(delta: np.ndarray) -> np.ndarray:
-        """Return the largest relative distance from the limit, less the one that is allowed."""
-        step = 0.008  # central differences of fourth order: truncation and rounding move the root by 2e-10
-        at = np.asarray(delta)[..., None, None] + step * np.array([-2.0, -1.0, 1.0, 2.0])
-        values = np.asarray(alpha_max(at, delays[:, None], delay="fractional_power").alpha)
+        """Return the largest relative difference from g among the curves, minus the allowed difference."""
+        step = 0.008  # fourth-order central differences; their truncation and rounding errors move the root by 2e-10
+        deltas = np.asarray(delta)[..., None, None] + step * np.array([-2.0, -1.0, 1.0, 2.0])
+        values = np.asarray(alpha_max(deltas, delays[:, None], delay="fractional_power").alpha)
         derivative = values @ np.array([1.0, -8.0, 8.0, -1.0]) / (12.0 * step)
         return np.abs(derivative / limit - 1.0).max(axis=-1) - LINEAR_WITHIN
 
@@ -221,7 +221,7 @@ _AGREEMENT = {True: "yes", False: "**NO**", None: "cited"}
 
 
 def _spell(row: Comparison) -> str:
-    """Return the computed number with ten digits, or the note of a cited one."""
+    """Return the computed number with ten digits, or the note on a cited number."""
     return row.note if row.computed is None else f"{row.computed:{'#' if row.computed else ''}.10g}"
 
 
@@ -235,7 +235,7 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         f"{SOURCE}.",
         "",
         f"{len(printed)} printed numbers, {len(computed)} of them results: {agreeing} of {len(computed)} agree.",
-        f"The computed value then lies within half a unit of the last printed digit.{cited}",
+        f"Agreement: the computed value lies within half a unit of the last printed digit.{cited}",
         "",
         "| quantity | where | printed | computed | agrees |",
         "|---|---|---|---|---|",

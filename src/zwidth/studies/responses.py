@@ -183,8 +183,8 @@ class RecommendStudy(ResponseStudy):
     """Device in SI units."""
 
     stiffness_fraction: Fraction | None = None
-    """Stiffness of the recommended wall as a share of the maximum, at most. Without any requirement the defaults apply:
-    0.75 of the maximum, a gain margin of 2 and a phase margin of 30 degrees."""
+    """Largest stiffness of the recommended wall as a fraction of K_max. If no requirement is given, the defaults are
+    0.75 of K_max, a gain margin of 2, a phase margin of 30 degrees and stability in the soft reference grasps."""
 
     gain_margin: Annotated[float, Quantity(allowed=RANGES["gain_margin"])] | None = None
     """The factor on stiffness and damping together that the wall must bear, at least."""
@@ -196,7 +196,7 @@ class RecommendStudy(ResponseStudy):
     """Whether the wall must be passive."""
 
     beyond_safe: bool = False
-    """Ignore the safe limit of the device, which a fit sets."""
+    """Ignore the safe limit of the device, which is usually set by a fit."""
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         return ((self.device, None),)

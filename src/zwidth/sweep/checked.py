@@ -1,4 +1,4 @@
-"""Reading a store: what is missing or damaged is refused and named."""
+"""Read access to a store that reports missing and damaged files."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 class CheckedStore(LocalStore):
-    """The files of a store for Zarr, which would read a missing file as fill values and not name a damaged one.
+    """Files of a store for Zarr, with an error for each missing or damaged file.
 
-    Unfinished chunks are listed once and stay absent, so that all variables of a chunk have the same state even if a
-    run computes meanwhile.
+    Zarr itself would replace a missing file by fill values and would not name a damaged one. Unfinished chunks are
+    listed once and then stay absent, so that all variables of a chunk are consistent even if a run adds chunks.
     """
 
     def __init__(self, store: Store) -> None:
@@ -37,19 +37,19 @@ class CheckedStore(LocalStore):
     def get_sync(
         self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return the content of a file; raise a `StoreError` if values are missing or damaged."""
+        """Return the content of a file; raise `StoreError` if a file of values is missing or damaged."""
         assert byte_range is None, "chunks are read as a whole"
         file, is_chunk = self._kept.path / key, "c" in key.split("/")
-        # If the group's description is damaged, its copy is not.
+        # Take the checked description of the group, because one of the two files with it may be damaged.
         data = json.dumps(self._kept.description).encode() if key == "zarr.json" else content(file)
         if file in self._absent or not (data or is_chunk):
             return None
         if is_chunk and (fault := self._kept.find_fault(file, data)):
-            raise StoreError(f"{file}: {fault}; 'zwidth run CONFIG --resume' makes it again")
+            raise StoreError(f"{file}: {fault}; 'zwidth run CONFIG --resume' computes it again")
         return (prototype or default_buffer_prototype()).buffer.from_bytes(data)
 
     async def get(
         self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return the same, several at one time."""
+        """Return the content of a file as `get_sync` does, in a thread, so that Zarr reads several files at once."""
         return await asyncio.to_thread(self.get_sync, key, prototype=prototype, byte_range=byte_range)

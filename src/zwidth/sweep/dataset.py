@@ -67,7 +67,7 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     checked = CheckedStore(store)
     with silence_zarr():
         dataset = xarray.open_zarr(checked, consolidated=store.has_checksums, chunks={})
-    # Without the checksums that an old store keeps in arrays.
+    # Drop the arrays in which an old store keeps its checksums.
     dataset = dataset[[name for family in store.plan.families for name in family.variables]]
     if "device" in dataset.coords:
         # Neither netCDF nor pandas knows NumPy's strings of variable length.
@@ -169,7 +169,7 @@ def _verify_store(path: Path) -> Verification:
     store = Store(path)
     try:
         if not store.has_checksums:
-            return Verification(path, error="an old format, whose checksums this release does not read")
+            return Verification(path, error="old format; this release does not read its checksums")
         tasks = list(store.plan.tasks())
         damaged = [f"{name} is damaged or missing" for name in store.damaged_files()]
     except StoreError as error:

@@ -74,9 +74,9 @@ def compute_sweeps(
     progress: Callable[[Progress], None],
 ) -> Sweeps:
     """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there."""
-    # The folder is held by the caller; ``about`` has name, description, config and config_sha256 (of config.yaml) for
-    # the stores' attributes; the options are those of `zwidth.run`. A scheduler that does not answer, or whose workers
-    # do not see the folder, is an `InputError`.
+    # The caller holds the lock of the folder. ``about`` contains the attributes of the stores: name, description,
+    # config and config_sha256 (of config.yaml). The options are those of `zwidth.run`. Raises `InputError` if the
+    # scheduler does not answer or its workers have no access to the folder.
     from zwidth.sweep.jobs import perform
 
     with ExitStack() as stack:
@@ -141,7 +141,7 @@ def _prepare_store(plan: Plan, folder: Path, about: Mapping[str, Any]) -> tuple[
         }
         return create(path, attributes), ()
     store = Store(path)
-    # Unfinished files of a run that was killed.
+    # Remove unfinished files of a killed run.
     for left in path.rglob("*.partial"):
         left.unlink(missing_ok=True)
     return store, tuple(f"{plan.study.name}/{what}" for what in repair(store, store.plan.tasks()))
@@ -197,9 +197,9 @@ def store_path(folder: Path, study: SweepStudy) -> Path:
 
 
 def check_same(store: Store, study: SweepStudy) -> None:
-    """Refuse a store that was made from another study, by other releases or in an old format."""
+    """Raise `StoreError` if a store has an old format, or was created for another study or by another release."""
     if not store.has_checksums:
-        raise StoreError(f"{store.path}: an old format, which can be read but not continued; {ELSEWHERE}")
+        raise StoreError(f"{store.path}: old format, which can be read but not continued; {ELSEWHERE}")
     now = study.model_dump(mode="json", exclude_none=True)
     refuse_changes(store.path, study.name, "store", store.attributes["study"], now)
     refuse_versions(store.path, store.attributes["versions"])

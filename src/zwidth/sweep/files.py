@@ -1,7 +1,7 @@
-"""Files and folders of results: checks, checksums, versions, and the lock of the one run that writes a folder.
+"""Files and folders of results: checks, checksums, versions, and the lock that limits a folder to one writing run.
 
-The lock is the system's own, on ``DIR/.locks/run``: it ends with its process, even a killed one, so that the file that
-stays behind blocks no later run. NFS extends it to other machines.
+The lock is an operating system lock on ``DIR/.locks/run``. It ends with its process, even if the process is killed, so
+that the remaining file blocks no later run. On NFS it also excludes runs on other machines.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ LOCKS = ".locks"
 ELSEWHERE = "choose another folder with --out DIR"
 """What helps in every case."""
 
-PATIENCE = 1.0  # s; a killed program needs some time to end
-# Reported by file systems without locks.
+PATIENCE = 1.0  # s; waiting time for the lock, because a killed run needs some time to end
+# Error codes of file systems that do not support locks.
 _NO_LOCKS = frozenset({errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK})
 
 
@@ -104,8 +104,8 @@ def differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, 
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Lock a folder of results, created if missing, for this run; raise `StoreBusyError` if another run holds it."""
-    # Loading it takes longer than many commands that import this module.
+    """Create a folder of results if missing and lock it; raise `StoreBusyError` if another run holds the lock."""
+    # Import here, because loading filelock takes longer than many commands that import this module.
     from filelock import FileLock, Timeout
 
     check_folder(folder)
@@ -114,23 +114,23 @@ def lock_folder(folder: Path) -> Iterator[None]:
         raise InputError(f"out: {place} is a link; remove it, or {ELSEWHERE}")
     place.mkdir(parents=True, exist_ok=True)
     holder = place / "holder"
-    # Writable by all, because other users of the folder lock it too. No fallback to files in place of flock: they
-    # would block later runs after a kill.
+    # Writable by all, because other users of the folder lock it too. No fallback to lock files, because the lock file
+    # of a killed run would block later runs.
     lock = FileLock(place / "run", timeout=PATIENCE, mode=0o666, fallback_to_soft=False)
     try:
         lock.acquire()
     except Timeout:
         who = content(holder).decode(errors="replace")
-        what = f"another run computes in this folder{who and f' ({who})'}"
-        raise StoreBusyError(f"out: {folder}: {what}; wait until it ends, stop that process, or {ELSEWHERE}") from None
+        fault = f"another run is writing to this folder{who and f' ({who})'}"
+        raise StoreBusyError(f"out: {folder}: {fault}; wait until it ends, stop that process, or {ELSEWHERE}") from None
     except OSError as error:
-        # Without locks nothing keeps two runs apart, but every file of a store is still complete or absent.
+        # Continue without a lock if the file system has none: each file of a store is still either complete or absent.
         if error.errno not in _NO_LOCKS:
             raise
     try:
         since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")
         who = f"process {os.getpid()} on {socket.gethostname()}, since {since} UTC"
-        # For messages only: a full disk must not end a run here. Removed first, because it may be a link.
+        # Ignore errors, because this file only serves messages. Remove it first, because it may be a link.
         with suppress(OSError):
             holder.unlink(missing_ok=True)
             holder.write_text(who, encoding="utf-8")

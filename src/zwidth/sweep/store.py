@@ -1,10 +1,10 @@
 """The store of one sweep: a Zarr group that xarray opens, which knows what is in it and whether that is whole.
 
-A chunk of the plan is a chunk of every variable of its family, so that no two tasks ever write one file. The file of
-the status is written last: its existence marks the chunk as done. Every file appears under its name at once and
-complete. That holds when a program is killed at any moment; it does not when the machine loses power, because nothing
-waits for the disk. Therefore every file of values ends with its checksum (Zarr's codec crc32c). The group's description
-contains those of all arrays and has a checksum as well.
+A chunk of the plan is a chunk of every variable of its family, so that no two tasks write the same file. The status
+file is written last: its existence marks the chunk as done. Every file appears under its name only when it is complete,
+even if the program is killed. After a power failure this is not guaranteed, because writes are not synchronized with
+the disk. Therefore every file of values ends with a checksum (Zarr's codec crc32c). The description of the group
+contains the descriptions of all arrays and has a checksum as well.
 
 Only this module, which writes, and `dataset` with `checked`, which read, import zarr or xarray.
 """
@@ -33,11 +33,10 @@ from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
 
 SUFFIX = ".zarr"
-FORMAT = 2
-# Written by earlier releases with checksums in arrays of their own, which are not read any more.
-OLD_FORMAT = 1
-SEAL = "attributes_sha256"
-# Zarr reads the first; the second is a copy of it, because one flipped bit would lose the whole store.
+FORMAT = 2  # format version of new stores
+OLD_FORMAT = 1  # format of earlier releases, whose checksums are kept in separate arrays and no longer read
+SEAL = "attributes_sha256"  # attribute with the checksum of the description
+# Zarr reads the first file; the second is a copy, because one flipped bit in a single file would lose the whole store.
 _DESCRIPTIONS = ("zarr.json", "zwidth.json")
 
 
@@ -65,7 +64,7 @@ class Store:
 
     @cached_property
     def description(self) -> dict[str, Any]:
-        """The description of the group and its arrays; a `StoreError` if neither copy has a valid checksum."""
+        """Description of the group and its arrays; `StoreError` if neither copy has a valid checksum."""
         faults = []
         for name in _DESCRIPTIONS:
             try:
@@ -81,8 +80,8 @@ class Store:
             if not any((self.path / name).exists() for name in _DESCRIPTIONS):
                 raise StoreError(f"{self.path}: no store of a sweep ({faults[0]}); check the path")
             raise StoreError(f"{self.path}: {'; '.join(faults)}; start again in a new folder")
-        if (found := description["attributes"].get("zwidth_format")) not in (OLD_FORMAT, FORMAT):
-            raise StoreError(f"{self.path}: format {found}, this release reads format {FORMAT}; use another release")
+        if (version := description["attributes"].get("zwidth_format")) not in (OLD_FORMAT, FORMAT):
+            raise StoreError(f"{self.path}: format {version}, this release reads format {FORMAT}; use another release")
         return description
 
     @property
@@ -116,12 +115,12 @@ class Store:
         return f"{self.study.name}/{task}"
 
     def files(self, task: Task) -> list[Path]:
-        """Return the files of a chunk, in the order of its variables, which ends with the status."""
+        """Return the files of a chunk in the order of its variables; the status is the last one."""
         key = "/".join(("c", *map(str, task.position)))
         return [self.path / name / key for name in task.plan.variables]
 
     def flag(self, task: Task) -> Path:
-        """Return the file whose existence marks a chunk as done: that of its status."""
+        """Return the file whose existence marks a chunk as done, which is the status file."""
         return self.files(task)[-1]
 
     def is_done(self, task: Task) -> bool:
@@ -173,7 +172,7 @@ class Store:
         return ", ".join(f"{name} is {fault}" for name, fault in faults if fault)
 
     def find_fault(self, file: Path, data: bytes | None = None) -> str:
-        """Return "missing" or "damaged" for a file of values, read if not given; "" if its checksum is right."""
+        """Return "missing" or "damaged" for a file of values with content ``data``; "" if its checksum is correct."""
         import google_crc32c
 
         data = content(file) if data is None else data
@@ -183,12 +182,12 @@ class Store:
         return "" if right or not self.has_checksums else "damaged"
 
     def damaged_files(self) -> list[str]:
-        """Return the names of damaged coordinates, and of the group's description if its copies differ."""
+        """Return the names of damaged coordinate files, and those of the description if its two copies differ."""
         places = ((name, len(dims)) for name, (dims, *_) in self.plan.grid.coordinates().items())
         names = ["/".join((name, "c", *["0"] * count)) for name, count in places]
-        found = [name for name in names if self.find_fault(self.path / name)]
+        damaged = [name for name in names if self.find_fault(self.path / name)]
         first, second = (content(self.path / name) for name in _DESCRIPTIONS)
-        return found if first == second else [*_DESCRIPTIONS, *found]
+        return damaged if first == second else [*_DESCRIPTIONS, *damaged]
 
     def restore(self, names: list[str]) -> None:
         """Write such files again; they follow from the store's attributes."""
@@ -202,7 +201,7 @@ class Store:
 
 
 def create(path: Path, attributes: dict[str, Any]) -> Store:
-    """Make an empty store that appears complete."""
+    """Create an empty store, which appears under its name only when it is complete."""
     with _build_beside(path, attributes) as fresh:
         os.rename(fresh, path)
     return Store(path)
@@ -232,7 +231,7 @@ def _build_beside(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
 
 
 def _seal(description: dict[str, Any]) -> str:
-    """Return the checksum of a description, without the checksum in it."""
+    """Return the checksum of a description, computed without its checksum attribute."""
     attributes = {key: value for key, value in description["attributes"].items() if key != SEAL}
     old = attributes.get("zwidth_format") == OLD_FORMAT
     return digest(attributes if old else {**description, "attributes": attributes})

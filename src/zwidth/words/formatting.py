@@ -50,8 +50,9 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
 
 
 def spell_periods(count: float) -> str:
-    """Return a number of sampling periods as text: ``1 period``, ``0.7 periods``."""
-    return f"{short(float(f'{count:.6g}'))} period{'' if count == 1 else 's'}"
+    """Return a number of sampling periods, to four significant digits, with its noun: ``1 period``, ``0.7 periods``."""
+    rounded = float(f"{count:.4g}" if count < 1000 else f"{count:.0f}")
+    return f"{short(rounded)} period{'' if count == 1 else 's'}"
 
 
 def spell_short(value: float, unit: str, digits: int = 3) -> str:

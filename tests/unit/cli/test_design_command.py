@@ -138,7 +138,7 @@ def test_tolerances_are_drawn_and_proved():
     assert "% of 10000 devices drawn" in text
     # What is printed is no stiffer than what is proved, with the very damping of it.
     told = " ".join(text.split())
-    printed = re.search(r"proved every device is stable with K = (.*) kN/m at B = (.*) N s/m; (.*) kN/m, each", told)
+    printed = re.search(r"certified every device is stable with K = (.*) kN/m at B = (.*) N s/m; (.*) kN/m, each", told)
     K, B, most = map(float, printed.groups() if printed else ())
     assert float(B) == found["every_device"]["virtual_damping"]
     assert 0 <= found["every_device"]["stiffness"] - 1e3 * K < 10
@@ -147,7 +147,7 @@ def test_tolerances_are_drawn_and_proved():
     assert zwidth.is_stable(1e-3 * K / mass, 1e-3 * B / mass, 1e-3 * np.array([7.0, 10.0, 13.0]) / mass, 1).all()
     normal = design(*wall, *shares[:2], "--tolerance", "mass=5%", "--distribution", "normal", "--samples", "500")
     assert "of 500 devices drawn" in normal
-    assert "proved" not in normal
+    assert "certified" not in normal
 
 
 def test_the_damping_for_a_stiffness_is_that_of_the_library():

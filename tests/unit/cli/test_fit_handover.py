@@ -89,7 +89,7 @@ def test_beyond_the_safe_limit_only_on_demand_and_with_a_warning(tmp_path):
     own = "--stiffness", document["stiffness"], "--virtual-damping", document["virtual_damping"]
     assert "exceeds" not in run("check", file, *own)
     program = run("recommend", file, *wanted, "--beyond-safe", "--code", "c")
-    assert "WARNING: this wall is beyond the safe limit" in program
+    assert "WARNING: this wall exceeds the safe limit" in program
 
 
 def test_warnings_forbid_a_wall_in_every_command(tmp_path):

@@ -44,7 +44,7 @@ def test_the_resolution_is_that_of_the_configuration_or_of_the_command(tmp_path)
             assert round(picture.info["dpi"][0]) == (360 if options else look.get("dpi", 180))
     assert widths == pytest.approx(widths[:1] * 4, rel=0.01)
     done = CliRunner().invoke(cli, ["figures", str(tmp_path / "r0")])
-    assert "holds no sweep" in str(done.exception)
+    assert "contains no sweep" in str(done.exception)
     assert "--overwrite --size 85mm --dpi 300" in str(done.exception)
 
 

@@ -259,6 +259,6 @@ def test_record_and_store_name_the_same_configuration(both, tmp_path):
 
 
 def test_a_scheduler_without_a_sweep_is_refused(config, tmp_path):
-    with pytest.raises(InputError, match="scheduler: got 'foo', but no study of the configuration is a sweep"):
+    with pytest.raises(InputError, match="scheduler: got 'foo', but the configuration has no sweep"):
         run(config, out=tmp_path / "out", scheduler="foo")
     assert not (tmp_path / "out").exists()

@@ -68,7 +68,7 @@ def test_check_shows_the_range():
     assert found.exit_code == 0
     text = " ".join(found.output.split())
     assert text.startswith("MARGINAL")
-    assert "a pure damper: marginal only because no stiffness returns the free position" in text
+    assert "a pure damper: marginal only because without stiffness no force restores the position" in text
     assert "B from -80.00 µN m s/rad to 12.01 mN m s/rad at this K" in text
     found = CliRunner().invoke(cli, ["check", *options, *damper, "100 mN m s/rad"])
     text = " ".join(found.output.split())

@@ -276,5 +276,7 @@ def test_too_few_lines_are_named_as_the_cause():
     device = zwidth.MeasuredDevice(frequency, 5e-6 * (z + 1) / (z * (z - 1) ** 2))
     found = zwidth.Scene(device, zwidth.Timing(1e-3)).recommend()
     assert found.status == Status.UNDECIDED
-    assert found.reason.startswith("the 8 lines of the response decide no wall; measure anew from")
+    assert found.reason.startswith(
+        "the 8 frequencies of the response decide the stability of no wall; measure anew from"
+    )
     assert found.reason.endswith("lines there are too far apart; measure more")

@@ -136,7 +136,7 @@ def test_what_no_wall_has_is_said_and_leaves_no_wall():
     assert found.status == Status.UNREACHABLE
     assert np.isnan(found.stiffness)
     assert found.verdict is None
-    reason = "no wall keeps passivity, however soft; without damping of the device no wall is passive"
+    reason = "no wall, however soft, has passivity; without physical damping no wall is passive"
     assert (found.reason, found.lines()) == (reason, (f"no wall: {reason}",))
     known = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert known["recommended"]["stiffness"] is None
@@ -274,7 +274,7 @@ def test_grasps_that_destabilize_a_wall_are_named_with_a_wall_that_none_destabil
     held = scene.replace(operator=zwidth.Operator(**hand))
     assert not held.is_stable(found.stiffness, found.virtual_damping)
     assert [name for name, stable in found.grasps.items() if not stable] == ["firm, light damping"]
-    wall = r"in the hand \(firm, light damping\); K = (.*?), B = (.*?) is stable in all"
+    wall = r"in the hand \(firm, light damping\); K = (.*?), B = (.*?) is stable in every grasp"
     match = re.search(wall, found.cautions[1])
     assert match is not None
     K, B = match.groups()

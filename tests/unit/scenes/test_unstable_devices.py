@@ -58,7 +58,7 @@ def test_commands_agree():
     advised = run("recommend", *PENDULUM)
     assert 3.0 < advised["recommended"]["stiffness"] < checked["stiffness_max"]
     for notes in (checked["notes"], advised["notes"]):
-        assert any("unstable by itself: no wall softer than K = 3" in note for note in notes)
+        assert any("unstable without a wall: no wall softer than K = 3" in note for note in notes)
 
 
 def test_a_stable_device_says_nothing():

@@ -148,7 +148,9 @@ def counting() -> Any:
 def test_a_law_with_memory_is_refused(make):
     law = make()
     for _ in range(2):
-        with pytest.raises(zwidth.InputError, match=r"keeps values between calls; it may use position, velocity, time"):
+        with pytest.raises(
+            zwidth.InputError, match=r"keeps values between calls; it is compiled once, so use only position"
+        ):
             RIGID.simulate(force=law, start_position=1e-3, periods=5)
 
 

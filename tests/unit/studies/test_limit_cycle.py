@@ -61,7 +61,7 @@ def test_the_words_count_what_the_arrays_hold(plane):
         for those, name in ((stable, "stable"), (~stable, "unstable")):
             counts = [np.count_nonzero(end[those]) for end in (silent, ~silent & ~beyond, beyond)]
             told = ", ".join(
-                f"{a:,} {b}" for a, b in zip(counts, ("at rest", "in a limit cycle", "wider than 1 mm"), strict=True)
+                f"{a:,} {b}" for a, b in zip(counts, ("at rest", "in a limit cycle", "larger than 1 mm"), strict=True)
             )
             assert f"of {those.sum():,} linearly {name} walls {told}" in note
     # The encoder makes stable walls buzz that are silent without.
@@ -110,7 +110,7 @@ def test_a_curve_without_a_point_is_named_and_explained():
     assert [text.get_text() for text in upper.texts] == ["at rest everywhere:\n$K = 5$ kN/m"]
     assert not lower.texts
     (legend,) = upper.figure.legends
-    assert [text.get_text() for text in legend.get_texts()][-1] == "gap: at rest, or wider than 1 mm"
+    assert [text.get_text() for text in legend.get_texts()][-1] == "gap: at rest, or larger than 1 mm"
 
 
 def test_where_every_wall_is_silent_the_figure_says_so():
@@ -139,12 +139,12 @@ def test_the_bounds_of_a_rotary_device_are_angles():
         outcome = study.compute(None, True)
         (draw,) = outcome.figures.values()
         upper, _ = draw()
-    assert "2 in a limit cycle, 0 wider than 349 mrad" in outcome.notes[0]
-    assert outcome.notes[-1].endswith("limit cycle: from 1 µrad to 349 mrad")
+    assert "2 in a limit cycle, 0 larger than 349 mrad" in outcome.notes[0]
+    assert outcome.notes[-1].endswith("limit cycle: amplitude from 1 µrad to 349 mrad")
     amplitude = outcome.arrays["amplitude_m"]
     assert ((amplitude > 1e-4) & (amplitude < 1e-2)).all()
     (legend,) = upper.figure.legends
-    assert [text.get_text() for text in legend.get_texts()][-1] == "gap: at rest, or wider than 349 mrad"
+    assert [text.get_text() for text in legend.get_texts()][-1] == "gap: at rest, or larger than 349 mrad"
 
 
 def test_the_bounds_follow_a_coarse_encoder():
@@ -157,8 +157,8 @@ def test_a_figure_without_limit_cycles_gives_the_reason():
         outcome = knob_of(widest="0.1 mrad").compute(None, True)
         (draw,) = outcome.figures.values()
         upper, _ = draw()
-    assert "2 wider than 100 µrad" in outcome.notes[0]
-    assert upper.texts[0].get_text() == "wider than 100 µrad everywhere"
+    assert "2 larger than 100 µrad" in outcome.notes[0]
+    assert upper.texts[0].get_text() == "larger than 100 µrad everywhere"
 
 
 def test_a_limited_motor_swings_as_the_describing_function_says(curves):
@@ -214,7 +214,7 @@ def test_an_adaptive_window_has_no_linear_boundary():
         ({"conditions": []}, "one of the conditions at least is needed"),
         ({"conditions": [{"resolution": "20 um"}]}, "label"),
         ({"axes": {**PLANE, "coulomb": 0.1}, "conditions": [{"label": "a", "coulomb": 0.2}]}, "here and as an axis"),
-        ({"silence": "2 mm"}, "silence is less than widest"),
+        ({"silence": "2 mm"}, "silence must be less than widest"),
         ({"conditions": [{"label": "a", "coulomb": 0.2, "static": 0.1}]}, "below coulomb, 0.2 N"),
     ],
 )

@@ -62,7 +62,7 @@ def test_a_damaged_chunk_is_named_where_it_is_read(store, damage, name):
     with open_dataset(store) as data, pytest.raises(StoreError) as caught:
         data[name].load()
     state = "damaged" if file.exists() else "missing"
-    assert str(caught.value) == f"{file}: {state}; 'zwidth run CONFIG --resume' makes it again"
+    assert str(caught.value) == f"{file}: {state}; 'zwidth run CONFIG --resume' computes it again"
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
@@ -145,7 +145,7 @@ def test_on_the_command_line_a_damage_is_one_line(store, words, tmp_path, monkey
     assert main_of(words[0], store.parent, *words[1:]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f"Error: {store.parent / 'map.zarr'}{str(file)[len(str(store)) :]}: missing; " + (
-        "'zwidth run CONFIG --resume' makes it again"
+        "'zwidth run CONFIG --resume' computes it again"
     )
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
@@ -166,6 +166,6 @@ def test_a_store_of_an_old_format_is_read_and_not_continued(tmp_path):
     assert old.keys() == new.keys()
     assert all(np.allclose(old[name], new[name], rtol=1e-12, equal_nan=True) for name in new)
     assert open_dataset(tmp_path / "map.zarr").attrs["complete"] == 1
-    assert "an old format" in verify(tmp_path / "map.zarr")[0].error
-    with pytest.raises(StoreError, match="an old format, which can be read but not continued; choose another folder"):
+    assert "old format" in verify(tmp_path / "map.zarr")[0].error
+    with pytest.raises(StoreError, match="old format, which can be read but not continued; choose another folder"):
         run_sweeps(config, tmp_path, resume=True)

@@ -64,7 +64,7 @@ def test_a_second_run_is_refused_and_told_who_holds_the_folder(holder, tmp_path)
     with pytest.raises(StoreBusyError) as caught:
         run_sweeps(config_of(), tmp_path, resume=True)
     message = str(caught.value)
-    assert message.startswith(f"out: {tmp_path}: another run computes in this folder (process {process.pid} on ")
+    assert message.startswith(f"out: {tmp_path}: another run is writing to this folder (process {process.pid} on ")
     assert f" on {socket.gethostname()}, since 20" in message
     assert message.endswith(" UTC); wait until it ends, stop that process, or choose another folder with --out DIR")
     assert list(tmp_path.glob("*.zarr")) == []
@@ -100,7 +100,7 @@ def test_the_command_line_says_it_in_one_line_and_ends_with_exit_code_2(holder, 
     for words in (["--resume"], ["--overwrite"]):
         assert main_of("run", path, "--out", out, *words) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith(f"Error: out: {out}: another run computes in this folder (process {process.pid} on ")
+        assert line.startswith(f"Error: out: {out}: another run is writing to this folder (process {process.pid} on ")
     # Who only reads has nothing to wait for.
     assert main_of("verify", out) == 0
     assert main_of("export", out, "--csv", tmp_path / "table.csv") == 0
@@ -116,7 +116,7 @@ def test_other_studies_neither_replace_nor_enter_a_folder_that_is_held(holder, t
     path.write_text(yaml.safe_dump({"version": 1, "name": "both", "studies": [ridge, study()]}), encoding="utf-8")
     process = holder(out)
     assert main_of("run", path, "--out", out) == 2
-    assert f"another run computes in this folder (process {process.pid} " in capsys.readouterr().err
+    assert f"another run is writing to this folder (process {process.pid} " in capsys.readouterr().err
     kill(process)
     assert main_of("run", path, "--out", out) == 0
     holder(out)
@@ -132,7 +132,7 @@ def test_overwriting_starts_again(tmp_path):
     assert run_sweeps(changed, tmp_path / "out", overwrite=True).computed == 1
     assert run_sweeps(changed, tmp_path / "fresh").ok
     assert_same(tmp_path / "fresh", tmp_path / "out")
-    with pytest.raises(InputError, match="overwrite: it starts again"):
+    with pytest.raises(InputError, match="overwrite: given together with resume"):
         run_sweeps(changed, tmp_path / "out", overwrite=True, resume=True)
 
 
@@ -163,7 +163,10 @@ def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch, numbe
 def test_a_missing_name_of_the_holder_costs_only_the_name(holder, tmp_path):
     holder(tmp_path)
     (tmp_path / ".locks" / "holder").unlink()
-    with pytest.raises(StoreBusyError, match="another run computes in this folder; wait until"), lock_folder(tmp_path):
+    with (
+        pytest.raises(StoreBusyError, match="another run is writing to this folder; wait until"),
+        lock_folder(tmp_path),
+    ):
         pass
 
 

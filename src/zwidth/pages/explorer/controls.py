@@ -229,7 +229,7 @@ class Controls:
 
 
 def _check_range(name: str, slider: Slider, value: float) -> None:
-    """Raise an error in the unit of the page if a number lies outside its range."""
+    """Raise `InputError`, in the unit of the slider, if a value lies outside the allowed range."""
     allowed, by = PARAMETERS[name].allowed, slider.per_si
     if not allowed.holds(float(value) / by):
         ends = allowed._replace(low=allowed.low * by, high=allowed.high * by)
@@ -268,7 +268,7 @@ def read_controls(path: Path | None) -> Controls:
 
 
 def _in_seconds(scene: Scene) -> Scene:
-    """Return the scene with its delay in seconds, the unit of the slider."""
+    """Return the scene with its delay in seconds, because the slider uses seconds."""
     return scene.replace(delay=float(scene.timing.delay)) if scene.timing.in_periods else scene
 
 

@@ -166,7 +166,7 @@ def caption_poles(poles: np.ndarray, word: str) -> str:
     if word == "stable":
         return f"Stable: all {count} lie inside the circle."
     if word == "marginal" and np.abs(poles - 1.0).min(initial=np.inf) > 1e-9:
-        return f"Marginal: of {count}, none lies outside the circle, and some lie on it."
+        return f"Marginal: some of the {count} poles lie on the circle, none outside."
     if word == "marginal":
         return f"Marginal: of {count}, one stands on the circle, at z = 1; without stiffness nothing pulls back."
     return f"Unstable: {outside} of {count} outside of the circle." if outside else "Not stable: one on the circle."

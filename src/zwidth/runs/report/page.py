@@ -42,7 +42,7 @@ _GRAY = "not finite, or not known"
 _LINES = " Lines: exact edges of the stable walls, dashed of the passive ones."
 # Of each axis of a slice, of each other axis, and numbers a map in all: half a megabyte.
 _ALONG, _OTHERS, _MOST = 120, 9, 120_000
-_COLORS = 21  # of a map; odd, so that the center of a diverging colormap is one of them
+_COLORS = 21  # colors of a map; odd, so that they include the center of a diverging colormap
 
 
 def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | None = None) -> Path:
@@ -276,7 +276,7 @@ def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edg
 
 
 def _list_colors(colormap: str) -> list[str]:
-    """Return evenly spaced colors of a colormap, between which the page interpolates."""
+    """Return evenly spaced colors of a colormap as hexadecimal RGB; the page interpolates between them."""
     return [to_hex(color)[1:] for color in matplotlib.colormaps[colormap](np.linspace(0.0, 1.0, _COLORS))]
 
 

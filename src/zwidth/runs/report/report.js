@@ -31,7 +31,7 @@
       const image = painter.createImageData(columns, rows), start = offset();
       for (let row = 0; row < rows; row++) for (let column = 0; column < columns; column++) {
         const value = values[start + row * columns + column], k = 4 * ((rows - 1 - row) * columns + column);
-        // 0 has no place on a logarithmic scale.
+        // Gray for values up to 0, because a logarithmic scale cannot show them.
         const rgb = Number.isFinite(value) && !(logarithmic && value <= 0) ? color(share(value)) : [138, 138, 138];
         image.data.set([...rgb, 255], k);
       }
@@ -98,7 +98,7 @@
       // The colors, and what they stand for at both ends and in the middle.
       const bar = left + across + 12;
       for (let k = 0; k < up; k++) { pen.fillStyle = `rgb(${color(data.truth ? +(k < up / 2) : 1 - k / up)})`; pen.fillRect(bar, top + k, 12, 1.5); }
-      // An arrow at an end: values beyond it have its color.
+      // Draw an arrow at each end of the color bar beyond which values lie; these values have the color of that end.
       for (const [side, level, peak] of [["min", top + up, top + up + 10], ["max", top, top - 10]]) if ([side, "both"].includes(data.extend)) {
         pen.fillStyle = `rgb(${color(side === "max" ? 1 : 0)})`;
         pen.beginPath(); pen.moveTo(bar, level); pen.lineTo(bar + 12, level); pen.lineTo(bar + 6, peak); pen.closePath(); pen.fill();

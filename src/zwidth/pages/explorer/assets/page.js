@@ -155,8 +155,8 @@ function show(answer) {
   if ("state" in answer || "error" in answer || "csv" in answer) answered = Math.max(answered, answer.serial);
   flush();
 }
-// Lines of the commands: a label of 10 characters, or a longer one before two spaces, and its text. A line that is
-// indented by these 10 characters and a space goes on with the text of the one before.
+// Format of the lines: a label of 10 characters and a space, or a longer label and two spaces, then the text. A line
+// indented by 11 spaces continues the text of the previous line.
 function showLines(box, text) {
   box.dataset.text = text;
   const lines = text.replace(/\n {11}(?=\S)/g, " ").split("\n");
@@ -206,8 +206,8 @@ function download(blob, kind) {
 }
 async function save(kind) {
   const name = by("figure").value;
-  by("copied").textContent = by(name).offsetParent === null ? "simulate a hit first" : document.body.matches(".busy") ? "not yet: it is being computed"
-    : document.body.matches(".stale") ? "not saved: an entry is not valid; correct it, or press Escape in its field" : "";
+  by("copied").textContent = by(name).offsetParent === null ? "simulate a hit first" : document.body.matches(".busy") ? "not saved: the computation is still running"
+    : document.body.matches(".stale") ? "not saved: an input is invalid; correct it, or press Escape in its field" : "";
   if (by("copied").textContent) return;
   if (kind === "csv") return void (inputs.data = { json: [JSON.stringify({ serial: ++serial, csv: name })] });
   const view = Bokeh.index.get(Bokeh.documents[0].get_model_by_name(name));

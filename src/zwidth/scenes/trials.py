@@ -1,0 +1,147 @@
+"""Simulations of one wall with an encoder, friction and a motor, from several initial conditions.
+
+A trial is one set of parameter values. It comes to rest if every simulated response, one for each initial condition,
+does. Symbols: K is the stiffness of the wall, Q the step of the encoder.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.parts.linear_device import LinearDevice
+from zwidth.simulation.result import MotionKind
+from zwidth.simulation.simulate import simulate
+from zwidth.words.errors import InputError
+
+DISPLACEMENTS = (0.6, 1.3, 2.2, 3.7, 7.1, 13.0, 26.0, 50.0)  # initial displacements, in steps of the encoder
+OVERLOADS = (1.5, 6.0, 30.0)  # initial spring forces, in units of max_force and of max_rate times the sampling period
+LARGEST_PUSH = 0.9  # largest constant external force on a `LinearDevice`, in units of the motor's force limit
+SPEEDS = (0.05, 0.5)  # initial velocities if K = 0, in initial displacements per sampling period
+FIRST_DISPLACEMENT = 1e-3  # m or rad; used if neither the encoder nor the motor sets a scale
+
+SUSTAINED = 0.8  # least trend (see `Motion`) of a sustained oscillation, if its outcome is UNCLEAR
+RUNAWAY = 1.1  # trend above which a response without a frequency counts as growing without bound
+
+TRIALS = 16  # trials per call of `simulate`; constant, because JAX compiles once per batch size
+LONG_DELAY = 50.0  # sampling periods; with a longer delay one trial takes seconds, so trials run one by one
+
+
+class Hardware(NamedTuple):
+    """Encoder, friction and motor of a device, in SI units."""
+
+    resolution: float  # step of the encoder; 0 for an ideal sensor
+    coulomb: float  # Coulomb friction
+    static: float  # static friction
+    max_force: float  # largest force of the motor; infinite for none
+    max_rate: float  # largest rate of change of the commanded force; infinite for none
+
+
+class Starts(NamedTuple):
+    """Initial conditions of the simulations of one wall: one-dimensional arrays of equal length."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    push: np.ndarray  # constant external force
+    half_steps: np.ndarray  # additional constant external force, in units of K Q/2
+    scaled: np.ndarray  # bool; the displacement is proportional to the encoder step
+
+
+class SustainedMotion(NamedTuple):
+    """The sustained motion of largest amplitude in each trial: one-dimensional arrays of equal length."""
+
+    amplitude: np.ndarray  # 0 if every response of the trial comes to rest
+    frequency: np.ndarray  # in Hz; NaN if the motion has no frequency
+    outcome: np.ndarray  # code of `MotionKind`
+    certified: np.ndarray  # bool; no response of the trial has the outcome UNCLEAR
+
+
+class Experiment(NamedTuple):
+    """Simulations of one wall with one set of hardware, always from the same initial conditions."""
+
+    scene: Any
+    hardware: Hardware
+    starts: Starts
+    periods: int  # length of a simulation, in sampling periods
+    decay: float  # length of a simulation, in time constants of the linear loop
+
+    @property
+    def present(self) -> dict[str, float]:
+        """The present wall and hardware, by the argument names of `simulate`."""
+        wall = self.scene.wall
+        walls = {"stiffness": float(wall.stiffness), "virtual_damping": float(wall.virtual_damping)}
+        return self.hardware._asdict() | walls
+
+    def measure(self, **changes: Any) -> SustainedMotion:
+        """Run one trial for each value of the changed parameters, all other parameters at their present values."""
+        count = max([np.size(value) for value in changes.values()], default=1)
+        width = TRIALS if self.scene.d <= LONG_DELAY else 1
+        rows = [np.minimum(np.arange(start, start + width), count - 1) for start in range(0, count, width)]
+        table = {name: np.broadcast_to(value, count) for name, value in (self.present | changes).items()}
+        parts = [self._measure({name: value[row] for name, value in table.items()}) for row in rows]
+        return SustainedMotion(*(np.concatenate(columns)[:count] for columns in zip(*parts, strict=True)))
+
+    def _measure(self, table: dict[str, np.ndarray]) -> SustainedMotion:
+        """Run one trial for each row of a table of parameters."""
+        starts = self.starts
+        columns: dict[str, Any] = {name: value[:, None] for name, value in table.items()}
+        present = self.hardware.resolution
+        ratio = columns["resolution"] / present if present > 0 else 1.0
+        push = starts.push + 0.5 * starts.half_steps * columns["stiffness"] * columns["resolution"]
+        motion = simulate(
+            self.scene,
+            **columns,
+            start_position=starts.position * np.where(starts.scaled, ratio, 1.0),
+            start_velocity=starts.velocity,
+            push=push,
+            periods=self.periods,
+            record=False,
+        )
+        if np.any(motion.outcome == MotionKind.INVALID):
+            raise InputError("coulomb: friction stops and restarts the device too often within one period; lower it")
+        # The trend of a response that decays like the linear loop is exp(-decay/8), because each half of the tail is
+        # an eighth of the simulation. The square root of this factor is the least trend of a sustained oscillation.
+        return _pick_largest(motion, max(SUSTAINED, math.exp(-max(self.decay, 0.0) / 16.0)))
+
+
+def list_starts(scene: Any, hardware: Hardware) -> Starts:
+    """Return the initial conditions for the present wall and hardware."""
+    K, Q, period = float(scene.wall.stiffness), hardware.resolution, scene.timing.period
+    position = [Q * factor for factor in DISPLACEMENTS if Q > 0]
+    half_steps = [0.0] * len(position) + [1.0] * len(position)
+    # These displacements scale with the encoder step of a trial. The largest is added once more without scaling.
+    scaled = 2 * len(position)
+    position, half_steps = position * 2 + position[-1:] * 2, half_steps + [0.0, 1.0][: 2 * len(position)]
+    loads = [hardware.max_force, hardware.max_rate * period]
+    position += [factor * load / K for load in loads if K > 0 and load < math.inf for factor in OVERLOADS]
+    position = position or [FIRST_DISPLACEMENT]
+    velocity = np.zeros(len(position))
+    if K == 0:
+        velocity = np.resize(SPEEDS, len(position)) * position / period
+    halves = np.zeros(len(position))
+    halves[: len(half_steps)] = half_steps
+    starts = np.array(position), velocity, np.zeros(len(position)), halves, np.arange(len(position)) < scaled
+    if isinstance(scene.device, LinearDevice):
+        # A linear system always starts at rest at 0, so a constant external force displaces its equilibrium instead.
+        push = np.minimum(K * starts[0], LARGEST_PUSH * hardware.max_force)
+        return Starts(np.zeros(len(push)), np.zeros(len(push)), push, *starts[3:])
+    return Starts(*starts)
+
+
+def _pick_largest(motion: Any, least_trend: float) -> SustainedMotion:
+    """Return the sustained motion of largest amplitude along the last axis."""
+    kind, unclear = motion.outcome, motion.outcome == MotionKind.UNCLEAR
+    unbounded = (kind == MotionKind.DIVERGED) | (kind == MotionKind.GROWING)
+    sustained = (kind == MotionKind.STEADY) | (kind == MotionKind.RESTLESS) | (unclear & (motion.trend > least_trend))
+    # A response without a frequency either drifts or departs from an unstable equilibrium.
+    oscillating = np.isfinite(motion.frequency)
+    unbounded |= ~oscillating & (unclear | (kind == MotionKind.RESTLESS)) & (motion.trend > RUNAWAY)
+    sustained = unbounded | (sustained & oscillating)
+    amplitude = np.where(unbounded, np.inf, np.where(sustained, motion.amplitude, 0.0))
+    index = np.argmax(amplitude, axis=-1)[:, None]
+    size, frequency, outcome = (
+        np.take_along_axis(part, index, -1)[:, 0] for part in (amplitude, motion.frequency, kind)
+    )
+    return SustainedMotion(size, frequency, outcome, ~unclear.any(-1))
