@@ -79,7 +79,8 @@ def compiled_ridge(structure: Structure, *values: Array) -> RidgePoint:
     told = jax.lax.bitcast_convert_type(told, dtype)
     status = told[-1].astype(jnp.int32)
     found = status == Status.OK
-    told = jnp.where(found, told[:-1], jnp.asarray(_NOWHERE, dtype))
+    nowhere = jnp.asarray(_NOWHERE, dtype).reshape(-1, *(1 for _ in found.shape))
+    told = jnp.where(found, told[:-1], nowhere)
     codes = told[4:6].astype(jnp.int32)
     alpha, beta, w1, w2, close = _solve(structure, _fill(structure, values), told[:4], codes, found)
     status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
