@@ -167,8 +167,8 @@ def find_stiffest(
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
             found[log_stiffness] = beta * unit
-        # A zero slack satisfies the requirement; false_position expects a positive value there.
-        return max(min(-lowest, 1.0), 1e-12 if lowest <= 0 else -1.0)
+        # False_position ends at a value next to 0: keep the sign, with a size that lets it continue.
+        return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
 
     top = math.log(most)
     low = high = top if near is None or not 0 < near < most else math.log(near)
