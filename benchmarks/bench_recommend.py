@@ -100,9 +100,9 @@ def measure_margins(scene: zwidth.Scene, stiffness: float, damping: float) -> di
         return angle[index] + share * (angle[index + 1] - angle[index])
 
     loop = respond(angle)
-    unit, real = cross(np.log(np.abs(loop))), cross(loop.imag)
+    unit, real = cross(np.log(np.abs(loop))), cross(np.imag(loop))
     late = np.mod(np.angle(respond(unit)) + math.pi, 2 * math.pi)
-    gains = respond(np.append(real, math.pi)).real
+    gains = np.real(respond(np.append(real, math.pi)))
     logs = np.abs(np.log(-gains[gains < 0]))
     return {
         "gain": float(np.exp(np.min(logs, initial=math.inf))),
@@ -138,7 +138,8 @@ def judge_grasps(scene: zwidth.Scene, stiffness: float, damping: float) -> dict[
 
 def improve(scene: zwidth.Scene, step: Any) -> zwidth.Scene:
     """Return the changed device, built from its parameters."""
-    device, timing, velocity = scene.device, scene.timing, scene.velocity
+    device, timing = scene.device, scene.timing
+    velocity: Any = scene.velocity
     period, delay = timing.period, timing.delay
     if "rate" in step.words:
         kept_periods = step.name == "period_and_delay" or timing.in_periods
