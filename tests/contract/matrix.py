@@ -34,6 +34,8 @@ ARRAYS = {
     "JAX float32 array": lambda value: jnp.full(2, value, jnp.float32),
 }
 TYPES = NUMBERS | ARRAYS
+# One of each way in which the other arguments are converted; each entry with derivatives compiles programs of its own.
+WAYS = ("int", "float", "int32", "JAX float32", "list of int", "float64 array")
 DIFFERENTIATED = ("grad", "jit(grad)", "hessian")
 ALL = "all"  # in place of the name of an argument: every argument is traced
 EVERY_CASE = [*CASES, *SCENE_CASES]
@@ -58,8 +60,13 @@ def combinations(case: Case) -> Iterator[Combination]:
             # JAX turns a list into one traced value per item. Single numbers need a program of their own.
             if not kind.startswith("list") and (x64 or kind in ARRAYS):
                 yield Combination(kind, "jit", ALL, x64)
-            for traced in case.free:
+            if "period" in case.concrete and kind.startswith("JAX"):
+                # JAX arrays that a trace uses become part of it, but these arguments determine shapes.
+                continue
+            for traced in case.free if kind in WAYS else case.free[:1]:
                 yield Combination(kind, "jit", traced, x64)
+            if kind not in WAYS:
+                continue
             # What is compiled depends on the argument, and the conversion of the others does not.
             first = case.free[0]
             yield Combination(kind, "vmap", first, x64)

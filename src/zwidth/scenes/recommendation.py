@@ -85,14 +85,22 @@ class Recommendation:
         The digits are the fewest, at least 4, with which the rounded wall still satisfies the requirements. K is
         rounded down. More than 4 digits are needed if only a narrow range of B satisfies them.
         """
-        slack = measure_slack(self.scene, self.wanted)
+        slack, verdict = measure_slack(self.scene, self.wanted), self.verdict
+        ends = (math.nan, math.nan)
+        if verdict is not None:
+            ends = verdict.virtual_damping_lower, verdict.virtual_damping_upper
 
         def rounded(digits: int) -> tuple[float, float]:
             return round_safely(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
 
         def holds(digits: int) -> bool:
             wall = rounded(digits)
-            return bool(self.scene.is_stable(*wall)) and all(spare >= 0 for spare in slack(*wall).values())
+            if not (self.scene.is_stable(*wall) and all(spare >= 0 for spare in slack(*wall).values())):
+                return False
+            # The printed B must lie in the printed range of stable B, whose ends are rounded inwards.
+            low, high = ends
+            inside = round_safely(low, "above", digits) <= wall[1] <= round_safely(high, "below", digits)
+            return inside or not low <= self.virtual_damping <= high
 
         digits = count_digits(holds)
         return *rounded(digits), digits
@@ -161,7 +169,7 @@ class Recommendation:
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m")
+        lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m", self.read[2])
         room = f"B from {lower} to {upper} is stable at this K"
         margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
         cautions = (f"caution: {caution}" for caution in self.cautions)

@@ -167,9 +167,8 @@ def find_stiffest(
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
             dampings[log_stiffness] = beta * unit
-        # Replace zero by a small positive value, because zero slack satisfies the requirements and false_position
-        # requires opposite signs.
-        return max(min(-lowest, 1.0), 1e-12 if lowest <= 0 else -1.0)
+        # Keep the sign, with a size that lets false_position continue: it ends at a value next to 0.
+        return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
 
     top = math.log(most)
     low = high = top if near is None or not 0 < near < most else math.log(near)

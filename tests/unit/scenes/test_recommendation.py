@@ -303,3 +303,29 @@ def test_the_default_is_stable_in_the_soft_grasps():
         for name, grasp in zwidth.reference_grasps(radius).items():
             held = light.replace(operator=grasp).is_stable(found.stiffness, found.virtual_damping)
             assert held or name.startswith("firm"), (radius, name)
+
+
+def test_a_limit_met_exactly_during_the_search_does_not_end_it():
+    # At B = 0 a gain margin of 2 is half of K_max: the second stiffness tried leaves a slack of -3e-16.
+    device = zwidth.Device(1.7478657475046673e-06, 1.1 * 0.006315271246825399, rotary=True)
+    velocity = zwidth.Butterworth(cutoff=79.4335656705188)
+    found = zwidth.Scene(device, zwidth.Timing(0.0004620892004257242, "1 periods"), velocity=velocity).recommend()
+    assert found.limited_by == "gain_margin"
+    assert found.stiffness == pytest.approx(0.5 * float(found.stiffest.stiffness), rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", [43, 64])
+def test_the_printed_range_of_damping_contains_the_printed_damping(seed):
+    rng = np.random.default_rng(seed)
+    lines = int(rng.choice([10, 10, 20, 60, 400]))
+    mass = 10 ** rng.uniform(-1.5, 0.3)
+    damping, delay = mass * 10 ** rng.uniform(0, 2), rng.uniform(0, 2) * 1e-3
+    hertz = np.geomspace(1, 490, lines)
+    s = 2j * np.pi * hertz
+    device = zwidth.MeasuredDevice(hertz, np.exp(-s * delay) / (mass * s**2 + damping * s))
+    wanted = {"phase_margin": 5.0} if seed == 43 else {}
+    found = zwidth.Scene(device, zwidth.Timing(1e-3)).recommend(**wanted)
+    printed = re.search(r"B from (\S+)(?: N s/m)? to (\S+) N s/m is stable", found.lines()[1])
+    assert printed is not None
+    assert float(printed[1]) <= found.read[1] <= float(printed[2])
+    assert found.scene.is_stable(*found.read[:2])

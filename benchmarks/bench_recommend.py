@@ -1,0 +1,243 @@
+#!/usr/bin/env python3
+"""Check recommended walls of random ordinary devices by eigenvalues and frequency responses computed without zwidth.
+
+    python benchmarks/bench_recommend.py [--count 400] [--first 0]
+
+Checks per device: the printed wall is stable, alone and in the soft reference grasps; the labels of all grasps are
+right; cautions appear if and only if a margin is thin or a grasp is unstable; the printed range of B is stable and
+contains the printed B; the stiffness of each improvement agrees with the recommendation for the changed device.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import zwidth
+from zwidth.scenes.cautions import LEAST_DELAY_MARGIN, LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN, LONGEST_TIME_CONSTANT
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
+
+from independent_scenes import closed_loop_matrix, continuous, flow, velocity_polynomials
+
+PRINTED = 10  # devices between two lines of totals
+POINTS = 40_000  # frequencies of an open-loop response
+NEAR = 0.02  # relative distance from a threshold within which no caution is checked
+PREFIXES = {"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6}
+ROUNDING = 1e-12  # relative; of a product of a number and its prefix
+TRUE_STEP = 0.02  # relative error allowed in the stiffness of an improvement
+
+
+def draw_scene(random: np.random.Generator) -> zwidth.Scene:
+    """Return a linear or rotary device with an ordinary velocity estimate."""
+    rotary = bool(random.integers(2))
+    period, delta = 10 ** random.uniform(-4, -2.7), 10 ** random.uniform(-3, math.log10(2))
+    mass = 10 ** (random.uniform(-6, -3) if rotary else random.uniform(-1.5, 0.5))
+    delay = float(random.integers(0, 4)) if random.integers(2) else float(random.uniform(0, 3))
+    kind = random.integers(4)
+    velocity: Any = zwidth.BackwardDifference()
+    if kind == 1:
+        velocity = zwidth.LowPass(cutoff=10 ** random.uniform(-2, -0.5) / period)
+    elif kind == 2:
+        velocity = zwidth.Butterworth(10 ** random.uniform(-2, -0.5) / period, 2)
+    elif kind == 3:
+        velocity = zwidth.WindowedDifference(int(random.integers(2, 12)))
+    timing: dict[str, Any] = {"period": period, "delay": delay * period}
+    if random.integers(2):
+        timing["delay"] = f"{delay!r} periods"
+    device = zwidth.Device(mass, delta * mass / period, rotary=rotary)
+    return zwidth.Scene(device, zwidth.Timing(**timing), velocity=velocity)
+
+
+def draw_wishes(random: np.random.Generator) -> dict[str, Any]:
+    """Return the requirements of a recommendation; the default ones for every other device."""
+    if random.integers(2):
+        return {}
+    wishes: list[dict[str, Any]] = [
+        {"stiffness_fraction": float(random.uniform(0.3, 0.99))},
+        {"phase_margin": float(random.uniform(5, 50))},
+        {"gain_margin": float(random.uniform(1.1, 3))},
+        {"phase_margin": 40.0, "gain_margin": 2.5},
+        {"passive": True},
+    ]
+    return wishes[random.integers(len(wishes))]
+
+
+def find_radius(scene: zwidth.Scene, stiffness: float, damping: float) -> float:
+    """Return the spectral radius of the closed loop."""
+    return float(np.abs(np.linalg.eigvals(closed_loop_matrix(scene, stiffness, damping))).max())
+
+
+def measure_margins(scene: zwidth.Scene, stiffness: float, damping: float) -> dict[str, float]:
+    """Return the smallest gain, phase (degrees) and delay (s) margins by the frequency response of the open loop."""
+    a, b, sensor = continuous(scene)
+    period, part = scene.timing.period, scene.d - scene.whole_delay
+    step, older = flow(a, b, period)[0], flow(a, b, part * period)[1]
+    rest, newer = flow(a, b, (1 - part) * period)
+    eigenvalues, vectors = np.linalg.eig(step)
+    left, right = sensor @ vectors, np.linalg.inv(vectors) @ np.stack([newer, rest @ older], 1)
+    angle = np.concatenate([np.geomspace(1e-6, 0.02, POINTS // 4), np.linspace(0.02, math.pi, POINTS)[1:-1]])
+    top, bottom = velocity_polynomials(scene)
+
+    def respond(angle: np.ndarray) -> np.ndarray:
+        z = np.exp(1j * angle)
+        modal = (left / (z[:, None] - eigenvalues)) @ right
+        plant = (modal[:, 0] + modal[:, 1] / z) * z**-scene.whole_delay
+        return (stiffness + damping * np.polyval(top, z) / np.polyval(bottom, z)) * plant
+
+    def cross(values: np.ndarray) -> np.ndarray:
+        """Return the angles of the sign changes."""
+        index = np.flatnonzero(values[:-1] * values[1:] < 0)
+        share = values[index] / (values[index] - values[index + 1])
+        return angle[index] + share * (angle[index + 1] - angle[index])
+
+    loop = respond(angle)
+    unit, real = cross(np.log(np.abs(loop))), cross(np.imag(loop))
+    late = np.mod(np.angle(respond(unit)) + math.pi, 2 * math.pi)
+    gains = np.real(respond(np.append(real, math.pi)))
+    logs = np.abs(np.log(-gains[gains < 0]))
+    return {
+        "gain": float(np.exp(np.min(logs, initial=math.inf))),
+        "phase": math.degrees(np.min(np.minimum(late, 2 * math.pi - late), initial=math.inf)),
+        "delay": float(np.min(late / unit, initial=math.inf)) * period,
+    }
+
+
+def judge_thin(scene: zwidth.Scene, stiffness: float, damping: float) -> bool | None:
+    """Return True if a margin is thin; None if one lies next to its threshold."""
+    margins, period = measure_margins(scene, stiffness, damping), scene.timing.period
+    constant = -period / math.log(find_radius(scene, stiffness, damping))
+    ratios = (
+        math.log(margins["gain"]) / math.log(LEAST_GAIN_MARGIN),
+        margins["phase"] / LEAST_PHASE_MARGIN,
+        margins["delay"] / (LEAST_DELAY_MARGIN * period),
+        LONGEST_TIME_CONSTANT / constant,
+    )
+    if min(ratios) < 1 - NEAR:
+        return True
+    return False if min(ratios) > 1 + NEAR else None
+
+
+def judge_grasps(scene: zwidth.Scene, stiffness: float, damping: float) -> dict[str, bool]:
+    """Return the stability in the reference grasps, by name."""
+    found: dict[str, bool] = {}
+    for radius in zwidth.parts.grasps.RADII if scene.device.rotary else (None,):
+        for name, hand in zwidth.reference_grasps(radius).items():
+            held = scene.replace(operator=hand)
+            found[name] = found.get(name, True) and find_radius(held, stiffness, damping) < 1
+    return found
+
+
+def improve(scene: zwidth.Scene, step: Any) -> zwidth.Scene:
+    """Return the changed device, built from its parameters."""
+    device, timing = scene.device, scene.timing
+    velocity: Any = scene.velocity
+    period, delay = timing.period, timing.delay
+    if "rate" in step.words:
+        kept_periods = step.name == "period_and_delay" or timing.in_periods
+        if isinstance(velocity, zwidth.WindowedDifference):
+            velocity = zwidth.WindowedDifference(2 * velocity.samples)
+        later = f"{float(scene.d)!r} periods" if kept_periods else delay
+        return zwidth.Scene(device, zwidth.Timing(period=period / 2, delay=later), velocity=velocity)
+    if step.words == "half the delay":
+        return zwidth.Scene(device, zwidth.Timing(period=period, delay=0.5 * scene.d * period), velocity=velocity)
+    if "damping" in step.words:
+        device = zwidth.Device(device.mass, 1.1 * device.damping, rotary=device.rotary)
+    elif step.words == "no velocity filter":
+        velocity = zwidth.BackwardDifference()
+    elif "filter" in step.words:
+        velocity = replace(velocity, cutoff=2 * velocity.cutoff)
+    else:
+        assert "window" in step.words, step.words
+        velocity = zwidth.WindowedDifference(max(1, round(velocity.samples / 2)))
+    return zwidth.Scene(device, timing, velocity=velocity)
+
+
+def check_device(seed: int) -> tuple[Counter[str], list[str]]:
+    """Return the counts of one device and its failures."""
+    random = np.random.default_rng(seed)
+    scene, wishes = draw_scene(random), draw_wishes(random)
+    counts, failures = Counter(devices=1), []
+
+    def count(name: str, right: bool, more: str = "") -> None:
+        counts[name] += 1
+        counts[f"right: {name}"] += right
+        if not right:
+            failures.append(f"{name} {more}".rstrip())
+
+    found = scene.recommend(**wishes)
+    counts["default wishes"] += not wishes
+    if found.status != zwidth.Status.OK:
+        return counts + Counter(without_a_wall=1), failures
+    K, B, _ = found.read
+    for wall in ((K, B), (found.stiffness, found.virtual_damping)):
+        count("walls stable", find_radius(scene, *wall) < 1, f"{wall}")
+    grasps = judge_grasps(scene, found.stiffness, found.virtual_damping)
+    count("labels of grasps", grasps == found.grasps, f"{grasps} {found.grasps}")
+    soft = all(stable for name, stable in judge_grasps(scene, K, B).items() if name.startswith("soft"))
+    if not wishes:
+        count("stable in soft hands", soft)
+    held = any("in the hand" in each for each in found.cautions)
+    count("cautions of hands", held == (not all(grasps.values())))
+    thin, printed = judge_thin(scene, found.stiffness, found.virtual_damping), len(found.cautions) > held
+    if thin is not None:
+        count("cautions of margins", thin == printed, f"thin {thin}: {found.cautions}")
+    for caution in found.cautions:
+        check_remedy(caution, scene, count)
+    ends = read_range(found.lines()[1])
+    assert ends is not None, found.lines()
+    spare = ROUNDING * max(abs(B), *map(abs, ends))
+    inside = ends[0] - spare <= B <= ends[1] + spare
+    stable = all(find_radius(scene, K, end) < 1 for end in ends)
+    count("printed ranges", stable and inside, f"{found.lines()[:2]}")
+    for step in found.steps:
+        true = improve(scene, step).recommend(**wishes).stiffness
+        right = bool(abs(step.stiffness / true - 1) < TRUE_STEP)
+        count("improvements", right, f"{step.words}: {step.stiffness / true:.4f} of the true one")
+    return counts, failures
+
+
+def check_remedy(caution: str, scene: zwidth.Scene, count: Any) -> None:
+    """Count the wall that a caution proposes as stable in all grasps."""
+    wall = re.search(r"K = (\S+) (k?)N/m, B = (\S+) N s/m is stable in all", caution)
+    if wall is not None:
+        K, B = float(wall[1]) * (1e3 if wall[2] else 1.0), float(wall[3])
+        count("walls of cautions", all(judge_grasps(scene, K, B).values()) and find_radius(scene, K, B) < 1, caution)
+
+
+def read_range(line: str) -> tuple[float, float] | None:
+    """Return the ends of the printed stable range of B in N s/m or N m s/rad; None if the line has no range."""
+    unit = r"(\S*?)N (?:s/m|m s/rad)"
+    found = re.search(rf"B from (\S+)(?: {unit})? to (\S+) {unit} is stable", line)
+    if found is None:
+        return None
+    low, low_prefix, high, high_prefix = found.groups()
+    return float(low) * PREFIXES[high_prefix if low_prefix is None else low_prefix], float(high) * PREFIXES[high_prefix]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=400)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first device")
+    given = parser.parse_args()
+    total: Counter[str] = Counter()
+    for seed in range(given.first, given.first + given.count):
+        counts, failures = check_device(seed)
+        for failure in failures:
+            print(f"seed {seed}: {failure}", flush=True)
+        total.update(counts)
+        if (seed + 1) % PRINTED == 0:
+            print("; ".join(f"{name} {count}" for name, count in total.items()), flush=True)
+    print("".join(f"\n{name:<32}{count}" for name, count in total.items()))
+
+
+if __name__ == "__main__":
+    main()
