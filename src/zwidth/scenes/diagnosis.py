@@ -106,7 +106,9 @@ class Diagnosis:
         if self.cause in ("none", "undecided"):
             return ""
         if self.remedies:
-            return ", or ".join(remedy.spell() for remedy in self.remedies)
+            simulated = self.cause != "instability"
+            advice = ", or ".join(remedy.spell(simulated) for remedy in self.remedies)
+            return f"{advice} (confirmed by simulation at these values only)" if simulated else advice
         return "no remedy by a change of one parameter was found"
 
     def as_dict(self) -> dict[str, Any]:

@@ -162,7 +162,7 @@ class Recommendation:
         """
         if self.status != Status.OK:
             raise InputError(f"code: there is no wall: {self.reason}")
-        return write_wall(self.scene, language)
+        return write_wall(self.scene, language, self.cautions)
 
     def lines(self) -> tuple[str, ...]:
         """Return lines with the wall, its margins and its cautions, or the reason why no wall is recommended."""

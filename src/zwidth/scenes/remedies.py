@@ -35,19 +35,24 @@ _PHRASES = {
 
 
 class Remedy(NamedTuple):
-    """A range of one parameter in which the oscillation stops, all other parameters unchanged."""
+    """A range of one parameter in which the oscillation stops, all other parameters unchanged.
+
+    For an unstable linear loop the whole range is stable. For a limit cycle or saturation, simulations confirm only the
+    finite end of the range: other values in it may oscillate, because the outcome need not be monotone.
+    """
 
     parameter: str  # "resolution", "coulomb", "stiffness", "virtual_damping" or "delay"
     low: float  # in SI units; 0 if the range has no lower end
     high: float  # in SI units; infinite if the range has no upper end
 
-    def spell(self) -> str:
-        """Return the change in words, with its unit."""
+    def spell(self, simulated: bool = False) -> str:
+        """Return the change in words, with its unit; only the confirmed value if it was ``simulated``."""
         phrase, unit = _PHRASES[self.parameter]
         low, high = (with_unit(end, unit, 3) for end in (self.low, self.high))
         if self.low > 0 and self.high < math.inf:
             return f"{phrase} {low} to {high}"
-        text = f"{phrase} at least {low}" if self.low > 0 else f"{phrase} at most {high}"
+        side = "" if simulated else "at least " if self.low > 0 else "at most "
+        text = f"{phrase} {side}{low if self.low > 0 else high}"
         if self.parameter == "resolution" and is_rotary():
             text += f" ({_count_steps(self.high):,} counts per turn)"
         return text

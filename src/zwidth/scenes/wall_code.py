@@ -11,11 +11,11 @@ has the states ``p = zeta W`` and ``q = W`` with ``zeta^2 W = w = u - a1 p - a0 
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.velocity import Estimate
 from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import check_choice
@@ -36,13 +36,13 @@ def _describe_call() -> tuple[str, str]:
     )
 
 
-def _describe_limit(limit: SafeLimit | None, stiffness: float, virtual_damping: float) -> list[str]:
-    """Return the lines on the safe limit in the comment at the head of a program."""
-    if limit is None:
-        return []
-    texts = [f"Safe limit: {limit.describe()}", *(f"Warning: {text}" for text in limit.warnings)]
-    if not limit.allows(stiffness, virtual_damping):
-        texts.insert(0, "WARNING: this wall exceeds the safe limit; it may be unstable.")
+def _describe_cautions(scene: SceneParts, cautions: Sequence[str]) -> list[str]:
+    """Return the lines on the safe limit and the cautions in the comment at the head of a program."""
+    limit, texts = scene.safe_limit, [f"CAUTION: {caution}" for caution in cautions]
+    if limit is not None:
+        texts += [f"Safe limit: {limit.describe()}", *(f"Warning: {text}" for text in limit.warnings)]
+        if not limit.allows(float(scene.wall.stiffness), float(scene.wall.virtual_damping)):
+            texts.insert(0, "WARNING: this wall exceeds the safe limit; it may be unstable.")
     # Replace character sequences that would end the comment or start an escape, because the texts come from a file.
     plain_texts = (text.replace("*/", "* /").replace('"', "'").replace("\\", "/") for text in texts)
     return [line for text in plain_texts for line in textwrap.wrap(text, _COLUMNS)]
@@ -89,14 +89,14 @@ class WallProgram(NamedTuple):
     law: str
 
 
-def write_wall(scene: SceneParts, language: str = "c") -> str:
+def write_wall(scene: SceneParts, language: str = "c", cautions: Sequence[str] = ()) -> str:
     """See `zwidth.scenes.recommendation.Recommendation.code`."""
     check_choice("language", language, ("c", "python"))
-    program = lay_program(scene)
+    program = lay_program(scene, cautions)
     return _write_c(program) if language == "c" else _write_python(program)
 
 
-def lay_program(scene: SceneParts) -> WallProgram:
+def lay_program(scene: SceneParts, cautions: Sequence[str] = ()) -> WallProgram:
     """The wall of a scene and its velocity estimate as statements."""
     period = float(scene.timing.period)
     estimate = scene.velocity.estimate(period)
@@ -125,7 +125,7 @@ def lay_program(scene: SceneParts) -> WallProgram:
         force.append(f"{names[0]} += w")
     K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
     estimated = f"velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}"
-    head = "\n".join([f"Virtual wall: {name_wall(K, B)}, {estimated}.", *_describe_limit(scene.safe_limit, K, B)])
+    head = "\n".join([f"Virtual wall: {name_wall(K, B)}, {estimated}.", *_describe_cautions(scene, cautions)])
     return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], f"-({K!r} * x + {B!r} * v)")
 
 

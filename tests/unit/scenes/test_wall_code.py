@@ -97,7 +97,7 @@ def test_a_recommendation_writes_its_own_wall():
 
 def test_where_there_is_no_wall_there_is_no_program():
     bare = zwidth.Scene(zwidth.Device(0.1, 0.0), zwidth.Timing(1e-3, 1e-3))
-    with pytest.raises(zwidth.InputError, match="code: there is no wall: none was found"):
+    with pytest.raises(zwidth.InputError, match="code: there is no wall: no wall, however soft"):
         bare.recommend(passive=True).code()
 
 
