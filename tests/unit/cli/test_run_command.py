@@ -81,7 +81,7 @@ def test_a_scene_that_no_device_has_is_doubted_before_anything_is_computed(tmp_p
 
     assert doubts_of("{mass: 100, damping: 10, rate: 1, delay: 1}") == [
         "mass is 100 kg, far from any device; did you mean 'mass: 100 g'?",
-        "delay is 1 s, far from any device; did you mean 'delay: 1 ms'?",
+        "delay is 1 s, far from any device; did you mean 'delay: 1 ms' or 'delay: 1 periods'?",
         "rate is 1 Hz, far from any device; did you mean 'rate: 1 kHz'?",
     ]
     (of_a_part,) = doubts_of("{mass: 1, rate: 1 kHz, operator: {mass: 70, stiffness: 100}}")

@@ -80,7 +80,7 @@ def test_what_is_refused(changes, message):
 @pytest.mark.parametrize("name", ["actuator", "coupling", "modes"])
 def test_a_device_given_as_a_whole_has_no_parts_of_its_own(name):
     whole = zwidth.Scene(zwidth.LinearDevice(([1], [0.1, 10, 0])), zwidth.Timing(1e-3))
-    with pytest.raises(InputError, match=f"parameter: got '{name}', allowed are 'system', .*'operator'$"):
+    with pytest.raises(InputError, match=f"parameter: got '{name}', allowed are 'system', .*'operator', 'safe_limit'$"):
         whole.replace(**{name: None})
 
 

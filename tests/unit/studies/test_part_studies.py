@@ -71,7 +71,9 @@ def test_a_recommendation_has_a_stable_wall_and_the_damping_that_goes_with_it():
     found = json.loads(outcome.documents["recommendation.json"])
     best, scene = found["recommended"], study.device.to_scene()
     stiffness = best["stiffness"]
-    assert stiffness == pytest.approx(0.75 * found["maximum"]["stiffness"])
+    assert 0 < stiffness <= 0.75 * found["maximum"]["stiffness"]
+    assert best["phase_margin"] >= 30
+    assert best["gain_margin"] >= 2
     lower, upper = best["virtual_damping_lower"], best["virtual_damping_upper"]
     inside = np.linspace(lower, upper, 101)[1:-1]
     assert best["stable"]
@@ -106,7 +108,7 @@ def test_a_share_that_is_not_stable_with_the_damping_of_the_stiffest_wall_has_an
     assert best["stiffness"] == 0.5 * most["stiffness"]
     assert not scene.is_stable(best["stiffness"], most["virtual_damping"])
     assert np.abs(scene.poles(best["stiffness"], best["virtual_damping"])).max() < 1
-    assert "stable for B from -41.61 to 18.51 N s/m" in outcome.documents["recommendation.md"]
+    assert "B from -41.61 to 18.51 N s/m is stable" in outcome.documents["recommendation.md"]
     assert any("B differs from that of the stiffest wall" in note for note in outcome.notes)
 
 
