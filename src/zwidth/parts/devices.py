@@ -130,7 +130,7 @@ class KnownDevice:
         Example:
             >>> import zwidth
             >>> zwidth.devices.find_device("phantom_2006").to_timing(rate="2 kHz")
-            Timing(period=0.0005, delay=0.0005)
+            Timing(period=0.0005, delay='1 periods')
         """
         if delay is None and self.delay is not None:
             delay = f"{self.delay.value!r} periods" if self.delay.unit == "periods" else self.delay.value

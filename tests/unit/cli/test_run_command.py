@@ -42,30 +42,25 @@ def run(tmp_path, monkeypatch, unpainted):
 @pytest.mark.parametrize("name", SCENES)
 def test_a_recommendation_is_told_again_whenever_the_run_is(name, run):
     scene, velocity = SCENES[name]
-    told = run(f"scene: {scene}\n" + STUDY % 0.5)
+    told = " ".join(" ".join(run(f"scene: {scene}\n" + STUDY % 0.5)).split())
     bare = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), velocity=velocity)
+    found = bare.recommend(stiffness_fraction=0.5)
     top = bare.max_stiffness()
     wall = 0.5 * float(top.stiffness), float(top.virtual_damping)
-    margins = bare.margins(*wall)
-    first, second = told
-    # What is told to be borne is rounded down.
+    assert (found.stiffness, found.virtual_damping) == pytest.approx(wall)
+    # Stiffnesses are rounded down.
     stiffness, top_stiffness = (with_unit(round_safely(K, "below"), "N/m") for K in (wall[0], 2 * wall[0]))
-    gain, phase, delay = (round_safely(float(margins[k]), "below") for k in range(3))
-    damping = plain(wall[1])
-    share = f"50 % of the stiffest stable wall, {top_stiffness}"
-    assert " ".join(first.split()) == f"best K = {stiffness}, B = {damping} N s/m: {share}"
-    assert f"gain {plain(gain)}, phase {plain(phase)} degrees, delay " in second
-    assert with_unit(delay, "s") in second
-    assert second.endswith(f"passive: {'yes' if bare.is_passive(*wall) else 'no'}")
-    assert run(f"scene: {scene}\n" + STUDY % 0.5, "--resume") == told
+    assert told.startswith(f"best K = {stiffness}, B = {plain(wall[1])} N s/m: 50 % of K_max = {top_stiffness}")
+    assert all(line in told for line in found.lines())
+    assert f"passive: {'yes' if bare.is_passive(*wall) else 'no'}; " in told
 
 
 def test_a_study_asks_for_margins(run):
-    first, _ = run("scene: {mass: 0.1, damping: 10, period: 1e-3}\n" + MARGINS % (30, "true"))
+    told = " ".join(" ".join(run("scene: {mass: 0.1, damping: 10, period: 1e-3}\n" + MARGINS % (30, "true"))).split())
     found = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3)).recommend(phase_margin=30, passive=True)
-    assert " ".join(first.split()) == f"best {found.lines()[0]}"
-    (told,) = run("scene: {mass: 0.1, period: 1e-3}\n" + MARGINS % (30, "true"), "--overwrite")
-    assert "no wall: none was found that keeps a phase margin of 30 degrees and passivity" in told
+    assert told.startswith(f"best {found.lines()[0]}")
+    told = " ".join(run("scene: {mass: 0.1, period: 1e-3}\n" + MARGINS % (30, "true"), "--overwrite"))
+    assert "no wall: no wall, however soft, has 30 deg phase margin and passivity" in " ".join(told.split())
 
 
 def test_a_scene_that_no_device_has_is_doubted_before_anything_is_computed(tmp_path, monkeypatch, unpainted):

@@ -108,7 +108,7 @@ def test_a_share_that_is_not_stable_with_the_damping_of_the_stiffest_wall_has_an
     assert best["stiffness"] == 0.5 * most["stiffness"]
     assert not scene.is_stable(best["stiffness"], most["virtual_damping"])
     assert np.abs(scene.poles(best["stiffness"], best["virtual_damping"])).max() < 1
-    assert "B from -41.61 to 18.51 N s/m is stable" in outcome.documents["recommendation.md"]
+    assert "B from -41.61 N s/m to 18.51 N s/m is stable" in outcome.documents["recommendation.md"]
     assert any("B differs from that of the stiffest wall" in note for note in outcome.notes)
 
 
