@@ -58,11 +58,10 @@ def combinations(case: Case) -> Iterator[Combination]:
             if case.refuses_tracing:
                 continue
             # JAX turns a list into one traced value per item. Single numbers need a program of their own.
-            if not kind.startswith("list") and (x64 or kind in ARRAYS):
+            # A scene computes with what is traced as it is, in half precision too.
+            half = kind == "float16" and case.one_number
+            if not kind.startswith("list") and not half and (x64 or kind in ARRAYS):
                 yield Combination(kind, "jit", ALL, x64)
-            if "period" in case.concrete and kind.startswith("JAX"):
-                # JAX arrays that a trace uses become part of it, but these arguments determine shapes.
-                continue
             for traced in case.free if kind in WAYS else case.free[:1]:
                 yield Combination(kind, "jit", traced, x64)
             if kind not in WAYS:
@@ -94,8 +93,9 @@ def compute(case: Case, entry: Combination) -> dict[str, Any]:
     def total(x: Any) -> Any:
         return sum_leaves(values(x), jnp)
 
-    # Two points, with numbers as with arrays beside them: one program serves both.
-    x = jnp.full(2, moving(case, entry.traced), jnp.float64 if entry.x64 else jnp.float32)
+    # Two points, with numbers as with arrays beside them: one program serves both. Scenes hold single numbers.
+    shape = () if entry.traced in case.one_number else (2,)
+    x = jnp.full(shape, moving(case, entry.traced), jnp.float64 if entry.x64 else jnp.float32)
     if entry.transform == "vmap":
         return {name: leaf[0] for name, leaf in jax.vmap(values)(x[None]).items()}
     if entry.transform == "jit":
@@ -124,8 +124,8 @@ def convert(case: Case, name: str, kind: str) -> Any:
 
 
 def moving(case: Case, name: str) -> float:
-    """Return the value of a traced argument: not whole, for a derivative in a delay jumps at whole ones."""
-    return case.whole[name] + 0.25
+    """Return the value of a traced argument: no integer, because a derivative jumps at integer delays; a lag is one."""
+    return case.whole[name] + (0.0 if name == "lag" else 0.25)
 
 
 def sum_leaves(leaves: dict[str, Any], xp: Any) -> Any:

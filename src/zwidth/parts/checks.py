@@ -17,7 +17,7 @@ from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, PARAMETE
 from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.types import Array
 from zwidth.words.units import TIME, find_dimension, read_quantity, tell_kind, to_float
-from zwidth.words.xp import frozen, is_jax, namespace
+from zwidth.words.xp import frozen, is_jax, is_traced, namespace
 
 
 def in_periods(delay: Array, period: Array) -> Array:
@@ -211,7 +211,7 @@ def check_number(field: str, value: Any, unit: str = "", allowed: Range | None =
     """Return one quantity in its SI unit, a float unless JAX traces or holds it; else raise `InputError`."""
     # A text is a number with a unit, as in configuration files: "70 g". Unit and range are those that
     # `words.quantities` has for the field where they are left out.
-    if is_jax(value):
+    if is_traced(value):
         return value
     if not unit:
         unit = PARAMETERS[field].unit
@@ -223,13 +223,13 @@ def check_number(field: str, value: Any, unit: str = "", allowed: Range | None =
 
 def check_span(field: str, value: Any) -> Any:
     """Return a length of time as `Span`, in s or in periods as it was given; what JAX holds stays as it is."""
-    return value if is_jax(value) else _read(field, value, lambda known: read_span(known, NOT_NEGATIVE))
+    return value if is_traced(value) else _read(field, value, lambda known: read_span(known, NOT_NEGATIVE))
 
 
 def _read(field: str, value: Any, read: Callable[[Any], Any]) -> Any:
     if not isinstance(value, str | Span) and np.ndim(value) != 0:
         raise InputError(f"{field}: got an array of shape {np.shape(value)}; a scene holds single numbers")
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray) or is_jax(value):
         value = value.item()
     if isinstance(value, Real) and not isinstance(value, bool):
         # Also what NumPy holds.
