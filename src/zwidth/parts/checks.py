@@ -230,7 +230,7 @@ def _read(field: str, value: Any, read: Callable[[Any], Any]) -> Any:
     if not isinstance(value, str | Span) and np.ndim(value) != 0:
         raise InputError(f"{field}: got an array of shape {np.shape(value)}; a scene holds single numbers")
     if isinstance(value, np.ndarray) or is_jax(value):
-        value = value.item()
+        value = np.asarray(value).item()
     if isinstance(value, Real) and not isinstance(value, bool):
         # Also what NumPy holds.
         value = to_float(value)  # pyright: ignore[reportArgumentType]  (anything that float takes)
