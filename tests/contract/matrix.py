@@ -58,9 +58,9 @@ def combinations(case: Case) -> Iterator[Combination]:
             if case.refuses_tracing:
                 continue
             # JAX turns a list into one traced value per item. Single numbers need a program of their own.
-            # A scene computes with what is traced as it is, in half precision too.
-            half = kind == "float16" and case.one_number
-            if not kind.startswith("list") and not half and (x64 or kind in ARRAYS):
+            # A scene converts units in the precision of its traced parameters.
+            coarse = case.one_number and kind in NUMBERS and kind.endswith(("float16", "float32"))
+            if not kind.startswith("list") and not coarse and (x64 or kind in ARRAYS):
                 yield Combination(kind, "jit", ALL, x64)
             for traced in dict.fromkeys((case.free[0], case.free[-1])) if kind in WAYS else case.free[:1]:
                 yield Combination(kind, "jit", traced, x64)
