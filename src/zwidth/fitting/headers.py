@@ -31,7 +31,7 @@ _WORDS = {
 }
 # Endings of compound words, as in the German "Sollmoment".
 _ENDINGS = {"time": (), "position": ("winkel", "position"), "force": ("moment", "kraft")}
-# Of several forces the commanded one is preferred, and measured forces are excluded. The reverse holds for positions.
+# A commanded force is preferred to other forces, and measured forces are excluded. The reverse holds for positions.
 _COMMANDED = ("cmd", "command", "commanded", "des", "desired", "ref", "reference", "target", "setpoint", "soll", "goal")
 _MEASURED = ("meas", "measured", "actual", "sensed", "sensor", "est", "estimated", "ist")
 # Words for derivatives, errors and temperatures. Columns with these words are neither positions nor forces.

@@ -74,7 +74,7 @@ class LinearLoop:
     # a stiffest wall takes some 10 to 50 ms.
     delay_models: ClassVar[tuple[DelayModel, ...]] = ("held",)
     draws: ClassVar[int] = 200
-    # Whether the methods that take walls work inside jit, vmap and grad.
+    # True if the methods that take walls work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
     # The most periods of window and delay that a search affords: its cost grows with their square.
     most_periods: ClassVar[float] = 128
