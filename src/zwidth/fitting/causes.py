@@ -28,7 +28,8 @@ _EXPLAINED = 0.25  # a further force is the cause if it leaves less than this sh
 
 # Test of the residuals.
 _SHARE = 0.5  # a force is the cause if it explains more than this share of the residual sum of squares
-_ROUNDING_SHARE = 0.2  # the same for rounding errors of the force, whose size is computed and not fitted
+# The same share for rounding errors of the force: lower, because their size is computed and not fitted.
+_ROUNDING_SHARE = 0.2
 _TRIALS = 4  # random draws of the rounding errors
 _MIN_LEVELS = 8  # least number of distinct forces for which a common step is attributed to rounding
 _MIN_STEP = 2e-4  # least rounding step, relative to the largest force

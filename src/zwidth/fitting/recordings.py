@@ -28,7 +28,7 @@ class ReadLogs(NamedTuple):
     """Logs at even times, after repair."""
 
     logs: tuple[Recording, ...]
-    places: tuple[np.ndarray, ...]  # index of each sample of a log, in periods after its first sample
+    places: tuple[np.ndarray, ...]  # for each log, the times of its samples in whole periods after the first
     period: float  # s
     wavers: float  # relative standard error of the period
     notes: tuple[str, ...]  # the repairs, one clause each

@@ -49,7 +49,7 @@ _SPAN = 0.5  # least jump of a wrap at an unknown modulus, relative to the span 
 # Times rounded to ticks of a coarse clock.
 _FEW_ODD = 5  # least number of steps that differ from the usual one by a tick
 _MANY_ODD = 20  # from this number on the rounding errors may spread over 1.1 instead of 1.02 ticks, for jitter
-_COARSEST = 10.0  # longest tick, in periods
+_COARSEST = 10.0  # longest clock tick that is repaired, in sampling periods
 
 
 class RepairedLog(NamedTuple):

@@ -160,7 +160,12 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     gaps = sum(int(np.count_nonzero(np.diff(motion.time) > 1.5 * fit.period)) for motion in fit.motions)
     if gaps:
         where = "a gap" if gaps == 1 else f"each of {gaps} gaps"
-        rows.append(("used", f"{count:,} of {total:,} samples: the first ones after {where} depend on unknown forces"))
+        rows.append(
+            (
+                "used",
+                f"{count:,} of {total:,} samples: those after {where} depend on forces that were not logged",
+            )
+        )
     elif any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
         rows.append(("used", f"{count:,} of {total:,} samples, from the start; more would only reduce the errors"))
     if math.isfinite(fit.virtual_damping):
@@ -177,7 +182,9 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     if fit.lag is not None:
         names = ("time_constant", "delay", "stiffness_max")
         lag, delay, K = (spell(name, value, 3) for name, value in zip(names, fit.lag, strict=True))
-        rows.append(("or as well", f"an actuator lag of up to {lag}, with a delay of {delay} and K_max = {K}"))
+        rows.append(
+            ("or as well", f"an actuator lag of up to {lag}; at this lag the fitted delay is {delay} and K_max is {K}")
+        )
     if fit.is_doubted or fit.scene.safe_limit is None:
         return rows
     rows.append(("safe limit", fit.scene.safe_limit.describe()))

@@ -156,7 +156,7 @@ def scene_notes(scene: Scene) -> list[str]:
 
 
 def _compare_with_limit(scene: Scene) -> list[str]:
-    """Return the warnings of a scene's safe limit, preceded by a note if the wall exceeds the limit."""
+    """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
     limit, wall = scene.safe_limit, scene.wall
     if limit is None or isinstance(wall, NoWall):
         return []

@@ -225,7 +225,7 @@ def _is_stable_held(scene: SceneOptima, wall: WallChoice) -> bool:
 
 
 def _choose_free(scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None, width: float) -> WallChoice:
-    """Choose the wall by all requirements except stability in the soft grasps."""
+    """Choose the wall by all requirements except stability in the reference grasps named soft."""
     nan = math.nan
     if top.status != Status.OK:
         return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
