@@ -195,7 +195,7 @@ class Slope(NamedTuple):
 
 
 def list_slopes(scene: Scene) -> list[Slope]:
-    """What a little more of every parameter of a scene changes of its stiffest wall."""
+    """Return the sensitivity of the maximum stiffness to each parameter of a scene, with its effect in words."""
     if isinstance(scene.device, MeasuredDevice):
         return []
     per, values = scene.sensitivities().per, scene.parameters()
@@ -207,10 +207,9 @@ def list_slopes(scene: Scene) -> list[Slope]:
         by_one = not size or (unit == "N s/m" and not is_rotary())
         # A power of ten near one percent, as people can picture it.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if is_rotary() else 1.0
-        effect = "changes nothing"
-        if change := value * step:
-            amount = with_unit(abs(change), "N/m", 3) if isfinite(change) else "stiffness at an infinite rate at first"
-            effect = f"{'buys' if change > 0 else 'costs'} {amount}"
+        effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
+        if isfinite(value) and (change := value * step):
+            effect = f"{'buys' if change > 0 else 'costs'} {with_unit(abs(change), 'N/m', 3)}"
         note = f" (the delay stays {scene.timing.kept_delay})" if path == "period" and scene.timing.delay else ""
         words = f"{with_unit(step, unit, 1)} more {effect}{note}"
         found.append(Slope(path, value, f"N/m per {unit}" if unit else "N/m", words))
