@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.encoder import find_resolution
+from zwidth.fitting.encoder import find_steps
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import FittedModel
 from zwidth.words.formatting import plain, with_unit
@@ -160,7 +160,7 @@ def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float) -> s
         squares: residual sum of squares.
     """
     forces = np.concatenate([log.force for log in best.model.logs])
-    step, largest = find_resolution(forces), best.model.largest
+    step, largest = find_steps(forces)[1], best.model.largest
     if step < _MIN_STEP * largest or np.unique(forces).size < _MIN_LEVELS:
         return ""
     rng, expected = np.random.default_rng(0), []

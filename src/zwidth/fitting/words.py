@@ -17,7 +17,7 @@ from zwidth.words.quantities import FIELDS
 from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 from zwidth.words.status import Status
 
-NEAR_ROUNDING = 1.1  # residuals below this multiple of the encoder's quantization noise are as expected
+NEAR_ROUNDING = (0.5, 1.1)  # range of residuals as expected, in units of the encoder's quantization noise
 
 SYMBOLS = {
     "mass": "m",
@@ -130,7 +130,7 @@ def _describe_residuals(fit: DeviceFit) -> str:
     size = f"residuals of {spell('position', fit.noise, 3)}"
     if not fit.resolution:
         return size
-    expected = fit.noise < NEAR_ROUNDING * fit.resolution / math.sqrt(12.0)
+    expected = NEAR_ROUNDING[0] < fit.noise / fit.resolution * math.sqrt(12.0) < NEAR_ROUNDING[1]
     step = spell("position", fit.resolution, 3)
     return f"{size}, {'as expected for an encoder step of' if expected else 'with an encoder step of'} {step}"
 
