@@ -248,7 +248,9 @@ def _list_steps(resolution: Any, read: ReadLogs) -> tuple[list[float], list[str]
     pairs = zip(read.logs, read.steps, strict=True)
     if step and not all(fits_steps(log.position, step, slack=column) for log, (_, column) in pairs):
         text = with_unit(step, "m")
-        return [0.0], [f"the positions are no whole steps of {text}, so its errors are taken for noise: check resolution"]
+        return [0.0], [
+            f"the positions are no multiples of {text}, so their errors are treated as noise: check resolution"
+        ]
     return [step], []
 
 
