@@ -103,6 +103,7 @@ class Study(Strict):
         supplied["delay_models"] = [scene.delay_model]
         if isinstance(scene, PhysicalScene):
             supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
+            supplied |= scene.hardware
             if "device" in absent:
                 supplied["device"] = scene.bare(SimulatedDevice if cls.simulates else PhysicalDevice)
         if "devices" in absent:

@@ -27,10 +27,10 @@ _LAGS, _RATIO = (0.3, 1.5), 0.7
 # So many resonances are started from, their frequencies so far apart.
 _PARTED, _APART = 2, float(np.exp(0.2))
 
-_Looked = tuple[FittedModel, HiddenPole | None, list[PoleBank], LagTest | None]
+Choice = tuple[FittedModel, HiddenPole | None, list[PoleBank], LagTest | None]
 
 
-def choose_structure(best: FittedModel) -> _Looked:
+def choose_structure(best: FittedModel) -> Choice:
     """Add what explains the residuals best as long as they show a pole; then what they still show, and of lags."""
     # Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
     way = max(float(np.ptp(log.position)) for log in best.model.logs)
@@ -54,7 +54,7 @@ def choose_structure(best: FittedModel) -> _Looked:
     return (best, rival or pole, banks, lags) if known else rigid
 
 
-def _look(best: FittedModel) -> _Looked:
+def _look(best: FittedModel) -> Choice:
     """What the residuals show; of lags where they show no pole and the device has none."""
     pole, banks = find_hidden(best)
     return best, pole, banks, None if pole or best.model.lag else look_for_lags(best)

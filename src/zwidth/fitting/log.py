@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.causes import Cause, explain_motion, explain_residuals
-from zwidth.fitting.choosing import ALIKE, EXACT, choose_structure
+from zwidth.fitting.choosing import ALIKE, EXACT, Choice, choose_structure
 from zwidth.fitting.device_estimate import differentiate, reach_of
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, doubt_period
 from zwidth.fitting.encoder import fits_steps
@@ -153,10 +153,7 @@ def _fit(
     )
     doubts = [doubt for log in logs for doubt in find_stretches(log)]
     steps, odd = _list_steps(resolution, read)
-    for step in steps:
-        best, pole, banks, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
-        if best.variance > (_FINER * step) ** 2 / 12.0:
-            break
+    step, (best, pole, banks, lags) = _choose_step(recordings, longest, steps)
     model, theta = best.model, best.theta
     _refuse_unmoved(best, period)
     if best.inverse.open[:3].any():
@@ -248,8 +245,18 @@ def _list_steps(resolution: Any, read: ReadLogs) -> tuple[list[float], list[str]
     pairs = zip(read.logs, read.steps, strict=True)
     if step and not all(fits_steps(log.position, step, slack=column) for log, (_, column) in pairs):
         text = with_unit(step, "m")
-        return [0.0], [f"the positions are no whole steps of {text}, so its errors are taken for noise: check resolution"]
+        return [0.0], [
+            f"the positions are no whole steps of {text}, so its errors are taken for noise: check resolution"
+        ]
     return [step], []
+
+
+def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[float]) -> tuple[float, Choice]:
+    """Return the coarsest encoder step that the residuals do not exclude, and the model fitted with it."""
+    step, *finer = steps
+    choice = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
+    excluded = choice[0].variance <= (_FINER * step) ** 2 / 12.0
+    return _choose_step(recordings, longest, finer) if finer and excluded else (step, choice)
 
 
 def _refuse_unmoved(best: FittedModel, period: float) -> None:

@@ -166,13 +166,15 @@ def _compare_with_limit(scene: Scene) -> list[str]:
 
 
 @in_own_units
+def spell_diagnosis(found: Diagnosis) -> list[tuple[str, str]]:
+    """Return pairs of label and text: the result of a diagnosis and, if the device oscillates, its remedies."""
+    advice = found.advise()
+    return [("simulated", f"{found.word}: {found.explain()}"), *([("", f"to stop it: {advice}")] if advice else [])]
+
+
 def diagnosis_lines(found: Diagnosis) -> list[str]:
     """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
-    advice = found.advise()
-    return [
-        line("simulated", f"{found.word}: {found.explain()}"),
-        *([line("", f"to stop it: {advice}")] if advice else []),
-    ]
+    return [line(*each) for each in spell_diagnosis(found)]
 
 
 def note_lines(notes: list[str]) -> list[str]:
