@@ -119,7 +119,7 @@ def fit(
             if value:
                 raise click.UsageError(f"--{name.replace('_', '-')} belongs to a LOG.csv")
         if period is None:
-            raise click.UsageError("give --period, --rate or a scene file")
+            raise click.UsageError("give --period or --rate, or a scene file")
         from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 
         kinds = {rotary for _, rotary in walls} - {None}

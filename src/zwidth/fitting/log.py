@@ -175,7 +175,7 @@ def _fit(
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
         doubts.append(
-            f"the delay ends the range looked in, {with_unit(longest * period, 's')}; give a longer max_delay"
+            f"the delay is at the end of the search range, {with_unit(longest * period, 's')}; give a longer max_delay"
         )
     motions = _place(best, logs, places, stretches, skip, period)
     offset, friction = (_in_newton(best, k) for k in (-2, -1))
