@@ -254,6 +254,8 @@ _OF_MOTIONS = (
     Parameter("max_rate", "the fastest that the command changes", "R_m", POSITIVE, "N/s", note="without one no limit"),
 )  # fmt: skip
 OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
+# Encoder, friction and motor: arguments of `zwidth.diagnose` and `zwidth.simulate`.
+HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
 FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
 """Every number of a part or a motion by its name; the noise of an estimate without stable walls is no axis."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
