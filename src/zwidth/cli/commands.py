@@ -94,15 +94,8 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
 @click.option("--delta", type=quantity_type("1", Range(*SIZES["delta"])), help="Normalized physical damping b T/m.")
 @click.option("--d", type=quantity_type("1", Range(*SIZES["d"])), help="Delay in periods.")
 @scene_options(wall=False, instead="--delta and --d")
-@click.option(
-    "--delay-model",
-    type=click.Choice(["held", "fractional_power"]),
-    default="held",
-    show_default=True,
-    help="How a delay that is not whole is modelled.",
-)
 @json_option
-def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as_json: bool) -> None:
+def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> None:
     """Print the stiffest stable wall of a device.
 
     With a velocity filter, a linear system or a measured response only walls with B >= 0 count, because a negative B
@@ -122,7 +115,6 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
         raise click.UsageError("give either --delta and --d, or --mass and --rate (with --damping and --delay)")
     given = scene
     scene = Scene(Device(1.0, delta), Timing(1.0, d)) if scene is None else scene
-    scene = scene.replace(delay_model=delay_model)
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY

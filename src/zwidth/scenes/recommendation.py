@@ -19,7 +19,6 @@ from zwidth.scenes.assessment import (
     Assessment,
     Limit,
     assess,
-    check_held,
     compute_gains,
     describe_islands,
     name_kind,
@@ -319,7 +318,6 @@ class SceneAdvice(SceneOptima):
             >>> scene.recommend().limited_by
             'phase_margin'
         """
-        check_held(self)
         wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe, grasps)
         if wanted.passive and (obstacle := find_obstacle(**vars(self.device))):
             raise InputError(f"passive: got True {obstacle}")

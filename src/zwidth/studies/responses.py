@@ -25,7 +25,7 @@ from zwidth.config.scenes import (
     PhysicalWall,
     normalized_wall,
 )
-from zwidth.config.study import HeldStudy, refuse_parts, register
+from zwidth.config.study import refuse_parts, register
 from zwidth.config.values import Duration, Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.style import WIDTH, house_style, new_figure
@@ -42,7 +42,7 @@ from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range
 from zwidth.words.rotation import is_rotary
 
 
-class ResponseStudy(ComputedStudy, HeldStudy):
+class ResponseStudy(ComputedStudy):
     """What the studies that compute responses share."""
 
     remedy_if_too_large = "shorten the duration, or lower substeps"
@@ -96,7 +96,7 @@ class StepStudy(WallsStudy, ResponseStudy):
     """Response of the position to a step of force, for one or more devices."""
 
     method = "Exact solution between the instants at which a force changes; rounding alone."
-    from_scene = ("devices", "delay_model")
+    from_scene = ("devices",)
 
     kind: Literal["step"]
 
@@ -173,7 +173,7 @@ class RecommendStudy(ResponseStudy):
     """The wall to set on a device in SI units, at wanted margins, and its response."""
 
     method = "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings."
-    from_scene = ("device", "delay_model")
+    from_scene = ("device",)
 
     takes_parts = True
 
