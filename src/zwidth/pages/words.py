@@ -195,7 +195,7 @@ def note_lines(notes: list[str]) -> list[str]:
 
 
 class Slope(NamedTuple):
-    """The derivative of K_max in one parameter of a scene, and what a small step of it comes to in words."""
+    """The derivative of K_max with respect to one parameter, and the effect of a small change in words."""
 
     name: str
     value: float
@@ -203,7 +203,9 @@ class Slope(NamedTuple):
     words: str
 
     def line(self) -> str:
-        return row(f"dK_max/d({self.name})", f"{with_unit(self.value, self.unit)}: {self.words}")
+        """Return the derivative as a printed line."""
+        name = "inertia" if self.name == "mass" and is_rotary() else self.name
+        return row(f"dK_max/d({name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
         return {"value": self.value, "unit": own_unit(self.unit)}
