@@ -26,9 +26,8 @@ from zwidth.arrays.evaluate import evaluate_columns
 from zwidth.arrays.held_mass import DelayClasses, DeviceTerms, PhiFunctions, classify_delays, held_plant
 from zwidth.arrays.held_mass import device as discretize
 from zwidth.loops.rigid.crossover import Lag, Verdict, compute_lag, first_zero, long_verdict, short_verdict
-from zwidth.loops.rigid.folding import Points, pick_points
+from zwidth.loops.rigid.folding import Points
 from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.row_limit import row_limits
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
@@ -44,8 +43,6 @@ CUBIC_TOLERANCE = 2.0**-45  # largest error of the cubic H whose zero is u
 TINY = 2.0**-960  # added to each size; TOLERANCE * TINY exceeds what XLA flushes to zero
 
 UNSTABLE, STABLE, OPEN, EDGE = 0, 1, 2, 3  # codes; EDGE: alpha = 0, and all poles but z = 1 lie inside the circle
-ASIDE = 1e-7  # relative distance from the end of a row at which the filter certifies the row
-SHORTEST_ROW = 64  # values of alpha; below, two certified walls per row cost more than they save
 
 
 class Sized:
@@ -153,50 +150,31 @@ def size_lag(u: Sized, whole: Array) -> Lag:
     return Lag(cosine, sine, Sized(lag.rise, 5.0 * lag.rise + TINY), lag.within, lag.beyond)
 
 
-def each_code(points: Points) -> np.ndarray:
-    """Return the code of each point, computed point by point."""
-    return evaluate_columns(wall_codes, points.columns(), classify_delays(points.d)).reshape(points.shape)
-
-
-def filter_walls(points: Points) -> np.ndarray:
-    """Return the code of each point, of the broadcast shape; OPEN if out of range."""
-    # Find invalid numbers by NumPy, because XLA treats those below 2^-1022 as 0.
-    device = (np.where(value < 0, np.nan, value) for value in points[2:])
-    points = Points(*nan_beyond(WALL_RANGE, points.alpha, points.beta), *device)
-    rows = np.broadcast_shapes(*(array.shape for array in points[1:]))
-    apart = all(1 in lengths for lengths in zip(points.alpha.shape, rows, strict=True))
-    if not (points.is_dense and apart and points.alpha.size >= SHORTEST_ROW):
-        return each_code(points)
-    # The stable walls of a row are one interval, 0 < alpha < limit (docs/theory/one-lobe.md). Therefore walls softer
-    # than a stable one are stable, and walls stiffer than an unstable one are unstable. The certificate holds for any
-    # two walls; the computed limit only selects two that leave few walls open.
-    limit = row_limits(*points[1:])
-    below, above = (np.clip(limit * (1.0 + side), *WALL_RANGE) for side in (-ASIDE, ASIDE))
-    codes = [each_code(Points(alpha, *points[1:])) for alpha in (below, above)]
-    alpha = np.where(points.alpha < 0, np.inf, np.where(points.alpha == 0, np.nan, points.alpha))
-    code = np.full(points.shape, OPEN, np.uint8)
-    code -= (alpha <= np.where(codes[0] == STABLE, below, 0.0)).view(np.uint8)
-    code -= OPEN * (alpha >= np.where(codes[1] == UNSTABLE, above, np.inf)).view(np.uint8)
-    rest = code == OPEN
-    if rest.any():
-        code[rest] = each_code(pick_points(points, rest))
-    return code
-
-
 def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
     """Return certified labels and their statuses; ON_BOUNDARY or UNDECIDED for walls without a label."""
-    code = filter_walls(points)
-    stable, status = np.asarray(code == STABLE), np.zeros(points.shape, np.int32)
-    rest = code >= OPEN
-    if rest.any():
-        stable[rest], status[rest] = _decide_rest(pick_points(points, rest).columns(), code[rest])
-    return stable, status
+    columns = points.columns()
+    code = filter_walls(*columns)
+    stable, status = code == STABLE, np.zeros(code.shape, np.int32)
+    rest = np.flatnonzero(code >= OPEN)
+    if rest.size:
+        walls = (column if column.size == 1 else column[rest] for column in columns)
+        stable[rest], status[rest] = _decide_rest(code[rest], *walls)
+    return stable.reshape(points.shape), status.reshape(points.shape)
 
 
-def _decide_rest(columns: list[np.ndarray], code: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def filter_walls(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return the code of each wall; OPEN if out of range."""
+    # Find invalid numbers by NumPy, because XLA treats those below 2^-1022 as 0.
+    device = (np.where(value < 0, np.nan, value) for value in (delta, d))
+    return evaluate_columns(wall_codes, [*nan_beyond(WALL_RANGE, alpha, beta), *device], classify_delays(d))
+
+
+def _decide_rest(
+    code: np.ndarray, alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return labels and statuses of walls that are at the edge alpha = 0, out of range, or left open by the filter."""
-    alpha, beta, delta, d = np.broadcast_arrays(*columns)
-    status = np.broadcast_to(wall_status(alpha, beta, delta, d), code.shape).copy()
+    code, alpha, beta, delta, d = np.broadcast_arrays(code, alpha, beta, delta, d)
+    status = wall_status(alpha, beta, delta, d)
     inside, stable = status == Status.OK, np.zeros(code.shape, bool)
     # For alpha = 0 and |beta| <= delta, |beta N| <= |beta| phi1 <= 1 - c <= |z - c| on the circle: apart from z = 1, no
     # pole lies outside.

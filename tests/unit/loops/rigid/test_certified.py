@@ -14,9 +14,8 @@ from waiting import LONGEST
 import zwidth
 from zwidth.arrays import evaluate
 from zwidth.loops.rigid import certified
-from zwidth.loops.rigid.certified import OPEN, each_code, filter_walls
+from zwidth.loops.rigid.certified import OPEN, filter_walls
 from zwidth.loops.rigid.crossover import Verdict
-from zwidth.loops.rigid.folding import Points, fold_arguments
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
@@ -53,8 +52,8 @@ def test_every_reference_label_is_found():
     assert (result.status == Status.OK).all()
     np.testing.assert_array_equal(result.stable, points["stable"])
     # The other walls are within 1e-10 of the boundary.
-    walls = Points(*(points[name] for name in NAMES))
-    left = each_code(walls) == OPEN
+    walls = [points[name] for name in NAMES]
+    left = filter_walls(*walls) == OPEN
     assert left.mean() < 0.2
     for alpha, beta, delta, d in zip(*(column[left].tolist() for column in walls), strict=True):
         found = certified.verdict(alpha, beta, delta, d, certified.BITS[0])
@@ -69,7 +68,7 @@ def test_every_adversarial_label_is_found():
     )
     np.testing.assert_array_equal(result.stable, points["label"] == STABLE)
     # These points are hard: some must be left to balls.
-    code = filter_walls(Points(*(points[name] for name in NAMES)))
+    code = filter_walls(*(points[name] for name in NAMES))
     assert 0.02 < (code == OPEN).mean() < 0.4
 
 
@@ -79,7 +78,7 @@ def test_compiled_and_plain_filters_agree_with_the_labels():
     points = adversarial()
     times = evaluate.FEW // points["label"].size + 1
     alpha, beta, delta, d = (np.tile(points[name], times) for name in NAMES)
-    code, label = filter_walls(fold_arguments((alpha, beta, delta, d))[0]), np.tile(points["label"], times)
+    code, label = filter_walls(alpha, beta, delta, d), np.tile(points["label"], times)
     decided = code < OPEN
     assert decided.mean() > 0.6
     np.testing.assert_array_equal(code[decided] == 1, label[decided] == STABLE)
@@ -183,47 +182,6 @@ def test_every_layout_gives_the_same_labels():
     np.testing.assert_array_equal(scattered.stable, as_map.stable.ravel()[few])
     assert as_map.stable.any()
     assert not as_map.stable[0].any()
-
-
-@pytest.mark.parametrize(("delta", "d"), [(0.0, 0.0), (0.3, 0.4), (5.0, 1.0), (1e4, 1.5), (0.3, 500.5)])
-def test_rows_of_a_map_are_labelled_as_point_by_point(delta, d):
-    scale = (1 + delta) / (1 + d)
-    # With negative, no and huge stiffness, negative and no damping, beta = -delta, and values out of range.
-    alpha = scale * np.append(np.linspace(-0.2, 3.0, 641), [1e59, 1e70, np.nan])
-    beta = np.append(scale * np.linspace(-1.1, 3.0, 120), [0.0, -delta, 1e70, np.nan])
-    points = fold_arguments((alpha, beta[:, None], delta, d))[0]
-    by_row = filter_walls(points)
-    # As a list of points there are no rows.
-    alone = filter_walls(Points(*map(np.ravel, np.broadcast_arrays(*points)))).reshape(points.shape)
-    decided = (by_row != OPEN) & (alone != OPEN)
-    np.testing.assert_array_equal(by_row[decided], alone[decided])
-    # Rows decide at least as many walls.
-    assert 0 < (by_row == OPEN).sum() <= (alone == OPEN).sum()
-
-
-def test_rows_of_several_devices_are_kept_apart():
-    alpha, beta = np.linspace(0.01, 2.0, 512), np.linspace(-0.5, 1.5, 40)[:, None]
-    delta, d = np.array([0.0, 0.1, 3.0])[:, None, None], np.array([0.0, 0.5, 1.0, 3.0])[:, None, None, None]
-    points = fold_arguments((alpha, beta, delta, d))[0]
-    np.testing.assert_array_equal(filter_walls(points), each_code(points))
-
-
-def test_alpha_that_shares_its_axis_has_no_rows(monkeypatch):
-    alpha, beta = np.linspace(0.01, 2.0, 512), np.linspace(-0.5, 1.5, 400)[:, None]
-    monkeypatch.setattr(certified, "row_limits", lambda *_: pytest.fail("rows were computed"))
-    assert (filter_walls(fold_arguments((alpha, beta, 0.1 + alpha, 1.0))[0]) != OPEN).any()
-
-
-@pytest.mark.parametrize("error", [0.3, 0.9, 1.1, 3.0, np.nan])
-def test_a_wrong_row_limit_certifies_no_wrong_label(error, monkeypatch):
-    """The limit only selects two walls of the row: the codes stay those of the walls one by one."""
-    arrays = np.linspace(0.0, 0.9, 1701)[None, :], np.linspace(-0.3, 1.1, 41)[:, None], np.full((1, 1), 0.2)
-    points = Points(*arrays, np.full((1, 1), 1.5))
-    expected = each_code(points)
-    assert {certified.STABLE, certified.UNSTABLE} <= set(expected.ravel().tolist())
-    computed = certified.row_limits
-    monkeypatch.setattr(certified, "row_limits", lambda *row: computed(*row) * error)
-    np.testing.assert_array_equal(filter_walls(points), expected)
 
 
 def test_mixed_delays_keep_their_places():

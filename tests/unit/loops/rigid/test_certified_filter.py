@@ -214,7 +214,7 @@ def test_exponentials_and_phi_functions_are_as_accurate_as_assumed():
 def test_labels_of_the_filter_are_those_of_balls(d):
     alpha, beta, delta, _ = walls(4000, 19, d)
     truth = certified_stable(alpha, beta, delta, d)
-    code = certified.each_code(certified.Points(alpha, beta, delta, np.full(1, d)))
+    code = certified.filter_walls(alpha, beta, delta, np.full(1, d))
     assert (code != certified.OPEN).mean() > 0.999
     for label in (certified.STABLE, certified.UNSTABLE):
         assert (code == label).sum() > 100
