@@ -91,8 +91,8 @@ def _is_stabilized(scene: Any, remedy: Remedy) -> bool:
         {"push": 1.0} if isinstance(scene.device, LinearDevice) else {"start_position": FIRST_DISPLACEMENT}
     )
     changed = [scene.replace(**{remedy.parameter: end}) for end in ends]
-    outcome = simulate(changed, periods=CHECK_PERIODS, record=False, **start).outcome
-    return bool(np.isin(outcome, (MotionKind.REST, MotionKind.DECAYING)).all())
+    motion = simulate(changed, periods=CHECK_PERIODS, record=False, **start)
+    return bool(np.all((motion.outcome == MotionKind.REST) | (motion.trend < 1.0)))
 
 
 class _Candidates(NamedTuple):

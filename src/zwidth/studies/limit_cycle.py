@@ -87,7 +87,7 @@ class CycleAxes(Strict, what="the axes of a limit_cycle study"):
 class LimitCycleStudy(SimulatedStudy, Circumstances):
     """Amplitude of limit cycles over one or two parameters, under one or several conditions."""
 
-    method = "Simulations, exact between samples, each judged by the end of what was simulated."
+    method = "Simulations, exact between samples; amplitude and frequency as observed in the last quarter."
     point_bytes = 8 * (1 + len(_OUTPUTS))
 
     kind: Literal["limit_cycle"]
