@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from zwidth.parts.chain import chain_of
 from zwidth.parts.device import Device
 from zwidth.parts.paths import Parts, replace_parameters
 from zwidth.parts.velocity import FOAW, BackwardDifference
-from zwidth.simulation.flow import Mechanics, build_mechanics
+from zwidth.simulation.flow import build_mechanics
 from zwidth.simulation.parameters import (
     ExternalInputs,
     Motor,
@@ -47,115 +47,131 @@ def name_bodies(scene: Parts) -> tuple[str, ...]:
     return "position", *tip, *hand
 
 
-class Batch:
-    """Simulations of scenes of one structure.
+class Model(NamedTuple):
+    """Loop of one scene."""
 
-    Attributes:
-        which: index of the scene of each simulation.
-        numbers: arguments of `simulate` in SI units, by name, with one row per simulation.
-    """
+    chain: Any
+    estimate: Any
+    late: int  # integer delay
+    fraction: float  # remaining delay, in periods
+    window: int  # in samples
+    period: float  # in s
+    mass: float  # in kg
 
-    def __init__(
-        self, scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], settings: Settings
-    ) -> None:
-        self.names, self.which, self.numbers, self.settings = name_bodies(scenes[0]), which, numbers, settings
-        # FOAW is not a filter, so its parameters bypass the chain.
-        adapts = isinstance(scenes[0].velocity, FOAW)
-        plain = [replace_parameters(each, {"velocity": BackwardDifference()}) for each in scenes] if adapts else scenes
-        chains: Any = [chain_of(each) for each in plain]
-        self.mechanics = build_mechanics(chains)
-        self.estimates: list[Any] = (
-            [each.velocity for each in scenes] if adapts else [chain.estimate for chain in chains]
-        )
-        self.late = np.array([chain.whole for chain in chains])
-        self.fractions = np.array([float(chain.d - chain.whole) for chain in chains])
-        self.periods = np.array([float(scene.timing.period) for scene in scenes])
-        self.masses = np.array([float(scene.mass) for scene in scenes])
-        # The energies of a linear system are unknown, because its bodies are.
-        self.unknown = set() if isinstance(scenes[0].device, Device) else OF_ENERGY
-        jitter, friction = bool(np.any(numbers["jitter"] > 0)), bool(np.any(numbers["static"] > 0))
-        self.options = Options(
-            substeps=settings.substeps,
-            pieces=4 if jitter else 2 if friction or np.any(self.fractions > 0) else 1,
-            friction=friction,
-            jitter=jitter,
-            foaw=scenes[0].velocity.samples if adapts else 0,
-            record=settings.record,
-            law=settings.law,
-        )
-        self.windows = np.array([each.samples if isinstance(each, FOAW) else each.window for each in self.estimates])
-        # The minima avoid further compilations; a longer ring takes no more time.
-        self.rings = round_up(max(int(self.windows.max()), 3) + 1), round_up(max(int(self.late.max()), 5) + 3)
 
-    def build(self, rows: np.ndarray) -> tuple[Parameters, ExternalInputs]:
-        """Return the normalized parameters and inputs of the selected simulations."""
-        own, scene_of = np.unique(self.which[rows], return_inverse=True)
-        settings, options = self.settings, self.options
-        numbers = {name: part[rows] for name, part in self.numbers.items()}
-        shared = ("place", "motion")
-        machine = Mechanics(*(part if name in shared else part[own] for name, part in self.mechanics._asdict().items()))
-        period, mass = self.periods[self.which[rows]], self.masses[self.which[rows]]
-        force = period * period / mass
-        late, fractions = (spread_scenes(part[own], scene_of) for part in (self.late, self.fractions))
-        params = Parameters(
-            alpha=numbers["stiffness"] * force,
-            beta=numbers["virtual_damping"] * period / mass,
-            period=period,
-            force=1.0 / force,
-            resolution=numbers["resolution"],
-            push=numbers["push"] * force,
-            bilateral=np.array([settings.contact == "bilateral"]),
-            pulling=np.array([settings.contact != "push_only"]),
-            late=late,
-            motor=Motor(
-                numbers["max_force"] * force,
-                numbers["max_rate"] * period * force,
-                numbers["coulomb"] * force,
-                numbers["static"] * force,
-            ),
-            estimator=build_estimators([self.estimates[k] for k in own], scene_of),
-            **build_flows(
-                machine, cut_period(self.fractions[own], options.substeps, options.pieces), scene_of, options
-            ),
-        )
-        instants = durations = None
-        if options.jitter:
-            instants, durations = draw_instants(numbers["seed"], numbers["jitter"] / period, late, fractions, settings)
-        return params, ExternalInputs(
-            positions=np.stack([numbers[f"start_position.{name}"] for name in self.names]),
-            velocities=np.stack([numbers[f"start_velocity.{name}"] for name in self.names]) * period,
-            noise=draw_noise(numbers["seed"], numbers["noise"], settings.periods),
-            history=(numbers["push_history"] * force[:, None]).T if "push_history" in numbers else None,
-            durations=durations,
-            instants=instants,
-            period=period,
-            mass=mass,
-        )
-
-    def run(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the fields of `Motion` by name, with one row per selected simulation."""
-        # Import JAX only here, because importing zwidth must not load it.
-        from zwidth.simulation.engine import run_batch
-
-        params, inputs = self.build(rows)
-        with compute_concretely():
-            found = run_batch(params, self.options, self.settings, inputs, self.rings)
-        memory = (self.late + self.windows)[self.which[rows]]
-        columns = convert_to_si(found, inputs, params.motor.static > 0, memory, self.names, self.settings)
-        return columns | {name: np.full_like(columns[name], np.nan) for name in self.unknown & columns.keys()}
+def build_model(scene: Any) -> Model:
+    """Return the loop of a scene."""
+    estimate, period, mass = scene.velocity, float(scene.timing.period), float(scene.mass)
+    # FOAW is not a filter, so its parameters bypass the chain.
+    adapts = isinstance(estimate, FOAW)
+    chain: Any = chain_of(replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene)
+    fraction = float(chain.d - chain.whole)
+    if adapts:
+        return Model(chain, estimate, chain.whole, fraction, estimate.samples, period, mass)
+    return Model(chain, chain.estimate, chain.whole, fraction, chain.estimate.window, period, mass)
 
 
 def run_scenes(
     scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], settings: Settings
 ) -> dict[str, np.ndarray]:
-    """Run the simulations of a `Batch`; return the fields of `Motion` by name, with one row per simulation."""
-    batch, count = Batch(scenes, which, numbers, settings), which.size
+    """Simulate scenes of one structure.
+
+    Args:
+        scenes: the scenes.
+        which: index of the scene of each simulation.
+        numbers: arguments of `simulate` in SI units by name, with one row per simulation.
+        settings: settings that all simulations share.
+
+    Returns:
+        The fields of `Motion` by name, with one row per simulation.
+    """
+    models = [build_model(scene) for scene in scenes]
+    jitter, friction = bool(np.any(numbers["jitter"] > 0)), bool(np.any(numbers["static"] > 0))
+    options = Options(
+        substeps=settings.substeps,
+        pieces=4 if jitter else 2 if friction or any(model.fraction > 0 for model in models) else 1,
+        friction=friction,
+        jitter=jitter,
+        foaw=scenes[0].velocity.samples if isinstance(scenes[0].velocity, FOAW) else 0,
+        record=settings.record,
+        law=settings.law,
+    )
+    # The minima avoid further compilations; a longer ring takes no more time.
+    rings = (
+        round_up(max(3, *(model.window for model in models)) + 1),
+        round_up(max(5, *(model.late for model in models)) + 3),
+    )
+    names, count = name_bodies(scenes[0]), which.size
+    # The energies of a linear system are unknown, because its bodies are.
+    unknown = set() if isinstance(scenes[0].device, Device) else OF_ENERGY
+
+    def run(rows: np.ndarray) -> dict[str, np.ndarray]:
+        # Import JAX only here, because importing zwidth must not load it.
+        from zwidth.simulation.engine import run_batch
+
+        own, scene_of = np.unique(which[rows], return_inverse=True)
+        members, group = [models[k] for k in own], {name: part[rows] for name, part in numbers.items()}
+        params, inputs = build_batch(members, scene_of, group, settings, options, names)
+        with compute_concretely():
+            found = run_batch(params, options, settings, inputs, rings)
+        memory = np.array([model.late + model.window for model in members])[scene_of]
+        columns = convert_to_si(found, inputs, params.motor.static > 0, memory, names, settings)
+        return columns | {name: np.full_like(columns[name], np.nan) for name in unknown & columns.keys()}
+
     size = min(GROUP, 1 << (count - 1).bit_length())
     # Repeat the last simulation to fill the last group, because each size needs a compilation.
     groups = [np.minimum(np.arange(first, first + size), count - 1) for first in range(0, count, size)]
     # Compile with the first group; threads run the others in parallel, because JAX releases the interpreter lock.
-    found = [batch.run(groups[0]), *run_in_threads(batch.run, groups[1:])]
+    found = [run(groups[0]), *run_in_threads(run, groups[1:])]
     return {name: np.concatenate([each[name] for each in found])[:count] for name in found[0]}
+
+
+def build_batch(
+    models: list[Model],
+    which: np.ndarray,
+    numbers: dict[str, np.ndarray],
+    settings: Settings,
+    options: Options,
+    names: tuple[str, ...],
+) -> tuple[Parameters, ExternalInputs]:
+    """Return the normalized parameters and inputs of one group; ``which``: index of the model of each simulation."""
+    chains, estimates, late, fractions, _, periods, masses = zip(*models, strict=True)
+    period, mass = np.array(periods)[which], np.array(masses)[which]
+    force = period * period / mass
+    durations = cut_period(np.ones(len(models)), [np.array(fractions)][: options.pieces - 1], settings.substeps)
+    late, fractions = (spread_scenes(np.array(part), which) for part in (late, fractions))
+    params = Parameters(
+        alpha=numbers["stiffness"] * force,
+        beta=numbers["virtual_damping"] * period / mass,
+        period=period,
+        force=1.0 / force,
+        resolution=numbers["resolution"],
+        push=numbers["push"] * force,
+        bilateral=np.array([settings.contact == "bilateral"]),
+        pulling=np.array([settings.contact != "push_only"]),
+        late=late,
+        motor=Motor(
+            numbers["max_force"] * force,
+            numbers["max_rate"] * period * force,
+            numbers["coulomb"] * force,
+            numbers["static"] * force,
+        ),
+        estimator=build_estimators(estimates, which),
+        **build_flows(build_mechanics(chains), np.moveaxis(durations, -1, 0), which, options),
+    )
+    instants = durations = None
+    if options.jitter:
+        instants, durations = draw_instants(numbers["seed"], numbers["jitter"] / period, late, fractions, settings)
+    return params, ExternalInputs(
+        positions=np.stack([numbers[f"start_position.{name}"] for name in names]),
+        velocities=np.stack([numbers[f"start_velocity.{name}"] for name in names]) * period,
+        noise=draw_noise(numbers["seed"], numbers["noise"], settings.periods),
+        history=(numbers["push_history"] * force[:, None]).T if "push_history" in numbers else None,
+        durations=durations,
+        instants=instants,
+        period=period,
+        mass=mass,
+    )
 
 
 def draw_noise(seeds: np.ndarray, sizes: np.ndarray, periods: int) -> np.ndarray | None:
@@ -183,20 +199,16 @@ def draw_instants(
         Instants in periods, and durations of shape (periods, substeps, pieces, batch).
     """
     each, index = np.unique(seeds, return_inverse=True)
-    periods, substeps = settings.periods, settings.substeps
+    periods = settings.periods
     drawn = np.stack([np.random.default_rng([1, seed]).random(periods + 1) for seed in each], 1)
     late = drawn[:, index] * most
     late[0] = 0.0
     whole, fractions = np.broadcast_to(whole, most.shape), np.broadcast_to(fractions, most.shape)
     k = np.arange(periods)[:, None]
-    length = 1.0 + np.diff(late, axis=0)
-    begin = np.arange(substeps)[:, None] / substeps * length[:, None]  # (periods, substeps, batch)
-    part = np.broadcast_to(length[:, None] / substeps, begin.shape)
-    cuts = [np.zeros(begin.shape)]
+    effective = []
     for age in (1, 0, -1):
         # Time at which the command of this age takes effect; there is no command before the first sample.
         sample = np.clip(k - whole - age, 0, periods)
-        effective = fractions - age + np.take_along_axis(late, sample, 0) - late[:-1]
-        cuts.append(np.clip(effective[:, None] - begin, 0.0, part))
-    cuts.append(part)
-    return np.arange(periods + 1)[:, None] + late, np.moveaxis(np.diff(np.stack(cuts), axis=0), 0, 2)
+        effective.append(fractions - age + np.take_along_axis(late, sample, 0) - late[:-1])
+    durations = cut_period(1.0 + np.diff(late, axis=0), effective, settings.substeps)
+    return np.arange(periods + 1)[:, None] + late, durations

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.parts.state_space import estimate_matrices
-from zwidth.parts.velocity import FOAW, Estimate
+from zwidth.parts.velocity import FOAW
 from zwidth.simulation.flow import DIGITS, Flow, Mechanics, flow
 from zwidth.words.errors import InputError
 from zwidth.words.types import Array
@@ -130,33 +130,42 @@ def round_up(size: int) -> int:
     return 0 if size == 0 else max(2, 1 << (size - 1).bit_length())
 
 
-def build_estimators(estimates: Sequence[Estimate | FOAW], which: np.ndarray) -> Estimator:
+def build_estimators(estimates: Sequence[Any], which: np.ndarray) -> Estimator:
     """Return the velocity estimates of all scenes, the filters padded to the largest order."""
+    count, adapts = len(estimates), isinstance(estimates[0], FOAW)
     # The ring of measured positions replaces the shift register of a window.
-    filters = [
-        estimate_matrices(replace(each, window=0)) if isinstance(each, Estimate) and each.degree > each.window else None
-        for each in estimates
-    ]
-    order = round_up(max(0 if each is None else each.A.shape[0] for each in filters))
-    columns = []
-    for each, matrices in zip(estimates, filters, strict=True):
-        A, B, C = np.zeros((order, order)), np.zeros(order), np.zeros(order)
-        D = each.gain if isinstance(each, Estimate) else 0.0
-        if matrices is not None:
-            size = matrices.A.shape[0]
-            A[:size, :size], B[:size], C[:size] = matrices.A, matrices.B[:, 0], matrices.C[0]
-            D = matrices.D[0, 0]
-        window, bound = (each.window, 0.0) if isinstance(each, Estimate) else (each.samples, each.noise)
-        columns.append((A, B, C, D, window, bound))
-    return spread_scenes(Estimator(*map(np.array, zip(*columns, strict=True))), which)
+    filters = {
+        k: estimate_matrices(replace(each, window=0))
+        for k, each in enumerate(estimates)
+        if not adapts and each.degree > each.window
+    }
+    order = round_up(max((matrices.A.shape[0] for matrices in filters.values()), default=0))
+    A, B, C = np.zeros((count, order, order)), np.zeros((count, order)), np.zeros((count, order))
+    D = np.array([0.0 if adapts else each.gain for each in estimates])
+    for k, matrices in filters.items():
+        size = matrices.A.shape[0]
+        A[k, :size, :size], B[k, :size], C[k, :size] = matrices.A, matrices.B[:, 0], matrices.C[0]
+        D[k] = matrices.D[0, 0]
+    window = np.array([each.samples if adapts else each.window for each in estimates])
+    bound = np.array([each.noise if adapts else 0.0 for each in estimates])
+    return spread_scenes(Estimator(A, B, C, D, window, bound), which)
 
 
-def cut_period(fractions: np.ndarray, substeps: int, pieces: int) -> np.ndarray:
-    """Return the durations of constant force within a period, (scenes, substeps, pieces)."""
-    begin = np.arange(substeps) / substeps
-    cut = np.clip(fractions[:, None] - begin, 0.0, 1.0 / substeps)
-    parts = [cut, 1.0 / substeps - cut] if pieces > 1 else [np.full_like(cut, 1.0 / substeps)]
-    return np.stack(parts, -1)
+def cut_period(lengths: np.ndarray, effective: Sequence[np.ndarray], substeps: int) -> np.ndarray:
+    """Return the durations of constant force within periods.
+
+    Args:
+        lengths: lengths of the periods, (..., batch).
+        effective: times since the start of the period at which the force changes, each (..., batch), increasing.
+        substeps: number of substeps.
+
+    Returns:
+        Durations (..., substeps, pieces, batch), with one piece more than there are changes.
+    """
+    substep = np.arange(substeps)[:, None] * lengths[..., None, :] / substeps
+    part = np.broadcast_to(lengths[..., None, :] / substeps, substep.shape)
+    cuts = [np.clip(time[..., None, :] - substep, 0.0, part) for time in effective]
+    return np.moveaxis(np.diff([np.zeros(part.shape), *cuts, part], axis=0), 0, -2)
 
 
 def find_longest_steps(machine: Mechanics) -> np.ndarray:

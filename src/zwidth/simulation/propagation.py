@@ -110,15 +110,6 @@ class _Slide(NamedTuple):
     def pending(self) -> Array:
         return (self.left > 0) & (self.events < MOST_EVENTS)
 
-    def pack(self) -> Array:
-        """Return all fields as rows of one array, which is gathered and scattered in one operation."""
-        return jnp.concatenate([self.body.x, jnp.stack([self.body.slip, *self[1:]])])
-
-    @classmethod
-    def unpack(cls, rows: Array) -> _Slide:
-        """Return the fields of packed rows."""
-        return cls(BodyState(rows[:-5], rows[-5]), *rows[-4:])
-
 
 class _Trip(NamedTuple):
     x: Array
@@ -272,10 +263,9 @@ def propagate_with_friction(
 
     def finish_few(state: _Slide) -> _Slide:
         which = jnp.sort(jnp.where(state.pending, np.arange(size), size))[:few]
-        own, rows = jax.tree.map(lambda part: _take(part, which), joint), state.pack()
-        part = _Slide.unpack(_take(rows, which))
+        own, part = jax.tree.map(lambda part: _take(part, which), (joint, state))
         part = finish(own, part._replace(left=jnp.where(which < size, part.left, 0.0)), which)
-        return _Slide.unpack(rows.at[:, which].set(part.pack(), mode="drop"))
+        return jax.tree.map(lambda rows, part: rows.at[..., which].set(part, mode="drop"), state, part)
 
     if whole is None or few == size:
         state = finish(joint, state, None)

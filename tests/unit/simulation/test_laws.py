@@ -107,7 +107,7 @@ def test_a_law_without_a_value_spoils_its_own_motion_only():
         ({"stiffness": 1.0, "start_position": {"nose": 1e-3}}, "start_position: got 'nose', allowed are 'position'"),
         ({"stiffness": 1.0, "start_position": {"position": math.inf}}, "start_position: got inf m"),
         ({"stiffness": 1.0, "hand_history": np.zeros(11), "periods": 10}, "use operator=zwidth.Operator"),
-        ({"stiffness": 1.0, "hand_history": np.zeros(10), "periods": 10}, "needs 11 positions"),
+        ({"stiffness": 1.0, "hand_history": np.zeros(10), "periods": 10}, "needs 11 values"),
         ({"stiffness": 1.0, "hand_history": [0.0, math.nan], "periods": 1}, "fill the gaps"),
     ],
 )

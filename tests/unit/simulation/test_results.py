@@ -147,7 +147,7 @@ def test_a_dataset_has_one_time_where_all_share_it_and_else_instants():
         (SCENE, {"stiffness": np.ones(0)}, "use at least one simulation"),
         ([], {}, "use at least one simulation"),
         (SCENE, {"push_history": np.zeros((3, 10)), "stiffness": [1.0, 2.0]}, "push_history"),
-        (SCENE, {"push_history": [0.0] * 9 + [np.nan]}, "push_history: got a force that is not finite"),
+        (SCENE, {"push_history": [0.0] * 9 + [np.nan]}, "push_history: got a value that is not finite"),
     ],
 )
 def test_what_cannot_be_simulated_is_named(scenes, options, words):
