@@ -51,24 +51,9 @@ class Summary(NamedTuple):
     exits: Array  # number of samples at which contact ends
     impact: Array  # velocity at the first sample in contact
     given: Array  # largest energy that the wall has supplied so far
-    far: Array  # largest distances down and up, (1 + SEGMENTS, 2, bodies, batch)
+    far: Array  # largest -x and x of the bodies, (1 + SEGMENTS, 2, bodies, batch); -inf without samples
     turns: Array  # number of times the velocity becomes positive, (1 + SEGMENTS, batch)
     turned: Array  # first and last time in the tail at which it does, (2, batch)
-
-    @property
-    def low(self) -> Array:
-        """The smallest positions, (1 + SEGMENTS, bodies, batch)."""
-        return -self.far[:, 0]
-
-    @property
-    def high(self) -> Array:
-        """The largest positions, (1 + SEGMENTS, bodies, batch)."""
-        return self.far[:, 1]
-
-    @property
-    def widest(self) -> Array:
-        """The largest distance of a body from 0."""
-        return np.maximum(self.far.max((0, 1, 2)), 0.0)
 
 
 class State(NamedTuple):
@@ -230,9 +215,8 @@ def _simulate_period(
     forces = [look_back(controller.commands, inputs.k, params.late + age) for age in ages]
     durations = inputs.durations if options.jitter else params.durations
 
-    def substep(carry: tuple[BodyState, Array], j: Array | int) -> tuple[tuple[BodyState, Array], Array | None]:
-        body, work = carry
-        frame, lasting = None, read(durations, j)
+    def substep(carry: Any, j: Any) -> Any:
+        (body, work), frame, lasting = carry, None, read(durations, j)
         if options.record:
             # Skip the forces of pieces without duration, because they never act.
             acting = forces[-1]
@@ -242,7 +226,7 @@ def _simulate_period(
             rows = dot(params.motion[0], body.x), acting, body.slip, stored_energy(params, body.x)
             frame = jnp.stack([*positions, *rows, *work])
 
-        def one(carry: tuple[BodyState, Array], piece: Any) -> tuple[tuple[BodyState, Array], None]:
+        def one(carry: Any, piece: Any) -> Any:
             number, force = piece
             return propagate(params, options, *carry, force, inputs.push, (j, number), read(lasting, number)), None
 

@@ -77,11 +77,11 @@ def advance(
         ways = [_take(read(way, k), which) for way in part]
         return jnp.where(held, ways[1], ways[0]) if len(ways) > 1 else ways[0]
 
-    def remain(state: tuple[Array, ...]) -> Array:
+    def remain(state: Any) -> Array:
         k, _, time, _ = state
         return (k < DIGITS) & jnp.any(time < limit)
 
-    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+    def step(state: Any) -> Any:
         k, x, time, lost = state
         z = jnp.concatenate([x, forces])
         longer, after = time + jnp.exp2(-k.astype(time.dtype)), x + times(pick(digits.change, k), z)
@@ -186,7 +186,7 @@ class _Joint(NamedTuple):
         """Propagate the batch entries without an event over the whole duration in one step."""
         x, slip = state.body
 
-        def go(_: Any) -> tuple[Array, Array, Array]:
+        def go(_: Any) -> Any:
             z = jnp.concatenate([x, self.drive(slip)])
             change, loss = (jnp.where(slip == 0, part[1], part[0]) for part in whole)
             far = x + times(change, z)
@@ -206,7 +206,7 @@ class _Joint(NamedTuple):
         x, slip = state.body
         held, driven, limit = slip == 0, self.drive(slip), jnp.minimum(state.left, self.longest)
 
-        def search(trip: _Trip, turn: Array) -> tuple[_Trip, None]:
+        def search(trip: _Trip, turn: Array) -> Any:
             """Propagate by the whole step, then to the minimum of the reserve, then to the event; compiled once."""
             side = self.find_side(x, trip.far)
             wanted = jnp.stack([self.dips(x, slip, trip.far, side), self.reserve(trip.x, slip, side) < 0])

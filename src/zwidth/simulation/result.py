@@ -193,19 +193,24 @@ class Motion:
 
 def _measure_width(summary: Any, start: int, stop: int) -> np.ndarray:
     """Return the peak-to-peak positions in consecutive segments, (bodies, batch); NaN without samples."""
-    high, low = summary.high[start:stop].max(0), summary.low[start:stop].min(0)
-    return np.where(high >= low, high - low, np.nan)
+    width = summary.far[start:stop].max(0).sum(0)
+    return np.where(width >= 0, width, np.nan)
 
 
 def _measure_halves(summary: Any) -> list[np.ndarray]:
     """Return the peak-to-peak positions in both halves of the tail, (bodies, batch)."""
-    count = len(summary.turns)
+    count = len(summary.far)
     return [_measure_width(summary, *half) for half in ((1, (1 + count) // 2), ((1 + count) // 2, count))]
+
+
+def find_largest(summary: Any) -> np.ndarray:
+    """Return the largest distance of a body from 0."""
+    return np.maximum(summary.far.max((0, 1, 2)), 0.0)
 
 
 def classify(summary: Any, memory: np.ndarray, tail: int) -> np.ndarray:
     """Return the code of `MotionKind` of each motion; ``memory``: samples that decide the next command."""
-    widest = summary.widest
+    widest = find_largest(summary)
     width = np.stack([_measure_width(summary, k, k + 1)[0] for k in range(1, len(summary.turns))])
     before, (first, second) = _measure_width(summary, 0, 1), _measure_halves(summary)
     still = (second.max(0) <= AT_REST * widest) & (first.max(0) <= np.sqrt(AT_REST) * widest)
@@ -244,18 +249,19 @@ def convert_to_si(
     state, readings, frames = found
     period, mass, instants = inputs.period, inputs.mass, inputs.instants
     summary, force = state.summary, mass / period**2
-    low, high = summary.low[1:, 0], summary.high[1:, 0]
     first, second = _measure_halves(summary)
     turns = summary.turns[1:].sum(0)
     frequency = (turns - 1) / (np.diff(summary.turned, axis=0)[0] * period)
     # A motion that is not finite although it was small has too many friction events.
-    lost = ~np.isfinite(state.body.x).all(0) & (summary.widest < BEYOND)
+    lost = ~np.isfinite(state.body.x).all(0) & (find_largest(summary) < BEYOND)
     outcome = np.where(lost, MotionKind.INVALID, classify(summary, memory, settings.tail))
     columns = {
-        "amplitude": np.where(outcome == MotionKind.DIVERGED, np.inf, 0.5 * (high.max(0) - low.min(0))),
+        "amplitude": np.where(
+            outcome == MotionKind.DIVERGED, np.inf, 0.5 * _measure_width(summary, 1, len(summary.far))[0]
+        ),
         "trend": second[0] / first[0],
         "frequency": np.where((turns > 1) & (outcome != MotionKind.REST), frequency, np.nan),
-        "penetration": np.maximum(summary.high[:, 0].max(0), 0.0),
+        "penetration": np.maximum(summary.far[:, 1, 0].max(0), 0.0),
         "bounces": summary.exits.astype(int),
         "impact_velocity": summary.impact / period,
         "energy_given": summary.given * force,
