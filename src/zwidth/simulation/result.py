@@ -97,7 +97,7 @@ def _draw(motion: Motion) -> str:
     _draw,
     {
         "frequency": "fewer than two oscillations in the tail",
-        "impact_velocity": "no contact begins after the first sample",
+        "impact_velocity": "the device does not enter the wall after the first sample",
         "trend": "no motion in the tail, or a tail of one period",
     },
     outcome=MotionKind,
