@@ -228,7 +228,8 @@ def _simulate_period(
 
         def one(carry: Any, piece: Any) -> Any:
             number, force = piece
-            return propagate(params, options, *carry, force, inputs.push, (j, number), read(lasting, number)), None
+            body, work = carry
+            return propagate(params, options, body, work, force, inputs.push, (j, number), read(lasting, number)), None
 
         # With friction or jitter a piece is a long program, so compile it only once.
         if options.friction or options.jitter:
