@@ -24,6 +24,7 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import ANY, POSITIVE
+from zwidth.words.rotation import is_rotary
 
 TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS = 300  # shortest default length of a simulation, in sampling periods
@@ -102,7 +103,8 @@ def simulate(
         else "",
     ]
     force = max(abs(float(motion.command.min())), abs(float(motion.command.max())))
-    depth = f"penetrates {with_unit(float(motion.penetration), 'm', 3)}, force up to {with_unit(force, 'N', 3)}"
+    load = "torque" if is_rotary() else "force"
+    depth = f"penetrates {with_unit(float(motion.penetration), 'm', 3)}, {load} up to {with_unit(force, 'N', 3)}"
     lines = [
         row("start", ", ".join(filter(None, start)) or "at rest"),
         row("motion", f"{depth}; {ending}"),

@@ -7,7 +7,7 @@ import math
 import re
 import shutil
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from math import isfinite, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -156,7 +156,7 @@ def scene_notes(scene: Scene) -> list[str]:
 
 
 def _compare_with_limit(scene: Scene) -> list[str]:
-    """Return the warnings of a scene's safe limit, preceded by a note if the wall exceeds the limit."""
+    """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
     limit, wall = scene.safe_limit, scene.wall
     if limit is None or isinstance(wall, NoWall):
         return []
@@ -166,12 +166,24 @@ def _compare_with_limit(scene: Scene) -> list[str]:
 
 
 @in_own_units
-def diagnosis_lines(found: Diagnosis) -> list[str]:
+def diagnosis_lines(found: Diagnosis | None) -> list[str]:
     """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+    if found is None:
+        return []
     advice = found.advise()
     return [
-        line("simulated", f"{found.word}: {found.explain()}"),
+        line("simulated" if found.cause == "none" else "CAUTION", f"{found.word}: {found.explain()}"),
         *([line("", f"to stop it: {advice}")] if advice else []),
+    ]
+
+
+def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
+    """Return the caution about a delay that is 0 only because it was not given; ``silent`` names such options."""
+    if "delay" not in silent or scene.timing.delay:
+        return []
+    return [
+        "no delay given: the results hold only if the force acts at the sample; if it acts one period later, add "
+        "--delay '1 periods'"
     ]
 
 

@@ -228,7 +228,7 @@ class Limit(NamedTuple):
     note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
 
     def spell(self) -> str:
-        """Return the improvement and its gain in words."""
+        """Describe the improvement and the increase of the stiffness that it brings."""
         K = with_unit(round_safely(self.stiffness, "below"), "N/m")
         kept = f"; {self.note}" if self.note else ""
         return f"{self.words}: {K} (x {plain(self.gain, 3)}{kept})"
@@ -275,7 +275,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
 
 def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima], float]) -> list[Limit]:
-    """Return the gains of all improvements of a scene, largest first, NaN last; ``measure`` computes the stiffness."""
+    """Return all improvements by the increase of the stiffness that ``measure`` computes, largest first, NaN last."""
     found = []
     for name, words, improved, note in list_improvements(scene):
         stiffness = measure(improved)

@@ -77,7 +77,7 @@ def _draw(motion: Motion) -> str:
     _draw,
     {
         "frequency": "the velocity does not turn twice in the tail",
-        "impact_velocity": "no contact begins after the first sample",
+        "impact_velocity": "the device does not enter the wall after the first sample",
         "trend": "nothing moves, or the tail is one period",
     },
     outcome=MotionKind,

@@ -1,7 +1,7 @@
 """Figs. 6 and 10 of the paper: exact fractional delays and, in addition, the paper's z^(1+d) with real d.
 
-For integer d both are the same. For other d, z^d has several branches, so poles are not defined. On the principal branch
-the boundary is the closed form of integer delays at a real lag d, in the letters of `loops.rigid.ridge_newton`:
+For integer d both are the same. For other d, z^d has several branches, so poles are not defined. On the principal
+branch the boundary is the closed form of integer delays at a real lag d, in the letters of `loops.rigid.ridge_newton`:
 ``s = sin(omega/2)``.
 
 References:

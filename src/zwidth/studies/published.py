@@ -107,7 +107,7 @@ def published_numbers() -> list[Comparison]:
 
 
 def _with_lag() -> str:
-    """Return, in words, the effect of the cited filter lag on K_max of the undamped device of section VIII."""
+    """Describe how the filter lag that the paper quotes changes K_max of the undamped device of its section VIII."""
     scene = Scene(Device(MASS), Timing(period=PERIOD, delay=DELAY_FACTOR * PERIOD))
     # Use a window of 2 lag/T differences, because the mean of n differences lags by n/2 periods.
     walls = [scene, scene.replace(velocity=WindowedDifference(round(2 * FILTER_LAG / PERIOD)))]

@@ -35,7 +35,7 @@ from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.recommendation import Recommendation
-from zwidth.scenes.wall_search import RANGES
+from zwidth.scenes.wall_search import RANGES, Grasps
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range
@@ -183,8 +183,8 @@ class RecommendStudy(ResponseStudy):
     """Device in SI units."""
 
     stiffness_fraction: Fraction | None = None
-    """Largest stiffness of the recommended wall as a fraction of K_max. If no requirement is given, the defaults are
-    0.75 of K_max, a gain margin of 2, a phase margin of 30 degrees and stability in the soft reference grasps."""
+    """Largest stiffness of the recommended wall as a fraction of K_max. If neither a fraction, a margin nor passivity
+    is given, the defaults are 0.75 of K_max, a gain margin of 2, a phase margin of 30 degrees and soft grasps."""
 
     gain_margin: Annotated[float, Quantity(allowed=RANGES["gain_margin"])] | None = None
     """The factor on stiffness and damping together that the wall must bear, at least."""
@@ -195,6 +195,10 @@ class RecommendStudy(ResponseStudy):
     passive: bool = False
     """Whether the wall must be passive."""
 
+    grasps: Grasps | None = None
+    """Require stability in all reference grasps, in the soft ones, or in none. By default soft, with the default
+    margins; none if a requirement is given or the scene has a hand."""
+
     beyond_safe: bool = False
     """Ignore the safe limit of the device, which is usually set by a fit."""
 
@@ -204,7 +208,7 @@ class RecommendStudy(ResponseStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         stem, label = "recommendation" if alone else f"{self.name}_recommendation", self.device.label or self.name
         bare = self.device.to_scene()
-        wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive", "beyond_safe")
+        wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive", "grasps", "beyond_safe")
         found = bare.recommend(**{name: getattr(self, name) for name in wanted})
         told, notes, response = found.as_dict(), list(found.notes), None
         if not bare.parts_beyond and found.verdict is not None:
