@@ -208,9 +208,8 @@ def _name_part(name: str, count: int) -> str:
 
 
 def spell_rival(rival: RivalDevice) -> str:
-    """Its numbers in a line."""
+    """Return the parameters of a rival device in one line."""
     parts = {symbol_of(name): spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
-    parts |= {_name_part(name, 1).strip(): spell(name, value) for name, value in (rival.parts or {}).items()}
     parts[symbol_of("stiffness_max")] = spell("stiffness", rival.stiffness_max)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 
