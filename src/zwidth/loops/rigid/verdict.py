@@ -70,7 +70,8 @@ def is_stable(
     """
     values = (alpha, beta, delta, d)
     arguments, numbers = dict(zip(NAMES, values, strict=True)), are_numbers(*values)
-    check_choice("method", method, STABILITY_METHODS)
+    if method != "auto":
+        check_choice("method", method, STABILITY_METHODS)
     if method in ("auto", "crossover") and (numbers or is_traced(*values)):
         return evaluate(stable_kernel, arguments, classify_delays(d))
     check_scalars(arguments)
