@@ -197,16 +197,6 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     return rows
 
 
-def _name_part(name: str, count: int) -> str:
-    """The label of a number of the amplifier or of one of so many resonances."""
-    _, *place, number = name.split(".")
-    if number == "time_constant":
-        return "amplifier's lag"
-    if number == "frequency":
-        return f"resonance {int(place[0]) + 1}" if count > 1 else "resonance"
-    return f"  its {number.replace('_', ' ')}"
-
-
 def spell_rival(rival: RivalDevice) -> str:
     """Return the parameters of a rival device in one line."""
     parts = {symbol_of(name): spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
