@@ -40,8 +40,9 @@ Written by `benchmarks/bench_onsets.py --write docs/onsets.md`.
 four walls, and others with an actuator lag of 0.1 to 1 ms, one or two resonances of 30 to 400 Hz, or both, with four to
 six walls. K and f have 2 % noise. B increases from 0 to 0.7 to 1.2 times the damping of the stiffest wall. Onsets and
 stability are computed by eigenvalues of the true device. A safe wall counts as stable only if softer walls of the same
-damping are stable, too. No K_max means that the fit refused the walls or warned, and recommends no wall. The width of
-the interval and the stiffness of the safe wall are medians, relative to the true K_max.
+damping are stable, too; it is computed for 99 % of the devices that the measurements allow. No K_max means that the fit
+refused the walls or warned, and recommends no wall. The width of the interval and the stiffness of the safe wall are
+medians, relative to the true K_max.
 """
 
 

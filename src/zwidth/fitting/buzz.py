@@ -75,8 +75,10 @@ def fit_buzz(
 
     Numerics:
         SciPy's Levenberg-Marquardt method from several initial values; exact walls reproduce the device to about 1e-12.
-        Errors are linear in the noise, those of K_max in its logarithm.
-        @FIGURES@
+        Errors are linear in the noise, those of K_max in its logarithm. With 2 % noise of K and f, the 95 % interval
+        contained K_max for 95.5 % of 200 random rigid devices with four walls each, and 198 safe walls were stable. Of
+        200 devices with an actuator lag, resonances or both, 65 were refused; of the others the interval contained
+        K_max for 91.9 %, and every safe wall was stable (docs/onsets.md).
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V (the boundary). Boggs, Rogers 1990 (errors in both coordinates).
@@ -114,16 +116,16 @@ def fit_buzz(
     if share and best.squares > chdtri(chosen.freedom, CHANCE):
         far = plain(np.sqrt(best.squares / chosen.freedom), 2)
         against = (
-            f"no rigid device has these walls: their residuals are {far} times the noise; check K, B and f, or fit a "
-            "log, which determines a lag or a resonance"
+            f"no rigid device has these walls: residuals are {far} times the noise; check K, B and f, or fit a log for "
+            "lags and resonances"
         )
     elif not share and scale > ROUGH**2:
         against = (
-            f"no rigid device has these walls: their residuals are {plain(100 * np.sqrt(scale), 2)} %; check K, B, f "
+            f"no rigid device has these walls: residuals are {plain(100 * np.sqrt(scale), 2)} %; check K, B, f "
             "and the period, fit a log, or give a larger noise"
         )
     elif not equals:
-        against = "the walls do not lie on the edge of this device's stable set: they began to buzz before or later"
+        against = "these walls are not on the stability boundary of the fitted device; check K, B, f and the period"
     status = Status.NO_BOUNDARY if against else Status.OK
     slopes = weigh(onsets.follow(best.theta).slopes(), weights)
     _refuse_blind(slopes, best.theta, table, bool(equals))

@@ -207,7 +207,8 @@ def check_same(store: Store, study: SweepStudy) -> None:
 
 def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> None:
     """Raise a `StoreError` that names every key in which results were made from another study."""
-    changed = list(differences(old, new))
+    # Ignore the keys delay_model and delay_models of earlier releases with the only model that is left.
+    changed = [each for each in differences(old, new) if each[1:] not in (("held", None), (["held"], None))]
     if changed:
         lines = [
             f"{where}: studies[{name}].{key}: the {what} was made with {describe(before)}, the configuration has "

@@ -100,7 +100,7 @@ def test_walls_that_no_rigid_device_has_are_refused(true, noise):
     fit = zwidth.fit_buzz(begin_to_buzz(true, SHARES, noise, seed=1), period=PERIOD, noise=noise)
     assert fit.status == Status.NO_BOUNDARY
     assert "no rigid device has these walls" in " ".join(fit.doubts)
-    assert all(len(doubt.split()) <= 32 for doubt in fit.doubts)
+    assert all(len(doubt.split()) <= 25 for doubt in fit.doubts)
     assert np.isnan([fit.stiffness_max, fit.safe_wall().stiffness]).all()
     assert fit.recommended.status == Status.UNREACHABLE
     assert fit.next is None

@@ -22,6 +22,7 @@ from sweeping import (
 
 import zwidth
 from zwidth.sweep.dataset import open_dataset, verify
+from zwidth.sweep.engine import refuse_changes
 from zwidth.sweep.store import Store
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
 from zwidth.words.status import Status
@@ -223,6 +224,14 @@ def test_another_configuration_is_refused(finished, change, key, words):
     assert f"studies[map].{key}: the run was made with" in str(caught.value)
     assert words in str(caught.value)
     assert flags(folder) == before
+
+
+def test_delay_models_of_earlier_releases_do_not_matter_if_held(tmp_path):
+    place, new = tmp_path / "a.zarr", {"kind": "sweep", "scene": {"d": 0.5}}
+    refuse_changes(place, "a", "store", {**new, "delay_model": "held", "delay_models": ["held"]}, new)
+    refuse_changes(place, "a", "store", {**new, "scene": {"d": 0.5, "delay_model": "held"}}, new)
+    with pytest.raises(StoreError, match=r"studies\[a\].delay_models: the store was made with a list of 2 items"):
+        refuse_changes(place, "a", "store", {**new, "delay_models": ["held", "fractional_power"]}, new)
 
 
 def test_another_release_is_refused(finished, monkeypatch):
