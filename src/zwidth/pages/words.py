@@ -166,15 +166,18 @@ def _compare_with_limit(scene: Scene) -> list[str]:
 
 
 @in_own_units
-def diagnosis_lines(found: Diagnosis | None) -> list[str]:
-    """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+def spell_diagnosis(found: Diagnosis | None) -> list[tuple[str, str]]:
+    """Return pairs of label and text: the result of a diagnosis and, if the device oscillates, its remedies."""
     if found is None:
         return []
     advice = found.advise()
-    return [
-        line("simulated" if found.cause == "none" else "CAUTION", f"{found.word}: {found.explain()}"),
-        *([line("", f"to stop it: {advice}")] if advice else []),
-    ]
+    label = "simulated" if found.cause == "none" else "CAUTION"
+    return [(label, f"{found.word}: {found.explain()}"), *([("", f"to stop it: {advice}")] if advice else [])]
+
+
+def diagnosis_lines(found: Diagnosis | None) -> list[str]:
+    """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+    return [line(*each) for each in spell_diagnosis(found)]
 
 
 def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
