@@ -80,15 +80,15 @@ def report() -> str:
     few = zwidth.simulate(scenes[:BESIDE], stiffness[:BESIDE], damping[:BESIDE], periods=PERIODS, push=PUSH)
     assert few.position is not None, "a recorded motion"
     lines = [
-        "# What simulations cost",
+        "# Run times of simulations",
         "",
         "Written by `benchmarks/bench_simulation.py --write docs/simulation.md`.",
         "",
-        f"{SCENES:,} devices of different masses, dampings and delays, each on a wall of its own, pushed by a",
-        f"constant force for {PERIODS:,} periods: time a sample, everything included that a call does. The others run",
-        "a part of the devices, in the same process. Difference: of the positions, relative to the largest.",
+        f"{SCENES:,} devices of different masses, dampings and delays, each on a different wall, with a constant",
+        f"external force for {PERIODS:,} periods: time per sample of the whole call. The other methods run a part",
+        "of the devices in the same process. Difference: of the positions, relative to the largest.",
         "",
-        "| method | time a sample | over the batch | largest difference |",
+        "| method | time per sample | relative to the batch | largest difference |",
         "|---|--:|--:|--:|",
         f"| `zwidth.simulate`, one batch | {own * 1e9:.0f} ns | 1 | |",
     ]
@@ -121,9 +121,9 @@ def report_parts() -> list[str]:
         "coupling, contact and friction": (zwidth.Scene(coupled, timing), {**hit, "coulomb": 0.1}),
     }
     lines = [
-        "Parts beside the linear loop, one device and 1,000 walls, 1,000 periods; a single one of them, recorded.",
+        "Nonlinear parts: one device, 1,000 walls and 1,000 periods; and one of these motions, recorded.",
         "",
-        "| scene | first call | time a sample of 1,000 | one motion of 1,000 periods |",
+        "| scene | first call | time per sample, 1,000 walls | one motion of 1,000 periods |",
         "|---|--:|--:|--:|",
     ]
     stiffness = np.linspace(100.0, 10e3, 1000)

@@ -23,7 +23,7 @@ LARGEST_PUSH = 0.9  # largest constant external force on a `LinearDevice`, in un
 SPEEDS = (0.05, 0.5)  # initial velocities if K = 0, in initial displacements per sampling period
 FIRST_DISPLACEMENT = 1e-3  # m or rad; used if neither the encoder nor the motor sets a scale
 
-SUSTAINED = 0.5  # least trend (see `Motion`) of a sustained oscillation
+SUSTAINED = 0.8  # least trend (see `Motion`) of a sustained oscillation
 RUNAWAY = 1.1  # trend above which a response without a frequency counts as growing without bound
 
 TRIALS = 16  # trials per call of `simulate`; constant, because JAX compiles once per batch size
