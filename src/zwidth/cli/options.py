@@ -199,7 +199,7 @@ def take_options(
 
 
 def warn_implausible(given: dict[str, Any]) -> None:
-    """Write a warning to the error stream for each value, in SI units by path, that is implausible for a device."""
+    """Write a warning to the error stream for each implausible value of ``given``, a dict of SI values by path."""
     for line in list_doubts(given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
         click.echo(f"zwidth: {line}", err=True)
 

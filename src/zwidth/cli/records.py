@@ -98,7 +98,7 @@ def loop_options(*, logs: bool) -> Callable[[Command], Command]:
 
 
 def log_options(command: Command) -> Command:
-    """Add the options on the columns of a log, and on the values of a count and of an ampere."""
+    """Add the options for the columns of a log, the encoder step and the motor constant."""
     for name, text in reversed(OF_LOGS.items()):
         command = click.option(flag_of(name), help=text)(command)
     return command
@@ -123,7 +123,7 @@ def read_logs(
     for log in logs:
         size = log.stat().st_size if log.is_file() else 0
         if size > _LONG:
-            click.echo(f"zwidth: reading {log.name}, {size / 2**20:.0f} MiB; then the numbers are computed", err=True)
+            click.echo(f"zwidth: reading {log.name}, {size / 2**20:.0f} MiB; the results follow", err=True)
     options = {"period": loop.period, "usual_period": loop.known_period, "motor_constant": motor_constant}
     options["resolution"] = resolution or get_hardware().get("resolution")
     motions = [read_log(log, columns, **options) for log in logs]

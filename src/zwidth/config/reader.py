@@ -82,7 +82,7 @@ def _check(
 
 
 def tells_rotary(data: Any, key: str = "") -> bool:
-    """Return whether a configuration has rotary devices: by a unit, ``rotary: true``, or a device's name or table."""
+    """Return whether a configuration has rotary devices, by its units, ``rotary: true``, device names or data files."""
     # One rotary value makes all devices of a file rotary. A fit determines the kind from its logs.
     if isinstance(data, Mapping):
         return data.get("kind") != "fit" and any(tells_rotary(each, str(name)) for name, each in data.items())

@@ -68,7 +68,7 @@ N_NEIGHBORS = 15  # poles on each side from which the local standard error is es
 MIN_RESPONSE_FREQUENCY = 2e-4
 N_BELOW_BANK = 40  # frequencies below the pole bank
 BAND_PHASE_STEP = 0.3  # rad; most phase by the delay between two frequencies of the band
-INTERPOLATION_PHASE_STEP = 0.06  # rad; the same if the response is interpolated linearly
+INTERPOLATION_PHASE_STEP = 0.06  # rad; largest phase change by the delay per grid step, for linear interpolation
 RESONANCE_OFFSETS = np.sinh(np.linspace(-4.0, 4.0, 61))  # grid around a resonance, in half-widths
 DIFFERENCE_STEP = 1e-6  # relative step of finite differences in theta
 
@@ -87,7 +87,7 @@ class HiddenResonances(NamedTuple):
 
 
 class HiddenPole(NamedTuple):
-    """A pole missing from the model according to the residuals; or a resonance that fits as well as the model's lag."""
+    """A pole that the model lacks, or a resonance that explains the log as well as the model's actuator lag."""
 
     frequency: float  # relative to the sampling rate
     rings: bool  # complex pole (resonance); otherwise real (lag)
@@ -260,7 +260,7 @@ def _build_frequency_grid(scene: Scene, phase_step: float) -> np.ndarray:
 def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     """Return the contribution of unit modes to the frequency response."""
     (g, delta, d), mode = fit.theta[:3], (2.0 * np.pi * frequency, ratio, np.sqrt(1.0 - ratio**2))
-    return g * RequiredWall(delta, d, (), [mode]).add(circle(2.0 * np.pi * grid)).value
+    return g * RequiredWall(delta, d, (), [mode]).add(circle(2.0 * np.pi * grid))
 
 
 def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -269,7 +269,7 @@ def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tup
 
     def evaluate(theta: np.ndarray) -> np.ndarray:
         wall = RequiredWall(*fit.model.normalize(theta, period)[1:])
-        return (-theta[0] / wall.jet(points).value).reshape(grid.shape)
+        return (-theta[0] / wall.value(points)).reshape(grid.shape)
 
     count, response = fit.model.parts.stop, evaluate(fit.theta)
     steps = np.abs(fit.theta[:count])
@@ -298,7 +298,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
         residuals: Weighted residuals, orthogonal to ``basis``.
         noise_variance: Variance of white noise.
     """
-    # The pole -inf passes the force of the last period only.
+    # The pole -inf has decay factor 0, so this filter returns the latest force, which the unit modes need.
     last = _filter_forces(fit, np.array([-np.inf]))[0]
     last_in_basis = basis.T @ last
     last_outside = last - basis @ last_in_basis

@@ -197,20 +197,9 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     return rows
 
 
-def _name_part(name: str, count: int) -> str:
-    """The label of a number of the amplifier or of one of so many resonances."""
-    _, *place, number = name.split(".")
-    if number == "time_constant":
-        return "amplifier's lag"
-    if number == "frequency":
-        return f"resonance {int(place[0]) + 1}" if count > 1 else "resonance"
-    return f"  its {number.replace('_', ' ')}"
-
-
 def spell_rival(rival: RivalDevice) -> str:
-    """Its numbers in a line."""
+    """Return the parameters of a rival device in one line."""
     parts = {symbol_of(name): spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
-    parts |= {_name_part(name, 1).strip(): spell(name, value) for name, value in (rival.parts or {}).items()}
     parts[symbol_of("stiffness_max")] = spell("stiffness", rival.stiffness_max)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 

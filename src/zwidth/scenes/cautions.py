@@ -90,7 +90,10 @@ def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[
 
 
 def judge_grasps(scene: Any) -> dict[str, bool]:
-    """Return the stability of a wall in each reference grasp, by name, and without the scene's operator if any."""
+    """Return whether a wall is stable in each reference grasp, by the name of the grasp.
+
+    If the scene has an operator, the entry "released" is the stability without the operator.
+    """
     if not isinstance(scene.device, Device):
         return {}
     held = list_grasps(bool(scene.device.rotary))

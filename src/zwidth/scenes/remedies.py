@@ -18,7 +18,7 @@ from zwidth.words.rotation import is_rotary
 
 SPAN = 64.0  # largest factor by which a remedy changes its parameter
 COARSE = 12  # values of a parameter simulated over the whole span
-FINE = 16  # values simulated from the last oscillating coarse value to the second coarse value after the first at rest
+FINE = 16  # values simulated between the last oscillating value and the third coarse value after it
 LONGEST_TRIAL = 20_000  # sampling periods per simulation of the search, to limit its run time
 RESERVE = 3  # of these values skipped after the first at rest, because the outcome is not monotone close to it
 

@@ -34,7 +34,7 @@ HELD_GAIN = 1.1  # factor on K and B with which a wall is still stable in a requ
 HELD = 0.95  # factor on K for the initial guess if a grasp destabilizes the wall
 FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
 WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
-COARSE = 1e-3  # the same for an improved device, because its gain is printed with 3 digits
+COARSE = 1e-3  # half-width of the bracket of log K for alternatives, whose gain or cost is printed with 2 or 3 digits
 MAX_STEPS = 60  # root-finding steps on log K, bisections included; 8 usually suffice
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}

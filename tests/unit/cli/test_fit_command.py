@@ -225,4 +225,4 @@ def test_a_long_log_is_announced_before_it_is_read(log, tmp_path, capsys):
     short, told = said
     assert told.out.replace("long.csv", "log.csv") == short.out
     assert short.err == ""
-    assert told.err == "zwidth: reading long.csv, 9 MiB; then the numbers are computed\n"
+    assert told.err == "zwidth: reading long.csv, 9 MiB; the results follow\n"

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 # Relative to the size of a number. Steps C1 to C6 of docs/theory/certified.md derive the three bounds.
 TOLERANCE = 2.0**-35  # largest error of a number that depends on the gain crossover u
-CROSSOVER_WIDTH = 2.0**-39  # largest relative error of u
+CROSSOVER_WIDTH = 2.0**-39  # largest relative error of the gain crossover u = 1 - cos omega
 CUBIC_TOLERANCE = 2.0**-45  # largest error of the cubic H whose zero is u
 TINY = 2.0**-960  # added to each size; TOLERANCE * TINY exceeds what XLA flushes to zero
 

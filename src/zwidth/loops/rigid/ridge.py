@@ -62,7 +62,7 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
 
 
 def follow(s: Array, plant: Plant, lag: Array, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
-    """Return alpha, beta, omega and s of a ridge at ``s``, with their derivatives in plant and lag."""
+    """Return alpha, beta, omega and s of the solved ridge, differentiable in plant and integer delay (``lag``)."""
     # One step of Newton's method, through which derivatives pass: it is exact to the first order. A corner stays at 1,
     # and at a maximum alpha moves as if s stood still.
     xp = namespace(s, plant.a2, lag)
@@ -78,7 +78,7 @@ def follow(s: Array, plant: Plant, lag: Array, kind: DelayClasses) -> tuple[Arra
 
 
 def differentiable_ridge(plant: Plant, lag: Array, start: Start, kind: DelayClasses) -> Ridge:
-    """Return `loops.rigid.ridge_newton.solve`, in JAX with derivatives in plant and lag to any order."""
+    """Solve for the ridge; JAX can differentiate the result in plant and integer delay (``lag``) to any order."""
     ridge = solve if namespace(plant.a2, lag) is np else _jax_ridge()
     return ridge(plant, lag, start, kind)
 
