@@ -138,7 +138,6 @@ def fit(
         options = {name: of_logs.pop(name) for name in ("max_delay", "resample")}
         motions = read_logs(logs, loop, **of_logs)
         found = fit_motions(motions, period=period, velocity=velocity, **options)
-        loop.check_period(found.period)
         source = " and ".join(log.name for log in logs)
     wrote = []
     if figure is not None:
@@ -287,7 +286,6 @@ def respond(
     from zwidth.fitting.respond import respond_to_logs
 
     found = respond_to_logs(read_logs(logs, loop, **of_logs), loop.known_period, cycle)
-    loop.check_period(found.period)
     with use_kind(found.device.rotary):
         _print_response(found, logs, loop.velocity, save, figure, as_json)
 

@@ -18,7 +18,6 @@ from zwidth.cli.options import (
     make_velocity,
     take_options,
 )
-from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import CHOICES, OF_LOGS, OF_PARTS
 
 if TYPE_CHECKING:
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
 
 _LONG = 2**23  # bytes; the user is informed that reading a longer log takes a while
-_SAME_PERIOD = 1e-3  # largest relative difference of the periods of a record and a scene file
 
 
 class Loop(NamedTuple):
@@ -48,13 +46,6 @@ class Loop(NamedTuple):
             raise click.UsageError(
                 f"the record is that of a {kinds[0]} device, but the scene file has a {kinds[1]} one"
             )
-
-    def check_period(self, period: float) -> None:
-        """Raise an error if the sampling period of a record differs from that of the scene file."""
-        known = self.known_period
-        if known is not None and abs(period - known) > _SAME_PERIOD * known:
-            got, own = with_unit(known, "s"), with_unit(period, "s")
-            raise click.UsageError(f"period: the scene file has {got}, but the samples of the record are {own} apart")
 
 
 def _make_loop(given: dict[str, Any]) -> Loop:

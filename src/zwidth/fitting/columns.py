@@ -37,6 +37,7 @@ _AMPERES = {"A": 1.0, "mA": 1e-3}
 _PER_AMPERE = re.compile(r"(.*?)\s*/\s*A\s*")
 _MANY_COUNTS = 50.0  # least difference of maximum and minimum of whole numbers that are read as encoder counts
 _ROUNDING = 1e-9  # largest relative difference of two equal units, for rounding errors
+_SAME_PERIOD = 1e-3  # largest relative difference of the period of the times and the specified one
 _OTHER = 0.1  # relative difference above which two periods contradict each other
 # Units of mass that scales and load cells display for a force, and the unit of the corresponding weight.
 _WEIGHTS = {"kg": "kgf", "g": "gf", "lb": "lbf", "oz": "ozf"}
@@ -357,8 +358,18 @@ def join_logs(motions: Sequence[LoggedMotion], period: float | None) -> dict[str
     return {**columns, "resolution": steps.pop(), "rotary": motions[0].rotary}
 
 
+def check_period(period: float | None, found: float) -> None:
+    """Raise `InputError` if the sampling period found in the times of logs differs from the specified one."""
+    if period is not None and abs(found - period) > _SAME_PERIOD * period:
+        raise InputError(
+            f"period: got {with_unit(period, 's')}, but the samples of the log are {with_unit(found, 's')} apart; "
+            "correct the period, or leave it out"
+        )
+
+
 def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None, **options: Any) -> DeviceFit:
     """Fit logs that were read from files with `zwidth.fit_log`, and add the notes on their columns to the fit."""
     fit = fit_log(**join_logs(motions, period), **options)
+    check_period(period, fit.period)
     notes = dict.fromkeys(note for motion in motions for note in motion.notes)
     return replace(fit, notes=(*notes, *fit.notes)) if notes else fit

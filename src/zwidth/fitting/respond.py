@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from zwidth.fitting.columns import LoggedMotion, join_logs
+from zwidth.fitting.columns import LoggedMotion, check_period, join_logs
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.recordings import find_runs, read_logs
 from zwidth.parts.checks import check_number
@@ -181,6 +181,7 @@ def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> R
 def respond_to_logs(motions: Sequence[LoggedMotion], period: float | None, cycle: Any = None) -> ResponseEstimate:
     """Estimate the response with `respond` from logs that were read from files, and add the notes on their columns."""
     estimate = respond(**join_logs(motions, period), cycle=cycle)
+    check_period(period, estimate.period)
     notes = dict.fromkeys(note for motion in motions for note in motion.notes)
     return replace(estimate, notes=(*notes, *estimate.notes))
 

@@ -32,8 +32,6 @@ from zwidth.words.quantities import OF_LOGS, POSITIVE
 from zwidth.words.rotation import in_own_units
 from zwidth.words.status import Status
 
-# Times of a log and the period may differ so much, as a share.
-_SAME_PERIOD = 1e-3
 # 95 % of chi-squared with three degrees of freedom, and of a normal distribution within so many standard deviations.
 _CHANCE, _NORMAL = 7.815, 1.96
 
@@ -230,9 +228,6 @@ class FitStudy(ComputedStudy):
         if self.log:
             options = {"max_delay": self.max_delay, "resample": self.resample}
             found = fit_motions(self._motions, period=period, velocity=velocity, **options)
-            if period is not None and abs(found.period - period) > _SAME_PERIOD * period:
-                given, own = with_unit(period, "s"), with_unit(found.period, "s")
-                raise InputError(f"period: got {given}, and the log's times are {own} apart; remove it, or the times")
             period = found.period
             fits.append(_Fitted("log", " and ".join(Path(section.csv).name for section in self.log), found))
         if self.buzz:

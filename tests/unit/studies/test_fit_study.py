@@ -146,7 +146,7 @@ def test_an_answer_that_is_not_ok_begins_with_that(monkeypatch):
     outcome = study_of(log={"csv": "fit_log.csv", "resolution": "0.03 mm"}, max_delay="1 ms").compute(None, True)
     assert outcome.table["status"].tolist() == ["UNREACHABLE"]
     assert outcome.answer[1] == "NO WALL: resolve the warnings first, then record again"
-    assert "WARNING: UNREACHABLE: the delay is at the end of the search range" in outcome.answer
+    assert "WARNING: the delay is at the end of the search range, 1.000 ms; give a longer max_delay" in outcome.answer
 
 
 def test_records_of_two_devices_do_not_agree(monkeypatch):
@@ -240,7 +240,7 @@ def test_faults_are_told_with_their_place(name, tmp_path):
 def test_a_period_beside_other_times_is_refused(monkeypatch):
     monkeypatch.chdir(ROOT / "configs")
     log = {"csv": "fit_log.csv", "resolution": "0.03 mm", "time": "time [ms]"}
-    with pytest.raises(zwidth.InputError, match=r"the log's times are 1\.000 ms apart"):
+    with pytest.raises(zwidth.InputError, match=r"the samples of the log are 1\.000 ms apart"):
         study_of(log=log, period="2 ms").compute(None, True)
 
 
