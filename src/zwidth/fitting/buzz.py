@@ -21,7 +21,7 @@ from zwidth.words.formatting import plain, with_unit
 from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.status import Status
 
-CHANCE = 0.003  # probability of refusing the walls of a rigid device; with 1e-4 some walls of resonances would pass
+CHANCE = 0.003  # probability of refusing the walls of a rigid device
 ROUGH = 0.1  # largest standard deviation of K and f if the noise is not given
 ANGLES = 240  # frequencies of the boundary at which the next experiment is searched
 SAME = 1e-6  # dampings with a smaller relative difference count as one

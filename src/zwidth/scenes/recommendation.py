@@ -22,6 +22,7 @@ from zwidth.scenes.assessment import (
     compute_gains,
     describe_islands,
     name_kind,
+    nearest_interval,
     round_margin,
 )
 from zwidth.scenes.cautions import judge_grasps, list_cautions
@@ -172,7 +173,9 @@ class Recommendation:
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper, "N s/m", self.read[2])
+        # The range of the printed K, which is rounded; a negative lower end is sensitive to this.
+        column = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
+        lower, upper = tell_apart(*nearest_interval(column, self.virtual_damping), "N s/m", self.read[2])
         room = f"B from {lower} to {upper} is stable at this K"
         margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
         cautions = (f"caution: {caution}" for caution in self.cautions)
