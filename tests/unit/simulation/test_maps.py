@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from independent_scenes import continuous
+from any_loop import continuous
 from tolerances import SIMULATED_LINEAR
 
 import zwidth

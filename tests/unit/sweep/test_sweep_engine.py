@@ -23,7 +23,7 @@ from sweeping import (
 import zwidth
 from zwidth.sweep.dataset import open_dataset, verify
 from zwidth.sweep.store import Store
-from zwidth.words.errors import InputError, StoreError, StoreExistsError
+from zwidth.words.errors import InputError, StoreError
 from zwidth.words.status import Status
 
 
@@ -199,12 +199,6 @@ def test_events_tell_how_far_it_is(tmp_path):
     assert all(progress.rate > 0 and progress.study == "map" for progress in told)
 
 
-def test_a_store_is_never_overwritten(finished):
-    config, folder = finished
-    with pytest.raises(StoreExistsError, match=r"already holds a run; .* go on with it with --resume"):
-        run_sweeps(config, folder)
-
-
 @pytest.mark.parametrize(
     "change, key, words",
     [
@@ -223,13 +217,6 @@ def test_another_configuration_is_refused(finished, change, key, words):
     assert f"studies[map].{key}: the run was made with" in str(caught.value)
     assert words in str(caught.value)
     assert flags(folder) == before
-
-
-def test_another_release_is_refused(finished, monkeypatch):
-    config, folder = finished
-    monkeypatch.setattr("zwidth.sweep.files.__version__", "99.0")
-    with pytest.raises(StoreError, match=r"made with zwidth .*, now there is 99\.0; install the same release"):
-        run_sweeps(config, folder, resume=True)
 
 
 def test_a_damaged_chunk_is_named_and_repaired_alone(finished, tmp_path):
