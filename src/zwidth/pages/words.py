@@ -166,20 +166,24 @@ def _compare_with_limit(scene: Scene) -> list[str]:
 
 
 @in_own_units
-def diagnosis_lines(found: Diagnosis | None) -> list[str]:
-    """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+def spell_diagnosis(found: Diagnosis | None) -> list[tuple[str, str]]:
+    """Return pairs of label and text: the result of a diagnosis and, if the device oscillates, its remedies."""
     if found is None:
         return []
     advice = found.advise()
-    return [
-        line("simulated" if found.cause == "none" else "CAUTION", f"{found.word}: {found.explain()}"),
-        *([line("", f"to stop it: {advice}")] if advice else []),
-    ]
+    label = "simulated" if found.cause == "none" else "CAUTION"
+    return [(label, f"{found.word}: {found.explain()}"), *([("", f"to stop it: {advice}")] if advice else [])]
+
+
+def diagnosis_lines(found: Diagnosis | None) -> list[str]:
+    """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+    return [line(*each) for each in spell_diagnosis(found)]
 
 
 def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
     """Return the caution about a delay that is 0 only because it was not given; ``silent`` names such options."""
-    if "delay" not in silent or scene.timing.delay:
+    # A measured response usually contains the delay.
+    if "delay" not in silent or scene.timing.delay or isinstance(scene.device, MeasuredDevice):
         return []
     return [
         "no delay given: the results hold only if the force acts at the sample; if it acts one period later, add "
@@ -192,7 +196,7 @@ def note_lines(notes: list[str]) -> list[str]:
 
 
 class Slope(NamedTuple):
-    """The derivative of K_max in one parameter of a scene, and what a small step of it comes to in words."""
+    """The derivative of K_max with respect to one parameter, and the effect of a small change in words."""
 
     name: str
     value: float
@@ -200,7 +204,9 @@ class Slope(NamedTuple):
     words: str
 
     def line(self) -> str:
-        return row(f"dK_max/d({self.name})", f"{with_unit(self.value, self.unit)}: {self.words}")
+        """Return the derivative as a printed line."""
+        name = "inertia" if self.name == "mass" and is_rotary() else self.name
+        return row(f"dK_max/d({name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
         return {"value": self.value, "unit": own_unit(self.unit)}

@@ -19,7 +19,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
 from zwidth.words.results import Margins
 from zwidth.words.rotation import in_own_units
-from zwidth.words.showing import shown
+from zwidth.words.showing import ResultList, shown
 from zwidth.words.status import RidgeKind, Status
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
@@ -280,7 +280,7 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
     for name, words, improved, note in list_improvements(scene):
         stiffness = measure(improved)
         found.append(Limit(name, words, stiffness, stiffness / now, note))
-    return sorted(found, key=lambda limit: (not limit.gain >= 0, -limit.gain))
+    return ResultList(sorted(found, key=lambda limit: (not limit.gain >= 0, -limit.gain)))
 
 
 @in_own_units

@@ -25,8 +25,9 @@ Cause: TypeAlias = Literal["none", "instability", "quantization", "saturation", 
 TIME_CONSTANTS = 30.0  # length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS = 2000  # length of the shortest simulation, in sampling periods
 MOST_PERIODS = 200_000  # length of the longest simulation, in sampling periods; limits the run time
-SETTLED = 2.0  # time constants that must be simulated before an UNCLEAR motion may count as sustained
-CONFIRMED = "simulated at these and larger changes; check the value that you choose with diagnose"
+SETTLED = 2.0  # time constants that must be simulated before a motion may count as sustained
+CONFIRMED = "simulated at these and larger changes: check the value that you choose with diagnose"
+FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in proportion to its steps"
 
 
 @shown(
@@ -53,7 +54,7 @@ class Diagnosis:
             rest, infinite if one grows without bound.
         frequency: frequency of the largest sustained motion in Hz; NaN at rest. For an unstable linear loop whose
             simulation shows no frequency: frequency of the dominant pole.
-        outcome: code of `zwidth.MotionKind` of the largest sustained motion; UNCLEAR: sustained, without a certificate.
+        outcome: code of `zwidth.MotionKind` observed for the largest sustained motion.
         remedies: changes of one parameter, each of which stops the oscillation. For limit cycles the list is empty if
             the delay exceeds 50 periods, because the search would take too long.
     """
@@ -106,11 +107,13 @@ class Diagnosis:
         """Return the remedies in one sentence; "" if none is needed."""
         if self.cause in ("none", "undecided"):
             return ""
-        if self.remedies:
-            simulated = self.cause != "instability"
-            advice = ", or ".join(remedy.spell(3 if simulated else 4) for remedy in self.remedies)
-            return f"{advice} ({CONFIRMED})" if simulated else advice
-        return "no remedy by a change of one parameter was found"
+        simulated = self.cause != "instability"
+        advice = ", or ".join(remedy.spell(3 if simulated else 4) for remedy in self.remedies)
+        parts = [advice or "no remedy by a change of one parameter was found"]
+        parts += [CONFIRMED] if advice and simulated else []
+        # Without friction the loop scales with the encoder step, and between two force steps no equilibrium exists.
+        parts += [FRICTIONLESS] if self.cause == "quantization" and not self.hardware.static else []
+        return "; ".join(parts)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as JSON values, with None in place of NaN and infinity."""
@@ -208,14 +211,17 @@ def _find_cause(experiment: Experiment, worst: SustainedMotion, dominant: Any) -
     scene, hardware = experiment.scene, experiment.hardware
     if not dominant.marginal and not scene.is_stable():
         return "instability"
-    if not worst.certified[0] and experiment.decay < SETTLED:
+    limited = min(hardware.max_force, hardware.max_rate) < math.inf
+    if not limited and hardware.resolution == 0:
+        # The verdict of the linear loop decides, because friction only dissipates energy.
+        return "none"
+    if not worst.at_rest[0] and experiment.decay < SETTLED:
         return "undecided"
     if worst.amplitude[0] == 0:
         return "none"
-    limited = min(hardware.max_force, hardware.max_rate) < math.inf
     if limited and hardware.resolution > 0:
         unlimited = experiment.measure(max_force=np.inf, max_rate=np.inf)
         # A motion sustained by saturation is larger than the quantization limit cycle that remains once the force
         # limits are removed.
         limited = bool(worst.amplitude[0] > 2.0 * unlimited.amplitude[0])
-    return "saturation" if limited else "quantization" if hardware.resolution > 0 else "undecided"
+    return "saturation" if limited else "quantization"

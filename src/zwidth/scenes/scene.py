@@ -12,6 +12,7 @@ from zwidth.scenes.base import WallSI, require_numbers
 from zwidth.scenes.recommendation import SceneAdvice
 from zwidth.simulation.simulate import simulate
 from zwidth.words.rotation import wrap_methods
+from zwidth.words.showing import ResultList
 from zwidth.words.types import ArrayLike
 from zwidth.words.xp import is_traced, namespace
 
@@ -68,10 +69,10 @@ class Scene(SceneAdvice):
             `islands` means it.
         """
         units = self.units
-        return [
+        return ResultList(
             Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
             for piece in self.loop.outlines()
-        ]
+        )
 
     simulate = simulate
     """A method: `zwidth.simulate` of this scene, with all its arguments."""

@@ -53,11 +53,8 @@ WALL_RANGE = (1e-60, 1e60)
 LARGEST_DAMPING = 1e12
 LONGEST_DELAY = 1e5
 SIZES = {"alpha": WALL_RANGE, "beta": WALL_RANGE, "delta": (0.0, LARGEST_DAMPING), "d": (0.0, LONGEST_DELAY)}
-# Shorter limits of the delay: in files, where more is a slip of a unit; of all poles, which take degree^3 operations
-# and degree^2 numbers (4,000 take minutes and 0.3 GB); and of settling times, which take them at once.
-MAX_DELAY_PERIODS = 10_000.0
-MOST_POLES = 4000
-LONGEST_SETTLING = 500
+MAX_DELAY_PERIODS = 10_000.0  # longest delay in files; a longer one is a wrong unit
+MOST_POLES = 4000  # largest degree for all poles, which takes minutes and 0.3 GB
 # Stiffness of a recommended wall over that of the stiffest stable one.
 RECOMMENDED_SHARE = 0.75
 
@@ -254,6 +251,8 @@ _OF_MOTIONS = (
     Parameter("max_rate", "the fastest that the command changes", "R_m", POSITIVE, "N/s", note="without one no limit"),
 )  # fmt: skip
 OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
+# Encoder, friction and motor: arguments of `zwidth.diagnose` and `zwidth.simulate`.
+HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
 FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
 """Every number of a part or a motion by its name; the noise of an estimate without stable walls is no axis."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")

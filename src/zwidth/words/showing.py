@@ -75,6 +75,13 @@ def shown(
     return decorate
 
 
+class ResultList(list[Any]):
+    """List of `shown` results, displayed as tables in notebooks."""
+
+    def _repr_html_(self) -> str:
+        return "\n".join(each._repr_html_() for each in self)
+
+
 def _add_rotary(kind: Any) -> None:
     """Let results made for a rotary device keep its units: they are of a class below, ``kind.InRotaryUnits``."""
     name, plain_new = "InRotaryUnits", kind.__new__
