@@ -26,7 +26,7 @@ from zwidth.scenes.cautions import LEAST_DELAY_MARGIN, LEAST_GAIN_MARGIN, LEAST_
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 
-from independent_scenes import closed_loop_matrix, continuous, flow, velocity_polynomials
+from any_loop import closed_loop_matrix, continuous, flow, velocity_polynomials
 
 POINTS = 40_000  # frequencies of an open-loop response
 NEAR = 0.02  # relative distance from a threshold within which no caution is checked

@@ -29,7 +29,7 @@ import zwidth
 from zwidth.cli import cli
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests" / "support"))
+sys.path[:0] = [str(ROOT / "tests" / folder) for folder in ("support", "oracles")]
 Answers = Iterator[tuple[str, np.ndarray]]
 
 _WALLS, _SCENES = 4000, 10

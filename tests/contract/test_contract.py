@@ -47,11 +47,6 @@ def test_numpy_in_numpy_out_in_float64(case):
 
 
 @ALL
-def test_lists_are_arrays(case):
-    assert_same(case.leaves(case.call(**case.good)), case.leaves(case.call(**case.arguments)))
-
-
-@ALL
 def test_jax_in_jax_out_with_all_digits(case):
     # Powers of two, so that float32 holds them: nothing else may be rounded to it.
     arguments = {name: np.float32(values) for name, values in case.arguments.items()}
@@ -194,6 +189,7 @@ import zwidth
 zwidth.count_poles([0.8], [1.0, 0.9], 0.01, 3.0)
 for name, line in (("beta", 0.3), ("alpha", 0.1)):
     zwidth.boundary_point(0.1, 1.0, **{{name: line}})
+zwidth.stable_region(0.5, 1)
 calls = {[(case.function, numbers_of(case)) for case in CASES if called_by_name(case)]!r}
 for name, numbers in calls:
     getattr(zwidth, name)(**numbers)

@@ -14,7 +14,7 @@ from zwidth.scenes.loop import LinearLoop, RigidLoop
 DELAYS = (0.0, 0.3, 1.0, 1.6, 2.0, 4.0, 8.5)
 
 
-@pytest.fixture(scope="module", params=range(24))
+@pytest.fixture(scope="module", params=range(14))
 def loops(request):
     """A random rigid scene of T = 1 s and m = 1 kg, whose SI quantities are the normalized ones, and walls around it.
 

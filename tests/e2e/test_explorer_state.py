@@ -99,15 +99,6 @@ def test_the_address_brings_the_scene_back(page, browser):
     settle(page, "document.getElementById('velocity').value === 'BackwardDifference'")
 
 
-def test_an_address_that_is_no_scene_is_said(page, address):
-    start = page.url
-    page.goto(f"{address}#mass=heavy")
-    wait_for(lambda: "scene.mass: got 'heavy'" in page.inner_text("#error"), lambda: page.inner_text("header"))
-    assert page.is_visible("#stale")
-    page.goto(start)
-    settle(page, "document.getElementById('error').textContent === ''")
-
-
 @pytest.mark.parametrize("entry, says", [("-5", "mass m: got -5 g; it must be greater than 0 g"), ("", "no number")])
 def test_the_badge_is_stale_while_an_entry_is_wrong(page, entry, says):
     badge = page.inner_text("#word")

@@ -9,7 +9,6 @@ import pytest
 from unpainted import painting_nothing
 
 import zwidth
-from zwidth.words.errors import StoreExistsError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -128,13 +127,6 @@ def test_fig11_settles_faster_with_more_damping(paper):
         outside = np.abs(table["position_m"][here] - final) > 0.02 * final
         settled.append(table["time_s"][here][outside][-1])
     assert settled == sorted(settled, reverse=True)
-
-
-def test_a_second_run_into_the_same_folder_is_refused(paper):
-    before = {file.name: file.stat().st_mtime_ns for file in paper.folder.iterdir()}
-    with pytest.raises(StoreExistsError, match="already holds a run"):
-        zwidth.run(CONFIGS / "paper.yaml", out=paper.folder)
-    assert {file.name: file.stat().st_mtime_ns for file in paper.folder.iterdir()} == before
 
 
 def test_the_recommendation_is_the_library_s_in_si_units(phantom):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from independent_scenes import continuous
+from any_loop import continuous
 from scipy.integrate import solve_ivp
 
 # A share of a period: an event is not looked for right behind another one, and so short a way is a parabola.

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.signal
+from any_loop import continuous
 from dry_bodies import BLIND, Bodies, Friction, RigidBody
-from independent_scenes import continuous
 
 import zwidth
 

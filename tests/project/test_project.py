@@ -190,17 +190,18 @@ try:
     main()
 except SystemExit as end:
     assert not end.code
-print("heavy:", sorted({"jax", "jaxlib", "matplotlib", "scipy", "zarr"} & set(sys.modules)))
+print("heavy:", sorted({"bokeh", "jax", "jaxlib", "matplotlib", "scipy", "tornado", "zarr"} & set(sys.modules)))
 """)
     assert "Usage" in output
     assert output.splitlines()[-1] == "heavy: []"
 
 
-def test_figures_are_drawn_without_jax():
+def test_figures_and_configurations_need_no_jax():
     output = run_python("""
 import sys
 
 import zwidth.figures
+import zwidth.studies.document
 
 print("jax" in sys.modules)
 """)

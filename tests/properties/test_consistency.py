@@ -291,39 +291,6 @@ def test_settling_times_belong_to_stable_walls():
     assert np.mean(np.isfinite(times[stable])) > 0.5
 
 
-def test_an_assessment_says_what_the_functions_say():
-    random = np.random.default_rng(23)
-    walls = draw(120, random)
-    walls = walls.select((walls.delta == 0) | (walls.delta >= 1e-30))
-    walls = walls.select(np.all([(x == 0) | ((np.abs(x) > 1e-29) & (np.abs(x) < 1e29)) for x in walls], axis=0))
-    assert walls.alpha.size > 36
-    for wall in zip(*(column.tolist() for column in walls), strict=True):
-        alpha, beta, delta, d = wall
-        scene = zwidth.Scene(zwidth.Device(1.0, delta), zwidth.Timing(1.0, d), zwidth.VirtualWall(alpha, beta))
-        found = zwidth.assess(scene)
-        assert found.alpha == alpha
-        assert (found.beta, found.delta) == (beta, delta)
-        # A quotient next to a whole number counts as that.
-        wall = alpha, beta, delta, found.d
-        stands, rate = zwidth.margins(*wall), zwidth.decay_rate(*wall)
-        same = {
-            "stable": zwidth.is_stable(*wall),
-            "passive": zwidth.is_passive(*wall),
-            "passivity_margin": zwidth.passivity_margin(*wall),
-            "decay_rate": rate,
-            "spectral_radius": zwidth.spectral_radius(*wall),
-            "stiffness_limit": zwidth.boundary_point(delta, found.d, beta=beta).alpha,
-            "stiffness_max": zwidth.alpha_max(delta, found.d).alpha,
-            "gain_margin": stands.gain_margin,
-            "phase_margin": stands.phase_margin,
-            "delay_margin": stands.delay_margin,
-            "modulus_margin": stands.modulus_margin,
-        }
-        for name, value in same.items():
-            assert getattr(found, name) == pytest.approx(float(value), rel=1e-15, nan_ok=True), name
-        assert np.isnan(found.time_constant) or found.stable == (0 < found.time_constant < np.inf)
-
-
 def main(count: str, seed: str) -> None:
     """Print what is found among so many walls."""
     found = found_in(int(count), int(seed))

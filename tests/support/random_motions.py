@@ -10,7 +10,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from independent_scenes import KINDS, closed_loop_matrix, continuous, random_scene, random_walls
+from any_loop import closed_loop_matrix, continuous
+from independent_scenes import KINDS, random_scene, random_walls
 from integrator import History, integrate
 
 PERIODS = 200

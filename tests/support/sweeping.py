@@ -10,7 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
 
-import numpy as np
 from waiting import LONGEST
 
 from zwidth import run
@@ -167,10 +166,3 @@ def flip(file, position=-1):
     data = bytearray(file.read_bytes())
     data[position] ^= 0xFF
     file.write_bytes(data)
-
-
-def poles_say_stable(alpha, beta, delta, d):
-    """Stability by poles, the slow way."""
-    from zwidth.loops.rigid.poles import radius_by_companion
-
-    return np.asarray(radius_by_companion(alpha, beta, delta, d)) < 1.0

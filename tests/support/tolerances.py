@@ -33,9 +33,6 @@ PHI_SLOPE = rounding_errors(16, "Relative. Autodiff adds two or three rounded pr
 PHI_CURVATURE = rounding_errors(24, "Relative. As PHI_SLOPE, with four or five rounded products.")
 
 PLANT = rounding_errors(4, "Relative, where e^-delta does not underflow. Sums of positive terms: nothing cancels.")
-PLANT_DECAYED = rounding_errors(
-    1, "Relative, times 1 + delta: the exponent's own rounding is multiplied by delta in e^-delta."
-)
 TRANSFER = rounding_errors(8, "Relative. As PHI, and the products with T^2/m.")
 COEFFICIENT = rounding_errors(4, "Relative to the sum of the magnitudes of its terms, which may cancel for some walls.")
 
@@ -49,7 +46,6 @@ BOUNDARY_POINT = Tolerance(
     "Relative to |alpha| + |beta|, or the wall's condition where that is larger: Newton's method ends within 16 "
     "rounding errors of the residual. Near the ridge a column touches the curve, which squares the condition.",
 )
-BOUNDARY_POINT_SLOPE = Tolerance(1e-10, "Relative. The implicit derivative divides by the residual's Jacobian.")
 
 POLE = Tolerance(1e-12, "Relative, for simple poles: Newton's last step in the factored form, times its condition.")
 DOUBLE_POLE = Tolerance(
@@ -68,9 +64,6 @@ PASSIVITY = Tolerance(
     1e-12,
     "Relative to |alpha| (d + 1) + |beta| + delta, the size of the terms: golden section finds a maximum squared.",
 )
-PASSIVITY_SCAN = Tolerance(
-    1e-7, "Relative to the same size: a scan of 1e5 frequencies misses a maximum by (step/2)^2/2 of its curvature."
-)
 PASSIVE_SLOPE = Tolerance(1e-7, "Golden bracket of 12 rounds narrows beta to 2 * 8^-12; the optimum is a corner.")
 PASSIVE_SLOPE_LP = Tolerance(
     1e-6, "The linear program sees 20,000 frequencies: between two of them the bound overshoots by the step squared."
@@ -79,23 +72,13 @@ PASSIVE_SLOPE_LP = Tolerance(
 RESPONSE = Tolerance(
     1e-11, "Relative to the largest sample: rounding errors of 200 periods add up, and a peer's state grows alike."
 )
-RESPONSE_DENSE = Tolerance(1e-8, "Relative to the largest value: solve_ivp's own tolerance of 1e-11 over 40 pieces.")
-SETTLING = Tolerance(1e-12, "In periods: the settling time is one of the time axis' own entries.")
 
-AREA = Tolerance(
-    2e-4, "Relative: chords of a 400-point outline cut corners by (length of a piece)^2/12 of its curvature."
-)
 AREA_GRID = Tolerance(0.01, "Relative: a grid of 200 x 200 cells counts each cell on the edge as in or out.")
 
 PEER = Tolerance(
     1e-10,
     "Relative to the largest coefficient: scipy's expm of [[A, B], [0, 0]] and control's transfer-function algebra "
     "multiply matrices whose entries differ by up to 1e6.",
-)
-PEER_POLE = Tolerance(
-    1e-6,
-    "Absolute: peers take eigenvalues of an unbalanced matrix and do not polish them; a pair of poles 1e-3 apart "
-    "costs three digits more.",
 )
 NORMALIZED = rounding_errors(4, "Relative: two or three rounded products and quotients.")
 
@@ -118,7 +101,6 @@ RIDGE_CURVATURE_FLOOR = rounding_errors(
     "Relative to |alpha| + |beta| over the units of both variables: about 16 terms of that size are added up. At"
     " delta = 1e6 the spread is 3.4, and the largest of 800 was 16.4, forward, backward or one in the other.",
 )
-RIDGE_ORACLE = Tolerance(1e-11, "Relative: bisection of a slope leaves omega with sqrt(eps) of the curve's curvature.")
 LIMIT_SLOPE = rounding_errors(8, "Relative: the same method as RIDGE, on a plant of three numbers.")
 
 JUDGE = Tolerance(

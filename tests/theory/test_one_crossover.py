@@ -245,11 +245,6 @@ class _Wall:
         return self.beta * alpha > self.alpha * beta, self.beta > beta
 
 
-def _radius(alpha, beta, delta, n, f) -> mpf:
-    """The largest pole, from the model's polynomial."""
-    return max(abs(root) for root in oracles.roots(oracles.polynomial(alpha, beta, delta, n + mpf(f))))
-
-
 @lru_cache(maxsize=1)
 def _random_walls() -> list[tuple]:
     """Walls near enough to the boundary that many are stable and many are not: (alpha, beta, delta, n, f)."""
@@ -266,7 +261,8 @@ def test_theorem_2_against_poles() -> None:
     """S9 to S14: the phase at the crossover, and the products, tell what the poles tell."""
     stable = 0
     for wall in _random_walls():
-        found, radius = _Wall(*wall), _radius(*wall)
+        alpha, beta, delta, n, f = wall
+        found, radius = _Wall(*wall), oracles.exact_radius(alpha, beta, delta, n + mpf(f))
         assert abs(radius - 1) > 1e-9
         assert found.by_phase() == (radius < 1), wall
         assert (wall[1] > -wall[2] and found.by_products()) == (radius < 1), wall
@@ -318,7 +314,7 @@ def test_s15_products_need_the_first_question() -> None:
     alpha, beta, delta, n, f = 0.9, -4.1, 1.0, 0, 0.9
     assert _Wall(alpha, beta, delta, n, f).by_products()
     assert not _Wall(alpha, beta, delta, n, f).by_phase()
-    assert abs(_radius(alpha, beta, delta, n, f) - mpf("1.3545034")) < 1e-6
+    assert abs(oracles.exact_radius(alpha, beta, delta, n + mpf(f)) - mpf("1.3545034")) < 1e-6
 
 
 # --- S16 to S18: the stable set is one piece ----------------------------------------------------------------------
@@ -351,10 +347,10 @@ def test_s16_crossover_and_margin_are_coordinates() -> None:
         wall = _Wall(alpha, beta, delta, n, f)
         assert abs(wall.margin() - m) < 1e-30
         assert abs(mp.arg(wall.factors()[3]) - w) < 1e-30
-        assert _radius(alpha, beta, delta, n, f) < 1
+        assert oracles.exact_radius(alpha, beta, delta, n + mpf(f)) < 1
         # Beyond the edge m = 0 lies no stable wall.
         alpha, beta, _ = _place(delta, n, f, w, -m * mpf("1e-3"))
-        assert alpha <= 0 or _radius(alpha, beta, delta, n, f) > 1
+        assert alpha <= 0 or oracles.exact_radius(alpha, beta, delta, n + mpf(f)) > 1
 
 
 def _turning_claim(tau, f, x):

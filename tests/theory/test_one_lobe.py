@@ -360,7 +360,7 @@ def _runs(flags: list[bool]) -> int:
 
 
 def _stable(alpha, beta, delta, d) -> bool:
-    return max(abs(root) for root in oracles.roots(oracles.polynomial(alpha, beta, delta, d))) < 1
+    return oracles.exact_radius(alpha, beta, delta, d) < 1
 
 
 def test_l15_to_l17_rows_and_columns() -> None:

@@ -71,23 +71,6 @@ def test_values_in_float32(name):
     assert max(errors(name, 0, arguments, got)) <= tol.PHI.float32
 
 
-@pytest.mark.parametrize(
-    "name, at_zero",
-    [
-        ("c", (1, -1, 1)),
-        ("phi1", (1, -1 / 2, 1 / 3)),
-        ("phi2", (1 / 2, -1 / 6, 1 / 12)),
-        ("psi", (1 / 2, -1 / 3, 1 / 4)),
-        ("gap", (0, 1 / 6, -1 / 6)),
-    ],
-)
-def test_limits_at_zero(name, at_zero, x64):
-    zero = jnp.zeros(1)
-    got = [float(derivative(name, order)(zero)[0]) for order in range(3)]
-    np.testing.assert_allclose(got, at_zero, rtol=tol.PHI_SLOPE.float64)
-    assert float(derivative(name, 0)(jnp.array([-0.0]))[0]) == at_zero[0]
-
-
 @pytest.mark.parametrize("name", EXACT)
 def test_nan_stays_nan(name, x64):
     assert np.isnan(derivative(name, 0)(jnp.array([np.nan]))[0])

@@ -146,13 +146,6 @@ def test_kinds_that_forget_parts_name_those_that_answer(load, kind):
     assert [fault.field for fault in caught.value.faults] == ["studies[0]"]
 
 
-def test_a_kind_that_takes_nothing_of_the_scene_is_not_refused(load):
-    config = load(
-        part("velocity: {kind: low_pass, cutoff: 100}", "studies: [{kind: ridge, name: r, delta: 1, d: 0}]\n")
-    )
-    assert config.studies[0].delta.values() == [1.0]
-
-
 @pytest.mark.parametrize(
     ("study", "field", "said"),
     [

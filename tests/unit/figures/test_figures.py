@@ -6,7 +6,6 @@ import io
 import warnings
 from functools import cache
 from itertools import combinations
-from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -368,12 +367,3 @@ def test_units_have_a_readable_prefix(largest, unit, factor, text):
     found, name = style.si_unit(largest, unit)
     assert found == pytest.approx(factor)
     assert name == text
-
-
-def test_no_figure_module_imports_jax_or_pyplot():
-    folder = Path(figures.__file__).parent
-    for file in folder.glob("*.py"):
-        source = file.read_text(encoding="utf-8")
-        assert "import jax" not in source, file.name
-        # Pictures of scenes draw into the current Axes, as people who work with pyplot expect.
-        assert file.name == "plot.py" or "pyplot as" not in source, file.name

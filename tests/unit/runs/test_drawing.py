@@ -155,16 +155,6 @@ def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_text_stays_text_where_a_style_sheet_says_so(folder, tmp_path):
-    sheet = tmp_path / "text.mplstyle"
-    sheet.write_text("svg.fonttype: none\n", encoding="utf-8")
-    words = ["--at", "delay=0", "--at", "mass=0.1", "--format", "svg", "--style", sheet]
-    assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path) == 0
-    files = list(tmp_path.glob("*.svg"))
-    assert files
-    assert all("<text" in file.read_text(encoding="utf-8") for file in files)
-
-
 def test_a_panel_has_the_values_that_fit_above_it(folder):
     values = {"period": (1e-3, "s"), "delay": (1.0, "sampling periods"), "damping": (10.0, "N s/m")}
     data = open_dataset(folder / "ridge.zarr").drop_vars(["damping", "delay"]).isel(damping=0, delay=0, rate=0)

@@ -1,7 +1,6 @@
 """The one run: folders, events, failures, the record, and going on with what is there."""
 
 import hashlib
-import json
 import shutil
 import time
 from pathlib import Path
@@ -156,14 +155,6 @@ def test_data_stay_when_the_drawing_fails(config, tmp_path, monkeypatch):
     assert (result.folder / "one.csv").is_file()
 
 
-def test_every_kind_of_study_is_in_the_record_and_the_result(finished):
-    assert states(finished) == {"one": "done", "two": "done", "swept": "done"}
-    assert {path.name for path in finished.iterdir()} == {
-        *("one.npz", "one_stable.png", "one_stable.svg", "two.npz", "swept.zarr", "run.json", "config.yaml", ".locks")
-    }
-    assert zwidth.open_dataset(finished / "swept.zarr").attrs["complete"] == 1
-
-
 def test_overwriting_leaves_what_no_run_has_written(finished, both):
     inner = finished / "another"
     shutil.copytree(finished, inner)
@@ -228,17 +219,6 @@ def test_a_strangers_store_of_the_same_name_is_never_replaced(both, tmp_path):
             run(both, out=tmp_path / "out", overwrite=overwrite)
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name != ".locks"] == ["swept.zarr"]
     np.testing.assert_array_equal(zarr.open_array(store, path="mine")[:], [0, 1, 2])
-
-
-def test_a_record_that_names_files_elsewhere_removes_none(finished, both, tmp_path):
-    precious = tmp_path / "precious.txt"
-    precious.write_text("mine", encoding="utf-8")
-    record = record_of(finished)
-    record["studies"][0]["files"] |= {"../precious.txt": "", str(precious): ""}
-    (finished / "run.json").write_text(json.dumps(record), encoding="utf-8")
-    with pytest.raises(StoreError, match="no file of its folder"):
-        run(both, out=finished, overwrite=True)
-    assert precious.read_text(encoding="utf-8") == "mine"
 
 
 def test_a_study_that_takes_long_tells_how_far_it_is(tmp_path):

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg
-from independent_scenes import KINDS, closed_loop_matrix, continuous, flow, random_scene, random_walls
+from any_loop import closed_loop_matrix, continuous, flow
+from independent_scenes import KINDS, random_scene, random_walls
 
 import zwidth
 from zwidth.loops.linear.poles import log_size, poles_less_one, spectral_radius
@@ -47,16 +48,6 @@ def test_poles_are_those_of_a_state_space_by_other_means(kind):
             assert good.any()
             assert apart[good].max() < 1e-9
             assert np.abs(found[k]).max() == pytest.approx(np.abs(values).max(), abs=1e-9)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_spectral_radius_and_the_verdict_agree(kind):
-    for scene, stiffness, damping in draw(kind, 3, 6, 2):
-        radius, stable = scene.spectral_radius(stiffness, damping), scene.is_stable(stiffness, damping)
-        np.testing.assert_array_equal(radius < 1, stable)
-        for k in range(6):
-            matrix = closed_loop_matrix(scene, stiffness[k], damping[k])
-            assert radius[k] == pytest.approx(np.abs(np.linalg.eigvals(matrix)).max(), abs=1e-9)
 
 
 def test_on_both_sides_of_the_boundary_radius_and_verdict_agree():
@@ -150,15 +141,6 @@ def test_a_decision_says_what_decided_and_where_it_could_not(method, used):
     )
     np.testing.assert_array_equal(found.method, [used] * 5)
     assert np.isnan(FILTERED.spectral_radius(K, 4.0)[2:]).all()
-
-
-def test_rigid_scenes_take_the_closed_functions():
-    scene = zwidth.Scene(zwidth.Device(mass=0.1, damping=3.0), zwidth.Timing(period=1e-3, delay=1.5e-3))
-    alpha, beta = scene.normalize_walls([1e3, 9e3], 4.0)
-    np.testing.assert_array_equal(
-        scene.spectral_radius([1e3, 9e3], 4.0), zwidth.spectral_radius(alpha, beta, scene.delta, 1.5)
-    )
-    np.testing.assert_array_equal(scene.poles([1e3, 9e3], 4.0), zwidth.poles(alpha, beta, scene.delta, 1.5))
 
 
 def test_to_control():

@@ -1,4 +1,4 @@
-"""Areas against the outlined region, a Monte Carlo count of poles, and Colgate's triangle."""
+"""Areas against the outlined region, quadrature in mpmath, and Colgate's triangle."""
 
 import jax
 import mpmath as mp
@@ -11,7 +11,6 @@ import oracles
 import zwidth
 from zwidth import passive_area, stable_area
 from zwidth.loops.rigid.boundary import Piece
-from zwidth.loops.rigid.poles import radius_by_companion
 
 # Undamped; cut by the line of z = -1 before and after the corner becomes the ridge; delayed; held.
 POINTS = [(0.0, 0.0), (0.5, 0.0), (3.0, 0.0), (10.0, 0.0), (0.1, 1.0), (1.0, 4.0), (40.0, 0.125), (2.0, 0.6)]
@@ -52,30 +51,18 @@ def test_the_area_by_quadrature_in_mpmath(delta, d):
         assert oracles.relative_error(stable_area(delta, d), exact) < 1e-12
 
 
-@pytest.mark.parametrize("delta, d", [(3.0, 0.0), (0.5, 1.0)])
-def test_the_area_is_the_share_of_stable_walls(delta, d):
-    outline = zwidth.stable_region(delta, d)
-    random = np.random.default_rng(7)
-    low, high = outline.beta.min(), outline.beta.max()
-    alpha, beta = random.uniform(0, outline.alpha.max(), 20_000), random.uniform(low, high, 20_000)
-    share = np.mean(np.asarray(radius_by_companion(alpha, beta, delta, d)) < 1)
-    box = outline.alpha.max() * (high - low)
-    # Four standard deviations of the count.
-    assert abs(share - stable_area(np.array([delta]), d)[0] / box) < 4 * np.sqrt(share * (1 - share) / 20_000)
-
-
 def test_the_passive_set_without_delay_is_a_triangle():
     np.testing.assert_allclose(passive_area(np.array([0.0, 0.5, 3.0]), 0), [0.0, 0.5, 18.0], rtol=1e-12)
 
 
 def test_the_passive_area_lies_between_two_polygons():
-    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 4001)
-    for d in (1.0, 0.5):
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 40_001)
+    for d in (0.03, 0.15, 0.4, 0.5, 1.0, 1.7, 20.0):
         needed = 1.0 - zwidth.passivity_margin(np.abs(np.cos(angle)), np.sin(angle), 1.0, d)
         x, y = np.cos(angle) / needed, np.sin(angle) / needed
         inner = 0.5 * np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])
-        # A convex set exceeds its chords; of 4,000 of them by less than 1e-6 of the area.
-        assert inner <= passive_area(1.0, d) < inner * (1 + 1e-6)
+        # A convex set exceeds its chords; of 40,000 of them by less than 1e-7 of the area.
+        assert inner <= passive_area(1.0, d) < inner * (1 + 1e-7)
 
 
 def test_passive_walls_are_fewer_than_stable_ones():
@@ -96,65 +83,3 @@ def test_second_derivatives_of_the_stable_area(x64):
         change = (differentiate(up)[0] - differentiate(down)[0]) / (up - down)[:, k : k + 1]
         # At delta = 0 the difference is to one side.
         np.testing.assert_allclose(bends[..., k], change, rtol=1e-4, atol=1e-6)
-
-
-def test_bad_points_are_nan():
-    assert np.isnan(stable_area(np.array([-1.0, 1.0, np.inf]), 1.0)).tolist() == [True, False, True]
-    assert np.isnan(passive_area(np.array([-1.0, 1.0]), np.array([0.0, np.nan]))).all()
-
-
-def test_the_passive_area_is_that_of_a_search_over_all_frequencies():
-    # Gauss-Legendre panels, halved where that changes the result, of the largest of many samples of the frequency.
-    d = np.array([0.03, 0.15, 0.4, 1.0, 1.7, 20.0])
-    reference = [adaptive_integral(lambda theta, d=d_: inverse_square(theta, d), -np.pi / 2, np.pi / 2) for d_ in d]
-    # The quadrature of the reference stops at 1e-9 a panel.
-    np.testing.assert_allclose(passive_area(1.0, d), 0.5 * np.array(reference), rtol=1e-8)
-
-
-def inverse_square(theta, d):
-    """1/needed^2 in a direction of the (alpha, beta) plane, by the condition for each frequency as it is derived."""
-    count = int(600 * (d + 1))
-    omega = (np.arange(count)[:, None] + 0.5) * np.pi / count
-    n, f = np.floor(d), d - np.floor(d)
-    step = 1 - np.exp(-1j * omega)
-    force = np.maximum(np.cos(theta), 0.0) + np.sin(theta) * step
-    g = np.conj(force) * (np.exp(1j * omega) - 1) * np.exp(1j * omega * n) / 2
-    # a delta^2 + b delta - c > 0 from its larger zero on
-    a, b, c = 2 * (1 - np.cos(omega)), 2 * np.real(((1 - f) + f * np.exp(1j * omega)) * g), f * (1 - f) * np.abs(g) ** 2
-    needed = (-b + np.sqrt(b * b + 4 * a * c)) / (2 * a)
-    # A parabola through the highest sample and its neighbors; the samples are symmetric about both ends.
-    padded = np.pad(needed, ((1, 1), (0, 0)), mode="edge")
-    top, column = np.argmax(needed, axis=0), np.arange(theta.size)
-    left, middle, right = (padded[top + i, column] for i in range(3))
-    return (middle - (right - left) ** 2 / (8 * (right + left - 2 * middle))) ** -2
-
-
-def adaptive_integral(function, low, high):
-    """Integrate a function with kinks: panels on which halving changes the result are halved, all at once."""
-    node, weight = np.polynomial.legendre.leggauss(12)
-
-    def panels(left, right):
-        half = 0.5 * (right - left)
-        points = (0.5 * (left + right))[:, None] + half[:, None] * node
-        return (function(points.ravel()).reshape(points.shape) @ weight) * half
-
-    edges = np.linspace(low, high, 17)
-    left, right = edges[:-1], edges[1:]
-    coarse, total = panels(left, right), 0.0
-    while left.size:
-        middle = 0.5 * (left + right)
-        lower, upper = panels(left, middle), panels(middle, right)
-        fine = lower + upper
-        done = (np.abs(fine - coarse) <= 1e-9 * (abs(total) + fine.sum())) | (right - left < 1e-6)
-        total += float(fine[done].sum())
-        left, right = np.concatenate([left[~done], middle[~done]]), np.concatenate([middle[~done], right[~done]])
-        coarse = np.concatenate([lower[~done], upper[~done]])
-    return total
-
-
-def test_a_bad_entry_leaves_other_passive_areas_alone():
-    # To the last bit.
-    d = np.array([0.0, 0.3, 1.0, 2.5, 0.1, 1.3])
-    spoiled = passive_area(0.7, np.where(np.arange(6) == 1, np.nan, d))
-    assert np.isnan(spoiled[1])
-    assert np.array_equal(np.delete(spoiled, 1), np.delete(passive_area(0.7, d), 1))

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from independent_scenes import closed_loop_matrix
+from any_loop import closed_loop_matrix
 
 import zwidth
 from zwidth.words.errors import InputError

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from any_loop import closed_loop_matrix
 from click.testing import CliRunner
-from independent_scenes import KINDS, closed_loop_matrix, random_scene
+from independent_scenes import KINDS, random_scene
 
 import zwidth
 from zwidth.cli import cli

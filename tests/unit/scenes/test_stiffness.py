@@ -1,4 +1,4 @@
-"""K_max in SI units and its sensitivities, against differences of the forward model and in words."""
+"""K_max in SI units and its sensitivities, against differences of the forward model."""
 
 import jax
 import jax.numpy as jnp
@@ -62,21 +62,6 @@ def test_gradients_pass_through_a_jitted_device(x64):
     gain = sensitivities(mass=0.1, damping=10.0, period=1e-3, delay=1e-3)
     slope = jax.jit(jax.grad(lambda b: max_stiffness(mass=0.1, damping=b, period=1e-3, delay=1e-3)))(jnp.asarray(10.0))
     assert float(slope) == pytest.approx(float(gain.per_damping), rel=1e-13)
-
-
-def test_one_bad_device_spoils_no_other():
-    gain = sensitivities(mass=np.array([0.1, -1.0, np.nan]), damping=10.0, period=1e-3, delay=1e-3)
-    assert gain.status.tolist() == [0, 1, 1]
-    assert np.all(np.isnan([leaf[1:] for leaf in gain[:5]]))
-    assert np.all(np.isfinite([leaf[0] for leaf in gain[:5]]))
-
-
-@pytest.mark.parametrize("bad, message", [({"mass": 0.0}, "mass: got 0.0"), ({"delay": -1.0}, "delay: got -1.0")])
-def test_wrong_input_is_named(bad, message):
-    good = {"mass": 0.1, "damping": 1.0, "period": 1e-3, "delay": 0.0}
-    for function in (max_stiffness, sensitivities):
-        with pytest.raises(zwidth.InputError, match=message):
-            function(**(good | bad))
 
 
 def test_gradients_at_concrete_devices_are_those_that_are_compiled(x64):

@@ -136,19 +136,6 @@ def filters():
     return FiltersStudy.model_validate(raw).compute(None, True)
 
 
-def test_filters_of_real_programs(filters):
-    """From a grid search with polynomial roots: K_max in kN/m, to three digits."""
-    expected = {
-        "backward_difference": [[14.44], [19.86]],
-        "low_pass": [[1.01, 2.80, 7.27], [6.85, 7.49, 11.94]],
-        "windowed_difference": [[4.49, 2.05, 1.21], [8.75, 6.85, 6.85]],
-    }
-    for kind, rows in expected.items():
-        for damping, row in zip((0.0, 10.0), rows, strict=True):
-            found = select(filters.table, estimate=kind, damping_N_s_per_m=damping)[SI_COLUMNS[0]]
-            np.testing.assert_allclose(found / 1e3, row, rtol=5e-3)
-
-
 def test_the_best_filter_is_the_stiffest_of_those_that_are_quiet(filters):
     for damping in (0.0, 10.0):
         rows = select(filters.table, damping_N_s_per_m=damping)

@@ -42,14 +42,6 @@ def test_every_printed_number_agrees():
     assert len(rows) == 17
 
 
-def test_the_numbers_are_those_of_the_library():
-    computed = {row.quantity: row.computed for row in report.published_numbers()}
-    ridge = zwidth.alpha_max(np.array([0.0, 0.1, 1.0]), 1)
-    for index, damping in enumerate((0, 10, 100)):
-        assert computed[f"0.75 alpha_max, b = {damping} N s/m"] == pytest.approx(0.75 * ridge.alpha[index], rel=1e-13)
-        assert computed[f"beta at alpha_max, b = {damping} N s/m"] == pytest.approx(ridge.beta[index], rel=1e-7)
-
-
 def test_remark_3_is_sharpened():
     # 60-digit arithmetic: 2.31057135675369424..., 3.659361627421783507...
     assert report.line_appears() == pytest.approx(2.310571356753694, abs=4e-15)

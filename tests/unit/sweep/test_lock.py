@@ -126,16 +126,6 @@ def test_other_studies_neither_replace_nor_enter_a_folder_that_is_held(holder, t
     assert verify(out)[0].ok
 
 
-def test_overwriting_starts_again(tmp_path):
-    assert run_sweeps(config_of(), tmp_path / "out").ok
-    changed = config_of(study(axes={"alpha": [0.1, 0.2], "beta": 0.1, "delta": 0.1, "d": 1}))
-    assert run_sweeps(changed, tmp_path / "out", overwrite=True).computed == 1
-    assert run_sweeps(changed, tmp_path / "fresh").ok
-    assert_same(tmp_path / "fresh", tmp_path / "out")
-    with pytest.raises(InputError, match="overwrite: given together with resume"):
-        run_sweeps(changed, tmp_path / "out", overwrite=True, resume=True)
-
-
 def test_a_store_in_the_place_of_another_is_computed_as_itself(tmp_path):
     for name, alpha in (("first", 0.1), ("second", 0.3)):
         axes = {"alpha": [alpha, 2 * alpha], "beta": 0.1, "delta": 0.1, "d": 1}

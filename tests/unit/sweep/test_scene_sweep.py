@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from independent_scenes import closed_loop_matrix
+from any_loop import closed_loop_matrix
 from sweeping import config_of, run_sweeps, study
 
 import zwidth
@@ -86,12 +86,6 @@ def test_radii_and_passivity_are_those_of_the_scenes(tmp_path):
             exact = np.abs(scene.poles(*grid)).max(-1)
             np.testing.assert_allclose(one.spectral_radius, exact, rtol=1e-9)
     assert 0 < data.passive.mean() < 1
-
-
-def test_numbers_of_published_filters(folder):
-    """From a grid search with polynomial roots: what 10, 30 and 100 Hz leave, in kN/m, to three digits."""
-    found = open_dataset(folder / "devices.zarr").stiffness_max.values
-    np.testing.assert_allclose(found, 1e3 * np.array([[1.01, 2.80, 7.27], [6.85, 7.49, 11.94]]), rtol=5e-3)
 
 
 def test_names_in_stores_tables_and_netcdf_have_no_dots(folder, tmp_path):

@@ -1,4 +1,4 @@
-"""Random scenes of every part against a state matrix in absolute coordinates (tests/support/any_loop.py)."""
+"""Random scenes of every part against a state matrix in absolute coordinates (tests/oracles/any_loop.py)."""
 
 from __future__ import annotations
 

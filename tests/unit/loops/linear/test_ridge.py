@@ -122,21 +122,6 @@ def test_an_island_of_negative_damping_does_not_count():
         assert not free.is_stable(stiffness, dampings[dampings < island.virtual_damping[1]]).any()
 
 
-def test_rigid_scenes_take_the_closed_form_and_any_loop_agrees():
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        delta = float(rng.choice([0.0, 10 ** rng.uniform(-3, 1.5)]))
-        d = float(rng.choice([0, 1, 2, 5, 20, 0.3, 0.999, 1.7]))
-        scene = Scene(Device(1.0, delta), Timing(1.0, d))
-        closed, wall = zwidth.alpha_max(delta, d), scene.max_stiffness()
-        assert wall.stiffness == zwidth.max_stiffness(mass=1.0, damping=delta, period=1.0, delay=d)
-        assert (wall.kind, wall.status) == (closed.kind, Status.OK)
-        assert wanted(scene, True).alpha == pytest.approx(closed.alpha, rel=1e-12)
-        least = scene.max_stiffness(negative_damping=False)
-        assert least.stiffness == pytest.approx(wanted(scene, False).alpha, rel=1e-12)
-        assert (least.kind == RidgeKind.NO_DAMPING) == (closed.beta < 0) == (least.stiffness < wall.stiffness)
-
-
 # Scenes by what binds them: whether B < 0 counts, the conditions.
 BOUND = {
     "smooth": (PAPER.replace(velocity=LowPass(cutoff=100), delay=1.3e-3), False, "PAIR STATIONARY"),

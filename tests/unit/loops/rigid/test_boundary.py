@@ -74,24 +74,6 @@ def test_the_limit_at_pi(d):
             assert abs(mpf(float(got.beta[k])) - beta) <= 8 * tol.BOUNDARY_LIMIT.float64 * size
 
 
-def test_undelayed_explicit_formula():
-    delta = np.array([1e-8, 0.1, 1.0, 2.4, 10.0, 1e3])[:, None]
-    got = zwidth.boundary(np.linspace(0.05, 3.1, 40), delta, 0)
-    for (row, column), beta in np.ndenumerate(got.beta):
-        with mp.workdps(60):
-            value = oracles.phi(delta[row, 0])
-
-            def alpha_of(b, value=value):
-                numerator = 1 - value.c + b * (value.phi2 + value.c * value.psi) - b**2 * value.psi * value.phi1
-                return numerator / (value.psi * (1 + value.phi2 * b))
-
-            b = mpf(float(beta))
-            alpha = alpha_of(b)
-            # What the rounding of beta makes of it.
-            condition = abs(alpha) + abs(b) + abs(alpha_of(b * (1 + mpf(10) ** -25)) - alpha) * mpf(10) ** 25
-            assert abs(mpf(float(got.alpha[row, column])) - alpha) <= 4 * tol.BOUNDARY.float64 * condition
-
-
 def test_the_line_of_a_pole_at_minus_one():
     points = np.array(list(itertools.product([0.1, 2.0, 2.31, 4.0, 1e3], [0.0, 0.125, 0.5, 0.9, 1.0, 2.0, 3.3])))
     for limit, (delta, d) in zip(1.0 / device(*points.T).tilt, points, strict=True):
@@ -112,21 +94,8 @@ def test_remark_3_in_all_digits():
     assert ends[0] < 0 < ends[1]
 
 
-def test_every_point_of_the_curve_has_a_pole_on_the_circle():
-    for d, delta in itertools.product([0.0, 0.37, 1.0, 2.6, 8.0], [0.0, 0.1, 4.0]):
-        omega = np.linspace(0.02, 3.0, 9)
-        curve = zwidth.boundary(omega, delta, d)
-        for w, alpha, beta in zip(omega, curve.alpha, curve.beta, strict=True):
-            with mp.workdps(60):
-                z = mp.expj(float(w))
-                terms = oracles.polynomial(alpha, beta, delta, d)
-                size = sum(abs(term) for term in terms)
-                assert abs(oracles.evaluate(terms, z)) <= 20 * tol.BOUNDARY.float64 * (d + 1) * size
-
-
 # Points at which derivatives are asked for: d whole (from the right) and not, delta = 0 too.
 SLOPE_POINTS = [(0.3, 0.0, 0.0), (0.7, 0.2, 1.0), (1.1, 3.0, 0.4), (2.6, 2.5, 0.0), (0.2, 1e3, 4.5), (0.05, 1e-9, 8.0)]
-BAD = [(-0.1, 0.1, 1.0), (3.2, 0.1, 1.0), (0.5, -0.1, 1.0), (0.5, 0.1, -1.0), (np.nan, 0.1, 1.0), (0.5, np.inf, 1.0)]
 DIRECTIONS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)], dtype=float)
 
 
@@ -190,84 +159,16 @@ def test_derivatives_in_omega_beside_pi(x64):
                 assert abs(mpf(float(got)) + second * left) <= allowed * abs(second), (delta, d)
 
 
-def test_points_out_of_range_are_nan_with_all_derivatives(x64):
-    assert np.isnan(zwidth.boundary(*np.array(BAD).T)).all()
-    for part in along()(np.array(BAD), DIRECTIONS):
-        assert np.isnan(part).all()
-
-
 # --- points on lines ---------------------------------------------------------------------------------------------
 
 # All calls hold as many points, so that they share one compilation.
 DEVICES = np.array(list(itertools.product([0.0, 0.1, 2.4, 100.0], [0.0, 0.5, 1.0, 1.3, 4.0])))
 DELTA, D = DEVICES.T
-SHARES = [1e-9, 0.3, 0.9]
 
 
 @pytest.fixture(scope="module")
 def ridge():
     return zwidth.alpha_max(DELTA, D)
-
-
-def assert_on_curve(points, rows, fixed):
-    """The wall is the exact point of the curve with this alpha (or beta), found anew by mpmath from the frequency."""
-    for row in rows:
-        omega, delta, d = float(points.omega[row]), DELTA[row], D[row]
-        if omega in (0.0, math.pi):
-            continue
-        wall = [mpf(float(points.alpha[row])), mpf(float(points.beta[row]))]
-        with mp.workdps(80):
-
-            def offset(w, delta=delta, d=d, wall=wall):
-                return oracles.boundary(w, delta, d)[fixed] - wall[fixed]
-
-            exact_omega = mp.findroot(offset, (mpf(omega), mpf(omega) * (1 - mpf(10) ** -10)), solver="secant")
-            exact = oracles.boundary(exact_omega, delta, d)
-            step = exact_omega * mpf(10) ** -20
-            near = oracles.boundary(exact_omega - step, delta, d)
-            slope = (near[1 - fixed] - exact[1 - fixed]) / (near[fixed] - exact[fixed])
-            size = abs(exact[0]) + abs(exact[1])
-            condition = size + abs(slope * exact[fixed]) * tol.EPS64 / tol.BOUNDARY_POINT.float64
-            error = abs(wall[1 - fixed] - exact[1 - fixed])
-            assert error <= tol.BOUNDARY_POINT.float64 * condition, (delta, d)
-            assert abs(omega - exact_omega) <= 1e-8
-
-
-def radius(alpha, beta, delta, d):
-    """The spectral radius by NumPy's roots of the exact polynomial."""
-    with mp.workdps(oracles.digits_for(delta)):
-        coefficients = [float(term) for term in oracles.polynomial(alpha, beta, delta, d)]
-    return np.abs(np.roots(coefficients)).max()
-
-
-@pytest.mark.parametrize("share", SHARES)
-def test_columns(ridge, share):
-    alpha = share * ridge.alpha
-    lower = zwidth.boundary_point(DELTA, D, alpha=alpha, side="lower")
-    upper = zwidth.boundary_point(DELTA, D, alpha=alpha, side="upper")
-    for points in (lower, upper):
-        assert (points.status == Status.OK).all()
-        np.testing.assert_allclose(points.alpha, alpha, rtol=1e-14)
-        assert_on_curve(points, range(DELTA.size), fixed=0)
-    assert (lower.beta < upper.beta).all()
-    for row in range(DELTA.size):
-        width = upper.beta[row] - lower.beta[row]
-        sides = lower.beta[row] + width * np.array([-0.01, 0.01, 0.99, 1.01])
-        stable = [radius(alpha[row], beta, DELTA[row], D[row]) < 1 for beta in sides]
-        # At 1e-9 of the height the outer poles are closer to the circle than np.roots resolves.
-        assert share < 1e-3 or stable == [False, True, True, False]
-
-
-@pytest.mark.parametrize("height", [0.05, 0.5, 0.97])
-def test_rows(ridge, height):
-    beta = -DELTA + height * (ridge.beta + DELTA)
-    points = zwidth.boundary_point(DELTA, D, beta=beta)
-    assert (points.status == Status.OK).all()
-    np.testing.assert_allclose(points.beta, beta, rtol=1e-14)
-    assert_on_curve(points, range(DELTA.size), fixed=1)
-    for row in range(DELTA.size):
-        inner, outer = (radius(s * points.alpha[row], beta[row], DELTA[row], D[row]) for s in (0.99, 1.01))
-        assert inner < 1 < outer
 
 
 def test_a_strongly_damped_device_is_bounded_by_a_pole_at_minus_one():
@@ -296,19 +197,6 @@ def test_lines_without_a_stable_part(ridge):
         np.testing.assert_array_equal(points.status, Status.NO_BOUNDARY)
         for value in (points.alpha, points.beta, points.omega):
             np.testing.assert_array_equal(value, nan)
-
-
-def test_bad_points_are_marked_and_leave_the_others_alone(ridge):
-    alpha = 0.3 * ridge.alpha
-    clean = zwidth.boundary_point(DELTA, D, alpha=alpha)
-    for name, value in (("delta", -1.0), ("delta", np.inf), ("d", np.nan), ("alpha", np.nan), ("alpha", np.inf)):
-        arguments = {"delta": DELTA, "d": D, "alpha": alpha}
-        arguments[name] = np.where(np.arange(DELTA.size) == 7, value, arguments[name])
-        got = zwidth.boundary_point(**arguments)
-        assert got.status[7] == Status.INVALID_INPUT
-        assert np.isnan([got.alpha[7], got.beta[7], got.omega[7]]).all()
-        for mine, other in zip(got, clean, strict=True):
-            np.testing.assert_array_equal(np.delete(mine, 7), np.delete(other, 7))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import zwidth
 from zwidth.loops.rigid.circle import factor_loop
 from zwidth.loops.rigid.pole_search import first_pair, slow_pole
 from zwidth.loops.rigid.pole_step import halley_step
-from zwidth.words.errors import InputError
 
 REFERENCE = Path(__file__).resolve().parents[3] / "reference"
 NAMES = ("alpha", "beta", "delta", "d")
@@ -51,16 +50,6 @@ def test_adversarial_walls_have_what_is_promised_or_nothing():
     assert judged.sum() > 2000
     np.testing.assert_allclose(rate[judged], -np.log1p(margin[judged]), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(rate[judged], -np.log1p(margin[judged]), rtol=1e-3)
-
-
-def test_the_sign_is_that_of_the_verdict():
-    rng = np.random.default_rng(8)
-    alpha, beta = 10.0 ** rng.uniform(-25, 1, 3000), rng.uniform(-0.5, 1, 3000)
-    delta, d = 10.0 ** rng.uniform(-9, 1, 3000), rng.choice([0.0, 0.3, 1.0, 2.5, 40.0], 3000)
-    rate = zwidth.decay_rate(alpha, beta, delta, d)
-    known = np.isfinite(rate)
-    assert known.mean() > 0.99
-    np.testing.assert_array_equal((rate > 0)[known], zwidth.is_stable(alpha, beta, delta, d)[known])
 
 
 @pytest.mark.parametrize(
@@ -211,9 +200,3 @@ def test_rates_are_right_or_missing_where_poles_nearly_meet(draw, count, rtol, a
 
 def test_without_stiffness_nothing_decays():
     assert zwidth.decay_rate(0.0, 0.3, 0.1, 1) == 0.0
-
-
-def test_bad_points_are_nan_and_scalars_refused():
-    assert np.isnan(zwidth.decay_rate([0.1, np.nan, 1e70], 0.3, 0.2, 1.0)).tolist() == [False, True, True]
-    with pytest.raises(InputError, match="alpha"):
-        zwidth.decay_rate(1e70, 0.3, 0.2, 1.0)

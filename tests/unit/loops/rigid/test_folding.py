@@ -1,26 +1,9 @@
 """Arguments grouped by a key and put together again, against the same work on plainly broadcast arrays."""
 
 import numpy as np
-import pytest
 
 import zwidth
-from zwidth.loops.rigid.folding import fold, fold_arguments, group_by
-
-SHAPE = (3, 4, 5)
-
-
-@pytest.mark.parametrize("axes", [(), (0,), (1,), (2,), (0, 2), (0, 1, 2)])
-def test_parts_of_a_key_join_to_the_whole(axes):
-    """The key varies along no axis, along one, or along several."""
-    random = np.random.default_rng(15)
-    key = random.integers(3, size=tuple(length if axis in axes else 1 for axis, length in enumerate(SHAPE)))
-    arrays = random.random(SHAPE), random.random((1, 4, 1)), random.random((3, 1, 5))
-    joined, values = np.full(SHAPE, np.nan), []
-    for value, (a, b, c), place in group_by(arrays, key):
-        joined[place] = value + a - 2.0 * b * c
-        values.append(value)
-    assert values == np.unique(key).tolist()
-    np.testing.assert_array_equal(joined, key + arrays[0] - 2.0 * arrays[1] * arrays[2])
+from zwidth.loops.rigid.folding import fold, fold_arguments
 
 
 def test_an_axis_along_which_values_repeat_is_shortened_and_no_other():
@@ -32,11 +15,6 @@ def test_an_axis_along_which_values_repeat_is_shortened_and_no_other():
     assert fold(ends).shape == (64, 1)
     ends[5] = 1.0
     assert fold(ends).shape == (1, 1)
-
-
-@pytest.mark.parametrize("shape", [(512, 512), (64, 64), (4, 8, 512)])
-def test_a_constant_array_folds_to_one_value(shape):
-    assert fold(np.full(shape, 0.1)).size == 1
 
 
 def test_a_contiguous_meshgrid_is_folded_as_a_sparse_one():

@@ -244,15 +244,6 @@ def test_no_frequency_comes_closer():
         assert found.modulus_margin == pytest.approx(np.sqrt(at), rel=1e-12)
 
 
-def test_the_distance_is_that_of_the_polynomials():
-    w = np.linspace(0, np.pi, 200)[1:]
-    for wall in ((0.1, 0.2, 0.1, 0.0), (0.05, -0.1, 0.3, 1.5), (1e-3, 0.05, 0.5, 3.0)):
-        z = np.exp(1j * w)
-        ratio = np.polyval(zwidth.char_poly(*wall), z) / np.polyval(zwidth.char_poly(0, 0, *wall[2:]), z)
-        square = squared_distance(w, *wall[:2], device(np.float64(wall[2]), np.float64(wall[3])))
-        np.testing.assert_allclose(square, np.abs(ratio) ** 2, rtol=1e-11)
-
-
 def test_what_is_returned_for_walls_without_margins():
     # No stiffness, negative stiffness, out of range.
     found = zwidth.margins(
@@ -331,20 +322,6 @@ def test_traced(x64):
     ):
         slopes = [tuple(along(np.array(wall), side))[1][0] for side in np.eye(4)[:3]]
         np.testing.assert_allclose(slopes, expected, rtol=1e-5, atol=1e-8)
-
-
-def test_the_margin_is_the_distance_of_p_over_its_open_loop():
-    omega = np.linspace(0, np.pi, 40_001)[1:]
-    z = np.exp(1j * omega)
-    for alpha, beta, delta, d in ((0.1, 0.2, 0.1, 0.0), (0.05, 0.1, 0.1, 1.5), (1e-3, 0.05, 0.5, 3.0)):
-        ratio = np.polyval(zwidth.char_poly(alpha, beta, delta, d), z) / np.polyval(zwidth.char_poly(0, 0, delta, d), z)
-        found = zwidth.margins(np.array([alpha]), beta, delta, d).modulus_margin
-        assert found[0] == pytest.approx(np.abs(ratio).min(), rel=1e-6)
-
-
-def test_the_margin_vanishes_on_the_boundary():
-    edge = zwidth.boundary(0.5, 0.3, 1.0)
-    assert zwidth.margins(np.array([edge.alpha]), edge.beta, 0.3, 1.0).modulus_margin[0] < 1e-8
 
 
 def test_second_derivatives_of_the_modulus_margin_and_of_its_frequency(x64):

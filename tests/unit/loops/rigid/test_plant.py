@@ -26,20 +26,6 @@ def plants():
         return jax.tree.map(np.asarray, jax.jit(jax.vmap(held_plant))(*jnp.asarray(GRID).T))
 
 
-def test_numerator_is_that_of_the_exact_discretization(plants):
-    for row, (delta, fraction) in enumerate(GRID):
-        allowed = tol.PLANT.float64 + tol.PLANT_DECAYED.float64 * delta
-        with mp.workdps(digits(delta, fraction)):
-            for got, exact in zip(
-                (plants.a2[row], plants.a1[row], plants.a0[row]), oracles.numerator(delta, fraction), strict=True
-            ):
-                if exact and abs(exact) < 1e-290:
-                    assert abs(got) < 1e-289
-                else:
-                    limit = allowed if got == plants.a0[row] else tol.PLANT.float64
-                    assert oracles.relative_error(got, exact) <= limit, (delta, fraction)
-
-
 def test_gap_is_the_numerator_at_minus_one(plants):
     for row, (delta, fraction) in enumerate(GRID):
         with mp.workdps(digits(delta, fraction)):
@@ -54,14 +40,6 @@ def test_one_minus_c_keeps_its_digits(plants):
         with mp.workdps(oracles.digits_for(delta)):
             assert oracles.relative_error(plants.em[row], 1 - mp.exp(-mpf(delta))) <= tol.PLANT.float64
             assert oracles.relative_error(plants.c[row], mp.exp(-mpf(delta)), floor=1e-290) <= tol.PLANT.float64
-
-
-def test_no_fraction_is_no_special_case(x64):
-    delta = jnp.asarray(DAMPINGS)
-    held = jax.vmap(held_plant)(delta, jnp.zeros_like(delta))
-    whole = jax.vmap(held_plant)(delta)
-    for with_fraction, without in zip(held, whole, strict=True):
-        np.testing.assert_array_equal(with_fraction, without)
 
 
 @pytest.mark.parametrize(

@@ -80,18 +80,6 @@ def test_an_axis_in_any_order_has_the_same_walls():
     assert np.isfinite(alone).mean() > 0.95
 
 
-def test_bad_values_on_an_axis_leave_the_others_alone():
-    alpha = np.where(np.arange(ALPHA.size) == 5, np.nan, ALPHA)
-    found = bound_radius(alpha, BETA[:, None], 0.1, 0.0)
-    assert (found.status[:, 5] == Status.INVALID_INPUT).all()
-    assert np.isnan(found.radius[:, 5]).all()
-    good = np.delete(np.arange(ALPHA.size), 5)
-    plain = zwidth.spectral_radius(ALPHA, BETA[:, None], 0.1, 0.0)
-    # What the two routes prove, or multiple poles.
-    np.testing.assert_allclose(found.radius[:, good], plain[:, good], rtol=1e-7)
-    assert np.median(np.abs(found.radius[:, good] - plain[:, good])) < 1e-15
-
-
 @pytest.mark.parametrize(("rows", "columns"), [(1, 40000), (40000, 1), (3, 12000), (3000, 12)])
 @pytest.mark.parametrize("d", [1.0, 0.37, 60.0])
 def test_lines_and_long_thin_maps_are_as_well_known(rows, columns, d):

@@ -64,13 +64,6 @@ def test_maps_keep_their_bounds(d, transposed):
         assert abs(found.radius[place] - oracles.exact_radius(alpha, beta, 0.1, d)) <= found.error[place]
 
 
-def test_several_devices_in_one_call_are_several_maps():
-    alpha, beta = np.linspace(0.01, 1.0, 128), np.linspace(0.0, 1.0, 128)[:, None]
-    both = bound_radius(alpha, beta, np.array([0.1, 0.5])[:, None, None], 0.0)
-    for delta, radius in zip((0.1, 0.5), both.radius, strict=True):
-        np.testing.assert_array_equal(radius, bound_radius(alpha, beta, delta, 0.0).radius)
-
-
 def test_mixed_delays_single_points_and_none():
     exact = float(oracles.exact_radius(0.5, 0.5, 0.1, 1.5))
     assert bound_radius(0.5, 0.5, 0.1, 1.5).radius == pytest.approx(exact, rel=1e-9)
@@ -78,17 +71,6 @@ def test_mixed_delays_single_points_and_none():
     mixed = bound_radius(0.5, 0.5, 0.1, [0.0, 1.5, 4.0])
     expected = [float(oracles.exact_radius(0.5, 0.5, 0.1, d)) for d in (0.0, 1.5, 4.0)]
     np.testing.assert_allclose(mixed.radius, expected, rtol=1e-9)
-
-
-@pytest.mark.parametrize("accuracy", ACCURACIES)
-def test_bad_points_leave_the_others_alone(accuracy):
-    alpha = np.array([0.1, np.nan, 0.2, np.inf, 0.3])
-    delta = np.array([0.1, 0.1, -1.0, 0.1, 0.1])
-    found = bound_radius(alpha, 0.3, delta, 1.5, accuracy=accuracy)
-    assert found.status.tolist() == [0, 1, 1, 1, 0]
-    assert np.isnan(found.radius).tolist() == [False, True, True, True, False]
-    alone = bound_radius(alpha[[0, 4]], 0.3, 0.1, 1.5, accuracy=accuracy)
-    np.testing.assert_array_equal(found.radius[[0, 4]], alone.radius)
 
 
 def test_double_poles_are_not_certified():

@@ -13,7 +13,6 @@ import zwidth
 from zwidth.arrays.held_mass import held_plant
 from zwidth.loops.rigid.folding import find_degree
 from zwidth.loops.rigid.polynomial import affine
-from zwidth.words.errors import TracedDelayError
 
 WALLS = [(0.5, 0.5), (1e-8, -0.3), (40.0, -7.0), (-0.1, 0.0), (0.0, 1.0)]
 DAMPINGS = [1e-300, 1e-12, 1e-8, 1e-3, 0.1, 1.0, 2.31, 30.0, 700.0, 1e4, 1e6]
@@ -151,8 +150,3 @@ def test_the_closed_loop_s_numerator_is_that_of_eq_10(scene, d):
 def test_the_undamped_mass_is_exact():
     # z^2 (z - 1)^2 + (z + 1)/2 (z/2 + (z - 1)/2), exact in binary
     np.testing.assert_array_equal(char_poly_si(0.5, 0.0, 1.0, 0.25, 0.25, 1.0), [1, -2, 1.5, 0.25, -0.25])
-
-
-def test_a_traced_delay_has_no_degree():
-    with pytest.raises(TracedDelayError, match="d: got a traced value, but the number of poles depends on it"):
-        jax.jit(lambda d: zwidth.char_poly(0.1, 0.1, 0.1, d))(1.0)

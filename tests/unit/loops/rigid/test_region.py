@@ -70,11 +70,6 @@ def test_area_by_counting_poles_on_a_grid(regions, device):
     assert region.area == pytest.approx(counted, rel=tol.AREA_GRID.float64)
 
 
-def test_area_converges_with_the_vertices(regions):
-    for device in DEVICES[:4]:
-        assert regions[device].area == pytest.approx(stable_region(*device, points=6000).area, rel=tol.AREA.float64)
-
-
 def test_vertices_of_the_curve_have_a_pole_on_the_circle(regions):
     delta, d = 3.0, 0.6
     region = regions[delta, d]
@@ -96,20 +91,6 @@ def test_the_cut_is_the_line_of_a_pole_at_minus_one(regions, device):
         for k in on_line:
             terms = oracles.polynomial(region.alpha[k], region.beta[k], *device)
             assert abs(oracles.evaluate(terms, -1)) <= 1e-13 * sum(abs(term) for term in terms)
-
-
-def test_without_strong_damping_there_is_no_line(regions):
-    for device in ((0.0, 0), (0.5, 1), (0.1, 4)):
-        assert (regions[device].piece == Piece.COMPLEX_PAIR).all()
-
-
-@pytest.mark.parametrize("scale", [0.9, 1.1, 1 - 1e-5, 1 + 1e-5])
-def test_a_wrong_outline_does_not(regions, scale):
-    region = regions[0.5, 1]
-    assert edge_is_right(region.alpha, region.beta, 0.5, 1)
-    assert not edge_is_right(scale * region.alpha, region.beta, 0.5, 1)
-    center = region.beta.mean()
-    assert not edge_is_right(region.alpha, center + scale * (region.beta - center), 0.5, 1)
 
 
 @pytest.mark.parametrize("points", [8, 9, 13, 32])

@@ -1,12 +1,8 @@
-"""Step responses against scipy's discrete simulation, matrix exponentials and a general integrator."""
-
-from typing import Any
+"""Step responses against matrix exponentials."""
 
 import numpy as np
 import pytest
-import scipy.signal
 import tolerances as tol
-from scipy.integrate import solve_ivp
 
 import zwidth
 from peers import models
@@ -38,53 +34,6 @@ def test_between_and_at_the_samples_by_matrix_exponentials(wall):
     assert_close(got.position, position, tol.RESPONSE)
     assert_close(got.velocity, velocity, tol.RESPONSE)
     assert_close(got.wall_force, wall_force, tol.RESPONSE)
-
-
-@pytest.mark.parametrize("wall", [wall for wall in STABLE if wall[3] == int(wall[3])])
-def test_samples_by_scipy_dlsim(wall):
-    alpha, beta, delta, d = wall
-    matrices = [np.array(matrix) for matrix in ([[0, 1], [0, -delta]], [[0], [1.0]], [[1.0, 0]], [[0.0]])]
-    discrete: Any = scipy.signal.cont2discrete(matrices, 1.0)
-    numerator, denominator = scipy.signal.ss2tf(*discrete[:4])
-    # G = H/(1 + H (alpha + beta (z - 1)/z) z^-d), over the common denominator
-    lag = np.r_[1, np.zeros(int(d) + 1)]
-    controller = np.array([alpha + beta, -beta])
-    closed = np.polyadd(np.polymul(denominator, lag), np.polymul(numerator[0], controller))
-    system = scipy.signal.dlti(np.polymul(numerator[0], lag), closed, dt=1.0)
-    expected = scipy.signal.dlsim(system, np.ones(200))[1]
-    got = step_response(*wall, periods=200, substeps=1)
-    assert_close(got.position, expected[:, 0], tol.RESPONSE)
-
-
-@pytest.mark.parametrize("wall", [STABLE[0], STABLE[5], STABLE[7]])
-def test_between_the_samples_by_solve_ivp(wall):
-    alpha, beta, delta, d = wall
-    periods, substeps = 20, 5
-    got = step_response(*wall, periods=periods, substeps=substeps)
-    samples = np.r_[0.0, got.position[::substeps]]
-    n, f = int(d), d - int(d)
-
-    def computed(k):
-        return -(alpha * samples[k + 1] + beta * (samples[k + 1] - samples[k])) if k >= 0 else 0.0
-
-    state, position = np.zeros(2), []
-    for k in range(periods):
-        # The force changes once a period: integrate up to there, then on.
-        for begin, end, force in ((0.0, f, computed(k - n - 1)), (f, 1.0, computed(k - n))):
-            if begin == end:
-                continue
-            inside = got.time[(got.time >= k + begin) & (got.time < k + end)] - k
-            piece = solve_ivp(
-                lambda _, s, force=force: [s[1], 1.0 + force - delta * s[1]],
-                (begin, end),
-                state,
-                rtol=1e-11,
-                atol=1e-11,
-                dense_output=True,
-            )
-            position.extend(piece.sol(inside)[0])
-            state = piece.y[:, -1]
-    assert_close(got.position, np.array(position), tol.RESPONSE_DENSE)
 
 
 def test_the_paper_s_example_settles_at_the_spring_s_deflection():

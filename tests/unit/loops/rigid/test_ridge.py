@@ -1,7 +1,6 @@
-"""The ridge against 160-digit values, its general solver, an independent implicit derivative and pole counts."""
+"""The ridge against 160-digit values, its general solver and a scan of the curve."""
 
 import json
-import warnings
 from functools import cache
 from pathlib import Path
 
@@ -11,10 +10,9 @@ import mpmath as mp
 import numpy as np
 import pytest
 import tolerances as tol
-from compiling import QUICKLY, compile_bends
+from compiling import compile_bends
 
 import zwidth
-from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.loops.rigid.ridge import ridge_kernel
 from zwidth.words.errors import InputError
 from zwidth.words.status import RidgeKind, Status
@@ -147,30 +145,6 @@ def precise_curve(omega, delta, d):
     return (mp.im(wall) - beta * mp.im(z)) / mp.im(z), beta
 
 
-def test_values_against_60_digits_at_random():
-    rng = np.random.default_rng(8)
-    delta = np.where(rng.random(60) < 0.1, 0.0, 10 ** rng.uniform(-6, 4, 60))
-    d = np.concatenate([rng.uniform(0, 3, 20), 10 ** rng.uniform(-3, np.log10(500), 20), rng.integers(0, 501, 20)])
-    got = zwidth.alpha_max(delta, d)
-    for i in range(60):
-        with mp.workdps(60):
-            point = (mp.mpf(float(delta[i])), mp.mpf(float(d[i])))
-
-            def height(omega, point=point):
-                return precise_curve(omega, *point)[0]
-
-            near_pi = height(mp.pi - mp.mpf(10) ** -12), height(mp.pi - 2 * mp.mpf(10) ** -12)
-            is_corner = near_pi[0] > near_pi[1] and height(mp.pi - mp.mpf(10) ** -3) > 0 and d[i] < 1
-            if got.kind[i] == RidgeKind.CORNER:
-                assert is_corner
-                top = near_pi[0]
-            else:
-                omega = mp.findroot(lambda w: mp.diff(height, w), mp.mpf(float(got.omega[i])), tol=1e-40)
-                assert abs(omega - float(got.omega[i])) < 1e-9
-                top = height(omega)
-            assert abs(float(got.alpha[i]) / top - 1) <= tol.RIDGE.float64, (delta[i], d[i])
-
-
 def test_published_values():
     undamped = zwidth.alpha_max(0.0, 0)
     assert undamped.alpha == pytest.approx(12 - 8 * np.sqrt(2), rel=1e-15)
@@ -190,67 +164,6 @@ def test_agrees_with_the_general_solver():
     np.testing.assert_array_equal(general.kind, fast.kind)
     np.testing.assert_allclose(general.alpha, fast.alpha, rtol=tol.RIDGE.float64)
     np.testing.assert_allclose(general.omega, fast.omega, rtol=1e-9)
-
-
-def independent_curve(omega, point):
-    """(alpha, beta) straight from the definitions, in complex arithmetic; for delta well above 0."""
-    delta, d = point
-    c, z = jnp.exp(-delta), jnp.exp(1j * omega)
-
-    def velocity(t):
-        return (1 - jnp.exp(-delta * t)) / delta
-
-    def position(t):
-        return (t - velocity(t)) / delta
-
-    n = jnp.floor(d)
-    f = d - n
-    t = 1 - f
-    x0, v0 = position(t), velocity(t)
-    x1, v1 = position(f) + velocity(f) * velocity(t), velocity(f) * jnp.exp(-delta * t)
-    gain = x0 * z + velocity(1.0) * v0 - c * x0 + (x1 * z + velocity(1.0) * v1 - c * x1) / z
-    q = -jnp.exp(1j * omega * n) * (z - 1) * (z - c) / gain
-    return q.real - jnp.tan(omega / 2) * q.imag, q.imag / jnp.sin(omega)
-
-
-def independent_ridge():
-    """Bisection of the curve's slope in omega; its implicit derivative from jaxopt."""
-    with warnings.catch_warnings():
-        # jaxopt announces at import that it is no longer maintained.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        from jaxopt import implicit_diff
-
-    def slope(omega, point):
-        return jax.grad(lambda w: independent_curve(w, point)[0])(omega)
-
-    def solve(_, point):
-        limit = jnp.minimum(jnp.pi, jnp.pi / (point[1] + 0.5))
-
-        def halve(_, bracket):
-            low, high = bracket
-            middle = 0.5 * (low + high)
-            rising = slope(middle, point) > 0
-            return jnp.where(rising, middle, low), jnp.where(rising, high, middle)
-
-        return jax.lax.fori_loop(0, 60, halve, (1e-3 * limit, limit * (1 - 1e-9)))[0]
-
-    def three(point):
-        omega = implicit_diff.custom_root(slope)(solve)(None, point)
-        return jnp.stack([*independent_curve(omega, point), omega])
-
-    return three
-
-
-def test_gradient_agrees_with_an_independent_implicit_derivative():
-    rng = np.random.default_rng(5)
-    delta, d = 10 ** rng.uniform(-0.5, 1, 24), rng.uniform(0.3, 5, 24)
-    with jax.enable_x64(True):
-        three = jax.vmap(jax.jacrev(independent_ridge()))
-        oracle = jax.jit(three, compiler_options=QUICKLY)(np.stack([delta, d], axis=1))
-    got = derivatives(delta, d)[0]
-    # alpha's slope sees the oracle's omega only to second order.
-    np.testing.assert_allclose(got[:, 0], oracle[:, 0], rtol=tol.RIDGE_ORACLE.float64)
-    np.testing.assert_allclose(got, oracle, rtol=1e-7, atol=1e-9)
 
 
 def test_slopes_are_continuous_where_the_corner_takes_over():
@@ -275,27 +188,6 @@ def test_slopes_are_continuous_at_whole_delays():
         assert (np.abs(before[:, 1, 1] / at[:, 1, 1] - 1) > 1e-2).all()
 
 
-BAD = [(np.nan, 1.0), (-1.0, 1.0), (np.inf, 0.5), (1.0, np.nan), (1.0, -0.5), (0.2, np.inf), (-np.inf, -np.inf)]
-
-
-def test_bad_points_spoil_nothing():
-    rng = np.random.default_rng(6)
-    good = np.stack([10 ** rng.uniform(-3, 3, 41), rng.uniform(0, 9, 41)])
-    place = np.sort(rng.choice(41, len(BAD)))
-    mixed = np.insert(good, place, np.transpose(BAD), axis=1)
-    is_bad = np.insert(np.zeros(41, bool), place, True)
-    alone = zwidth.alpha_max(*good)
-    among = zwidth.alpha_max(*mixed)
-    for clean, spoiled in zip(alone, among, strict=True):
-        np.testing.assert_array_equal(spoiled[~is_bad], clean)
-    np.testing.assert_array_equal(among.status[is_bad], Status.INVALID_INPUT)
-    for leaf in among[:3]:
-        assert np.isnan(leaf[is_bad]).all()
-    for clean, spoiled in zip(derivatives(*good), derivatives(*mixed), strict=True):
-        np.testing.assert_array_equal(spoiled[~is_bad], clean)
-        assert np.isnan(spoiled[is_bad]).all()
-
-
 def test_every_device_is_answered():
     """No point of a wide domain fails, and none lies below a plain scan of the curve."""
     rng = np.random.default_rng(7)
@@ -311,53 +203,6 @@ def test_every_device_is_answered():
         scanned = zwidth.boundary(fraction * limit, delta, d).alpha
         lobe &= scanned > 0
         assert (scanned[lobe] <= got.alpha[lobe] * (1 + 1e-13)).all()
-
-
-# Few whole parts of d: each is another polynomial, hence another compilation.
-SAMPLE = [
-    (0.0, 0.0),
-    (3.0, 0.0),
-    (3.67, 0.0),
-    (10.0, 0.01),
-    (34.0, 0.125),
-    (0.5, 0.9),
-    (1e3, 0.5),
-    (0.1, 2.0),
-    (5.0, 2.0),
-]
-
-
-def test_stable_just_inside_and_never_just_outside():
-    delta, d = np.transpose(SAMPLE)
-    ridge = zwidth.alpha_max(delta, d)
-    assert (radius_by_companion(ridge.alpha * (1 - 1e-9), ridge.beta, delta, d) < 1).all()
-    spread = np.maximum(np.abs(ridge.beta), ridge.alpha)
-    beta = ridge.beta + np.linspace(-0.2, 0.2, 401)[:, None] * spread
-    assert (radius_by_companion(1.0005 * ridge.alpha, beta, delta, d) >= 1).all()
-
-
-def test_shapes_types_and_precision():
-    point = zwidth.alpha_max(1, 1)
-    assert isinstance(point.alpha, np.float64)
-    assert type(point.kind) is np.int32
-    grid = zwidth.alpha_max(np.array([[0.1], [2.0]]), [0, 1, 2.5])
-    assert grid.alpha.shape == grid.status.shape == (2, 3)
-    assert grid.alpha.dtype == np.float64
-    assert zwidth.alpha_max([], 1).alpha.shape == (0,)
-    assert grid.alpha[1, 1] == pytest.approx(zwidth.alpha_max(2.0, 1).alpha, rel=tol.RIDGE.float64)
-    assert isinstance(zwidth.alpha_max(jnp.ones(2), 1).alpha, jax.Array)
-
-
-def test_ambient_precision_inside_jit():
-    exact = reference()
-    usual = (exact["delta"] <= 1e4) & (exact["d"] % 1 < 0.99)
-    delta, d = np.float32(exact["delta"][usual]), np.float32(exact["d"][usual])
-    got = jax.jit(lambda *point: zwidth.alpha_max(*point), compiler_options=QUICKLY)(delta, d)
-    assert got.alpha.dtype == jnp.float32
-    # float32 inputs are other numbers.
-    truth = zwidth.alpha_max(np.float64(delta), np.float64(d))
-    np.testing.assert_allclose(got.alpha, truth.alpha, rtol=tol.RIDGE.float32)
-    np.testing.assert_array_equal(got.status, Status.OK)
 
 
 def test_arguments_are_checked():

@@ -63,16 +63,6 @@ def test_no_time_where_there_is_none_or_it_is_not_known(wall):
     assert np.isnan(settling_time(*wall))
 
 
-def test_diverging_walls_never_settle():
-    random = np.random.default_rng(21)
-    walls = np.column_stack(
-        [random.uniform(0, 2, 400), random.uniform(-1, 2, 400), random.uniform(0, 0.5, 400), random.integers(0, 4, 400)]
-    )
-    unstable = walls[~zwidth.is_stable(*walls.T)]
-    assert len(unstable) > 100
-    assert all(np.isnan(settling_time(*wall)) for wall in unstable)
-
-
 def test_a_double_pole_settles_too():
     # The fastest damping is where two poles meet: computed, they nearly coincide.
     random = np.random.default_rng(22)

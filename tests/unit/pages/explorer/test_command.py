@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import socket
-import subprocess
 import sys
 
 import pytest
 from click.testing import CliRunner
-from waiting import LONGEST
 
 from zwidth.cli.commands import cli
 from zwidth.words.errors import ConfigError, InputError
@@ -37,11 +35,3 @@ def test_a_file_that_is_not_there_is_said():
     done = CliRunner().invoke(cli, ["explore", "--no-browser", "nowhere.yaml"])
     assert isinstance(done.exception, ConfigError)
     assert "nowhere.yaml: no such file; check the path" in str(done.exception)
-
-
-def test_the_help_loads_no_bokeh():
-    code = (
-        "import sys; from zwidth.cli.commands import cli; print([n for n in ('bokeh', 'tornado') if n in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=LONGEST)
-    assert done.stdout.strip() == "[]"

@@ -13,7 +13,6 @@ from zwidth.pages.explorer.controls import (
     ROTARY_SLIDERS,
     SLIDERS,
     Controls,
-    normalized_controls,
     read_controls,
     read_link,
     to_link,
@@ -126,12 +125,6 @@ def test_any_estimate_of_a_configuration_is_kept(tmp_path, velocity):
     assert controls.scene == given.to_scene()
     assert controls.change({"mass": 200}).scene.velocity == controls.scene.velocity
     assert controls.change(controls.shown()).scene.d == 1.5
-
-
-def test_a_normalized_scene_is_shown_as_it_is(tmp_path):
-    assert read_controls(written(tmp_path, "delta: 0.2, d: 1, alpha: 0.1, beta: 0.3")) == normalized_controls(
-        0.1, 0.3, 0.2, 1.0
-    )
 
 
 def test_a_delay_model_and_other_folders_are_refused(tmp_path):

@@ -79,6 +79,22 @@ def _rates(scene: Any, number: Any = float) -> tuple[list[list[Any]], int, np.nd
     return table, size, seen
 
 
+def continuous(scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return A, B and the sensor row of the device in continuous time, in SI units."""
+    table, size, seen = _rates(scene)
+    rate = np.array(table)
+    return rate[:size, :size], rate[:size, size], seen
+
+
+def flow(a: np.ndarray, b: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the transition matrix over a time, and the state after a unit force from rest."""
+    size = len(b)
+    block = np.zeros((size + 1, size + 1))
+    block[:size, :size], block[:size, size] = a * time, b * time
+    block = scipy.linalg.expm(block)
+    return block[:size, :size], block[:size, size]
+
+
 def _companion(device: Any, number: Any) -> tuple[list[list[Any]], int, np.ndarray]:
     """The same of a linear device that is not sampled, by its coefficients in a unit of time of about its own."""
     bottom, top = (
@@ -120,14 +136,19 @@ def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([np.zeros(bottom.size - top.size), top]), bottom
 
 
+def _sample(scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the transition over a period, the effects of the newer and the older force, and the sensor row."""
+    a, b, seen = continuous(scene)
+    period, fraction = scene.timing.period, scene.d - scene.whole_delay
+    rest, newer = flow(a, b, (1.0 - fraction) * period)
+    return flow(a, b, period)[0], newer, rest @ flow(a, b, fraction * period)[1], seen
+
+
 def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> np.ndarray:
     """One period of the closed loop; state: positions, velocities, filter, then the forces on their way."""
-    table, size, seen = _rates(scene)
-    period, late = scene.timing.period, scene.whole_delay
+    step, newer, older, seen = _sample(scene)
+    size, late = len(step), scene.whole_delay
     fraction = scene.d - late
-    rate = np.array(table) * period
-    step, rest, first = (scipy.linalg.expm(rate * part) for part in (1.0, 1.0 - fraction, fraction))
-    newer, older = rest[:size, size], rest[:size, :size] @ first[:size, size]
     top, bottom = velocity_polynomials(scene)
     top, bottom = top / bottom[0], bottom / bottom[0]
     order = bottom.size - 1
@@ -142,7 +163,7 @@ def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> 
         return force if age == 0 else np.eye(total)[size + order + age - 1]
 
     matrix = np.zeros((total, total))
-    matrix[:size, :size] = step[:size, :size]
+    matrix[:size, :size] = step
     matrix[:size] += np.outer(newer, sample(late))
     if fraction:
         matrix[:size] += np.outer(older, sample(late + 1))
@@ -348,12 +369,9 @@ def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np
 
     The response of the device comes from its matrix, solved at every angle: no roots, no nodes of the library.
     """
-    table, size, seen = _rates(scene)
-    late = scene.whole_delay
+    own, newer, older, seen = _sample(scene)
+    size, late = len(own), scene.whole_delay
     fraction = scene.d - late
-    rate = np.array(table) * scene.timing.period
-    step, rest, first = (scipy.linalg.expm(rate * part) for part in (1.0, 1.0 - fraction, fraction))
-    own, newer, older = step[:size, :size], rest[:size, size], rest[:size, :size] @ first[:size, size]
     top, bottom = velocity_polynomials(scene)
 
     def needed(w: np.ndarray) -> Any:
