@@ -36,7 +36,7 @@ def hardware_options(command: Command) -> Command:
     def with_hardware(**given: Any) -> Any:
         hardware = {name: value for _, name, *_ in _HARDWARE if (value := given.pop(name)) is not None}
         if "resolution" in hardware:
-            warn_implausible({"resolution": hardware["resolution"]})
+            warn_implausible({"resolution": hardware["resolution"]}, given["scene"].unit_system)
         return command(hardware=hardware, **given)
 
     decorated: Callable[..., Any] = with_hardware

@@ -24,8 +24,8 @@ from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError
 from zwidth.words.plausible import list_doubts
 from zwidth.words.quantities import ANY, CHOICES, OF_LOGS, OF_PARTS, PARAMETERS, Range
-from zwidth.words.rotation import is_rotary, use_kind
-from zwidth.words.units import find_dimension, read_quantity, tell_kind
+from zwidth.words.unit_system import SYSTEMS, UnitSystem
+from zwidth.words.units import DIMENSIONS, read_quantity, tell_kind
 
 if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
@@ -83,11 +83,11 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
             number = value if math.isfinite(value := float(text)) else text
         except ValueError:
             number = text
-        # Whether all are of one kind of device is asked when all are known.
-        with use_kind(bool(tell_kind(number))):
-            if periods:
-                return read_span(number, allowed)
-            return read_quantity(number, find_dimension(unit), allowed, counts=counts)[0]
+        if periods:
+            return read_span(number, allowed)
+        # Each option has its own system here; all options together are checked when the scene is made.
+        dimension = DIMENSIONS[SYSTEMS[bool(tell_kind(number))][unit]]
+        return read_quantity(number, dimension, allowed, counts=counts)[0]
 
     return Parsed("quantity", read)
 
@@ -149,15 +149,20 @@ def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Comma
     option is given.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
-    take = _take_options("scene", (*bare, *_PARTS), lambda given: build_scene(given, instead, wall=wall))
+    take = _take_options(
+        "scene", (*bare, *_PARTS), lambda given, system: build_scene(given, system, instead, wall=wall)
+    )
     file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
     return lambda command: file(take(command))
 
 
 def _take_options(
-    name: str, paths: Sequence[str], make: Callable[[dict[str, Any]], Any]
+    name: str, paths: Sequence[str], make: Callable[[dict[str, Any], UnitSystem], Any]
 ) -> Callable[[Command], Command]:
-    """Add the options of the parameters ``paths``; the command receives ``make(values)`` as its argument ``name``."""
+    """Add the options of the parameters ``paths``; the command receives ``make(values, units)`` as argument ``name``.
+
+    The units are those of the options of the command, linear or rotary.
+    """
 
     def decorate(function: Command) -> Command:
         @wraps(function)
@@ -176,8 +181,7 @@ def _take_options(
                     known["device"] = read_device(known["device"])
                     # Ignore the kind of the file's device, because the option --device replaces it.
                     told = context.meta.get(_TOLD, {}) | {"--device": known["device"]}
-                with use_kind(bool(find_kind(told))):
-                    return function(**{name: make(known)}, **given)
+                return function(**{name: make(known, SYSTEMS[bool(find_kind(told))])}, **given)
             except InputError as error:
                 field, _, text = str(error).partition(": ")
                 flags = {option.name: option.opts[0] for option in context.command.params}
@@ -193,7 +197,7 @@ def _take_options(
     return decorate
 
 
-def _read_period(given: dict[str, Any]) -> float | None:
+def _read_period(given: dict[str, Any], _: UnitSystem) -> float | None:
     """The period in s, of the one that is given."""
     if len(given) > 1:
         raise click.UsageError(_BOTH)
@@ -203,9 +207,11 @@ def _read_period(given: dict[str, Any]) -> float | None:
 period_options = _take_options("period", ("period", "rate"), _read_period)
 
 
-def warn_implausible(given: dict[str, Any]) -> None:
+def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
     """Write a warning to the error stream for each value, in SI units by path, that is implausible for a device."""
-    for line in list_doubts(given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
+    for line in list_doubts(
+        given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path), system
+    ):
         click.echo(f"zwidth: {line}", err=True)
 
 
@@ -220,7 +226,7 @@ def read_scene_file(path: Path) -> Scene:
     return load_scene(file)
 
 
-def build_scene(given: dict[str, Any], instead: str = "", *, wall: bool = False) -> Scene | None:
+def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *, wall: bool = False) -> Scene | None:
     """Return the scene described by options, given by path; ``given["scene"]`` supplies all other parameters.
 
     Return None if no option is given and ``instead`` names alternative options.
@@ -235,8 +241,8 @@ def build_scene(given: dict[str, Any], instead: str = "", *, wall: bool = False)
     numbers = {
         path: value.value if isinstance(value, Span) and value.unit == "s" else value for path, value in given.items()
     }
-    warn_implausible(numbers)
-    scene = _make_scene(given, instead) if base is None else _change_scene(base, given)
+    warn_implausible(numbers, system)
+    scene = _make_scene(given, system, instead) if base is None else _change_scene(base, given)
     scene.check_parts()
     return scene
 
@@ -279,7 +285,7 @@ def _change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
         raise click.UsageError(f"{flags}: the file gives the device as a whole; change it in the file") from None
 
 
-def _make_scene(given: dict[str, Any], instead: str) -> Scene:
+def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scene:
     """Return the scene described by options only, without a scene file."""
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
@@ -304,7 +310,7 @@ def _make_scene(given: dict[str, Any], instead: str) -> Scene:
     parts |= {"modes": modes} if modes else {}
     timing = Timing
     if device is None:
-        device = Device(**some("mass", "damping"), rotary=is_rotary())
+        device = Device(**some("mass", "damping"), rotary=system.rotary)
     elif isinstance(device, KnownDevice):
         timing, device = device.to_timing, device.to_device(**some("mass", "damping"))
     else:
@@ -400,7 +406,7 @@ def save_figure(drawn: Any, file: Path) -> str:
 velocity_options = _take_options(
     "velocity",
     [path for path in _PARTS if path.startswith("velocity.")],
-    lambda given: _make_velocity(_own(given, "velocity")),
+    lambda given, _: _make_velocity(_own(given, "velocity")),
 )
 
 

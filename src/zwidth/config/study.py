@@ -6,15 +6,16 @@ import math
 from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
-from pydantic import BeforeValidator, GetJsonSchemaHandler, WrapValidator
+from pydantic import BeforeValidator, GetJsonSchemaHandler, PrivateAttr, WrapValidator
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from zwidth.config.fields import LocatedProblem, Name, Strict, listing, members, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
-from zwidth.config.values import Axis
+from zwidth.config.values import Axis, find_system
 from zwidth.words.formatting import describe
 from zwidth.words.types import DelayModel
+from zwidth.words.unit_system import UnitSystem
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30
@@ -73,6 +74,13 @@ class Study(Strict):
 
     name: Name
     """Name of the study, unique in the file; its results are stored under it."""
+
+    _system: UnitSystem = PrivateAttr(default_factory=find_system)
+
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The units of its devices."""
+        return self._system
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:

@@ -182,7 +182,7 @@ class FittedKind(NamedTuple):
 
     def scene(self, theta: np.ndarray) -> Scene:
         """The loop of one of its devices."""
-        return self.onsets.normalize(theta).to_scene(self.onsets.period, self.onsets.velocity)
+        return self.onsets.normalize(theta).to_scene(self.onsets.period, self.onsets.velocity, self.onsets.system)
 
 
 def choose_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> tuple[FittedKind, list[FittedKind]]:

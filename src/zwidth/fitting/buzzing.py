@@ -24,6 +24,7 @@ from zwidth.fitting.required_wall import RequiredWall
 from zwidth.fitting.structure import LAGS, RATIOS, TURNS
 from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate, Velocity
+from zwidth.words.unit_system import LINEAR, UnitSystem
 
 # Newton's steps towards w, the longest of them as a share of w, the last one's share (it squares), and the share
 # beyond which w was not found.
@@ -59,6 +60,7 @@ class Onsets:
     period: float
     lag: int = 0
     modes: int = 0
+    system: UnitSystem = LINEAR
 
     @cached_property
     def _estimate(self) -> Estimate:

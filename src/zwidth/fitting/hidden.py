@@ -173,7 +173,7 @@ def bound_lag(best: FittedModel, test: LagTest | None, scene: Scene, reach: floa
     lag = float(test.lag[count - 1] * period)
     # What a lag moves of resonances is small, and may be more than there is.
     theta = np.clip(test.theta[:, count - 1], *best.model.bounds())
-    there = best.model.normalize(theta, period).to_scene(period, scene.velocity)
+    there = best.model.normalize(theta, period).to_scene(period, scene.velocity, scene.unit_system)
     there = replace(there, device=replace(there.device, actuator=Actuator(time_constant=lag)))
     return HiddenLag(lag, float(there.timing.delay), float(there.max_stiffness().stiffness))
 
@@ -190,7 +190,7 @@ def respond_as_fitted(best: FittedModel, scene: Scene, banks: list[PoleBank]) ->
             - bank.absorbed[: best.model.parts.stop].T @ slopes.T
         )
         radius = np.maximum(radius, np.max(np.abs(moved) * bank.bound_modes()[:, None], 0))
-    return MeasuredDevice(lines / scene.timing.period, response, radius, bool(scene.device.rotary))
+    return MeasuredDevice(lines / scene.timing.period, response, radius, scene.unit_system.rotary)
 
 
 def weigh_resonances(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> HiddenResonances | None:

@@ -14,9 +14,10 @@ import numpy as np
 from zwidth.words.errors import InputError, UnusableValueError, check_choice
 from zwidth.words.formatting import describe, short
 from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, PARAMETERS, Range
-from zwidth.words.rotation import is_rotary, use_kind
+from zwidth.words.showing import with_units
 from zwidth.words.types import Array
-from zwidth.words.units import TIME, find_dimension, read_quantity, tell_kind, to_float
+from zwidth.words.unit_system import LINEAR, SYSTEMS, UnitSystem
+from zwidth.words.units import DIMENSIONS, TIME, read_quantity, tell_kind, to_float
 from zwidth.words.xp import frozen, is_jax, is_traced, namespace
 
 
@@ -67,18 +68,21 @@ Result = TypeVar("Result")
 
 
 def accept_units(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Let the SI quantities that a function takes be texts with a unit: "70 g", and a delay "1.5 periods" as well."""
-    # Where one is in a unit of rotary devices, the answer is in theirs.
+    """Wrap a function to accept SI quantities as text with a unit, "70 g", and a delay as "1.5 periods".
+
+    The result is shown in rotary units if one of the units is rotary.
+    """
     names = tuple(inspect.signature(function).parameters)
 
     @wraps(function)
     def accepting(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         given = dict(zip(names, args, strict=False)) | kwargs
         if len(args) <= len(names) and any(map(_has_text, given.values())):
-            with use_kind(bool(find_kind(given))):
-                period = _in_si("period", given.get("period"), None)
-                return function(**{name: _in_si(name, value, period) for name, value in given.items()})  # pyright: ignore[reportCallIssue]
-        return function(*args, **kwargs)
+            system = SYSTEMS[bool(find_kind(given))]
+            period = _in_si("period", given.get("period"), None, system)
+            numbers = {name: _in_si(name, value, period, system) for name, value in given.items()}
+            return with_units(function(**numbers), system)  # pyright: ignore[reportCallIssue]
+        return with_units(function(*args, **kwargs), LINEAR)
 
     return accepting
 
@@ -104,12 +108,12 @@ def read_texts(field: str, value: Any, unit: str) -> Any:
     return value if unit in ("", "1") else _map_texts(lambda text: check_number(field, text, unit, ANY), value)
 
 
-def _in_si(name: str, value: Any, period: Any) -> Any:
-    """Texts as numbers in the SI base unit of an argument; anything else as it is."""
+def _in_si(name: str, value: Any, period: Any, system: UnitSystem) -> Any:
+    """Return an argument with all texts converted to numbers in its SI unit."""
     if name not in PARAMETERS or PARAMETERS[name].unit == "1":
         return value
     if name != "delay":
-        return read_texts(name, value, PARAMETERS[name].unit)
+        return read_texts(name, value, system[PARAMETERS[name].unit])
 
     def read(text: str) -> float:
         try:
@@ -136,18 +140,22 @@ class Part:
         told = find_kind({path: getattr(self, item.name) for path, item in own.items()})
         if told is not None:
             object.__setattr__(self, "rotary", told)
-        with use_kind(is_rotary() if told is None else told):
-            for path, item in own.items():
-                value = getattr(self, item.name)
-                if path in CHOICES:
-                    check_choice(path, value, CHOICES[path].names)
-                elif path in FIELDS and not (value is None and item.default is None):
-                    known, allowed = FIELDS[path], find_range(item, path)
-                    if known.whole:
-                        value = check_whole(path, value, int(allowed.low), int(allowed.high))
-                    else:
-                        value = check_number(path, value, known.unit, allowed)
-                    object.__setattr__(self, item.name, value)
+        for path, item in own.items():
+            value = getattr(self, item.name)
+            if path in CHOICES:
+                check_choice(path, value, CHOICES[path].names)
+            elif path in FIELDS and not (value is None and item.default is None):
+                known, allowed = FIELDS[path], find_range(item, path)
+                if known.whole:
+                    value = check_whole(path, value, int(allowed.low), int(allowed.high))
+                else:
+                    value = check_number(path, value, self.unit_system[known.unit], allowed)
+                object.__setattr__(self, item.name, value)
+
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The units of its device; linear unless a unit or an argument ``rotary`` defines a rotary device."""
+        return SYSTEMS[bool(getattr(self, "rotary", False))]
 
     def __repr__(self) -> str:
         """A call, without what is as it is where left out."""
@@ -218,7 +226,7 @@ def check_number(field: str, value: Any, unit: str = "", allowed: Range | None =
     if allowed is None:
         allowed = PARAMETERS[field].sign if field in PARAMETERS else NOT_NEGATIVE
     counts = field == "resolution"
-    return _read(field, value, lambda known: read_quantity(known, find_dimension(unit), allowed, counts=counts)[0])
+    return _read(field, value, lambda known: read_quantity(known, DIMENSIONS[unit], allowed, counts=counts)[0])
 
 
 def check_span(field: str, value: Any) -> Any:

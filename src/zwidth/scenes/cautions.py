@@ -81,7 +81,7 @@ def judge_grasps(scene: Any) -> dict[str, bool]:
     """Return the stability of a wall in each reference grasp, by name, and without the scene's operator if any."""
     if not isinstance(scene.device, Device):
         return {}
-    held = list_grasps(bool(scene.device.rotary))
+    held = list_grasps(scene.unit_system.rotary)
     hands = [*held, *([("released", None)] if scene.operator is not None else [])]
     labels: dict[str, bool] = {}
     for name, grasp in hands:
@@ -91,7 +91,7 @@ def judge_grasps(scene: Any) -> dict[str, bool]:
 
 def _advise_grasps(scene: Any) -> str:
     """Return the stiffest wall with the same K/B that is stable in every grasp, and its cost in stiffness."""
-    grasps = [*(grasp for _, grasp in list_grasps(bool(scene.device.rotary))), None]
+    grasps = [*(grasp for _, grasp in list_grasps(scene.unit_system.rotary)), None]
     K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
     walls = K * SHARES, B * SHARES
     stable = np.all([scene.replace(operator=grasp).is_stable(*walls) for grasp in grasps], axis=0)
@@ -101,4 +101,4 @@ def _advise_grasps(scene: Any) -> str:
         return "a passive wall is stable in every grasp: ask for --passive"
     share = SHARES[-count]
     cost = f"costs {100.0 * (1.0 - share):.2g} % of the stiffness"
-    return f"{name_wall(share * K, share * B)} is stable in every grasp ({cost})"
+    return f"{name_wall(share * K, share * B, scene.unit_system)} is stable in every grasp ({cost})"

@@ -16,7 +16,7 @@ from zwidth.scenes.trials import FIRST_DISPLACEMENT, Experiment
 from zwidth.simulation.result import MotionKind
 from zwidth.simulation.simulate import simulate
 from zwidth.words.formatting import round_safely, with_unit
-from zwidth.words.rotation import is_rotary
+from zwidth.words.unit_system import UnitSystem
 
 SPAN = 64.0  # largest factor by which a remedy changes its parameter
 COARSE = 12  # values of a parameter simulated over the whole span
@@ -45,15 +45,15 @@ class Remedy(NamedTuple):
     low: float  # in SI units; 0 if the range has no lower end
     high: float  # in SI units; infinite if the range has no upper end
 
-    def spell(self, simulated: bool = False) -> str:
+    def spell(self, system: UnitSystem, simulated: bool = False) -> str:
         """Return the change in words, with its unit; only the confirmed value if it was ``simulated``."""
         phrase, unit = _PHRASES[self.parameter]
-        low, high = (with_unit(end, unit, 3) for end in (self.low, self.high))
+        low, high = (with_unit(end, system[unit], 3) for end in (self.low, self.high))
         if self.low > 0 and self.high < math.inf:
             return f"{phrase} {low} to {high}"
         side = "" if simulated else "at least " if self.low > 0 else "at most "
         text = f"{phrase} {side}{low if self.low > 0 else high}"
-        if self.parameter == "resolution" and is_rotary():
+        if self.parameter == "resolution" and system.rotary:
             text += f" ({_count_steps(self.high):,} counts per turn)"
         return text
 
@@ -110,12 +110,12 @@ class _Candidates(NamedTuple):
         """Return values between the last oscillating value, excluded, and the selected one, included."""
         before = self.values[index - 1] if index else present or self.values[0] / 2
         values = np.geomspace(before, self.values[index], FINE + 2)[1:]
-        return self._replace(values=values).round()
+        return self._replace(values=values)
 
-    def round(self) -> _Candidates:
+    def round(self, system: UnitSystem) -> _Candidates:
         """Return the values to three significant digits, each rounded away from the parameter's current value."""
         values = [round_safely(value, "above" if self.increasing else "below", 3) for value in self.values.tolist()]
-        if self.parameter == "resolution" and is_rotary():
+        if self.parameter == "resolution" and system.rotary:
             values = [2.0 * math.pi / round_safely(_count_steps(value), "above", 3) for value in self.values.tolist()]
         return self._replace(values=np.array(values))
 
@@ -132,7 +132,8 @@ def search_remedies(experiment: Experiment, cause: Literal["quantization", "satu
     for each, at_rest in zip(candidates, _try(experiment, candidates), strict=True):
         index = each.select(at_rest)
         if index < len(at_rest):
-            chosen.append((each, each.refine(index, experiment.present[each.parameter])))
+            fine = each.refine(index, experiment.present[each.parameter])
+            chosen.append((each, fine.round(experiment.scene.unit_system)))
     remedies = []
     for (coarse, fine), at_rest in zip(chosen, _try(experiment, [fine for _, fine in chosen]), strict=True):
         index = fine.select(at_rest)
@@ -157,13 +158,14 @@ def _list_candidates(experiment: Experiment, cause: str) -> list[_Candidates]:
         candidates.append(_Candidates("coulomb", least * factors, True))
     # Without friction no K or B helps, because under an external force of K Q/2 the encoder reading never settles.
     if cause == "quantization" and not hardware.static:
-        return [each.round() for each in candidates]
+        return [each.round(scene.unit_system) for each in candidates]
     if K > 0:
         candidates.append(_Candidates("stiffness", K / factors, False))
     if B > 0:
         candidates.append(_Candidates("virtual_damping", B / factors, False))
         candidates.append(_Candidates("virtual_damping", B * factors, True))
-    return [each.round() for each in candidates if np.all(np.isfinite(each.values) & (each.values > 0))]
+    usable = [each for each in candidates if np.all(np.isfinite(each.values) & (each.values > 0))]
+    return [each.round(scene.unit_system) for each in usable]
 
 
 def _try(experiment: Experiment, candidates: list[_Candidates]) -> list[np.ndarray]:

@@ -14,7 +14,7 @@ from zwidth.scenes.stiffest import SceneOptima
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import round_safely, tell_apart, with_unit
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.showing import shown
+from zwidth.words.showing import find_unit, shown
 
 # Parameters with their direction of search, 1 (increase) or -1 (decrease), and the largest factor of the change.
 DIRECTIONS = {
@@ -56,7 +56,7 @@ class StableRange(NamedTuple):
 
     def spell(self) -> str:
         """Return the range in words, both ends rounded into the range."""
-        name, unit = NAMES.get(self.parameter, self.parameter), PARAMETERS[self.parameter].unit
+        name, unit = NAMES.get(self.parameter, self.parameter), find_unit(self, PARAMETERS[self.parameter].unit)
         kept = f" ({self.note})" if self.note else ""
         if self.parameter == "velocity.samples":
             return f"{name} of at most {self.high:g} samples"

@@ -220,7 +220,7 @@ def _is_stable_held(scene: SceneOptima, wall: WallChoice) -> bool:
     """Return whether a wall is stable in all soft reference grasps; True if the scene cannot have another operator."""
     if not isinstance(scene.device, Device) or scene.operator is not None:
         return True
-    grasps = (grasp for name, grasp in list_grasps(bool(scene.device.rotary)) if name.startswith("soft"))
+    grasps = (grasp for name, grasp in list_grasps(scene.unit_system.rotary) if name.startswith("soft"))
     return all(bool(scene.replace(operator=grasp).is_stable(wall.stiffness, wall.damping)) for grasp in grasps)
 
 

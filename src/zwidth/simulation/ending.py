@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth.simulation.result import Motion, MotionKind
 from zwidth.words.formatting import with_unit
-from zwidth.words.rotation import in_own_units
+from zwidth.words.showing import find_unit
 
 _UNBOUNDED = "grows without bound"
 _WORDS = {
@@ -20,7 +20,6 @@ _WORDS = {
 }
 
 
-@in_own_units
 def describe_ending(motion: Motion, index: Any = ()) -> str:
     """Return the final state of a recorded motion in words; ``index`` selects one entry of a batch."""
     kind = MotionKind(int(motion.outcome[index]))
@@ -35,7 +34,7 @@ def describe_ending(motion: Motion, index: Any = ()) -> str:
         hits = np.flatnonzero(contact[1:] & ~contact[:-1]) + 1
         if hits.size > 1:
             speeds = velocity.reshape(contact.size, -1)[hits, 0]
-            first, last = (with_unit(float(speed), "m/s", 3) for speed in speeds[[0, -1]])
+            first, last = (with_unit(float(speed), find_unit(motion, "m/s"), 3) for speed in speeds[[0, -1]])
             change = "growing" if speeds[-1] > speeds[0] else "decaying"
             return f"bounces, {change}: impact velocity from {first} to {last} over {hits.size} impacts"
     if kind in (MotionKind.REST, MotionKind.DECAYING, MotionKind.GROWING):
@@ -44,5 +43,5 @@ def describe_ending(motion: Motion, index: Any = ()) -> str:
     if kind is MotionKind.UNCLEAR and not np.isfinite(frequency):
         return "undecided: too few oscillations at the end; simulate longer"
     rate = f" at {with_unit(frequency, 'Hz', 3)}" if np.isfinite(frequency) else ""
-    swing = f"{rate}, amplitude {with_unit(float(motion.amplitude[index]), 'm', 3)}"
+    swing = f"{rate}, amplitude {with_unit(float(motion.amplitude[index]), find_unit(motion, 'm'), 3)}"
     return f"oscillates at the end{swing}" if kind is MotionKind.UNCLEAR else f"limit cycle{swing}"

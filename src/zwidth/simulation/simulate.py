@@ -19,9 +19,10 @@ from zwidth.simulation.lanes import Course, Law, TracedLaw
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
 from zwidth.words.errors import InputError, ResourceError, check_choice, describe_choice
 from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
-from zwidth.words.rotation import in_own_units
+from zwidth.words.showing import with_units
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
+from zwidth.words.unit_system import LINEAR, UnitSystem
 from zwidth.words.xp import is_traced
 
 Contact = Literal["bilateral", "unilateral", "push_only"]
@@ -42,7 +43,6 @@ _ARGUMENTS["jitter"] = "s", NOT_NEGATIVE
 _LIMITS = ("max_force", "max_rate")
 
 
-@in_own_units
 def simulate(
     scenes: Any,
     stiffness: ArrayLike | None = None,
@@ -141,12 +141,13 @@ def simulate(
     tail = max(periods // 4, 1) if tail is None else check_whole("tail", tail, 1, periods)
     course = Course(periods, substeps, tail, contact, record)
     known, which = _list_scenes(scenes)
+    system = known[0].unit_system if known else LINEAR
     if force is not None:
         course = course._replace(law=_trace_law(force, stiffness, virtual_damping))
         given |= {"stiffness": 0.0, "virtual_damping": 0.0}
     if hand_history is not None:
-        push_history = _push_by_hand(known, which, hand_history, push_history, periods)
-    numbers, which, good = _read(known, which, _spread_starts(known, given), seed, push_history, periods)
+        push_history = _push_by_hand(known, which, hand_history, push_history, periods, system)
+    numbers, which, good = _read(known, which, _spread_starts(known, given), seed, push_history, periods, system)
     for name in ("static", *(name for name in numbers if name.startswith(_STARTS))):
         _refuse_bodies(known, which, name, numbers[name])
     _check_memory(numbers, course)
@@ -174,7 +175,7 @@ def simulate(
         name: column if name == "time" and column.ndim == 1 else column.reshape((*shape, *column.shape[1:]))[()]
         for name, column in found.items()
     }
-    return Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped))
+    return with_units(Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped)), system)
 
 
 def _refuse_bodies(known: list[Any], which: np.ndarray, name: str, values: np.ndarray) -> None:
@@ -249,9 +250,9 @@ def _spread_starts(known: list[Any], given: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _push_by_hand(known: list[Any], which: np.ndarray, hand: Any, push: Any, periods: int) -> Any:
+def _push_by_hand(known: list[Any], which: np.ndarray, hand: Any, push: Any, periods: int, system: UnitSystem) -> Any:
     """The pushes of operators whose springs and dampers end at a moving place, each held at its mean over a period."""
-    places = as_float64("hand_history", read_texts("hand_history", hand, "m"))
+    places = as_float64("hand_history", read_texts("hand_history", hand, system["m"]))
     if places.ndim == 1 and not np.isfinite(places).all():
         raise InputError("hand_history: got a position that is not finite; fill the gaps")
     if not places.ndim or places.shape[-1] != periods + 1:
@@ -316,23 +317,33 @@ def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
         if scene.traced_path is not None:
             raise InputError("scenes: got one of values that JAX traces; simulate outside of jit, vmap and grad")
         which[place] = known.setdefault(id(scene), len(known))
-    return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))], which
+    distinct: list[Any] = [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))]
+    if len({scene.unit_system for scene in distinct}) > 1:
+        raise InputError("scenes: got both rotary and linear devices; simulate one kind per call")
+    return distinct, which
 
 
 def _read(
-    known: list[Any], which: np.ndarray, given: dict[str, Any], seed: Any, history: Any, periods: int
+    known: list[Any],
+    which: np.ndarray,
+    given: dict[str, Any],
+    seed: Any,
+    history: Any,
+    periods: int,
+    system: UnitSystem,
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     """The numbers of all simulations by name, the scene of each in the batch's shape, and which have usable ones."""
     if given["static"] is None:
         given = {**given, "static": given["coulomb"]}
-    walls = [resolve_wall(scene.wall, given["stiffness"], given["virtual_damping"]) for scene in known]
+    walls = [resolve_wall(scene.wall, given["stiffness"], given["virtual_damping"], system) for scene in known]
     if given["stiffness"] is None:
         own = np.array(walls, float).reshape(-1, 2)[which]
         given = {**given, "stiffness": own[..., 0], "virtual_damping": own[..., 1]}
     elif given["virtual_damping"] is None:
         given = {**given, "virtual_damping": 0.0}
+    units = {name: system[_ARGUMENTS[name.partition(".")[0]][0]] for name in given}
     arrays = {
-        name: as_float64(_spell(name), read_texts(_spell(name), value, _unit(name))) for name, value in given.items()
+        name: as_float64(_spell(name), read_texts(_spell(name), value, units[name])) for name, value in given.items()
     }
     seeds, pushes = _read_seeds(seed), None
     shapes = {
@@ -357,7 +368,7 @@ def _read(
     for name, array in arrays.items():
         usable, allowed = _check(name, array, arrays, clock[which] if array.ndim else clock.min())
         if array.ndim == 0 and not np.all(usable):
-            raise InputError(f"{_spell(name)}: got {float(array):g} {_unit(name)}; {allowed}")
+            raise InputError(f"{_spell(name)}: got {float(array):g} {units[name]}; {allowed}")
         good &= usable
     numbers: dict[str, Any] = {
         name: np.where(good, np.broadcast_to(array, shape), 0.0).reshape(-1) for name, array in arrays.items()
@@ -371,11 +382,6 @@ def _read(
         filled = np.where(finite, pushes, 0.0)
         numbers["push_history"] = np.broadcast_to(filled, (*shape, periods)).reshape(-1, periods)
     return numbers, which, good.reshape(-1)
-
-
-def _unit(name: str) -> str:
-    """Of an argument, or of a body's share of it."""
-    return _ARGUMENTS[name.partition(".")[0]][0]
 
 
 def _spell(name: str) -> str:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from zwidth.words.rotation import is_rotary
 from zwidth.words.status import Status
+from zwidth.words.unit_system import UnitSystem
 
 
 class Range(NamedTuple):
@@ -94,22 +94,19 @@ class Parameter:
         """What a figure and the explorer call it."""
         return self.short_name or self.long_name
 
-    @property
-    def own_words(self) -> str:
-        """The name for the current kind of device: "inertia" replaces "mass" for rotary devices."""
-        return self.words.replace("mass", "inertia") if is_rotary() else self.words
+    def words_in(self, system: UnitSystem) -> str:
+        """Return the name in figures; "inertia" replaces "mass" for rotary devices."""
+        return self.words.replace("mass", "inertia") if system.rotary else self.words
 
-    @property
-    def own_symbol(self) -> str:
-        """The symbol for the current kind of device, in mathtext: J replaces m for rotary devices."""
-        return re.sub(r"^m(?=_|$)", "J", self.symbol) if is_rotary() else self.symbol
+    def symbol_in(self, system: UnitSystem) -> str:
+        """Return the symbol in mathtext; J replaces m for rotary devices."""
+        return re.sub(r"^m(?=_|$)", "J", self.symbol) if system.rotary else self.symbol
 
-    @property
-    def axis_label(self) -> str:
-        """The label of a figure axis: name, symbol and definition for the current kind of device."""
+    def label_in(self, system: UnitSystem) -> str:
+        """Return the label of a figure axis: name, symbol and definition."""
         definition = f" = {self.definition}" if self.definition else ""
-        definition = definition.replace("/m", "/J") if is_rotary() else definition
-        return f"{self.own_words}  ${self.own_symbol}{definition}$"
+        definition = definition.replace("/m", "/J") if system.rotary else definition
+        return f"{self.words_in(system)}  ${self.symbol_in(system)}{definition}$"
 
     @property
     def sentence(self) -> str:

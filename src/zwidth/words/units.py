@@ -17,8 +17,8 @@ from typing import Any, NoReturn
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import describe, resembling, short
 from zwidth.words.quantities import ANY, SI_RANGE, Range
-from zwidth.words.rotation import ROTARY, is_rotary, own_unit
 from zwidth.words.unit_symbols import Exponents, measure_unit, normalize_symbols
+from zwidth.words.unit_system import UNIT_PAIRS
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
 _QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.{0,30})", re.DOTALL)
@@ -108,22 +108,18 @@ _SCALES = (
     *(MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED),
     *(INERTIA, ANGULAR_DAMPING, ANGULAR_STIFFNESS, TORQUE, TORQUE_RATE, ANGLE, ANGULAR_SPEED),
 )
-_OF_UNIT = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
-_OTHER_KIND = {one: other for pair in ROTARY.items() for one, other in (pair, pair[::-1])}
+DIMENSIONS = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
+_OTHER_KIND = {one: other for pair in UNIT_PAIRS for one, other in (pair, pair[::-1])}
+_ROTARY_UNITS = [rotary for _, rotary in UNIT_PAIRS]
 
 PERIOD_WORDS = ("periods", "period")
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
 """Units of encoder positions, which are converted with the resolution of the encoder."""
 
 
-def find_dimension(unit: str) -> Dimension:
-    """The units of a quantity by its SI unit, that of a linear device: of the kind of device in question."""
-    return _OF_UNIT[own_unit(unit)]
-
-
 def find_other(dimension: Dimension) -> Dimension | None:
     """The same quantity of the other kind of device, linear or rotary; None where both have one unit."""
-    return _OF_UNIT.get(_OTHER_KIND.get(dimension.base, ""))
+    return DIMENSIONS.get(_OTHER_KIND.get(dimension.base, ""))
 
 
 def tell_kind(value: Any) -> bool | None:
@@ -144,7 +140,7 @@ def tell_kind(value: Any) -> bool | None:
 def spell_exactly(value: float, unit: str) -> str:
     """A quantity in SI units as the shortest text that is read back as the same float64: ``0.1, "kg"`` as ``100 g``."""
     number = Decimal(repr(float(value)))
-    powers = {name: power for name, power in find_dimension(unit).powers.items() if not power % 3}
+    powers = {name: power for name, power in DIMENSIONS[unit].powers.items() if not power % 3}
     fitting = [name for name, power in powers.items() if abs(number.scaleb(-power)) >= 1]
     # The first name of a power is the usual one.
     chosen = max(fitting, key=lambda name: powers[name]) if fitting else unit
@@ -189,7 +185,7 @@ def _canonical(unit: str) -> str:
 
 
 _KIND_OF_EXPONENTS = {
-    _OF_UNIT[base].exponents: kind == 1 for pair in ROTARY.items() for kind, base in enumerate(pair) if base in _OF_UNIT
+    DIMENSIONS[base].exponents: kind == 1 for pair in UNIT_PAIRS for kind, base in enumerate(pair) if base in DIMENSIONS
 }
 
 
@@ -296,7 +292,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
         raise UnusableValueError(got, allowed, remedy)
     other = find_other(dimension)
     if other is not None and other.in_base(mantissa, 0, unit) is not None:
-        that = "linear" if is_rotary() else "rotary"
+        that = "linear" if dimension.base in _ROTARY_UNITS else "rotary"
         _refuse_kind(
             got,
             dimension,
@@ -308,7 +304,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
 
 def _refuse_kind(got: str, dimension: Dimension, remedy: str) -> NoReturn:
     """Raise `UnusableValueError` for a rotary unit in a linear device or a linear unit in a rotary device."""
-    this, that = ("rotary", "linear") if is_rotary() else ("linear", "rotary")
+    this, that = ("rotary", "linear") if dimension.base in _ROTARY_UNITS else ("linear", "rotary")
     names = ", ".join(dimension.units)
     raise UnusableValueError(
         f"{got}, a unit of a {that} device where the device is {this}", f"the units allowed are {names}", remedy

@@ -11,8 +11,8 @@ import pytest
 
 import zwidth
 from zwidth.words.formatting import with_unit
-from zwidth.words.rotation import ROTARY, is_rotary, use_kind
-from zwidth.words.units import find_dimension
+from zwidth.words.unit_system import LINEAR, ROTARY, UNIT_PAIRS
+from zwidth.words.units import DIMENSIONS
 
 LINEAR_UNITS = re.compile(r"\b(k|m|µ|M)?(N/m|N s/m|g)\b(?! ?cm\^2)|\bkg\b(?! m\^2)")
 
@@ -72,9 +72,9 @@ def test_a_rotary_scene_has_the_numbers_of_the_linear_one(seed):
     )
     assert one.verdict is not None
     assert other.verdict is not None
-    np.testing.assert_equal(dataclasses.asdict(one.verdict), dataclasses.asdict(other.verdict))
+    np.testing.assert_equal(one.verdict.as_dict(), other.verdict.as_dict())
     walls = [scene.replace(stiffness=K[0], virtual_damping=B[0]) for scene in (linear, rotary)]
-    first, second = (dataclasses.asdict(zwidth.assess(scene)) for scene in walls)
+    first, second = (zwidth.assess(scene).as_dict() for scene in walls)
     np.testing.assert_equal(first, second)
     # One of each: a program is compiled.
     if seed <= 3:
@@ -102,8 +102,6 @@ def test_results_are_shown_in_the_units_of_their_device():
     assert "angle in rad" in found.code()
     assert "angle in rad" in found.code("python")
     assert "N m/rad" in zwidth.limits_of(scene)[0].spell()
-    # The kind in question ends with the question.
-    assert not is_rotary()
     assert "N/m" in repr(zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3)).max_stiffness())
 
 
@@ -171,12 +169,9 @@ def test_no_typing_error_of_a_rotary_unit_is_taken_for_a_linear_one():
 
 
 def test_every_unit_of_the_table_is_read_and_written():
-    for linear, rotary in ROTARY.items():
-        with use_kind(True):
-            assert with_unit(1.0, linear) == with_unit(1.0, rotary)
-            if linear != "m/N":
-                assert find_dimension(linear).base == rotary
-        assert find_dimension("kg").base == "kg"
-    with use_kind(True):
-        assert with_unit(4.5e-4, "kg") == "4500 g cm^2"
-        assert with_unit(2.0, "N/m per kg") == "2.000 N m/rad per kg m^2"
+    for linear, rotary in UNIT_PAIRS:
+        assert (LINEAR[linear], ROTARY[linear], ROTARY[rotary]) == (linear, rotary, rotary)
+        if linear != "m/N":
+            assert [DIMENSIONS[unit].base for unit in (linear, rotary)] == [linear, rotary]
+    assert with_unit(4.5e-4, ROTARY["kg"]) == "4500 g cm^2"
+    assert with_unit(2.0, ROTARY["N/m per kg"]) == "2.000 N m/rad per kg m^2"
