@@ -47,14 +47,14 @@ class Row(NamedTuple):
 
 def fast(delta: jax.Array, d: jax.Array) -> jax.Array:
     """alpha_max of one point by the library's own route."""
-    return ridge_kernel(delta, d, "held").alpha
+    return ridge_kernel(delta, d).alpha
 
 
 def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
     """The same with optimistix' Newton method on the slope of the closed-form curve; smooth optima only."""
 
     def slope(omega: jax.Array, point: tuple[jax.Array, jax.Array]) -> jax.Array:
-        loop = frequency_loop(*point, "held")
+        loop = frequency_loop(*point)
         return jax.grad(lambda w: frequency_boundary(w, loop).alpha)(omega)
 
     # As good a start as the fast route has, which fits s = sin(omega/2): within 4 %.
@@ -64,7 +64,7 @@ def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
     omega = optimistix.root_find(
         slope, solver, jax.lax.stop_gradient(start), args=(delta, d), max_steps=16, throw=False
     ).value
-    return frequency_boundary(omega, frequency_loop(delta, d, "held")).alpha
+    return frequency_boundary(omega, frequency_loop(delta, d)).alpha
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, float]:

@@ -111,10 +111,10 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
         return radius.quick_kernel(*walls, 1e-9, True)  # pyright: ignore
 
     def point(a: Any, b: Any) -> Any:
-        return exact_points.kkt_kernel(a, b, "held")
+        return exact_points.kkt_kernel(a, b)
 
     def top(a: Any, b: Any) -> Any:
-        return ridge.ridge_kernel(a, b, "held", ANY)
+        return ridge.ridge_kernel(a, b, ANY)
 
     wide = xp.known_options(xp.WIDE)
     yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
@@ -133,7 +133,7 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     by_rule, alone = slopes()
     yield "custom_jvp, gradient of ridge", lambda: by_rule, lambda: alone, (delta, d)
     million = tuple(np.tile(np.asarray(column), 16) for column in (delta, d))
-    ridges = evaluate.compile_traced(ridge.ridge_kernel, ("held", ANY))
+    ridges = evaluate.compile_traced(ridge.ridge_kernel, (ANY,))
     yield "BLOCK, ridge of a million", in_blocks(ridges, 1 << 16), in_blocks(ridges, 1 << 20), million
     yield "sine series, radius", compiled(quick, wide), compiled(quick, wide, step___half_turn=their_half_turn), columns
 
@@ -145,8 +145,8 @@ def in_blocks(function: Callable[..., Any], size: int) -> Make:
 
 def slopes() -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The first gradient outside `jit`, by the rule of `arrays.evaluate` and by JAX alone."""
-    by_rule = evaluate.compile_traced.__wrapped__(ridge.ridge_kernel, ("held", ANY))
-    alone = jax.jit(lambda *columns: ridge.ridge_kernel(*columns, "held", ANY))  # pyright: ignore
+    by_rule = evaluate.compile_traced.__wrapped__(ridge.ridge_kernel, (ANY,))
+    alone = jax.jit(lambda *columns: ridge.ridge_kernel(*columns, ANY))  # pyright: ignore
     return tuple(jax.grad(lambda *c, f=f: f(*c).alpha.sum(), argnums=(0, 1)) for f in (by_rule, alone))  # type: ignore
 
 

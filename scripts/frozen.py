@@ -88,12 +88,9 @@ def functions() -> Answers:
     for name in ("alpha_max", "stable_area", "passive_area"):
         size = _WALLS if name == "alpha_max" else 40
         yield from ask(name, getattr(zwidth, name), delta[:size], d[:size])
-    for model in ("held", "fractional_power"):
-        yield from ask(f"alpha_max, {model}", zwidth.alpha_max, delta[:40], d[:40], delay=model)
-        yield from ask(f"stiffness_slope, {model}", zwidth.stiffness_slope, np.unique(d), delay=model)
-        omega = random.uniform(0.01, 3.1, 40)
-        yield from ask(f"boundary, {model}", zwidth.boundary, omega, delta[:40], d[:40], delay=model)
-        yield from ask(f"boundary_point, beta, {model}", zwidth.boundary_point, *(delta[:40], d[:40]), beta=beta[:40])
+    yield from ask("stiffness_slope", zwidth.stiffness_slope, np.unique(d))
+    omega = random.uniform(0.01, 3.1, 40)
+    yield from ask("boundary", zwidth.boundary, omega, delta[:40], d[:40])
     for size in (3, 40, _WALLS):
         at = delta[:size], d[:size]
         yield from ask(f"boundary_point, beta[{size}]", zwidth.boundary_point, *at, beta=beta[:size])

@@ -67,13 +67,13 @@ from .scenes.assessment import limits_of as limits_of
 from .scenes.diagnosis import Diagnosis as Diagnosis
 from .scenes.diagnosis import diagnose as diagnose
 from .scenes.recommendation import Recommendation as Recommendation
-from .scenes.remedies import Remedy as Remedy
 from .scenes.robust import Interval as Interval
 from .scenes.robust import RobustStiffness as RobustStiffness
 from .scenes.robust import RobustWall as RobustWall
 from .scenes.robust import robust_max_stiffness as robust_max_stiffness
 from .scenes.robust import robust_wall as robust_wall
 from .scenes.scene import Scene as Scene
+from .scenes.stabilization import Remedy as Remedy
 from .scenes.stiffness import Sensitivities as Sensitivities
 from .scenes.stiffness import max_stiffness as max_stiffness
 from .scenes.stiffness import sensitivities as sensitivities

@@ -30,7 +30,7 @@ GRID = dict(zip(WALL, np.broadcast_arrays(*WALL.values()), strict=True))
 DEVICE = {"delta": GRID["delta"], "d": np.full((2, 3), 1.5)}
 HALF = find_degree(1.5)
 KERNEL = {**GRID, **DEVICE, "degree": HALF}
-LOOP = frequency_loop(**DEVICE, delay_model="held")
+LOOP = frequency_loop(**DEVICE)
 ROOTS_FIRST = np.moveaxis(pole_kernel(**KERNEL), -1, 0)
 
 CALLS = [

@@ -5,7 +5,7 @@ import numpy as np
 from zwidth.figures.table import stack
 
 
-def outline(delta, d=0.0, delay_model="held", line=False):
+def outline(delta, d=0.0, line=False):
     """Half an ellipse from (0, -delta) to (0, 2 + delta); with ``line``, its end runs straight at omega = pi."""
     omega = np.linspace(0.0, np.pi if line else 2.0, 21)
     turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 21)
@@ -13,30 +13,35 @@ def outline(delta, d=0.0, delay_model="held", line=False):
     if line:
         alpha, beta, omega = np.append(alpha, 0.0), np.append(beta, 3.0), np.append(omega, np.pi)
         alpha[-2] = 0.5
-    keys = {"curve": "boundary", "d": d, "delta": delta, "delay_model": delay_model}
+    keys = {"curve": "boundary", "d": d, "delta": delta}
     return {**keys, "omega": omega, "alpha": alpha, "beta": beta}
 
 
-def ridge(d=0.0, delay_model="held"):
+def of_model(model):
+    """Return the column of a delay model; none in the tables of exact delays only."""
+    return {"delay_model": model} if model else {}
+
+
+def ridge(d=0.0, model="held"):
     delta = np.linspace(0.0, 10.0, 41)
     columns = {"alpha_max": (1.0 + delta) / (1.0 + d), "beta": 0.5 - 0.1 * delta, "omega": delta / 10}
-    return {"d": d, "delay_model": delay_model, "delta": delta, **columns}
+    return {"d": d, **of_model(model), "delta": delta, **columns}
 
 
 def path(d=0.0):
-    given = ridge(d)
+    given = ridge(d, "")
     return {"curve": "ridge_path", **given, "alpha": given.pop("alpha_max")}
 
 
-def interval(d=0.0, delay_model="held", curve="stable"):
+def interval(d=0.0, model="held", curve="stable"):
     delta = np.linspace(0.0, 2.0, 11)
     bounds = {"beta_lower": -delta, "beta_upper": 2.0 / (1.0 + d) + delta}
-    return {"curve": curve, "d": d, "delay_model": delay_model, "delta": delta, **bounds}
+    return {"curve": curve, "d": d, **of_model(model), "delta": delta, **bounds}
 
 
 def passive_outline(delta, d=0.0):
     columns = {"alpha": np.array([0.0, 2.0 * delta, 0.0]), "beta": np.array([-delta, 0.0, delta])}
-    return {"curve": "passive", "d": d, "delta": delta, "delay_model": "held", **columns}
+    return {"curve": "passive", "d": d, "delta": delta, **columns}
 
 
 def in_si(columns):
@@ -79,11 +84,8 @@ def measured_response():
 RESPONSE = measured_response()
 BOUNDARY = stack([outline(0.5), outline(1.0), outline(0.5, 2.0), outline(1.0, 2.0), path(), path(2.0)])
 RIDGE = stack([ridge(), ridge(0.5), ridge(0.5, "fractional_power")])
-LIMITS = {("held", 0.0): 4.0, ("held", 0.5): 2.5, ("fractional_power", 0.5): 2.5}
-SLOPES = stack(
-    {"delay_model": model, "d": np.linspace(0.0, 1.0, 9), "slope": 4.0 - 3.0 * np.linspace(0.0, 1.0, 9)}
-    for model in ("held", "fractional_power")
-)
+LIMITS = {0.0: 4.0, 0.5: 2.5}
+SLOPES = {"d": np.linspace(0.0, 1.0, 9), "slope": 4.0 - 3.0 * np.linspace(0.0, 1.0, 9)}
 COSTS = stack([cost(0.0), cost(1.0)])
 
 # What each function draws; the name is the function's, and what is special about the case.
@@ -97,12 +99,13 @@ EVERY_FIGURE = {
     "draw_boundary with a line": (stack([outline(1.0), outline(3.0, line=True)]),),
     "draw_boundary with passivity in SI": (in_si(stack([outline(0.5), passive_outline(0.5)])),),
     "draw_boundary of many deltas": (stack([outline(delta) for delta in np.linspace(0.1, 2.0, 20)]),),
-    "draw_boundary of both models": (stack([outline(0.5, 0.5), outline(0.6, 0.5, "fractional_power")]),),
     "draw_zero_stiffness": (
         stack([interval(), interval(0.5), interval(0.5, "fractional_power"), interval(3.0, curve="passive")]),
     ),
+    "draw_zero_stiffness of exact delays": (stack([interval(0.5, ""), interval(3.0, "", "passive")]),),
     "draw_ridge": (RIDGE,),
-    "draw_slope": (RIDGE, SLOPES),
+    "draw_ridge of exact delays": (stack([ridge(model=""), ridge(0.5, "")]),),
+    "draw_slope": (stack([ridge(model=""), ridge(0.5, "")]), SLOPES),
     "draw_passivity_cost": (COSTS,),
     "draw_response": (RESPONSE,),
     "draw_workspace": (POSES, "shoulder_deg", "elbow_deg"),

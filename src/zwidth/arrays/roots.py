@@ -26,19 +26,17 @@ _ROUNDING = 1e-15
 _NEWTON_STEPS = 16
 
 
-def bisect(holds: Function, low: Array, high: Array, *, geometric: bool = False) -> Array:
-    """Where a condition that holds at ``low`` ceases to; ``geometric``: by halving the ratio of two positive places."""
+def bisect(holds: Function, low: Array, high: Array) -> Array:
+    """Return the point between ``low``, where a condition holds, and ``high``, from which it does not."""
     xp = namespace(low, high)
 
-    def middle(low: Array, high: Array) -> Array:
-        return xp.sqrt(low) * xp.sqrt(high) if geometric else 0.5 * (low + high)
-
     def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        at = middle(*ends)
+        at = 0.5 * (ends[0] + ends[1])
         held = holds(at)
         return xp.where(held, at, ends[0]), xp.where(held, ends[1], at)
 
-    return middle(*repeat(_HALVINGS, halve, (low, high), xp))
+    low, high = repeat(_HALVINGS, halve, (low, high), xp)
+    return 0.5 * (low + high)
 
 
 def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) -> tuple[Array, Array]:

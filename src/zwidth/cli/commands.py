@@ -43,7 +43,9 @@ _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
 
 @click.group(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="Completion in bash (zsh, fish): _ZWIDTH_COMPLETE=bash_source zwidth > FILE, and '. FILE' in ~/.bashrc.",
+    epilog="Exit codes: 0 for an answer, which may be UNSTABLE; 1 if no wall or value exists, or a computation fails; "
+    "2 for invalid input.\n\n"
+    "Completion in bash (zsh, fish): _ZWIDTH_COMPLETE=bash_source zwidth > FILE, and '. FILE' in ~/.bashrc.",
 )
 @click.version_option(__version__, prog_name="zwidth")
 def cli() -> None:
@@ -64,7 +66,8 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
 
     With --resolution, --friction or --max-force the wall is also simulated, to find limit cycles and saturation.
     Required: --stiffness, --mass (or --device) and --rate (or --period); damping and delay default to 0. SCENE.yaml (or
-    the folder of a run) supplies parameters not given as options; options override it.
+    the folder of a run) supplies parameters not given as options; options override it. The exit code is 0 for every
+    verdict.
     """
     from zwidth.pages.verdict import check_lines
     from zwidth.scenes.assessment import assess, limits_of
@@ -72,18 +75,18 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
 
     verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
     result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
-    lines: list[str] = []
+    lines, diagnosis = list[str](), diagnose_wall(scene, hardware)
+    if diagnosis is not None:
+        result["diagnosis"] = diagnosis.as_dict()
     if as_json:
+        result["cautions"] = words.silent_cautions(scene, find_silent())
         result["islands"] = [island._asdict() for island in scene.islands()]
         unstable = verdict.stable is False and not verdict.marginal
         if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
             result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
-        lines = check_lines(scene, verdict, limits, silent=find_silent(), verbose=verbose)
-    if (diagnosis := diagnose_wall(scene, hardware)) is not None:
-        result["diagnosis"] = diagnosis.as_dict()
-        lines += ["", *words.diagnosis_lines(diagnosis)]
+        lines = check_lines(scene, verdict, limits, silent=find_silent(), diagnosis=diagnosis, verbose=verbose)
     words.tell(result, lines + words.note_lines(notes), as_json, words.LABEL)
 
 
@@ -91,15 +94,8 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
 @click.option("--delta", type=quantity_type("1", Range(*SIZES["delta"])), help="Normalized physical damping b T/m.")
 @click.option("--d", type=quantity_type("1", Range(*SIZES["d"])), help="Delay in periods.")
 @scene_options(wall=False, instead="--delta and --d")
-@click.option(
-    "--delay-model",
-    type=click.Choice(["held", "fractional_power"]),
-    default="held",
-    show_default=True,
-    help="How a delay that is not whole is modelled.",
-)
 @json_option
-def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as_json: bool) -> None:
+def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> None:
     """Print the stiffest stable wall of a device.
 
     With a velocity filter, a linear system or a measured response only walls with B >= 0 count, because a negative B
@@ -119,12 +115,11 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
         raise click.UsageError("give either --delta and --d, or --mass and --rate (with --damping and --delay)")
     given = scene
     scene = Scene(Device(1.0, delta), Timing(1.0, d)) if scene is None else scene
-    scene = scene.replace(delay_model=delay_model)
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
         fault = "no wall with K > 0 is stable on this device" if none else "K_max of this device could not be computed"
-        raise click.UsageError(f"{fault}: {explain_missing(scene, wall.status)}")
+        raise click.ClickException(f"{fault}: {explain_missing(scene, wall.status)}")
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
     if isinstance(scene.device, Device):
@@ -158,6 +153,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
             *lines,
             words.line("device", spell_device(scene, find_silent())),
             *words.part_lines(scene),
+            *(words.line("CAUTION", text) for text in words.silent_cautions(scene, find_silent())),
             words.line("next", "zwidth recommend, with the same options, for the wall to set"),
             "",
             *(slope.line() for slope in slopes),
@@ -327,6 +323,11 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option("--gain-margin", type=_FACTOR, help="Smallest gain margin, a factor on K and B together.  [default: 2]")
 @click.option("--phase-margin", type=_DEGREES, help="Smallest phase margin, in degrees.  [default: 30]")
 @click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
+@click.option(
+    "--grasps",
+    type=click.Choice(("all", "soft", "none")),
+    help="Reference grasps in which the wall must be stable.  [default: soft, with the default margins]",
+)
 @hardware_options
 @beyond_safe_option
 @figure_option
@@ -344,10 +345,11 @@ def recommend(
 ) -> None:
     """Recommend the wall to set: the stiffest one with the required margins.
 
-    Any given requirement replaces all defaults. With --resolution, --friction or --max-force the wall is also
-    simulated, to find limit cycles and saturation. A hand (--operator-...) counts as part of the device; the wall is
-    then also checked without it. Required: --mass (or --device) and --rate (or --period); damping and delay default to
-    0. SCENE.yaml (or the folder of a run) supplies parameters not given as options; options override it.
+    Any given margin, share or --passive replaces all defaults; --grasps does not. With --resolution, --friction or
+    --max-force the wall is also simulated, to find limit cycles and saturation; --max-force also limits the force in
+    the code of --code. A hand (--operator-...) counts as part of the device; the wall is then also checked without it.
+    Required: --mass (or --device) and --rate (or --period); damping and delay default to 0. SCENE.yaml (or the folder
+    of a run) supplies parameters not given as options; options override it. Exit code 1: no wall exists.
     """
     from zwidth.pages.verdict import recommend_lines
 
@@ -360,13 +362,20 @@ def recommend(
 
         wrote.append(save_figure(draw(found), figure))
     if code:
-        click.echo(found.code(code), nl=False)
+        if found.status != Status.OK:
+            raise click.ClickException(found.reason)
+        for caution in words.silent_cautions(scene, find_silent()):
+            click.echo(f"zwidth: {caution}", err=True)
+        click.echo(found.code(code, max_force=hardware.get("max_force", math.inf)), nl=False)
         return
-    notes = [*words.coded_period_notes(scene), *found.notes]
     diagnosis = diagnose_wall(found.scene, hardware) if found.status == Status.OK else None
-    simulated = [] if diagnosis is None else words.diagnosis_lines(diagnosis)
-    lines = () if as_json else recommend_lines(found, silent=find_silent(), hardware=simulated, verbose=verbose)
-    result = found.as_dict() | {"notes": notes} if as_json else {}
-    if as_json and diagnosis is not None:
-        result["diagnosis"] = diagnosis.as_dict()
+    notes, lines, result = [*words.coded_period_notes(scene), *found.notes], list[str](), dict[str, Any]()
+    if as_json:
+        result = found.as_dict() | {"notes": notes}
+        result["cautions"] += words.silent_cautions(scene, find_silent())
+        result |= {} if diagnosis is None else {"diagnosis": diagnosis.as_dict()}
+    else:
+        lines = recommend_lines(found, silent=find_silent(), diagnosis=diagnosis, verbose=verbose)
     words.tell(result, [*lines, *words.note_lines(notes), *wrote], as_json, words.LABEL)
+    if found.status != Status.OK:
+        raise SystemExit(EXIT_FAILED)

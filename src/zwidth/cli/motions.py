@@ -103,8 +103,9 @@ def simulate(
         else "",
     ]
     force = max(abs(float(motion.command.min())), abs(float(motion.command.max())))
+    load = "torque" if units.rotary else "force"
     depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}"
-    depth += f", force up to {with_unit(force, units['N'], 3)}"
+    depth += f", {load} up to {with_unit(force, units['N'], 3)}"
     lines = [
         row("start", ", ".join(filter(None, start)) or "at rest"),
         row("motion", f"{depth}; {ending}"),

@@ -248,7 +248,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 
 def _change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Return the scene of a file with the parameters given as options replaced."""
+    """Load the scene from a file and override the parameters given as command-line options."""
     from zwidth.parts.devices import KnownDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}

@@ -86,6 +86,9 @@ _PLAIN = {
 }
 
 
+_DELAY_MODELS = ("delay_model", "delay_models")
+
+
 def problems_of(error: ValidationError | PydanticCustomError, *above: str) -> list[LocatedProblem]:
     """Every problem of an error with the path to its field, below the keys ``above`` of what was read."""
     if not isinstance(error, ValidationError):
@@ -181,9 +184,12 @@ class Strict(BaseModel):
 
     @classmethod
     def unknown(cls, name: str) -> tuple[str, str, str]:
-        """Hook: what is wrong with a key that does not belong here, what is allowed and the remedy."""
+        """Return the problem, what is allowed and the remedy for a key that is not allowed here."""
         if name == "<<":
             return "unknown key", "YAML 1.2 has no merge keys", "write the keys out"
+        if name in _DELAY_MODELS:
+            remedy = "remove it; for the paper's z^(1+d), use the kinds 'paper_fig6' and 'paper_fig10'"
+            return "key of an earlier release", "every delay is exact ('held')", remedy
         key, colon, value = name.partition(":")
         if colon and key in cls.model_fields:
             return "unknown key", "a blank follows the colon behind a key", f"write '{key}: {value}'"

@@ -38,8 +38,10 @@ from zwidth.parts.devices import DEVICES
 from zwidth.parts.measured import SUFFIXES, MeasuredDevice
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe
+from zwidth.words.quantities import PARAMETERS
+from zwidth.words.tables import read_columns
 from zwidth.words.unit_system import SYSTEMS
-from zwidth.words.units import tell_kind
+from zwidth.words.units import split_head, tell_kind
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -81,8 +83,8 @@ def _check(
 
 
 def tells_rotary(data: Any, key: str = "") -> bool:
-    """Whether values are of rotary devices: a unit of theirs, ``rotary: true``, or a device by its name."""
-    # All devices of a file are of one kind: what is told of one holds for all. A fit finds the kind in its logs.
+    """Return whether a configuration has rotary devices: by a unit, ``rotary: true``, or a device's name or table."""
+    # One rotary value makes all devices of a file rotary. A fit determines the kind from its logs.
     if isinstance(data, Mapping):
         return data.get("kind") != "fit" and any(tells_rotary(each, str(name)) for name, each in data.items())
     if isinstance(data, list):
@@ -94,6 +96,12 @@ def tells_rotary(data: Any, key: str = "") -> bool:
                 return MeasuredDevice.read(find_file(data)).rotary
             return False
         return any(known.rotary for known in DEVICES if known.name == data)
+    if key == "csv" and isinstance(data, str):
+        # Coordinates in degrees do not make a device rotary, so only parameters count.
+        with suppress(InputError):
+            heads = map(split_head, read_columns(find_file(data)).heads)
+            return any(tell_kind(f"1 {unit}") is True for name, unit in heads if name in PARAMETERS)
+        return False
     return data is True if key == "rotary" else key not in _TEXTS and tell_kind(data) is True
 
 

@@ -31,7 +31,6 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
 from zwidth.words.plausible import list_doubts
 from zwidth.words.quantities import LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
-from zwidth.words.types import DelayModel
 from zwidth.words.xp import within
 
 _Parts: Any = make_parts_base("the difference of two samples", "none")
@@ -95,7 +94,7 @@ class _PhysicalPlant(_Parts, SampledMass):
     @cached_property
     def _scene(self) -> Scene:
         # As a length of time of its own: seconds of a delay in periods may miss it by a rounding error.
-        timing = Timing(self.period, self.delay, getattr(self, "delay_model", "held"))
+        timing = Timing(self.period, self.delay)
         # A device that is given as a whole is one of the parts, and takes the place of this one.
         device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
         limit = getattr(self, "safe_limit", None)
@@ -179,9 +178,6 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
     velocity: SimulatedVelocityField | None = None
     """How the velocity is estimated; the difference of two samples where left out."""
 
-    delay_model: DelayModel = "held"
-    """How a delay that is not whole is modeled."""
-
     safe_limit: SafeLimitSection | None = None
     """Stiffest wall that measurements of the device support."""
 
@@ -196,12 +192,6 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
         names = "mass", "damping", "period", "delay", "rotary", "safe_limit"
         own = {name: getattr(self, name) for name in names}
         return kind(**{name: value for name, value in own.items() if value is not None}, **list_parts(self))
-
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
-        if not self._is_double and self.delay_model not in self.to_scene().loop.delay_models:
-            allowed = "velocity filters, hands and other parts are computed in the model 'held'"
-            yield ("delay_model",), problem(f"got {self.delay_model!r}", allowed, "write 'delay_model: held'")
 
     @property
     def doubts(self) -> list[str]:
@@ -222,9 +212,6 @@ class NormalizedScene(_NormalizedPlant, what="a scene"):
 
     alpha: Number | None = None
     beta: Number | None = None
-
-    delay_model: DelayModel = "held"
-    """How a delay that is not whole is modeled."""
 
     def bare(self) -> NormalizedDevice:
         """The scene without its wall."""

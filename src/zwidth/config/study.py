@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
+from typing import Any, ClassVar, TypeVar, get_args
 
-from pydantic import BeforeValidator, GetJsonSchemaHandler, PrivateAttr, WrapValidator
+from pydantic import GetJsonSchemaHandler, PrivateAttr
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from zwidth.config.fields import LocatedProblem, Name, Strict, listing, members, problem
+from zwidth.config.fields import LocatedProblem, Name, Strict, listing, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
 from zwidth.config.values import Axis, find_system
-from zwidth.words.formatting import describe
-from zwidth.words.types import DelayModel
 from zwidth.words.unit_system import UnitSystem
 
 MAX_POINTS = 150_000_000
@@ -34,17 +32,6 @@ def register(model: _Kind) -> _Kind:
     return model
 
 
-def _only_held(value: Any) -> Any:
-    """A validator for a study that needs poles."""
-    if value == "fractional_power":
-        raise problem(
-            f"got {describe(value)}, the study's own or that of scene.delay_model",
-            "poles do not exist in this delay model, only the boundary and the ridge do; allowed is 'held'",
-            "write 'delay_model: held' in this study, or use the kind 'boundary' or 'ridge'",
-        )
-    return value
-
-
 def name_parts(parts: Iterable[str]) -> str:
     """Names of parts as words; a device that is given as a whole is one of them."""
     return " and ".join("a system or response in place of its mass" if name == "device" else name for name in parts)
@@ -56,9 +43,6 @@ def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticC
     allowed = f"the kind {kind!r} answers for a rigid mass with the difference of two samples alone"
     kinds = f"use one of the kinds {listing(name for name in sorted(KINDS) if KINDS[name].takes_parts)}"
     return problem(what, allowed, f"{kinds}, or {remedy}" if remedy else kinds)
-
-
-DelayModels = Annotated[tuple[DelayModel, ...], WrapValidator(members("delay models"))]
 
 
 class Study(Strict):
@@ -105,10 +89,9 @@ class Study(Strict):
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        """Add what the study leaves out and the scene knows."""
+        """Return the keys of a study with absent ones supplied by the scene."""
         absent = cls._list_absent(raw)
-        supplied: dict[str, Any] = {name: getattr(scene, name) for name in ("delta", "d", "delay_model")}
-        supplied["delay_models"] = [scene.delay_model]
+        supplied: dict[str, Any] = {"delta": scene.delta, "d": scene.d}
         if isinstance(scene, PhysicalScene):
             supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
             if "device" in absent:
@@ -124,21 +107,16 @@ class Study(Strict):
         return [name for name in cls.from_scene if name not in given]
 
     @classmethod
-    def _list_taken(cls, raw: dict[str, Any]) -> list[str]:
-        """What of the device the study takes from the scene."""
-        return [name for name in cls._list_absent(raw) if not name.startswith("delay_model")]
-
-    @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
-        """Refuse a scene with parts of which the study would take numbers and forget the rest."""
-        taken = cls._list_taken(raw)
+        """Raise a problem if the study would take parameters of the scene and ignore its parts."""
+        taken = cls._list_absent(raw)
         if taken and not cls.takes_parts and scene.parts_beyond:
             raise refuse_parts(cls.kind_name(), list_parts(scene), f"give {' and '.join(taken)} here")
 
     @classmethod
     def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:
-        """Refuse a scene whose velocity estimate has no linear form, where something is taken of it."""
-        if (cls.takes_parts or cls._list_taken(raw)) and not cls.simulates and is_adaptive(scene):
+        """Raise a problem if the study takes parameters from a scene whose velocity estimate has no linear form."""
+        if (cls.takes_parts or cls._list_absent(raw)) and not cls.simulates and is_adaptive(scene):
             raise problem("got scene.velocity of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
 
     @classmethod
@@ -176,10 +154,3 @@ class Study(Strict):
         what = f"{self.extent} is {self.points:.4g} points and {self.nbytes / 2**30:.3g} GiB"
         allowed = f"at most {MAX_POINTS:.4g} points and {MAX_BYTES / 2**30:g} GiB a study"
         yield (), problem(what, allowed, self.remedy_if_too_large)
-
-
-class HeldStudy(Study):
-    """What the studies have that need poles."""
-
-    delay_model: Annotated[Literal["held"], BeforeValidator(_only_held)] = "held"
-    """How a delay that is not whole is modeled: 'held', for poles, motions and passivity exist in no other model."""

@@ -22,7 +22,7 @@ from zwidth.config.devices import (
 from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, listing, members, problem
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
-from zwidth.config.study import HeldStudy, register
+from zwidth.config.study import Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.device import Device
@@ -168,11 +168,11 @@ _Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be ax
 
 
 @register
-class SweepStudy(_Parts, HeldStudy):
+class SweepStudy(_Parts, Study):
     """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
 
     method = "Closed forms in float64; the same bits whatever the chunks and workers."
-    from_scene = ("delay_model",)
+    from_scene = ()
     takes_parts = True
 
     kind: Literal["sweep"]

@@ -10,10 +10,10 @@ Example:
     >>> import numpy as np, zwidth
     >>> from zwidth import figures
     >>> delta = np.linspace(0, 2, 41)
-    >>> table = {"d": np.ones(41), "delay_model": ["held"] * 41, "delta": delta}
+    >>> table = {"d": np.ones(41), "delta": delta}
     >>> (ax,) = figures.draw_ridge({**table, "alpha_max": zwidth.alpha_max(delta, 1.0).alpha})
     >>> ax.lines[0].get_label()
-    'alpha_max, d = 1, held'
+    'alpha_max, d = 1'
 """
 
 import lazy_loader

@@ -31,12 +31,12 @@ _LEAST_DELTA = 0.1
 def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     """Draw the virtual damping that is stable for alpha -> 0 over delta, with the stable side shaded.
 
-    Solid: held delay; dashed: the fractional power; dash-dotted: the passivity condition. The lower bound
+    Solid: exact delay; dashed: the paper's fractional power; dash-dotted: the passivity condition. The lower bound
     ``beta = -delta`` is common to all delays.
 
     Args:
-        table: columns of a boundary study in the plane delta_beta: curve, d, delay_model, delta, beta_lower,
-            beta_upper.
+        table: columns of a boundary study in the plane delta_beta: curve, d, delta, beta_lower, beta_upper; with
+            delay_model ("held" or "fractional_power") those of a study of kind paper_fig6.
         ax: an Axes of yours; the function returns one, not an array of them.
     """
     ax = ax or style.panels(None, 1, 5.4, 4.1)[0]
@@ -45,7 +45,7 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     passive = curves(table, "d", over="delta", curve="passive")
     colors = style.color_by_value([interval.d for interval in stable])
     for interval in stable:
-        if interval.delay_model == "held":
+        if style.is_exact(interval):
             _shade(ax, interval, colors[interval.d], zorder=1)
         _draw_curve(ax, interval, interval.delta, interval.beta_upper, colors, "beta_upper")
     look = {"color": style.VERMILION, "linestyle": style.DASH_DOTTED, "linewidth": 1.3, "zorder": 4}
@@ -73,7 +73,7 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
 
 
 def _draw_curve(ax: Axes, of: Any, x: Any, y: Any, colors: dict[float, Any], words: str, **look: Any) -> None:
-    """One curve of a delay in its color, dashed in the model of the fractional power; a single point is a dot."""
+    """Draw the curve of a delay in its color, dashed for the fractional power; a single point becomes a dot."""
     look |= {"marker": "o", "clip_on": False} if np.size(x) == 1 else {}
     label = ", ".join([f"{words}, d = {of.d:g}", *([of.delay_model] if hasattr(of, "delay_model") else [])])
     ax.plot(x, y, label=label, **{"color": colors[of.d], "linestyle": style.dash_of(of), "zorder": 3, **look})
@@ -86,13 +86,16 @@ def _shade(ax: Axes, interval: Any, color: Any, **keywords: Any) -> None:
 
 @draws_tables
 def draw_ridge(table: Table, axes: style.AnyAxes | None = None, *, two_scalings: bool = False) -> np.ndarray:
-    """Draw alpha_max over delta, one curve for every delay and delay model; below a curve some wall is stable.
+    """Draw alpha_max over delta, one curve per delay; below a curve some wall is stable.
 
     Args:
-        table: columns of a ridge study: d, delay_model, delta, alpha_max.
+        table: columns of a ridge study: d, delta, alpha_max; with delay_model ("held" or "fractional_power") those of a
+            study of kind paper_fig10.
         axes: an Axes of yours; two of them, in this order, for the two scalings.
-        two_scalings: show the small deltas in a panel of their own, as the paper does.
+        two_scalings: show the small deltas, if there are any, in a panel of their own, as the paper does.
     """
+    delta = np.asarray(table["delta"])
+    two_scalings = bool(two_scalings and delta.min() <= _ZOOM * delta.max())
     width, height = (style.WIDTH, 3.6) if two_scalings else (5.4, 4.1)
     panels = style.panels(axes, 1 + two_scalings, width, height, columns=1 + two_scalings)
     for panel, share in zip(panels, (_ZOOM, 1.0)[-len(panels) :], strict=True):
@@ -112,7 +115,7 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
     colors = style.color_by_value([path.d for path in shown])
     for path in shown:
         _draw_curve(ax, path, path.delta, path.alpha_max, colors, "alpha_max")
-        if path.delay_model == "held":
+        if style.is_exact(path):
             ax.fill_between(path.delta, 0.0, path.alpha_max, color=colors[path.d], alpha=0.07, linewidth=0.0, zorder=1)
     if columns["delta"].min() < end:
         ax.set_xlim(float(columns["delta"].min()), end)
@@ -138,19 +141,19 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
     """Draw alpha_max/delta over delta beside its limit g(d), and g over the delay.
 
     Args:
-        table: columns of a ridge study: d, delay_model, delta, alpha_max.
-        slopes: delay_model, d and slope, which is g(d): over a range of delays, those of ``table`` among them.
-        axes: an Axes of yours for the first panel alone, or two.
+        table: columns of a ridge study: d, delta, alpha_max.
+        slopes: columns d and slope, the limit g(d), over a range of delays that includes those of ``table``.
+        axes: an existing Axes for the first panel only, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2, gridspec_kw={"width_ratios": [1.15, 1.0]})
-    paths, models = curves(table, "d", "delay_model", over="delta"), curves(slopes, "delay_model")
+    paths, limits = curves(table, "d", "delay_model", over="delta"), select(slopes)
+    paths = [path for path in paths if style.is_exact(path)]
     colors = style.color_by_value([path.d for path in paths])
     for path in paths:
-        own = next(model for model in models if model.delay_model == path.delay_model)
-        path.limit = float(own.slope[own.d == path.d][0])
+        path.limit = float(limits["slope"][limits["d"] == path.d][0])
     _draw_ratio(panels[0], paths, colors)
     for ax in panels[1:]:
-        _draw_limit(ax, paths, models, colors)
+        _draw_limit(ax, paths, limits["d"], limits["slope"], colors)
     style.letter(panels)
     return panels
 
@@ -175,16 +178,13 @@ def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
     ax.legend(handles=[style.line(r"$\alpha_{\max}/\delta$"), limit], loc="upper right")
 
 
-def _draw_limit(ax: Axes, paths: list[Any], models: list[Any], colors: dict[float, Any]) -> None:
-    for model in models:
-        look = {"color": style.GRAY, "linestyle": style.dash_of(model), "zorder": 2}
-        ax.plot(model.d, model.slope, label=f"g, {model.delay_model}", **look)
+def _draw_limit(ax: Axes, paths: list[Any], d: np.ndarray, slope: np.ndarray, colors: dict[float, Any]) -> None:
+    ax.plot(d, slope, label="g", color=style.GRAY, zorder=2)
     for path in paths:
         ax.plot([path.d], [path.limit], "o", color=colors[path.d], markersize=5, zorder=3, clip_on=False)
-    ax.set_xlim(0.0, max(float(model.d.max()) for model in models))
-    ax.set_ylim(0.0, 1.04 * max(float(model.slope.max()) for model in models))
+    ax.set_xlim(0.0, float(d.max()))
+    ax.set_ylim(0.0, 1.04 * float(slope.max()))
     ax.set(xlabel=r"delay  $d = t_d/T$", ylabel=r"limit slope  $g(d)$")
-    style.legend([ax], style.delay_model_handles(models), outside=False, loc="upper right")
 
 
 @draws_tables
@@ -238,7 +238,7 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
     stiffness; dash-dotted: the passivity condition.
 
     Args:
-        table: columns of a boundary study: curve, d, delta, delay_model, omega in radians a period, alpha, beta; with
+        table: columns of a boundary study: curve, d, delta, omega in rad per sample, alpha, beta; with
             stiffness_N_per_m and virtual_damping_N_s_per_m the axes are in SI units as well.
         axes: an Axes of yours for all delays together, or one for each delay.
 
@@ -275,12 +275,12 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
 
 def _draw_boundaries(ax: Axes, table: Table, colors: dict[float, Any], scale: tuple[float, float] | None) -> None:
     """Draw all of a table into one Axes, without labels."""
-    edges = curves(table, "d", "delta", "delay_model", curve="boundary")
+    edges = curves(table, "d", "delta", curve="boundary")
     # From the largest region to the smallest, so that none hides another.
     shade = min(0.10, 0.7 / len(edges))
     for edge in sorted(edges, key=lambda edge: -edge.delta):
         _draw_edge(ax, edge, colors[edge.delta], shade)
-    for path in curves(table, "d", "delay_model", curve="ridge_path"):
+    for path in curves(table, "d", curve="ridge_path"):
         look = {"color": style.BLACK, "linestyle": style.DASHED, "linewidth": 1.1, "zorder": 4}
         ax.plot(path.alpha, path.beta, label=f"path of alpha_max, d = {path.d:g}", **look)
     for passive in curves(table, "d", "delta", curve="passive"):
@@ -303,7 +303,7 @@ def _draw_edge(ax: Axes, edge: Any, color: Any, shade: float) -> None:
     curve = slice(None) if line.size < 2 else slice(0, line[0] + 1)
     device = f"delta = {edge.delta:g}, d = {edge.d:g}"
     look: dict[str, Any] = {"color": color, "zorder": 3}
-    ax.plot(edge.alpha[curve], edge.beta[curve], linestyle=style.dash_of(edge), label=f"boundary, {device}", **look)
+    ax.plot(edge.alpha[curve], edge.beta[curve], label=f"boundary, {device}", **look)
     if line.size >= 2:
         look |= {"linestyle": style.DOTTED, "linewidth": 1.9, "dash_capstyle": "butt"}
         ax.plot(edge.alpha[line], edge.beta[line], label=f"z = -1, {device}", **look)
@@ -321,10 +321,9 @@ def _mark_maximum(ax: Axes, edge: Any, scale: tuple[float, float] | None) -> Non
 
 
 def _legend_handles(table: Table, colors: dict[float, Any]) -> list[Line2D]:
-    """What the colors and the line styles of the drawn curves mean."""
-    edges = curves(table, "d", "delta", "delay_model", curve="boundary")
+    """Return legend entries for the colors and the line styles of the drawn curves."""
+    edges = curves(table, "d", "delta", curve="boundary")
     handles = [style.line(rf"$\delta = {delta:g}$", color=color) for delta, color in colors.items()]
-    handles += style.delay_model_handles(edges)
     if any(np.count_nonzero(edge.omega >= np.pi) >= 2 for edge in edges):
         handles.append(style.line("real pole at $z = -1$", style.DOTTED, 1.9))
     kinds = np.asarray(table["curve"])

@@ -229,9 +229,8 @@ def use_whole(ax: Axes) -> None:
 
 
 def label_ends(ax: Axes, found: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:
-    """Write the delay of each curve to the right of its end; where the held delay is drawn it stands for the other."""
-    held = {curve.d for curve in found if getattr(curve, "delay_model", "") == "held"}
-    named = [k for k, curve in enumerate(found) if not held or curve.delay_model == "held"]
+    """Write the delay of each curve to the right of its end; of two delay models only the exact one is labeled."""
+    named = [k for k, curve in enumerate(found) if is_exact(curve)]
     texts = [f"$d = {found[k].d:g}$" for k in named]
     name_heights(ax, texts, [ends[k] for k in named], [colors[found[k].d] for k in named])
 
@@ -253,13 +252,19 @@ def line(label: str, dash: Any = SOLID, width: float | None = None, color: str =
     return Line2D([], [], color=color, linestyle=dash, linewidth=width, label=label, **keywords)
 
 
+def is_exact(curve: Any) -> bool:
+    """Return whether a curve is that of the exact delay, not of the paper's fractional power."""
+    return getattr(curve, "delay_model", "held") == "held"
+
+
 def dash_of(curve: Any) -> Any:
-    return SOLID if getattr(curve, "delay_model", "held") == "held" else DASHED
+    """Return the line style of a curve: solid for the exact delay, dashed for the paper's fractional power."""
+    return SOLID if is_exact(curve) else DASHED
 
 
 def delay_model_handles(found: Sequence[Any]) -> list[Line2D]:
-    """What solid and dashed mean, where the fractional power is drawn."""
-    both = any(curve.delay_model != "held" for curve in found)
+    """Return legend entries for solid and dashed lines if fractional powers are drawn."""
+    both = not all(map(is_exact, found))
     return [line("held delay (exact)"), line(r"fractional power $z^{1+d}$", DASHED)] if both else []
 
 

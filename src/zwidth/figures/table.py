@@ -84,10 +84,13 @@ def grid_in_order(arrays: Mapping[str, np.ndarray], axes: Iterable[str]) -> dict
 
 
 def curves(table: Table, *keys: str, over: str = "", **wanted: object) -> list[Any]:
-    """The curves that lie below each other in a table: rows in a row that share the values of ``keys``."""
-    # Each has its columns as attributes: single values of the keys, arrays of the others, by rising values of the
-    # column ``over`` where one is named. Rows without the wanted values are left out.
+    """Return the curves of a table: consecutive rows with the same values of ``keys``.
+
+    A curve has the columns as attributes: single values of the keys, arrays of the others, sorted by the column
+    ``over`` if given. Only rows with the wanted values count. The key delay_model is ignored if it is no column.
+    """
     columns = select(table, **wanted)
+    keys = tuple(key for key in keys if key != "delay_model" or key in columns)
     changes = [columns[key][1:] != columns[key][:-1] for key in keys]
     ends = np.flatnonzero(np.any(changes, axis=0)) + 1
     parts = {name: np.split(column, ends) for name, column in columns.items()}

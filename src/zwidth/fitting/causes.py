@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.encoder import find_resolution
+from zwidth.fitting.encoder import find_steps
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import FittedModel
 from zwidth.words.formatting import plain, with_unit
@@ -28,7 +28,8 @@ _EXPLAINED = 0.25  # a further force is the cause if it leaves less than this sh
 
 # Test of the residuals.
 _SHARE = 0.5  # a force is the cause if it explains more than this share of the residual sum of squares
-_ROUNDING_SHARE = 0.2  # the same for rounding errors of the force, whose size is computed and not fitted
+# The same share for rounding errors of the force: lower, because their size is computed and not fitted.
+_ROUNDING_SHARE = 0.2
 _TRIALS = 4  # random draws of the rounding errors
 _MIN_LEVELS = 8  # least number of distinct forces for which a common step is attributed to rounding
 _MIN_STEP = 2e-4  # least rounding step, relative to the largest force
@@ -159,7 +160,7 @@ def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float, syst
         squares: residual sum of squares.
     """
     forces = np.concatenate([log.force for log in best.model.logs])
-    step, largest = find_resolution(forces), best.model.largest
+    step, largest = find_steps(forces)[1], best.model.largest
     if step < _MIN_STEP * largest or np.unique(forces).size < _MIN_LEVELS:
         return ""
     rng, expected = np.random.default_rng(0), []

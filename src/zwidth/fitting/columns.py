@@ -35,7 +35,7 @@ from zwidth.words.units import (
 
 _AMPERES = {"A": 1.0, "mA": 1e-3}
 _PER_AMPERE = re.compile(r"(.*?)\s*/\s*A\s*")
-_MANY_COUNTS = 50.0  # least range of whole numbers that are read as encoder counts
+_MANY_COUNTS = 50.0  # least difference of maximum and minimum of whole numbers that are read as encoder counts
 _ROUNDING = 1e-9  # largest relative difference of two equal units, for rounding errors
 _OTHER = 0.1  # relative difference above which two periods contradict each other
 # Units of mass that scales and load cells display for a force, and the unit of the corresponding weight.

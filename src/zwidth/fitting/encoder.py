@@ -21,33 +21,63 @@ import numpy as np
 
 # Waves of the saw that are followed; the others are taken for white, 1.6 % of its variance.
 _WAVES, _LEAST = 40, 1e-6
-# How far positions may lie from whole steps, as a share of a step, and how many steps to a whole log at the most.
-_OFF, _MOST = 0.02, 1e7
+# Lattices of positions.
+_OFF = 0.02  # largest distance of a position from whole steps, in steps
+_EXACT = 1e-4  # the same for a column that is rounded to whole steps, which leaves only rounding errors of float64
+_ROUNDINGS = 5.0  # least encoder step, in steps of the rounded column; finer ones are not distinguished from it
+_MOST = 1e7  # largest range of positions, in steps
+_CHANCE = 1e-6  # largest probability that positions which are no whole steps look like ones
+_PICKS = 100  # positions that refine a step
+
+
+def find_steps(position: np.ndarray) -> tuple[float, float]:
+    """Return the encoder step and the step of the column, as of an angle in degrees with three decimals.
+
+    Both are equal if the column has encoder counts; 0 if there is no such step.
+    """
+    values = np.unique(position)
+    # Subtracting a common offset leaves errors of the size of the spacing of float64.
+    error = 16.0 * float(np.spacing(np.abs(values).max()))
+    column = _find_lattice(values, _EXACT, error)
+    return _find_lattice(values, _OFF, max(column, error)) or column, column
 
 
 def find_resolution(position: np.ndarray) -> float:
-    """The step that all positions are whole numbers of, but for a common offset; 0 where there is none."""
-    ways = np.sort(np.diff(np.unique(position)))
-    if ways.size < 2:
-        return float(ways.sum())
-    span, rest = float(np.ptp(position)), ways[:1]
-    # Euclid's: what the smallest way leaves of the others, and what that leaves.
-    while rest.size and span <= _MOST * rest.min():
-        step = smallest = float(rest.min())
-        # The smallest way is the least sure one: by ever longer ones.
-        for way in [*ways[:: max(1, ways.size // 50)].tolist(), span]:
+    """Return the encoder step, of which all positions are whole multiples except for a common offset; 0 if none."""
+    return find_steps(position)[0]
+
+
+def _find_lattice(values: np.ndarray, off: float, slack: float) -> float:
+    """Return the largest step whose whole multiples are all values, 0 if there is none, by Euclid's algorithm.
+
+    Args:
+        values: positions, sorted, each once.
+        off: largest distance of a value from a whole multiple, in steps.
+        slack: largest distance in SI units, if that is more; steps below ``_ROUNDINGS`` times of it do not count.
+    """
+    gaps = np.diff(values)
+    if gaps.size < 2:
+        return float(gaps.sum())
+    gaps = gaps[gaps > 2.0 * slack]  # smaller ones are rounding errors of equal positions
+    span, rest = float(np.ptp(values)), gaps
+    picks = (values - values[0])[np.unique(np.geomspace(1, values.size - 1, _PICKS).astype(int))]
+    while rest.size and span <= _MOST * (least := float(rest.min())) and least >= (_ROUNDINGS - 1.0) * slack:
+        step = smallest = float(np.mean(rest[rest <= least + 2.0 * slack]))
+        # Refine by ever larger distances, because rounding errors of small ones are large relative to them.
+        for way in picks.tolist():
             step = way / max(1.0, np.round(way / step))
-        if fits_steps(position, step):
+        chance = (2.0 * max(off, slack / step)) ** (values.size - 1)
+        if step >= _ROUNDINGS * slack and chance < _CHANCE and fits_steps(values, step, off, slack):
             return step
-        rest = np.abs(ways - smallest * np.round(ways / smallest))
-        rest = rest[rest > _OFF * smallest]
+        rest = np.abs(gaps - smallest * np.round(gaps / smallest))
+        rest = rest[rest > max(off * smallest, slack)]
     return 0.0
 
 
-def fits_steps(position: np.ndarray, step: float) -> bool:
-    """Whether positions are whole numbers of a step, but for a common offset."""
+def fits_steps(position: np.ndarray, step: float, off: float = _OFF, slack: float = 0.0) -> bool:
+    """Return whether positions are whole multiples of a step, except for a common offset."""
     ratios = (position - position[0]) / step
-    return bool(np.all(np.abs(ratios - np.round(ratios)) <= _OFF))
+    return bool(np.all(np.abs(ratios - np.round(ratios)) <= max(off, slack / step)))
 
 
 @dataclass(frozen=True)

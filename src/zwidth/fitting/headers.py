@@ -49,7 +49,7 @@ _UNIT_WORDS = {"millis": "ms", "micros": "us", "nanos": "ns", "secs": "s", "seco
 # A time in two columns. Last words of the header of the second column (fractions of a second), with the unit.
 _PARTS: dict[str, str] = dict.fromkeys(("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"), "ns")
 _PARTS |= dict.fromkeys(("usec", "usecs", "microsec", "microseconds", "us"), "us")
-# Last words of the header of the first column (whole seconds).
+# Words that end the header of the other column of such a pair (whole seconds).
 _WHOLE = ("sec", "secs", "seconds", "s")
 
 

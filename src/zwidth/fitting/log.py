@@ -10,7 +10,7 @@ from zwidth.fitting.causes import Cause, explain_motion, explain_residuals
 from zwidth.fitting.choosing import ALIKE, EXACT, choose_structure
 from zwidth.fitting.device_estimate import differentiate, reach_of
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, doubt_period
-from zwidth.fitting.encoder import find_resolution, fits_steps
+from zwidth.fitting.encoder import fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted, weigh_resonances
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
@@ -37,6 +37,7 @@ _FEWEST = 20
 _FEW = 60
 # So many positions of all logs are fitted, minutes of a record: more would cost gigabytes and narrow errors alone.
 _MOST = 200_000
+_FINER = 0.3  # residuals below this share of the quantization noise of an encoder exclude its step
 # A slope of less than so many of its standard errors is none.
 _SEEN = 5.0
 # So much of the motion's squares may stay unexplained by anything, where it is so far from noise.
@@ -130,7 +131,7 @@ def _fit(
     system: UnitSystem,
 ) -> DeviceFit:
     """Return the fit of logs that were read and repaired."""
-    logs, places, period, wavers, notes = read
+    logs, places, period, wavers, notes, _ = read
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
     stretches = [find_even(place, skip + _FEWEST) for place in places]
@@ -148,8 +149,11 @@ def _fit(
         for each in own
     )
     doubts = [doubt for log in logs for doubt in find_stretches(log, system)]
-    step, odd = _find_step(resolution, logs, system)
-    best, pole, banks, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
+    steps, odd = _list_steps(resolution, read, system)
+    for step in steps:
+        best, pole, banks, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
+        if best.variance > (_FINER * step) ** 2 / 12.0:
+            break
     model, theta = best.model, best.theta
     _refuse_unmoved(best, period, system)
     if best.inverse.open[:3].any():
@@ -228,16 +232,23 @@ def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
     return 0.0 if none else float(value), error
 
 
-def _find_step(resolution: Any, logs: tuple[Recording, ...], system: UnitSystem) -> tuple[float, list[str]]:
-    """The encoder's step, and what is odd about it."""
+def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[list[float], list[str]]:
+    """Return the candidates for the encoder step, coarsest first, and warnings about a given step.
+
+    An ideal sensor is rounded to the step of the column only. A constant force moves it by nearly whole multiples of a
+    much larger step, which the positions do not distinguish from an encoder step; the residuals do.
+    """
     if resolution is None:
-        steps = [find_resolution(log.position) for log in logs]
-        return (min(steps) if min(steps) and max(steps) < 1.5 * min(steps) else 0.0), []
+        columns = zip(*read.steps, strict=True)
+        return sorted({min(each) if max(each) < 1.5 * min(each) else 0.0 for each in columns}, reverse=True), []
     step = check_number("resolution", resolution, system["m"], NOT_NEGATIVE)
-    if step and not all(fits_steps(log.position, step) for log in logs):
+    pairs = zip(read.logs, read.steps, strict=True)
+    if step and not all(fits_steps(log.position, step, slack=column) for log, (_, column) in pairs):
         text = with_unit(step, system["m"])
-        return 0.0, [f"the positions are no whole steps of {text}, so its errors are taken for noise: check resolution"]
-    return step, []
+        return [0.0], [
+            f"the positions are no multiples of {text}, so their errors are treated as noise: check resolution"
+        ]
+    return [step], []
 
 
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:

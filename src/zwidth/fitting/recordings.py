@@ -29,10 +29,11 @@ class ReadLogs(NamedTuple):
     """Logs at even times, after repair."""
 
     logs: tuple[Recording, ...]
-    places: tuple[np.ndarray, ...]  # index of each sample of a log, in periods after its first sample
+    places: tuple[np.ndarray, ...]  # for each log, the times of its samples in whole periods after the first
     period: float  # s
     wavers: float  # relative standard error of the period
     notes: tuple[str, ...]  # the repairs, one clause each
+    steps: tuple[tuple[float, float], ...]  # encoder step and column step of each log, from `find_steps`
 
 
 def read_logs(
@@ -57,7 +58,7 @@ def read_logs(
         )
     step = 0.0 if resolution is None else check_number("resolution", resolution, system["m"], NOT_NEGATIVE)
     read = [_read(*parts, resample, step, system) for parts in zip(times, positions, forces, strict=True)]
-    logs, places, periods, errors, notes = zip(*read, strict=True)
+    logs, places, periods, errors, notes, steps = zip(*read, strict=True)
     if len(read) > 1:
         notes = [[f"log {k}: {note}" for note in each] for k, each in enumerate(notes, start=1)]
     error = max(errors)
@@ -66,12 +67,12 @@ def read_logs(
             f"time: the logs have periods of {with_unit(min(periods), 's')} to {with_unit(max(periods), 's')}; fit "
             "them one by one"
         )
-    return ReadLogs(logs, places, float(np.mean(periods)), error, tuple(note for each in notes for note in each))
+    return ReadLogs(logs, places, float(np.mean(periods)), error, tuple(note for each in notes for note in each), steps)
 
 
 def _read(
     time: Any, position: Any, force: Any, resample: bool, step: float, system: UnitSystem
-) -> tuple[Recording, np.ndarray, float, float, list[str]]:
+) -> tuple[Recording, np.ndarray, float, float, list[str], tuple[float, float]]:
     x, f = as_float64("position", position), as_float64("force", force)
     clock = None if isinstance(time, str) or np.ndim(time) == 0 else as_float64("time", time)
     given = {"position": x, "force": f} | ({} if clock is None else {"time": clock})
@@ -92,7 +93,7 @@ def _read(
                 f"{name}: got values from {plain(low)} to {plain(high)}; they must be at most {most:g} in magnitude "
                 f"and at least {least:g} apart; check the unit"
             )
-    clock, row, x, f, notes = repair_log(clock, x, f, step, system)
+    clock, row, x, f, notes, steps = repair_log(clock, x, f, step, system)
     if clock is None:
         place, period, error = row - row[0], check_number("time", time, "s", POSITIVE), 0.0
     else:
@@ -103,7 +104,7 @@ def _read(
         )
     if np.ptp(x) == 0:
         raise InputError("position: it never changes; check the column, and that nothing holds the device")
-    return Recording(f, x, 0), place, period, error, notes
+    return Recording(f, x, 0), place, period, error, notes, steps
 
 
 def _place(clock: np.ndarray, wavering: bool, notes: list[str]) -> tuple[np.ndarray, float, float]:

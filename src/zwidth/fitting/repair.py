@@ -11,7 +11,7 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from zwidth.fitting.encoder import find_resolution
+from zwidth.fitting.encoder import find_resolution, find_steps
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.unit_system import UnitSystem
@@ -37,9 +37,9 @@ _UNPAIRED = 0.02  # largest share of positions without a force at this distance
 # Glitches of the position.
 _WILD = 0.02  # largest share of positions that are left out as glitches
 _REACH = 3  # maximum length of a glitch, and half-width of the running median, in samples
-_FAR = 10.0  # least distance of a glitch from the running median, in typical second differences
+_FAR = 10.0  # least distance of a glitch from the line through its neighbors, in typical second differences
 _STEPS = 4.0  # added to this distance, in smallest second differences, i.e. encoder steps
-_RETURN = 0.2  # largest net displacement across a glitch, relative to the glitch
+_RETURN = 0.2  # largest distance from the line after a glitch, relative to the glitch
 
 # Wraps of the position. A wrap is accepted if the second differences around it, once unwrapped, are below either limit.
 _SMOOTH = 8.0  # in typical second differences (their 99 % quantile)
@@ -49,7 +49,7 @@ _SPAN = 0.5  # least jump of a wrap at an unknown modulus, relative to the span 
 # Times rounded to ticks of a coarse clock.
 _FEW_ODD = 5  # least number of steps that differ from the usual one by a tick
 _MANY_ODD = 20  # from this number on the rounding errors may spread over 1.1 instead of 1.02 ticks, for jitter
-_COARSEST = 10.0  # longest tick, in periods
+_COARSEST = 10.0  # longest clock tick that is repaired, in sampling periods
 
 
 class RepairedLog(NamedTuple):
@@ -60,6 +60,7 @@ class RepairedLog(NamedTuple):
     position: np.ndarray  # m or rad, unwrapped
     force: np.ndarray  # N or N m
     notes: list[str]  # one clause per repair
+    steps: tuple[float, float]  # encoder step and column step of the logged positions, from `find_steps`
 
 
 def repair_log(
@@ -106,6 +107,8 @@ def repair_log(
         notes.append(f"left out {_count(bad.size, 'position glitch', 'es')}, the first at sample {row[bad[0]]}")
         clock = None if clock is None else clock[kept]
         row, position, force = row[kept], position[kept], force[kept]
+    # Unwrapping would shift rounded positions by a modulus that is no multiple of their step.
+    steps = find_steps(position)
     if modulus:
         # Count wraps after the removal of glitches, because a glitch may hide a wrap.
         count = int(np.count_nonzero(np.round(np.diff(position) / modulus)))
@@ -113,7 +116,7 @@ def repair_log(
         size = with_unit(modulus, system["m"], 6)
         notes.append(f"the position wraps at {size} ({turn}{_count(count, 'time')}) and was unwrapped")
         position = unwrap(position, modulus)
-    return RepairedLog(clock, row, position, force, notes)
+    return RepairedLog(clock, row, position, force, notes, steps)
 
 
 def _count(number: int, noun: str, ending: str = "s") -> str:
@@ -281,35 +284,30 @@ def _measure_modulus(moves: np.ndarray, span: float, step: float, system: UnitSy
 
 
 def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
-    """Return a mask of glitches: up to 3 successive positions far from the running median, between normal positions.
+    """Return a mask of glitches: up to 3 successive positions off the line through their neighbors.
 
     Args:
         position: positions, possibly unwrapped.
         modulus: the modulus that was used for unwrapping, 0 for none. After a glitch the unwrapped positions may be off
             by multiples of the modulus.
     """
-    bends = np.abs(np.diff(position, 2))
+    moves = np.diff(position)
+    bends = np.abs(np.diff(moves))
     moving = bends[bends > 0]
     wild = np.zeros(position.size, bool)
     if position.size < 4 * _REACH or not moving.size:
         return wild
-    off = np.abs(position - _filter_median(position, _REACH))
-    # Add encoder steps because slow motion has hardly any other second differences, and the motion of three samples
-    # because a glitch shifts the median.
-    speed = _filter_median(np.abs(np.diff(position, prepend=position[0])), _REACH)
-    far = off > _FAR * float(np.quantile(moving, 0.9)) + _STEPS * float(moving.min()) + 3.0 * speed
-    for first in np.flatnonzero(far & ~np.append(False, far[:-1])):
-        after = first + 1
-        while after < position.size and far[after]:
-            after += 1
-        if first > 0 and after < position.size and after - first <= _REACH:
-            jump, back = (
-                np.abs(position[first:after] - position[first - 1]).min(),
-                position[after] - position[first - 1],
-            )
-            back -= modulus * np.round(back / modulus) if modulus else 0.0
-            if abs(back) < _RETURN * jump:
-                wild[first:after] = True
+    # Add encoder steps because slow motion has hardly any other second differences.
+    limit = _FAR * float(np.quantile(moving, 0.9)) + _STEPS * float(moving.min())
+    # The median excludes the moves into, within and out of a glitch.
+    usual = _filter_median(moves, _REACH + 1)
+    for before in np.flatnonzero(np.abs(moves - usual) > limit):
+        for length in range(1, min(_REACH, position.size - before - 2) + 1):
+            off = position[before : before + length + 2] - position[before] - usual[before] * np.arange(length + 2)
+            back = off[-1] - (modulus * np.round(off[-1] / modulus) if modulus else 0.0)
+            if not wild[before] and np.all(np.abs(off[1:-1]) > max(limit, abs(back) / _RETURN)):
+                wild[before + 1 : before + length + 1] = True
+                break
     return wild
 
 

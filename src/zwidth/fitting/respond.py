@@ -14,7 +14,6 @@ from typing import Any, cast
 import numpy as np
 
 from zwidth.fitting.columns import LoggedMotion, join_logs
-from zwidth.fitting.encoder import find_resolution
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.recordings import find_runs, read_logs
 from zwidth.parts.checks import check_number
@@ -126,10 +125,10 @@ def _respond(
     time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any, resolution: Any, system: UnitSystem
 ) -> ResponseEstimate:
     """Estimate the response as in `respond`, in a unit system."""
-    logs, places, period, _, notes = read_logs(time, position, force, system, resolution=resolution)
-    notes = list(notes)
-    logs = tuple(_fill(log, place, k, notes) for k, (log, place) in enumerate(zip(logs, places, strict=True), start=1))
-    step = min(find_resolution(log.position) for log in logs)
+    read = read_logs(time, position, force, system, resolution=resolution)
+    period, notes = read.period, list(read.notes)
+    logs = tuple(_fill(log, place, k, notes) for k, (log, place) in enumerate(zip(*read[:2], strict=True), start=1))
+    step = min(encoder for encoder, _ in read.steps)
     step = step if resolution is None else check_number("resolution", resolution, system["m"])
     given = None if cycle is None else int(np.round(check_number("cycle", cycle, "s", POSITIVE) / period))
     doubts = []

@@ -17,7 +17,7 @@ from zwidth.words.quantities import FIELDS
 from zwidth.words.status import Status
 from zwidth.words.unit_system import UnitSystem
 
-NEAR_ROUNDING = 1.1  # residuals below this multiple of the encoder's quantization noise are as expected
+NEAR_ROUNDING = (0.5, 1.1)  # range of residuals as expected, in units of the encoder's quantization noise
 
 SYMBOLS = {
     "mass": "m",
@@ -132,7 +132,7 @@ def _describe_residuals(fit: DeviceFit) -> str:
     size = f"residuals of {spell('position', fit.noise, fit.unit_system, 3)}"
     if not fit.resolution:
         return size
-    expected = fit.noise < NEAR_ROUNDING * fit.resolution / math.sqrt(12.0)
+    expected = NEAR_ROUNDING[0] < fit.noise / fit.resolution * math.sqrt(12.0) < NEAR_ROUNDING[1]
     step = spell("position", fit.resolution, fit.unit_system, 3)
     return f"{size}, {'as expected for an encoder step of' if expected else 'with an encoder step of'} {step}"
 
@@ -161,7 +161,12 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     gaps = sum(int(np.count_nonzero(np.diff(motion.time) > 1.5 * fit.period)) for motion in fit.motions)
     if gaps:
         where = "a gap" if gaps == 1 else f"each of {gaps} gaps"
-        rows.append(("used", f"{count:,} of {total:,} samples: the first ones after {where} depend on unknown forces"))
+        rows.append(
+            (
+                "used",
+                f"{count:,} of {total:,} samples: those after {where} depend on forces that were not logged",
+            )
+        )
     elif any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
         rows.append(("used", f"{count:,} of {total:,} samples, from the start; more would only reduce the errors"))
     if math.isfinite(fit.virtual_damping):
@@ -178,7 +183,9 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     if fit.lag is not None:
         names = ("time_constant", "delay", "stiffness_max")
         lag, delay, K = (spell(name, value, units, 3) for name, value in zip(names, fit.lag, strict=True))
-        rows.append(("or as well", f"an actuator lag of up to {lag}, with a delay of {delay} and K_max = {K}"))
+        rows.append(
+            ("or as well", f"an actuator lag of up to {lag}; at this lag the fitted delay is {delay} and K_max is {K}")
+        )
     if fit.is_doubted or fit.scene.safe_limit is None:
         return rows
     rows.append(("safe limit", fit.scene.safe_limit.describe(units)))

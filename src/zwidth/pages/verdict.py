@@ -10,16 +10,27 @@ from math import isfinite, isnan
 from typing import TYPE_CHECKING
 
 from zwidth.loops.linear.passivity import find_obstacle
-from zwidth.pages.words import fold, line, part_lines, scene_notes, spell_radius, word_of
+from zwidth.pages.words import (
+    diagnosis_lines,
+    fold,
+    line,
+    part_lines,
+    scene_notes,
+    silent_cautions,
+    spell_radius,
+    word_of,
+)
 from zwidth.parts.device import Device
 from zwidth.parts.grasps import RADII
 from zwidth.scenes.assessment import round_margin
+from zwidth.scenes.cautions import find_thin
 from zwidth.scenes.stabilization import stabilize
 from zwidth.words.formatting import plain, round_safely, spell_periods, spell_stiffness, tell_apart, with_unit
 from zwidth.words.showing import find_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.assessment import Assessment, Intervals, Limit
+    from zwidth.scenes.diagnosis import Diagnosis
     from zwidth.scenes.recommendation import Recommendation
     from zwidth.scenes.scene import Scene
 
@@ -32,6 +43,13 @@ MARGINAL_DAMPER = (
 MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 # Numbers of grasps in words, by value.
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
+
+# Requirements on stability in the reference grasps, in words.
+HELD = {
+    "all": "stable in all six reference grasps",
+    "soft": "stable in the soft reference grasps",
+    "none": "not checked in the reference grasps",
+}
 
 
 def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
@@ -60,6 +78,7 @@ def check_lines(
     limits: Iterable[Limit] | None,
     *,
     silent: frozenset[str] = frozenset(),
+    diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
     """Return the lines of `zwidth check` without notes; ``limits=None`` omits gains and remedies, which take longer."""
@@ -69,8 +88,10 @@ def check_lines(
     if isinstance(scene.device, Device):
         wall_words += f" (alpha {plain(verdict.alpha)}, beta {plain(verdict.beta)})"
         device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
-    lines = [line(word, wall_words), line("device", device_words)]
+    alarm = f"; CAUTION: {diagnosis.word.lower()}" if diagnosis is not None and diagnosis.cause != "none" else ""
+    lines = [line(word, wall_words + (alarm if word == "STABLE" else "")), line("device", device_words)]
     lines += part_lines(scene)
+    lines += [line("CAUTION", text) for text in silent_cautions(scene, silent)]
     # A measured response has no poles.
     damper = wall.stiffness == 0 and not isnan(verdict.frequency)
     dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
@@ -88,7 +109,8 @@ def check_lines(
         lines.append(line("room", _spell_room(verdict, dampings)))
     lines.append(line("passive", spell_passivity(scene, verdict)))
     lines += _list_maximum(scene, verdict, verbose)
-    return lines + gain_lines("To gain K_max:", limits or (), verbose)
+    lines += gain_lines("To gain K_max:", limits or (), verbose)
+    return lines if diagnosis is None else [*lines, "", *diagnosis_lines(diagnosis)]
 
 
 def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | None) -> str:
@@ -198,14 +220,19 @@ def recommend_lines(
     found: Recommendation,
     *,
     silent: frozenset[str] = frozenset(),
-    hardware: Iterable[str] = (),
+    diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the lines of `zwidth recommend` without notes; ``hardware`` contains the lines of a diagnosis."""
+    """Return the lines of `zwidth recommend` without notes; ``diagnosis`` is that of the recommended wall."""
     scene, verdict = found.scene, found.verdict
-    device = line("device", spell_device(scene, silent))
+    device = [line("device", spell_device(scene, silent)), *part_lines(scene)]
+    unsaid = [line("CAUTION", text) for text in silent_cautions(scene, silent)]
     if verdict is None:
-        return [line("NO WALL", found.reason), device, *part_lines(scene)]
+        return [line("NO WALL", found.reason), *device, *unsaid]
+    alarms = [diagnosis.word.lower()] if diagnosis is not None and diagnosis.cause != "none" else []
+    alarms += ["small margins"] if find_thin(verdict, scene.timing.period) else []
+    alarms += ["unstable in a hand"] if not all(found.grasps.values()) else []
+    alarm = f"; CAUTION: {', '.join(alarms)}" if alarms else ""
     margins = [line("margins", found.spell_margins())]
     if verbose:
         margins = [
@@ -214,16 +241,17 @@ def recommend_lines(
             line("room", _spell_room(verdict, verdict.stable_damping)),
         ]
     lines = [
-        line("SET", f"{found.spell_wall()}; {found.spell_limit()}"),
-        device,
-        *part_lines(scene),
+        line("SET", f"{found.spell_wall()}; {found.spell_limit()}{alarm}"),
+        *device,
         *margins,
         *_list_hands(found),
-        *hardware,
+        *diagnosis_lines(diagnosis),
         line("passive", spell_passivity(scene, verdict) if verbose else found.spell_passive()),
+        *unsaid,
         *(line("CAUTION", caution) for caution in found.cautions),
     ]
-    return lines + gain_lines("To gain stiffness under the same requirements:", found.steps, verbose)
+    heading = f"To gain stiffness under the same requirements ({HELD[found.wanted.grasps]}):"
+    return lines + gain_lines(heading, found.steps, verbose)
 
 
 def _list_hands(found: Recommendation) -> list[str]:

@@ -7,7 +7,7 @@ import math
 import re
 import shutil
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from math import isfinite, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -154,7 +154,7 @@ def scene_notes(scene: Scene) -> list[str]:
 
 
 def _compare_with_limit(scene: Scene) -> list[str]:
-    """Return the warnings of a scene's safe limit, preceded by a note if the wall exceeds the limit."""
+    """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
     limit, wall = scene.safe_limit, scene.wall
     if limit is None or isinstance(wall, NoWall):
         return []
@@ -166,12 +166,24 @@ def _compare_with_limit(scene: Scene) -> list[str]:
     ]
 
 
-def diagnosis_lines(found: Diagnosis) -> list[str]:
+def diagnosis_lines(found: Diagnosis | None) -> list[str]:
     """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+    if found is None:
+        return []
     advice = found.advise()
     return [
-        line("simulated", f"{found.word}: {found.explain()}"),
+        line("simulated" if found.cause == "none" else "CAUTION", f"{found.word}: {found.explain()}"),
         *([line("", f"to stop it: {advice}")] if advice else []),
+    ]
+
+
+def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
+    """Return the caution about a delay that is 0 only because it was not given; ``silent`` names such options."""
+    if "delay" not in silent or scene.timing.delay:
+        return []
+    return [
+        "no delay given: the results hold only if the force acts at the sample; if it acts one period later, add "
+        "--delay '1 periods'"
     ]
 
 
@@ -195,7 +207,7 @@ class Slope(NamedTuple):
 
 
 def list_slopes(scene: Scene) -> list[Slope]:
-    """What a little more of every parameter of a scene changes of its stiffest wall."""
+    """Return the sensitivity of the maximum stiffness to each parameter of a scene, with its effect in words."""
     if isinstance(scene.device, MeasuredDevice):
         return []
     per, values = scene.sensitivities().per, scene.parameters()
@@ -207,14 +219,9 @@ def list_slopes(scene: Scene) -> list[Slope]:
         by_one = not size or unit == "N s/m"
         # A power of ten near one percent, as people can picture it.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
-        effect = "changes nothing"
-        if change := value * step:
-            amount = (
-                with_unit(abs(change), system["N/m"], 3)
-                if isfinite(change)
-                else "stiffness at an infinite rate at first"
-            )
-            effect = f"{'buys' if change > 0 else 'costs'} {amount}"
+        effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
+        if isfinite(value) and (change := value * step):
+            effect = f"{'buys' if change > 0 else 'costs'} {with_unit(abs(change), system['N/m'], 3)}"
         note = f" (the delay stays {scene.timing.kept_delay})" if path == "period" and scene.timing.delay else ""
         words = f"{with_unit(step, unit, 1)} more {effect}{note}"
         found.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))

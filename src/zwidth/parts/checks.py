@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, Field, fields
 from functools import wraps
@@ -13,7 +14,7 @@ import numpy as np
 
 from zwidth.words.errors import InputError, UnusableValueError, check_choice
 from zwidth.words.formatting import describe, short
-from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, PARAMETERS, Range
+from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
 from zwidth.words.showing import with_units
 from zwidth.words.types import Array
 from zwidth.words.unit_system import LINEAR, SYSTEMS, UnitSystem
@@ -227,6 +228,12 @@ def check_number(field: str, value: Any, unit: str = "", allowed: Range | None =
         allowed = PARAMETERS[field].sign if field in PARAMETERS else NOT_NEGATIVE
     counts = field == "resolution"
     return _read(field, value, lambda known: read_quantity(known, DIMENSIONS[unit], allowed, counts=counts)[0])
+
+
+def check_limit(name: str, value: Any, unit: str) -> float:
+    """Return a motor limit in SI units; infinite if the motor has no such limit."""
+    unlimited = isinstance(value, int | float | np.floating) and value == math.inf
+    return math.inf if unlimited else check_number(name, value, unit, POSITIVE)
 
 
 def check_span(field: str, value: Any) -> Any:

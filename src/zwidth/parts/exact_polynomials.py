@@ -98,7 +98,7 @@ def find_common_factor(one: Polynomial, other: Polynomial) -> Polynomial:
 
 
 def _to_integers(polynomial: Polynomial) -> list[int]:
-    """Return the integer coefficients of a multiple of a polynomial, without a common factor."""
+    """Scale a polynomial with rational coefficients to coprime integer coefficients."""
     scale = lcm(*(value.denominator for value in polynomial))
     return _without_content([int(value * scale) for value in polynomial])
 

@@ -8,9 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from zwidth.parts.checks import Part, Span, check_number, check_span, in_periods
-from zwidth.words.errors import InputError, check_choice
+from zwidth.words.errors import InputError
 from zwidth.words.formatting import spell_periods, with_unit
-from zwidth.words.types import DELAY_MODELS, DelayModel
 from zwidth.words.xp import is_jax
 
 
@@ -22,8 +21,6 @@ class Timing(Part):
         period: T in s, > 0; or give the rate.
         delay: t_d, from a sample to the moment its force acts, in s, >= 0, whole periods or not; or exactly in
             periods, as "1.5 periods". If the period changes, a delay given in periods keeps its number of periods.
-        delay_model: "held" (exact for every delay) or "fractional_power" (the paper's z^(1+d), boundary and
-            ridge only).
         rate: 1/T in Hz, > 0, in place of the period.
 
     Example:
@@ -34,7 +31,6 @@ class Timing(Part):
 
     period: Any = None
     delay: Any = 0.0
-    delay_model: DelayModel = "held"
     rate: Any = None
     # Store a delay given in periods, because its quotient in seconds over the period may have a rounding error.
     _periods: ClassVar[float | None] = None
@@ -51,7 +47,6 @@ class Timing(Part):
         if isinstance(delay, Span):
             object.__setattr__(self, "_periods", delay.value if delay.unit == "periods" else None)
             object.__setattr__(self, "delay", delay.seconds(self.period))
-        check_choice("delay_model", self.delay_model, DELAY_MODELS)
 
     def __repr__(self) -> str:
         """Return an expression that creates this timing, with the delay in its original unit, seconds or periods."""

@@ -93,14 +93,14 @@ def assess(scene: SceneOptima) -> Assessment:
     """Judge the wall of a scene.
 
     Args:
-        scene: device, timing, parts and wall; the delay model must be "held", the one that has poles.
+        scene: device, timing, parts and wall.
 
     Returns:
         Assessment: stability, distances to the boundary in K and in B, passivity, the stiffest stable wall of the
         device, the slowest pole, and the margins of control engineering.
 
     Raises:
-        InputError: the scene's delay model is "fractional_power", or it has no wall.
+        InputError: the scene has no wall.
 
     References:
         Hulin, Preusche, Hirzinger 2006, sections V to VIII.
@@ -112,7 +112,6 @@ def assess(scene: SceneOptima) -> Assessment:
         >>> verdict.stable, verdict.passive
         (True, False)
     """
-    check_held(scene)
     # First of all, for it refuses more poles than can be computed at once.
     slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
     stands, best, known = scene.margins(), scene.max_stiffness(), not find_obstacle(**vars(scene.device))
@@ -145,14 +144,6 @@ def assess(scene: SceneOptima) -> Assessment:
         **{name: float(getattr(stands, name)) for name in _MARGINS},
         unit_system=scene.unit_system,
     )
-
-
-def check_held(scene: SceneOptima) -> None:
-    """Refuse the delay model in which no wall can be judged."""
-    if scene.timing.delay_model != "held":
-        raise InputError(
-            f"delay_model: got {scene.timing.delay_model!r}, which has no poles; use 'held' to judge a single wall"
-        )
 
 
 def name_kind(wall: StiffestWall) -> str:
@@ -241,7 +232,7 @@ class Limit(NamedTuple):
     note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
 
     def spell(self) -> str:
-        """Return the improvement and its gain in words."""
+        """Describe the improvement and the increase of the stiffness that it brings."""
         K = with_unit(round_safely(self.stiffness, "below"), find_unit(self, "N/m"))
         kept = f"; {self.note}" if self.note else ""
         return f"{self.words}: {K} (x {plain(self.gain, 3)}{kept})"
@@ -288,7 +279,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
 
 def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima], float]) -> list[Limit]:
-    """Return the gains of all improvements of a scene, largest first, NaN last; ``measure`` computes the stiffness."""
+    """Return all improvements by the increase of the stiffness that ``measure`` computes, largest first, NaN last."""
     found = []
     for name, words, improved, note in list_improvements(scene):
         stiffness = measure(improved)

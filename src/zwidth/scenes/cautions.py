@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
 from zwidth.scenes.assessment import Assessment, assess, round_margin
-from zwidth.scenes.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN, choose_wall
+from zwidth.scenes.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN, Wanted, choose_wall
 from zwidth.words.formatting import name_wall, plain, with_unit
 from zwidth.words.status import Status
 
@@ -19,8 +19,6 @@ LEAST_PHASE_MARGIN = 10.0  # degrees
 LEAST_GAIN_MARGIN = 1.3  # factor on K and B together
 LEAST_DELAY_MARGIN = 0.1  # sampling periods
 LONGEST_TIME_CONSTANT = 1.0  # s
-
-SHARES = np.linspace(1.0, 0.02, 50)  # common factors on K and B, tried to find a wall stable in every grasp
 
 
 def find_thin(verdict: Assessment, period: float) -> list[str]:
@@ -38,22 +36,33 @@ def find_thin(verdict: Assessment, period: float) -> list[str]:
 
 def list_cautions(recommendation: Any) -> tuple[str, ...]:
     """Return the cautions about the wall of a `Recommendation`."""
-    scene, cautions = recommendation.scene, []
-    if thin := find_thin(recommendation.verdict, scene.timing.period):
-        rings = (
-            f": rings for {with_unit(recommendation.verdict.time_constant, 's', 2)}"
-            if recommendation.verdict.frequency
-            else ""
+    scene, verdict, wanted, cautions = recommendation.scene, recommendation.verdict, recommendation.wanted, []
+    if thin := find_thin(verdict, scene.timing.period):
+        rings = thin[0].startswith("phase") and verdict.frequency > 0 and math.isfinite(verdict.time_constant)
+        after = f": rings for {with_unit(verdict.time_constant, 's', 2)}" if rings else ""
+        advice = _advise(
+            recommendation,
+            _list_margins(wanted),
+            lambda improved: not find_thin(assess(improved), scene.timing.period),
+            "no other requirement avoids this; more damping of the device or less delay may",
         )
-        cautions.append(f"{', '.join(thin)}{rings}; {_advise_margins(recommendation)}")
+        cautions.append(f"{', '.join(thin)}{after}; {advice}")
     if unstable := [name for name, stable in recommendation.grasps.items() if not stable]:
-        cautions.append(f"unstable in the hand ({'; '.join(unstable)}); {_advise_grasps(scene)}")
+        options = {"--grasps all": wanted._replace(grasps="all")}
+        if float(scene.device.damping) > 0 and not find_obstacle(**vars(scene.device)):
+            options["--passive"] = Wanted(passive=True, beyond_safe=wanted.beyond_safe)
+        advice = _advise(
+            recommendation,
+            options,
+            lambda improved: all(judge_grasps(improved).values()),
+            "no wall was found that is stable in every grasp",
+        )
+        cautions.append(f"unstable in the hand ({'; '.join(unstable)}); {advice}")
     return tuple(cautions)
 
 
-def _advise_margins(recommendation: Any) -> str:
-    """Return the options that require larger margins, and their cost in stiffness."""
-    scene, wanted = recommendation.scene, recommendation.wanted
+def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
+    """Return requirements that may enlarge the margins, by the options that ask for them."""
     phase = max(DEFAULT_PHASE_MARGIN, wanted.phase_margin or 0.0)
     gain = max(DEFAULT_GAIN_MARGIN, wanted.gain_margin or 0.0)
     by_phase, by_gain = f"--phase-margin {phase:g}", f"--gain-margin {gain:g}"
@@ -61,20 +70,21 @@ def _advise_margins(recommendation: Any) -> str:
     tried[f"{by_phase} {by_gain}"] = wanted._replace(phase_margin=phase, gain_margin=gain)
     if wanted.passive:
         tried[f"{by_phase} without --passive"] = wanted._replace(phase_margin=phase, passive=False)
-    advice = "no softer wall has larger margins"
-    for words, more in tried.items():
-        wall = choose_wall(scene, more, recommendation.stiffest, recommendation.stiffness, COARSE)
-        if wall.status != Status.OK:
-            continue
-        change = 100.0 * (wall.stiffness / recommendation.stiffness - 1.0)
-        cost = f"{'costs' if change <= 0 else 'gains'} {max(abs(change), 0.1):.2g} % of the stiffness"
-        thin = find_thin(
-            assess(scene.replace(stiffness=wall.stiffness, virtual_damping=wall.damping)), scene.timing.period
-        )
-        advice = f"ask for {words} ({cost}{''.join(f'; still {each}' for each in thin)})"
-        if not thin:
-            break
-    return advice
+    defaults = Wanted.check(None, None, None, False, wanted.beyond_safe, wanted.grasps)
+    return tried | {"the default margins (no option for margins)": defaults}
+
+
+def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[Any], bool], otherwise: str) -> str:
+    """Return the first options with an accepted wall, that wall and its cost in stiffness; ``otherwise`` if none."""
+    for words, wanted in options.items():
+        scene = recommendation.scene
+        wall = choose_wall(scene, wanted, recommendation.stiffest, recommendation.stiffness, COARSE)
+        if wall.status == Status.OK and accepts(scene.replace(stiffness=wall.stiffness, virtual_damping=wall.damping)):
+            ratio = wall.stiffness / recommendation.stiffness
+            cost = f"costs {max(100.0 * (1.0 - ratio), 0.1):.2g} % of the stiffness"
+            cost = cost if ratio <= 1.0 else f"{plain(ratio, 3)} times the stiffness"
+            return f"ask for {words}: {name_wall(wall.stiffness, wall.damping, scene.unit_system)} ({cost})"
+    return otherwise
 
 
 def judge_grasps(scene: Any) -> dict[str, bool]:
@@ -87,18 +97,3 @@ def judge_grasps(scene: Any) -> dict[str, bool]:
     for name, grasp in hands:
         labels[name] = labels.get(name, True) and bool(scene.replace(operator=grasp).is_stable())
     return labels
-
-
-def _advise_grasps(scene: Any) -> str:
-    """Return the stiffest wall with the same K/B that is stable in every grasp, and its cost in stiffness."""
-    grasps = [*(grasp for _, grasp in list_grasps(scene.unit_system.rotary)), None]
-    K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
-    walls = K * SHARES, B * SHARES
-    stable = np.all([scene.replace(operator=grasp).is_stable(*walls) for grasp in grasps], axis=0)
-    # Count the stable walls from the softest upwards, so that every softer wall is stable as well.
-    count = int(np.argmin(np.append(stable[::-1], False)))
-    if not count:
-        return "a passive wall is stable in every grasp: ask for --passive"
-    share = SHARES[-count]
-    cost = f"costs {100.0 * (1.0 - share):.2g} % of the stiffness"
-    return f"{name_wall(share * K, share * B, scene.unit_system)} is stable in every grasp ({cost})"

@@ -8,15 +8,15 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from zwidth.parts.checks import check_number
+from zwidth.parts.checks import check_limit, check_number
 from zwidth.parts.wall import VirtualWall, resolve_wall
 from zwidth.scenes.base import of_scene
-from zwidth.scenes.remedies import Remedy, search_remedies, stabilize_loop
+from zwidth.scenes.remedies import search_remedies
+from zwidth.scenes.stabilization import Remedy, stabilize
 from zwidth.scenes.stiffest import SceneOptima
 from zwidth.scenes.trials import LONG_DELAY, Experiment, Hardware, SustainedMotion, list_starts
 from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import plain, to_json, with_unit
-from zwidth.words.quantities import POSITIVE
 from zwidth.words.showing import shown
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
@@ -26,6 +26,7 @@ TIME_CONSTANTS = 30.0  # length of a simulation, in time constants of the linear
 FEWEST_PERIODS = 2000  # length of the shortest simulation, in sampling periods
 MOST_PERIODS = 200_000  # length of the longest simulation, in sampling periods; limits the run time
 SETTLED = 2.0  # time constants that must be simulated before an UNCLEAR motion may count as sustained
+CONFIRMED = "simulated at these and larger changes; check the value that you choose with diagnose"
 
 
 @shown(
@@ -113,8 +114,8 @@ class Diagnosis:
             return ""
         if self.remedies:
             simulated = self.cause != "instability"
-            advice = ", or ".join(remedy.spell(self.unit_system, simulated) for remedy in self.remedies)
-            return f"{advice} (confirmed by simulation at these values only)" if simulated else advice
+            advice = ", or ".join(remedy.spell(3 if simulated else 4) for remedy in self.remedies)
+            return f"{advice} ({CONFIRMED})" if simulated else advice
         return "no remedy by a change of one parameter was found"
 
     def as_dict(self) -> dict[str, Any]:
@@ -142,8 +143,8 @@ def diagnose(
     First `zwidth.Scene.is_stable` decides the stability of the linear loop. Then the wall is simulated with encoder,
     friction and motor from several initial displacements, each without external force and with the worst constant one,
     K times half an encoder step. If removing the motor limits more than halves the amplitude, the cause is saturation;
-    otherwise it is quantization. Each remedy is confirmed by the same simulations, with the returned value and with
-    values further from the present one.
+    otherwise it is quantization. The same simulations confirm each remedy of a limit cycle at many values from the
+    returned one to 64 times the change. The ranges of an unstable linear loop are exact.
 
     Args:
         scene: device, timing and parts.
@@ -181,8 +182,8 @@ def diagnose(
         check_number("resolution", resolution, units["m"]),
         sliding,
         sliding if static is None else check_number("static", static, units["N"]),
-        _check_limit("max_force", max_force, units["N"]),
-        _check_limit("max_rate", max_rate, units["N/s"]),
+        check_limit("max_force", max_force, units["N"]),
+        check_limit("max_rate", max_rate, units["N/s"]),
     )
     scene = scene.replace(wall=VirtualWall(K, B))
     stable, dominant, margins = bool(scene.is_stable()), _find_dominant(scene), scene.margins()
@@ -195,19 +196,13 @@ def diagnose(
         frequency = dominant.angle / (2.0 * math.pi * scene.timing.period)
     changes: list[Remedy] = []
     if remedies and cause == "instability":
-        changes = stabilize_loop(scene)
+        changes = stabilize(scene)
     elif remedies and (cause == "quantization" or cause == "saturation") and scene.d <= LONG_DELAY:
         changes = search_remedies(experiment, cause)
     return Diagnosis(
         cause, K, B, hardware, stable, float(margins.phase_margin), float(worst.amplitude[0]), frequency,
         MotionKind(int(worst.outcome[0])), tuple(changes), units,
     )  # fmt: skip
-
-
-def _check_limit(name: str, value: Any, unit: str) -> float:
-    """Return a motor limit in SI units; infinite if the motor has no such limit."""
-    unlimited = isinstance(value, int | float | np.floating) and value == math.inf
-    return math.inf if unlimited else check_number(name, value, unit, POSITIVE)
 
 
 def _find_dominant(scene: Any) -> Any:

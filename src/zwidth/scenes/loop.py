@@ -11,7 +11,7 @@ import math
 from collections.abc import Container
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, get_args
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -41,11 +41,11 @@ from zwidth.parts.chain import AnyChain, chain_of
 from zwidth.parts.circle import circle
 from zwidth.parts.paths import AnyScene, list_parameters, replace_parameters
 from zwidth.scenes.variants import RIGID_PARAMETERS, RigidVariants, Variants
-from zwidth.words.errors import InputError, ZwidthError
+from zwidth.words.errors import ZwidthError
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.results import Margins, RidgePoint, Stability
 from zwidth.words.status import Method, RidgeKind, Status
-from zwidth.words.types import Array, DelayModel
+from zwidth.words.types import Array
 from zwidth.words.xp import is_jax, is_traced, namespace, nan_beyond
 
 # Largest log|z| of a lossless loop whose poles count as on the unit circle. A rounding error of 1e-16 moves a double
@@ -70,9 +70,7 @@ class LinearLoop:
     # The stiffest walls that were found: a scene is asked for them often.
     _ridges: dict[bool, BoundRidge | None] = field(default_factory=dict, init=False, repr=False)
 
-    # The delay models that it knows, and how many devices of its kind are drawn where a person waits for the answer:
-    # a stiffest wall takes some 10 to 50 ms.
-    delay_models: ClassVar[tuple[DelayModel, ...]] = ("held",)
+    # Random devices per interactive question: one maximum stiffness takes some 10 to 50 ms.
     draws: ClassVar[int] = 200
     # True if the methods that take walls work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
@@ -216,8 +214,7 @@ class LinearLoop:
         return self.border.outlines()
 
     def stiffest(self, negative: bool) -> RidgePoint:
-        """The stiffest stable wall, with beta >= 0 unless negative dampings count."""
-        self._check_delay_model()
+        """Return the stiffest stable wall, with beta >= 0 unless ``negative``."""
         if is_traced(*list_parameters(self.scene).values()):
             from zwidth.loops.linear.traced_ridge import trace_stiffest
 
@@ -230,8 +227,7 @@ class LinearLoop:
         return RidgePoint(alpha, beta, omega, np.int32(found.kind), np.int32(status))
 
     def ridge(self, negative: bool) -> tuple[BoundRidge | None, Status]:
-        """The same of plain numbers with the conditions that bind it, or why there is none."""
-        self._check_delay_model()
+        """Return the stiffest wall of plain numbers with its active constraints, or None, and a status."""
         border = self.border
         if negative not in self._ridges:
             try:
@@ -264,20 +260,10 @@ class LinearLoop:
         """The scene with each of the values drawn of some of its parameters."""
         return Variants(self.scene, drawn)
 
-    def _check_delay_model(self) -> None:
-        """Refuse the paper's z^(1+d) where it has no meaning."""
-        model = self.scene.timing.delay_model
-        if model != "held":
-            raise InputError(
-                f"delay_model: got {model!r}, which is known of a rigid device with the backward difference only; use "
-                "'held'"
-            )
-
 
 class RigidLoop(LinearLoop):
     """The loop of a rigid mass with the difference of two samples: closed forms of delta and d."""
 
-    delay_models = get_args(DelayModel)
     draws = 10_000
     most_periods = math.inf
     traceable = True
@@ -326,19 +312,19 @@ class RigidLoop(LinearLoop):
         device = self.scene.delta, self.scene.d
         if not is_traced(w, *device):
             return super().critical_walls(w)
-        return boundary(w, *device, delay=self.scene.timing.delay_model)
+        return boundary(w, *device)
 
     def outlines(self) -> list[Outline]:
         return [Outline(*stable_region(float(self.scene.delta), float(self.scene.d))[:2], False, False)]
 
     def stiffest(self, negative: bool) -> RidgePoint:
-        delta, d, model = self.scene.delta, self.scene.d, self.scene.timing.delay_model
-        found = alpha_max(delta, d, delay=model)
+        delta, d = self.scene.delta, self.scene.d
+        found = alpha_max(delta, d)
         xp, below = namespace(found.alpha), found.beta < 0
         # Asked for only where it counts, unless a trace hides whether it does.
         if negative or not (is_traced(below) or below):
             return found
-        row = boundary_point(delta, d, beta=0.0 * delta, delay=model)
+        row = boundary_point(delta, d, beta=0.0 * delta)
         kind = xp.where(row.status == Status.OK, int(RidgeKind.NO_DAMPING), int(RidgeKind.NONE))
         end = RidgePoint(row.alpha, 0.0 * row.alpha, row.omega, kind, row.status)
         return RidgePoint(*(xp.where(below, there, here) for there, here in zip(end, found, strict=True)))
@@ -370,9 +356,9 @@ def make_plain(scene: AnyScene) -> AnyScene:
 
 
 def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None:
-    """Those of a rigid device by closed forms; None where its ridge lies at a damping that does not count."""
-    values, model = (scene.delta, scene.d), scene.timing.delay_model
-    found = evaluate(slopes_kernel, {"delta": scene.delta, "d": scene.d}, model, classify_delays(scene.d))
+    """Return the sensitivities of a rigid device in closed form; None if its ridge needs a negative damping."""
+    values = scene.delta, scene.d
+    found = evaluate(slopes_kernel, {"delta": scene.delta, "d": scene.d}, classify_delays(scene.d))
     if not negative and found.point.beta < 0:
         return None
     with np.errstate(invalid="ignore"):
@@ -384,7 +370,7 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
         # A spring to ground that is not there yet has no closed form.
-        ridge = scene.loop.ridge(negative)[0] if model == "held" else None
+        ridge = scene.loop.ridge(negative)[0]
         per["operator.stiffness"] = math.nan if ridge is None else find_slope(scene, ridge, "operator.stiffness")
     per = {path: float(slope) for path, slope in per.items()}
     return SceneSensitivities(np.float64(stiffness), per, found.point.status)

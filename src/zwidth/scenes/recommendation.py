@@ -11,13 +11,14 @@ import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
+from zwidth.parts.checks import check_limit
+from zwidth.parts.device import Device
 from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.assessment import (
     Assessment,
     Limit,
     assess,
-    check_held,
     compute_gains,
     describe_islands,
     name_kind,
@@ -26,7 +27,7 @@ from zwidth.scenes.assessment import (
 from zwidth.scenes.cautions import judge_grasps, list_cautions
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.scenes.wall_code import write_wall
-from zwidth.scenes.wall_search import COARSE, Wanted, choose_wall, measure_slack
+from zwidth.scenes.wall_search import COARSE, Grasps, Wanted, choose_wall, list_held, measure_slack
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import WALL
@@ -53,7 +54,7 @@ class Recommendation:
         stiffest: the stiffest stable wall of the device.
         wanted: the requirements on the wall.
         limited_by: the active requirement, which excludes every stiffer wall: "stiffness_fraction", "gain_margin",
-            "phase_margin", "passive", "soft_grasps" or "safe_limit"; "" if no wall is recommended.
+            "phase_margin", "passive", "grasps" or "safe_limit"; "" if no wall is recommended.
         status: code of `zwidth.Status`; no wall is recommended unless it is OK.
         reason: the reason why no wall is recommended; "" otherwise.
         notes: further remarks, one sentence each.
@@ -89,7 +90,8 @@ class Recommendation:
         The digits are the fewest, at least 4, with which the rounded wall still satisfies the requirements. K is
         rounded down. More than 4 digits are needed if only a narrow range of B satisfies them.
         """
-        slack, verdict = measure_slack(self.scene, self.wanted), self.verdict
+        held = list_held(self.scene, self.wanted)
+        slack, verdict = measure_slack(self.scene, self.wanted, held), self.verdict
         ends = (math.nan, math.nan)
         if verdict is not None:
             ends = verdict.virtual_damping_lower, verdict.virtual_damping_upper
@@ -150,23 +152,26 @@ class Recommendation:
         """
         return {} if self.status != Status.OK else judge_grasps(self.scene)
 
-    def code(self, language: Literal["c", "python"] = "c") -> str:
+    def code(self, language: Literal["c", "python"] = "c", *, max_force: float | str = math.inf) -> str:
         """Return the wall and its velocity estimate as source code for a control loop.
 
         Args:
             language: "c" (C99 without any library) or "python".
+            max_force: largest force of the motor in N; the code limits the force to it.
 
         Returns:
             Source code with a state, a function that initializes it at rest, and a function to call once per period,
             which converts the position in m, positive into the wall, to the force on the device in N. The forces equal
-            those of `zwidth.simulate` with ``contact="unilateral"``, except for rounding errors.
+            those of `zwidth.simulate` with ``contact="unilateral"`` and the same ``max_force``, except for rounding
+            errors.
 
         Raises:
-            InputError: no wall is recommended, or the language is unknown.
+            InputError: no wall is recommended, the language is unknown, or ``max_force`` is not positive.
         """
         if self.status != Status.OK:
             raise InputError(f"code: there is no wall: {self.reason}")
-        return write_wall(self.scene, language, self.cautions)
+        limit = check_limit("max_force", max_force, self.unit_system["N"])
+        return write_wall(self.scene, language, self.cautions, limit)
 
     def lines(self) -> tuple[str, ...]:
         """Return lines with the wall, its margins and its cautions, or the reason why no wall is recommended."""
@@ -281,6 +286,7 @@ class SceneAdvice(SceneOptima):
         gain_margin: float | None = None,
         phase_margin: float | None = None,
         passive: bool = False,
+        grasps: Grasps | None = None,
         beyond_safe: bool = False,
     ) -> Recommendation:
         """Return the wall recommended for this device: the stiffest that satisfies the requirements.
@@ -290,11 +296,13 @@ class SceneAdvice(SceneOptima):
             gain_margin: smallest gain margin, a factor on K and B together, > 1.
             phase_margin: smallest phase margin in degrees, > 0.
             passive: require a passive wall.
+            grasps: require stability in "all" or only the "soft" grasps of `zwidth.reference_grasps`, or in "none".
             beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its K is at most
                 ``stiffness_fraction`` (default 0.75) of the limit's stiffness.
 
-        If no requirement is given, the defaults are a stiffness fraction of 0.75, a gain margin of 2, a phase margin of
-        30 degrees, and stability in the soft reference grasps. Any given requirement replaces all defaults.
+        If neither a fraction, a margin nor passivity is given, the defaults are a stiffness fraction of 0.75, a gain
+        margin of 2, a phase margin of 30 degrees and, unless the scene has an operator, ``grasps="soft"``. If one of
+        them is given, it replaces all defaults. ``grasps`` leaves the other defaults unchanged.
 
         Returns:
             Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, the active requirement; ``cautions``,
@@ -317,10 +325,13 @@ class SceneAdvice(SceneOptima):
             >>> scene.recommend().limited_by
             'phase_margin'
         """
-        check_held(self)
-        wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe)
+        wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe, grasps)
         if wanted.passive and (obstacle := find_obstacle(**vars(self.device))):
             raise InputError(f"passive: got True {obstacle}")
+        if not isinstance(self.device, Device) and wanted.grasps != "none" and grasps is not None:
+            raise InputError(f"grasps: got {grasps!r}, but the device is no Device with a mass; only 'none' is allowed")
+        if grasps is None and self.operator is not None:
+            wanted = wanted._replace(grasps="none")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)
         choice = choose_wall(bare, wanted, top)

@@ -1,98 +1,27 @@
-"""Remedies for the sustained oscillation of a wall: changes of a single parameter that stop it.
+"""Remedies for a limit cycle: changes of a single parameter that end it, found by simulation.
 
-`stabilize_loop` searches for changes that make the linear loop stable, `search_remedies` for changes that end a limit
-cycle. Symbols: K and B of the wall, Q the step of the encoder.
+Symbols: K and B of the wall, Q the step of the encoder.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from zwidth.parts.linear_device import LinearDevice
-from zwidth.scenes.trials import FIRST_DISPLACEMENT, Experiment
-from zwidth.simulation.result import MotionKind
-from zwidth.simulation.simulate import simulate
-from zwidth.words.formatting import round_safely, with_unit
+from zwidth.scenes.stabilization import Remedy, count_steps
+from zwidth.scenes.trials import Experiment
+from zwidth.words.formatting import round_safely
+from zwidth.words.showing import with_units
 from zwidth.words.unit_system import UnitSystem
 
 SPAN = 64.0  # largest factor by which a remedy changes its parameter
 COARSE = 12  # values of a parameter simulated over the whole span
-FINE = 6  # values simulated between the last oscillating coarse value and the first at rest
+FINE = 16  # values simulated from the last oscillating coarse value to the second coarse value after the first at rest
 LONGEST_TRIAL = 20_000  # sampling periods per simulation of the search, to limit its run time
-CHECK_PERIODS = 2000  # sampling periods of the simulation that confirms a stable range
-DELAY_ACCURACY = 1e-3  # relative accuracy of the largest stable delay; printed with 3 digits
-
-_PHRASES = {
-    "resolution": ("an encoder with steps of", "m"),
-    "coulomb": ("friction of", "N"),
-    "stiffness": ("K of", "N/m"),
-    "virtual_damping": ("B of", "N s/m"),
-    "delay": ("a delay of", "s"),
-}
-
-
-class Remedy(NamedTuple):
-    """A range of one parameter in which the oscillation stops, all other parameters unchanged.
-
-    For an unstable linear loop the whole range is stable. For a limit cycle or saturation, simulations confirm only the
-    finite end of the range: other values in it may oscillate, because the outcome need not be monotone.
-    """
-
-    parameter: str  # "resolution", "coulomb", "stiffness", "virtual_damping" or "delay"
-    low: float  # in SI units; 0 if the range has no lower end
-    high: float  # in SI units; infinite if the range has no upper end
-
-    def spell(self, system: UnitSystem, simulated: bool = False) -> str:
-        """Return the change in words, with its unit; only the confirmed value if it was ``simulated``."""
-        phrase, unit = _PHRASES[self.parameter]
-        low, high = (with_unit(end, system[unit], 3) for end in (self.low, self.high))
-        if self.low > 0 and self.high < math.inf:
-            return f"{phrase} {low} to {high}"
-        side = "" if simulated else "at least " if self.low > 0 else "at most "
-        text = f"{phrase} {side}{low if self.low > 0 else high}"
-        if self.parameter == "resolution" and system.rotary:
-            text += f" ({_count_steps(self.high):,} counts per turn)"
-        return text
-
-
-def _count_steps(resolution: float) -> int:
-    """Return the counts per turn of an encoder with this step in rad."""
-    return math.ceil(2.0 * math.pi / resolution - 1e-6)
-
-
-def stabilize_loop(scene: Any) -> list[Remedy]:
-    """Return the ranges of K, of B and of the delay in which the linear loop is stable."""
-    K, B, delay = float(scene.wall.stiffness), float(scene.wall.virtual_damping), float(scene.timing.delay)
-    ranges = []
-    for name, value, intervals in (
-        ("stiffness", K, scene.stable_stiffness(B)),
-        ("virtual_damping", B, scene.stable_damping(K)),
-    ):
-        if len(intervals):
-            ends = min(intervals.tolist(), key=lambda ends: max(ends[0] - value, value - ends[1]))
-            ranges.append(Remedy(name, round_safely(max(ends[0], 0.0), "above", 3), round_safely(ends[1], "below", 3)))
-    low, high = 0.0, delay
-    if delay and scene.replace(delay=0.0).is_stable():
-        while high - low > DELAY_ACCURACY * delay:
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if scene.replace(delay=middle).is_stable() else (low, middle)
-        if (value := round_safely(low, "below", 3)) > 0:
-            ranges.append(Remedy("delay", 0.0, value))
-    return [remedy for remedy in ranges if remedy.low < remedy.high and _is_stabilized(scene, remedy)]
-
-
-def _is_stabilized(scene: Any, remedy: Remedy) -> bool:
-    """Return whether simulations of the linear loop decay at both ends of a range."""
-    ends = [end for end in (remedy.low, remedy.high) if 0 < end < math.inf]
-    start: dict[str, Any] = (
-        {"push": 1.0} if isinstance(scene.device, LinearDevice) else {"start_position": FIRST_DISPLACEMENT}
-    )
-    changed = [scene.replace(**{remedy.parameter: end}) for end in ends]
-    outcome = simulate(changed, periods=CHECK_PERIODS, record=False, **start).outcome
-    return bool(np.isin(outcome, (MotionKind.REST, MotionKind.DECAYING)).all())
+RESERVE = 3  # of these values skipped after the first at rest, because the outcome is not monotone close to it
 
 
 class _Candidates(NamedTuple):
@@ -107,16 +36,16 @@ class _Candidates(NamedTuple):
         return len(at_rest) - int(np.argmin(np.append(at_rest[::-1], False)))
 
     def refine(self, index: int, present: float) -> _Candidates:
-        """Return values between the last oscillating value, excluded, and the selected one, included."""
+        """Return values from the last oscillating one, excluded, through the selected one to the second after it."""
         before = self.values[index - 1] if index else present or self.values[0] / 2
-        values = np.geomspace(before, self.values[index], FINE + 2)[1:]
+        values = np.geomspace(before, self.values[min(index + 2, len(self.values) - 1)], FINE + 1)[1:]
         return self._replace(values=values)
 
     def round(self, system: UnitSystem) -> _Candidates:
         """Return the values to three significant digits, each rounded away from the parameter's current value."""
         values = [round_safely(value, "above" if self.increasing else "below", 3) for value in self.values.tolist()]
         if self.parameter == "resolution" and system.rotary:
-            values = [2.0 * math.pi / round_safely(_count_steps(value), "above", 3) for value in self.values.tolist()]
+            values = [2.0 * math.pi / round_safely(count_steps(value), "above", 3) for value in self.values.tolist()]
         return self._replace(values=np.array(values))
 
 
@@ -138,10 +67,10 @@ def search_remedies(experiment: Experiment, cause: Literal["quantization", "satu
     for (coarse, fine), at_rest in zip(chosen, _try(experiment, [fine for _, fine in chosen]), strict=True):
         index = fine.select(at_rest)
         if index < len(at_rest):
-            value, last = float(fine.values[index]), float(coarse.values[-1])
+            value, last = float(fine.values[min(index + RESERVE, FINE - 1)]), float(coarse.values[-1])
             open_end = math.inf if coarse.parameter == "coulomb" else last
-            remedies.append(Remedy(coarse.parameter, *((value, open_end) if coarse.increasing else (0.0, value))))
-    return remedies
+            remedies.append(Remedy(coarse.parameter, *((value, open_end) if coarse.increasing else (-math.inf, value))))
+    return with_units(remedies, experiment.scene.unit_system)
 
 
 def _list_candidates(experiment: Experiment, cause: str) -> list[_Candidates]:

@@ -1,4 +1,4 @@
-"""Ranges of single parameters in which the wall of a scene is stable."""
+"""Remedies: ranges of single parameters in which the wall of a scene is stable, or in which an oscillation stops."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from zwidth.scenes.assessment import nearest_interval
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.stiffest import SceneOptima
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import round_safely, tell_apart, with_unit
-from zwidth.words.quantities import PARAMETERS
+from zwidth.words.formatting import count_digits, round_safely, tell_apart, with_unit
+from zwidth.words.quantities import FIELDS
 from zwidth.words.showing import find_unit, shown
 
 # Parameters with their direction of search, 1 (increase) or -1 (decrease), and the largest factor of the change.
@@ -30,11 +30,12 @@ DIRECTIONS = {
 }
 POINTS = 14  # values of a parameter tried, from the present one to the end of the search range
 HALVINGS = 14  # bisection steps between two tried values
-DIGITS = 4  # significant digits printed
 
 NAMES = {
     "stiffness": "K",
     "virtual_damping": "B",
+    "resolution": "encoder steps",
+    "coulomb": "friction",
     "damping": "damping of the device",
     "velocity.cutoff": "filter cutoff",
     "velocity.time_constant": "filter time constant",
@@ -46,29 +47,40 @@ NAMES = {
 
 
 @shown()
-class StableRange(NamedTuple):
-    """A range of one parameter in which a wall is stable, all other parameters unchanged."""
+class Remedy(NamedTuple):
+    """A range of one parameter in which an oscillation stops, all other parameters unchanged.
 
-    parameter: str  # dotted path
+    For an unstable linear loop the wall is stable in the whole range. For a limit cycle, simulations confirm many
+    values from the finite end on; values between them may oscillate, because the outcome need not be monotone.
+    """
+
+    parameter: str  # dotted path, or "resolution" or "coulomb"
     low: float  # in SI units; -inf if the range has no lower end
     high: float  # in SI units; inf if the range has no upper end
     note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
 
-    def spell(self) -> str:
+    def spell(self, digits: int = 4) -> str:
         """Return the range in words, both ends rounded into the range."""
-        name, unit = NAMES.get(self.parameter, self.parameter), find_unit(self, PARAMETERS[self.parameter].unit)
+        name, unit = NAMES.get(self.parameter, self.parameter), find_unit(self, FIELDS[self.parameter].unit)
         kept = f" ({self.note})" if self.note else ""
         if self.parameter == "velocity.samples":
             return f"{name} of at most {self.high:g} samples"
+        if self.parameter == "resolution" and unit == "rad":
+            kept = f" (at least {count_steps(self.high):,} counts per turn)"
         if self.high == math.inf:
-            return f"{name} at least {with_unit(round_safely(self.low, 'above', DIGITS), unit, DIGITS)}{kept}"
+            return f"{name} at least {with_unit(round_safely(self.low, 'above', digits), unit, digits)}{kept}"
         if self.low == -math.inf:
-            return f"{name} at most {with_unit(round_safely(self.high, 'below', DIGITS), unit, DIGITS)}{kept}"
-        return f"{name} from {' to '.join(tell_apart(self.low, self.high, unit))}{kept}"
+            return f"{name} at most {with_unit(round_safely(self.high, 'below', digits), unit, digits)}{kept}"
+        return f"{name} from {' to '.join(tell_apart(self.low, self.high, unit, digits))}{kept}"
+
+
+def count_steps(resolution: float) -> int:
+    """Return the counts per turn of an encoder with this step in rad."""
+    return math.ceil(2.0 * math.pi / resolution - 1e-6)
 
 
 @of_scene
-def stabilize(scene: SceneOptima) -> list[StableRange]:
+def stabilize(scene: SceneOptima) -> list[Remedy]:
     """Return the ranges of single parameters in which the wall of a scene is stable.
 
     The list starts with stiffness and virtual damping, each with the stable interval nearest to its present value.
@@ -79,10 +91,10 @@ def stabilize(scene: SceneOptima) -> list[StableRange]:
     row, column = (list(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
     ranges = []
     if row:
-        low, high = nearest_interval(tuple(row), K)
-        ranges.append(StableRange("stiffness", low if low > 0 or low >= K else -math.inf, high))
+        low, high = _round_inwards(*nearest_interval(tuple(row), K))
+        ranges.append(Remedy("stiffness", low if low > 0 or low >= K else -math.inf, high))
     if column:
-        ranges.append(StableRange("virtual_damping", *nearest_interval(tuple(column), B)))
+        ranges.append(Remedy("virtual_damping", *_round_inwards(*nearest_interval(tuple(column), B))))
     values = {**scene.parameters(), "rate": 1.0 / scene.timing.period}
     for path, (direction, factor) in DIRECTIONS.items():
         if path in values and (path != "delay" or values[path] > 0):
@@ -90,7 +102,16 @@ def stabilize(scene: SceneOptima) -> list[StableRange]:
     return ranges
 
 
-def _search(scene: SceneOptima, path: str, present: float, direction: int, factor: float) -> list[StableRange]:
+def _round_inwards(low: float, high: float) -> tuple[float, float]:
+    """Return the ends of an open stable interval, rounded to stable values with the fewest digits, at least 4."""
+
+    def shorten(digits: int) -> tuple[float, float]:
+        return round_safely(low, "above", digits), round_safely(high, "below", digits)
+
+    return shorten(count_digits(lambda digits: shorten(digits)[0] < shorten(digits)[1]))
+
+
+def _search(scene: SceneOptima, path: str, present: float, direction: int, factor: float) -> list[Remedy]:
     """Return the stable range nearest to the present value in one direction; an empty list if there is none."""
 
     def holds(value: float) -> bool | None:
@@ -102,7 +123,7 @@ def _search(scene: SceneOptima, path: str, present: float, direction: int, facto
 
     if path == "velocity.samples":
         shorter: int | None = next((count for count in range(int(present) - 1, 0, -1) if holds(count)), None)
-        return [] if shorter is None else [StableRange(path, -math.inf, shorter)]
+        return [] if shorter is None else [Remedy(path, -math.inf, shorter)]
     start = present or 1e-3 * scene.units.virtual_damping
     values = [present, *(start * np.geomspace(1.0, factor, POINTS)[1:] ** direction).tolist()]
     if path == "delay":
@@ -116,8 +137,8 @@ def _search(scene: SceneOptima, path: str, present: float, direction: int, facto
     far = _bisect(holds, values[beyond - 1], values[beyond]) if beyond else None
     note = f"the delay stays {scene.timing.kept_delay}" if path == "rate" and scene.timing.delay else ""
     if direction > 0:
-        return [StableRange(path, near, math.inf if far is None else far, note)]
-    return [StableRange(path, -math.inf if far is None else far, near, note)]
+        return [Remedy(path, near, math.inf if far is None else far, note)]
+    return [Remedy(path, -math.inf if far is None else far, near, note)]
 
 
 def _bisect(holds: Callable[[float], bool | None], inside: float, outside: float) -> float:

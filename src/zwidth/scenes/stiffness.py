@@ -60,14 +60,14 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
 
 
 def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
-    return ridge_kernel(delta, d, "held", kind).alpha * (mass / period) / period
+    return ridge_kernel(delta, d, kind).alpha * (mass / period) / period
 
 
 def move_max_stiffness(
     mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses
 ) -> tuple[Array, tuple[Array, ...]]:
     """`max_stiffness_kernel`, and how it moves with each of mass, period, delta and d."""
-    found = slopes_kernel(delta, d, "held", kind)
+    found = slopes_kernel(delta, d, kind)
     scale = (mass / period) / period
     value = found.point.alpha * scale
     return value, (value / mass, -2.0 * value / period, found.by_delta * scale, found.by_d * scale)
@@ -131,11 +131,8 @@ def sensitivities(
 
 def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensitivities:
     xp = namespace(mass, delta, d)
-    if xp is np:
-        found = slopes_kernel(delta, d, "held", kind)
-    else:
-        # Its slopes are found once, in delta and d, and not once more for each quantity.
-        found = compile_traced(slopes_kernel, ("held", kind))(delta, d)
+    # Traced: compute the slopes in delta and d only once, not again for each quantity.
+    found = slopes_kernel(delta, d, kind) if xp is np else compile_traced(slopes_kernel, (kind,))(delta, d)
     # An array's entry beyond the range of its quantity is NaN in delta or d; the quantities tell why.
     given = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
     status = xp.where(given == Status.OK, found.point.status, given).astype(np.int32)

@@ -17,7 +17,8 @@ from zwidth.simulation.simulate import simulate
 from zwidth.words.errors import InputError
 
 DISPLACEMENTS = (0.6, 1.3, 2.2, 3.7, 7.1, 13.0, 26.0, 50.0)  # initial displacements, in steps of the encoder
-OVERLOADS = (1.5, 6.0, 30.0)  # initial spring forces, in units of max_force and of max_rate times the sampling period
+# Initial spring forces, as multiples of max_force and, in further trials, of max_rate times the sampling period.
+OVERLOADS = (1.5, 6.0, 30.0)
 LARGEST_PUSH = 0.9  # largest constant external force on a `LinearDevice`, in units of the motor's force limit
 SPEEDS = (0.05, 0.5)  # initial velocities if K = 0, in initial displacements per sampling period
 FIRST_DISPLACEMENT = 1e-3  # m or rad; used if neither the encoder nor the motor sets a scale

@@ -88,8 +88,7 @@ class RigidVariants(Variants):
 
     @np.errstate(all="ignore")
     def stiffest(self) -> tuple[np.ndarray, np.ndarray]:
-        model = self.scene.timing.delay_model
-        alpha, beta = self.ask(lambda *at: np.stack(alpha_max(*at, delay=model)[:2]), self.delta, self.d)
+        alpha, beta = self.ask(lambda *at: np.stack(alpha_max(*at)[:2]), self.delta, self.d)
         return alpha * self.rate / self.period, beta * self.rate
 
     @staticmethod

@@ -10,6 +10,7 @@ has the states ``p = zeta W`` and ``q = W`` with ``zeta^2 W = w = u - a1 p - a0 
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -87,18 +88,21 @@ class WallProgram(NamedTuple):
     start: list[str]  # the states at rest
     force: list[str]  # from the position x to the velocity v
     law: str
+    max_force: float  # largest force; infinite for none
     system: UnitSystem
 
 
-def write_wall(scene: SceneParts, language: str = "c", cautions: Sequence[str] = ()) -> str:
-    """See `zwidth.scenes.recommendation.Recommendation.code`."""
+def write_wall(
+    scene: SceneParts, language: str = "c", cautions: Sequence[str] = (), max_force: float = math.inf
+) -> str:
+    """Return a wall as source code (`zwidth.scenes.recommendation.Recommendation.code`)."""
     check_choice("language", language, ("c", "python"))
-    program = lay_program(scene, cautions)
+    program = lay_program(scene, cautions, max_force)
     return _write_c(program) if language == "c" else _write_python(program)
 
 
-def lay_program(scene: SceneParts, cautions: Sequence[str] = ()) -> WallProgram:
-    """The wall of a scene and its velocity estimate as statements."""
+def lay_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
+    """Return the wall of a scene and its velocity estimate as statements."""
     period = float(scene.timing.period)
     estimate = scene.velocity.estimate(period)
     count, gain = estimate.window, float(estimate.gain) / period
@@ -126,8 +130,10 @@ def lay_program(scene: SceneParts, cautions: Sequence[str] = ()) -> WallProgram:
         force.append(f"{names[0]} += w")
     K, B, system = float(scene.wall.stiffness), float(scene.wall.virtual_damping), scene.unit_system
     estimated = f"velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}"
-    head = "\n".join([f"Virtual wall: {name_wall(K, B, system)}, {estimated}.", *_describe_cautions(scene, cautions)])
-    return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], f"-({K!r} * x + {B!r} * v)", system)
+    limited = f" {'Torque' if system.rotary else 'Force'} limited to {with_unit(max_force, system['N'])}."
+    wall = f"Virtual wall: {name_wall(K, B, system)}, {estimated}.{limited if max_force < math.inf else ''}"
+    head, law = "\n".join([wall, *_describe_cautions(scene, cautions)]), f"-({K!r} * x + {B!r} * v)"
+    return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], law, float(max_force), system)
 
 
 def _write_c(program: WallProgram) -> str:
@@ -135,9 +141,16 @@ def _write_c(program: WallProgram) -> str:
     count = program.window
     members = [f"double past[{count}]", "int next"] if count > 1 else ["double x"]
     begin = [f"for (int k = 0; k < {count}; k++) wall->past[k] = x", "wall->next = 0"] if count > 1 else ["wall->x = x"]
-    names = [name for name in "uvw" if any(line.startswith(f"{name} =") for line in program.force)]
+    limit, law = program.max_force, [f"return x > 0.0 ? {program.law} : 0.0"]
+    if limit < math.inf:
+        law = [
+            f"f = x > 0.0 ? {program.law} : 0.0",
+            f"return f > {limit!r} ? {limit!r} : f < -{limit!r} ? -{limit!r} : f",
+        ]
+    lines = [*program.force, *law]
+    names = [name for name in "uvwf" if any(line.startswith(f"{name} =") for line in lines)]
     start = [*(["double u"] if "u = x" in program.start else []), *begin, *program.start]
-    force = [f"double {', '.join(names)}", *program.force, f"return x > 0.0 ? {program.law} : 0.0"]
+    force = [f"double {', '.join(names)}", *lines]
     blocks = ["\n".join(f"    {line.replace('@', 'wall->')};" for line in lines) for lines in (start, force)]
     kept = "\n".join(f"    {line};" for line in (*members, *(f"double {name}" for name in program.states)))
     words = "\n   ".join(
@@ -156,7 +169,9 @@ def _write_python(program: WallProgram) -> str:
     """The wall as a class of Python."""
     count = program.window
     begin = [f"@past = [x] * {count}", "@next = 0"] if count > 1 else ["@x = x"]
-    force = [*program.force, f"return {program.law} if x > 0.0 else 0.0"]
+    limit, law = program.max_force, program.law
+    law = law if limit == math.inf else f"max(-{limit!r}, min({limit!r}, {law}))"
+    force = [*program.force, f"return {law} if x > 0.0 else 0.0"]
     words = "\n    ".join(
         [
             '    """' + program.head.replace("\n", "\n    ") + "\n",

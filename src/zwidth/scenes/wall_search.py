@@ -7,8 +7,8 @@ for an unstable wall. The active requirement of a wall is the one that excludes 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
 from zwidth.parts.safe_limit import SafeLimit
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, soft_dampings
-from zwidth.words.errors import InputError
+from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.status import Status
 from zwidth.words.units import to_float
@@ -30,10 +30,11 @@ SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive onl
 NEAR = 5.0  # tolerance of the best B over the tolerance of K
 LEAST = 1e-9  # smallest stiffness tried, relative to the largest allowed one
 STEP_DOWN = 0.25  # factor by which K is lowered until a wall satisfies the requirements
+HELD_GAIN = 1.1  # factor on K and B with which a wall is still stable in a required grasp, because grasps vary
+HELD = 0.95  # factor on K for the initial guess if a grasp destabilizes the wall
 FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
 WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
 COARSE = 1e-3  # the same for an improved device, because its gain is printed with 3 digits
-HELD_SHARES = np.linspace(0.95, 0.05, 19)  # fractions of K tried if a soft grasp destabilizes the wall
 MAX_STEPS = 60  # root-finding steps on log K, bisections included; 8 usually suffice
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
@@ -41,6 +42,7 @@ _EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", 
 OTHER_DAMPING = "B differs from that of the stiffest wall, because with that B this share of K_max is unstable"
 
 Slack = Callable[[float, Any], dict[str, np.ndarray]]
+Grasps: TypeAlias = Literal["all", "soft", "none"]
 
 
 class Wanted(NamedTuple):
@@ -51,7 +53,7 @@ class Wanted(NamedTuple):
     phase_margin: float | None = None  # lower limit, in degrees
     passive: bool = False  # require passivity
     beyond_safe: bool = False  # ignore the safe limit of the scene
-    soft_grasps: bool = False  # require stability in the soft grasps of `zwidth.reference_grasps`
+    grasps: Grasps = "none"  # require stability in these grasps of `zwidth.reference_grasps`
 
     @classmethod
     def check(
@@ -61,8 +63,9 @@ class Wanted(NamedTuple):
         phase_margin: float | None,
         passive: bool,
         beyond_safe: bool = False,
+        grasps: Grasps | None = None,
     ) -> Wanted:
-        """Return the requirements, or the defaults if none is given; raise `InputError` for an invalid value."""
+        """Return the requirements, with defaults if none is given; raise `InputError` for an invalid value."""
         ranges = {"stiffness_fraction": FRACTION, **RANGES}
         given = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
         for name, value in given.items():
@@ -73,10 +76,17 @@ class Wanted(NamedTuple):
         for name, value in switches.items():
             if not isinstance(value, bool | np.bool_):
                 raise InputError(f"{name}: got {value!r}; True or False is needed")
+        if grasps is not None:
+            check_choice("grasps", grasps, ("all", "soft", "none"))
         default = not passive and all(value is None for value in given.values())
         if default:
             given = dict(zip(given, (RECOMMENDED_SHARE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN), strict=True))
-        return cls(**given, passive=bool(passive), beyond_safe=bool(beyond_safe), soft_grasps=default)
+        return cls(
+            **given,
+            passive=bool(passive),
+            beyond_safe=bool(beyond_safe),
+            grasps=grasps or ("soft" if default else "none"),
+        )
 
     def spell(self, name: str) -> str:
         """Return a requirement in words."""
@@ -85,7 +95,7 @@ class Wanted(NamedTuple):
             "gain_margin": f"gain margin {self.gain_margin:g}" if self.gain_margin else "",
             "phase_margin": f"{self.phase_margin:g} deg phase margin" if self.phase_margin else "",
             "passive": "passivity",
-            "soft_grasps": "stability in the soft reference grasps",
+            "grasps": f"stability in {'the soft' if self.grasps == 'soft' else 'all six'} reference grasps",
             "safe_limit": f"{100.0 * self.safe_share:.4g} % of the safe limit",
         }[name]
 
@@ -106,14 +116,29 @@ class WallChoice(NamedTuple):
     note: str = ""  # remark on the choice
 
 
-def measure_slack(scene: SceneOptima, wanted: Wanted) -> Slack:
-    """Return a function of K in N/m and B in N s/m that returns the slack of each requirement on margins."""
+def list_held(scene: SceneOptima, wanted: Wanted) -> list[SceneOptima]:
+    """Return the scene in each required grasp, and without its operator if grasps are required and it has one."""
+    if not isinstance(scene.device, Device) or wanted.grasps == "none":
+        return []
+    pairs = list_grasps(scene.unit_system.rotary)
+    hands: list[Any] = [hand for name, hand in pairs if wanted.grasps == "all" or name.startswith(wanted.grasps)]
+    return [scene.replace(operator=hand) for hand in (*hands, *([None] if scene.operator is not None else []))]
+
+
+def measure_slack(scene: SceneOptima, wanted: Wanted, held: Sequence[SceneOptima] = ()) -> Slack:
+    """Return a function of K in N/m and B in N s/m that returns the slack of each requirement on margins.
+
+    The wall must also be stable in every scene of ``held``. The slack of this requirement is the modulus margin of the
+    wall, so that a search for the largest slack prefers well-damped walls.
+    """
     device_damping = float(scene.device.damping)
     asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
+    asked += ["modulus_margin"] if held else []
 
     def slack(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
         alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
         stable, slacks = scene.loop.labels(alpha, beta), {}
+        margins: Any = None
         if asked:
             margins = scene.loop.margins(alpha, beta, asked)
             if wanted.gain_margin:
@@ -125,9 +150,17 @@ def measure_slack(scene: SceneOptima, wanted: Wanted) -> Slack:
             margin = np.asarray(scene.passivity_margin(stiffness, damping)) / (device_damping or 1.0)
             # A margin of exactly 0 must yield a negative slack, because such a wall is not passive.
             slacks["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
+        if held:
+            steady = np.all([_is_stable_held(each, stiffness, damping) for each in held], axis=0)
+            slacks["grasps"] = np.where(steady, margins.modulus_margin, -1.0)
         return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in slacks.items()}
 
     return slack
+
+
+def _is_stable_held(held: SceneOptima, stiffness: float, damping: Any) -> Any:
+    """Return whether walls are stable in a grasp, as they are and with K and B increased by the required reserve."""
+    return np.all([held.is_stable(gain * stiffness, gain * damping) for gain in (1.0, HELD_GAIN)], axis=0)
 
 
 def find_stiffest(
@@ -206,26 +239,27 @@ def choose_wall(
     scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> WallChoice:
     """Choose the stiffest wall of a scene that satisfies the requirements; ``top`` is its stiffest stable wall."""
-    choice = _choose_free(scene, wanted, top, near, width)
-    if not wanted.soft_grasps or choice.status != Status.OK or _is_stable_held(scene, choice):
-        return choice
-    for share in HELD_SHARES * (choice.stiffness / float(top.stiffness)):
-        softer = _choose_free(scene, wanted._replace(stiffness_fraction=float(share)), top, None, width)
-        if softer.status == Status.OK and _is_stable_held(scene, softer):
-            return softer._replace(limit="soft_grasps")
-    return choice
+    grasps, active = list_held(scene, wanted), list[SceneOptima]()
+    free = choice = _choose_free(scene, wanted, top, near, width, active)
+    # Require only the grasps that destabilize a chosen wall, because each grasp makes the search slower.
+    while choice.status == Status.OK and (
+        unstable := [held for held in grasps if not _is_stable_held(held, choice.stiffness, choice.damping)]
+    ):
+        active += unstable
+        choice = _choose_free(scene, wanted, top, HELD * choice.stiffness, width, active)
+    softer = active and choice.status == Status.OK and choice.stiffness < (1.0 - 2.0 * width) * free.stiffness
+    return choice._replace(limit="grasps" if softer else free.limit)
 
 
-def _is_stable_held(scene: SceneOptima, wall: WallChoice) -> bool:
-    """Return whether a wall is stable in all soft reference grasps; True if the scene cannot have another operator."""
-    if not isinstance(scene.device, Device) or scene.operator is not None:
-        return True
-    grasps = (grasp for name, grasp in list_grasps(scene.unit_system.rotary) if name.startswith("soft"))
-    return all(bool(scene.replace(operator=grasp).is_stable(wall.stiffness, wall.damping)) for grasp in grasps)
-
-
-def _choose_free(scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None, width: float) -> WallChoice:
-    """Choose the wall by all requirements except stability in the soft grasps."""
+def _choose_free(
+    scene: SceneOptima,
+    wanted: Wanted,
+    top: StiffestWall,
+    near: float | None,
+    width: float,
+    held: Sequence[SceneOptima],
+) -> WallChoice:
+    """Choose the wall by all requirements, with stability in the scenes ``held`` as the only one on grasps."""
     nan = math.nan
     if top.status != Status.OK:
         return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
@@ -238,7 +272,7 @@ def _choose_free(scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: fl
         # Apply the same fraction to the safe limit as to K_max, because both need the same reserve.
         share = wanted.safe_share * safe.stiffness
         most, active = (share, "safe_limit") if share < most else (most, active)
-    usual, slack = choose_damping(scene, top, most), measure_slack(scene, wanted)
+    usual, slack = choose_damping(scene, top, most), measure_slack(scene, wanted, held)
     if safe is not None:
         low, high = safe.dampings(most) or (usual, usual)
         usual = min(max(usual, low), high)
@@ -246,10 +280,10 @@ def _choose_free(scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: fl
     if spare and not (wanted.stiffness_fraction and min(spare.values()) >= 0):
         stiffness, damping = find_stiffest(scene, slack, most, near, width, safe)
         if math.isnan(stiffness):
-            asked = " and ".join(map(wanted.spell, spare))
-            undamped = wanted.passive and scene.device.damping == 0
-            why = "without physical damping no wall is passive" if undamped else "relax a requirement"
-            return WallChoice(nan, nan, "", Status.UNREACHABLE, f"no wall, however soft, has {asked}; {why}")
+            reason = f"no wall satisfies {' and '.join(map(wanted.spell, spare))}; relax a requirement"
+            if wanted.passive and scene.device.damping == 0:
+                reason = "no passive wall exists, because the device has no physical damping"
+            return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
         spare = slack(stiffness, damping)
         limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else active
         return WallChoice(stiffness, damping, limit, Status.OK)

@@ -14,7 +14,7 @@ from zwidth import figures
 from zwidth.config.fields import LocatedProblem, members, problem, repeated
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene
-from zwidth.config.study import DelayModels, HeldStudy, name_parts, register
+from zwidth.config.study import name_parts, register
 from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.figures.stable_set import Outlines, tabulate_sets
 from zwidth.figures.table import stack
@@ -36,10 +36,9 @@ from zwidth.studies.outcome import (
     spell_stiffest,
     summarize_stiffest,
 )
-from zwidth.studies.ridge import find_edges, needed_models, passive_intervals, passive_outlines, ridge_table
+from zwidth.studies.ridge import find_edges, passive_intervals, passive_outlines, ridge_table
 from zwidth.words.quantities import OUTPUTS, WALL_RANGE
 from zwidth.words.status import note_failures
-from zwidth.words.types import DelayModel
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 
@@ -50,10 +49,9 @@ _RIDGE_POINTS = 101
 
 @register
 class BoundaryStudy(CurvesStudy):
-    """Stability boundaries, one for every delta, d and delay model."""
+    """Stability boundaries, one per delta and d."""
 
     method = "Closed form of the boundary, to a few rounding errors; the stable side by counting poles."
-    from_scene = ("delta", "d", "delay_models")
     reads_scene = True
     takes_parts = True
 
@@ -65,9 +63,6 @@ class BoundaryStudy(CurvesStudy):
     plane: Plane = "alpha_beta"
     """Boundary over alpha and beta, or over delta and beta at alpha -> 0."""
 
-    delay_models: DelayModels = ("held",)
-    """Models of a delay that is not whole."""
-
     ridge_path: bool = False
     """Draw the path of maximum stiffness over delta as well; in the plane alpha_beta."""
 
@@ -77,7 +72,7 @@ class BoundaryStudy(CurvesStudy):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         if "device" in raw or (scene.parts_beyond and not {"delta", "d"} & set(raw)):
-            return {"delay_models": [scene.delay_model], "device": scene.bare(), **raw}
+            return {"device": scene.bare(), **raw}
         return super().fill(raw, scene)
 
     @classmethod
@@ -117,7 +112,7 @@ class BoundaryStudy(CurvesStudy):
                 yield (name,), problem(what, "a device has its own", "remove one", on_key=True)
         if not self.device.parts_beyond:
             return
-        asked = {"plane": "alpha_beta", "delay_models": ("held",), "ridge_path": False, "passivity": False}
+        asked = {"plane": "alpha_beta", "ridge_path": False, "passivity": False}
         for name in [name for name, known in asked.items() if getattr(self, name) != known]:
             parts = name_parts(self.device.parts_beyond)
             allowed = f"it is known for a rigid mass with the difference of two samples, not for one with {parts}"
@@ -131,22 +126,19 @@ class BoundaryStudy(CurvesStudy):
         if self.device is not None and self.device.parts_beyond:
             return outline_device(self.device, self.device.label or self.name)
         deltas, delays = self.delta.values(), self.d.values()
-        models = needed_models(self.delay_models, delays)
         if self.plane == "delta_beta":
             deltas = np.sort(deltas)
-            parts = [part for model, chosen in models for part in stable_intervals(deltas, chosen, model)]
+            parts = stable_intervals(deltas, delays)
             parts += passive_intervals(deltas, delays) if self.passivity else ()
             table = stack(parts)
             return Outcome(table=table, figures={"": partial(figures.draw_zero_stiffness, table)})
-        parts, notes = [], []
-        for model, chosen in models:
-            parts += [outline(delta, d, model) for d, delta in product(chosen.tolist(), deltas.tolist())]
-        for model, chosen in models if self.ridge_path else ():
-            path, remarks = ridge_table(np.linspace(deltas.min(), deltas.max(), _RIDGE_POINTS), chosen, model)
+        notes: list[str] = []
+        parts = [outline(delta, d) for d, delta in product(delays.tolist(), deltas.tolist())]
+        if self.ridge_path:
+            path, notes = ridge_table(np.linspace(deltas.min(), deltas.max(), _RIDGE_POINTS), delays)
             path["alpha"] = path.pop("alpha_max")
             del path["kind"]
             parts.append({"curve": "ridge_path", **path})
-            notes += remarks
         share = share_of_device(self.delta, self.d, self.device or scene)
         parts += passive_outlines(deltas, delays, share) if self.passivity else ()
         table = add_si_of_scene(stack(parts), self.delta, self.d, self.device or scene)
@@ -154,28 +146,28 @@ class BoundaryStudy(CurvesStudy):
 
 
 def outline_device(device: PhysicalDevice, label: str) -> Outcome:
-    """The outlines of a device with parts, islands and holes told apart, and its stiffest wall."""
+    """Return the outlines of a device with parts, with islands and holes distinguished, and its stiffest wall."""
     outlines, walls = tabulate_sets({label: device.to_scene()})
     if not outlines:
         return Outcome(notes=("no wall of this device is stable",))
-    about = {"curve": "boundary", "delay_model": "held", "label": label, "d": device.d, "delta": device.delta}
+    about = {"curve": "boundary", "label": label, "d": device.d, "delta": device.delta}
     table = stack([{**about, **outlines}])
     return Outcome(table=table, figures={"": partial(figures.draw_stable_set, table, walls)})
 
 
-def outline(delta: float, d: float, delay: DelayModel) -> dict[str, Any]:
-    """The edge of one device's stable set, as columns."""
-    region = stable_region(delta, d, delay=delay)
+def outline(delta: float, d: float) -> dict[str, Any]:
+    """Return the edge of the stable set of one device, as columns."""
+    region = stable_region(delta, d)
     columns = {"omega": region.omega, "alpha": region.alpha, "beta": region.beta}
     columns["piece"] = np.array([Piece(int(code)).name.lower() for code in region.piece])
-    return {"curve": "boundary", "d": d, "delta": delta, "delay_model": delay, **columns}
+    return {"curve": "boundary", "d": d, "delta": delta, **columns}
 
 
-def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[dict[str, Any]]:
-    """The virtual damping that is stable for alpha -> 0, over delta, as columns for every delay."""
-    # At the softest wall that there is.
-    upper = boundary_point(deltas, delays[:, None], alpha=WALL_RANGE[0], side="upper", delay=delay).beta
-    shared = {"delay_model": delay, "delta": deltas, "beta_lower": -deltas}
+def stable_intervals(deltas: np.ndarray, delays: np.ndarray) -> list[dict[str, Any]]:
+    """Return the stable interval of the virtual damping for alpha -> 0 over delta, as columns per delay."""
+    # At the smallest alpha in range.
+    upper = boundary_point(deltas, delays[:, None], alpha=WALL_RANGE[0], side="upper").beta
+    shared = {"delta": deltas, "beta_lower": -deltas}
     rows = zip(delays, np.asarray(upper), strict=True)
     return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in rows]
 
@@ -248,11 +240,10 @@ _OUTPUTS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": 
 
 
 @register
-class MapStudy(ComputedStudy, HeldStudy):
+class MapStudy(ComputedStudy):
     """Stability and passivity on a grid of alpha, beta, delta and d."""
 
     method = "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors."
-    from_scene = ("delta", "d", "delay_model")
     reads_scene = True
 
     kind: Literal["map"]

@@ -81,17 +81,13 @@ class ComputedStudy(Study):
 
 
 class CurvesStudy(ComputedStudy):
-    """What the studies over delta and d share."""
+    """Base of the studies over delta and d."""
 
     # alpha, beta, frequency and two codes.
     point_bytes = 32
 
     delta: DeltaAxis
     d: DelayAxis
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        return super().sizes | {"delay models": len(getattr(self, "delay_models", ("held",)))}
 
 
 class WallsStudy(ComputedStudy):

@@ -23,6 +23,7 @@ from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import WindowedDifference
 from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import ComputedStudy, Outcome
+from zwidth.studies.paper_figures import limit_slope, maximize_alpha
 from zwidth.words.formatting import with_unit
 
 SOURCE = "Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006"
@@ -105,7 +106,7 @@ def published_numbers() -> list[Comparison]:
 
 
 def _with_lag() -> str:
-    """Return, in words, the effect of the cited filter lag on K_max of the undamped device of section VIII."""
+    """Describe how the filter lag that the paper quotes changes K_max of the undamped device of its section VIII."""
     scene = Scene(Device(MASS), Timing(period=PERIOD, delay=DELAY_FACTOR * PERIOD))
     # Use a window of 2 lag/T differences, because the mean of n differences lags by n/2 periods.
     walls = [scene, scene.replace(velocity=WindowedDifference(round(2 * FILTER_LAG / PERIOD)))]
@@ -137,18 +138,17 @@ def line_appears() -> float:
 def linear_from() -> float:
     """Return the delta above which d alpha_max/d delta is within 10 % of its limit g for every curve of Fig. 10.
 
-    Noninteger delays are modeled as fractional powers of z, as in the paper.
+    Fractional delays are modeled as fractional powers of z, as in the paper.
     """
-    delays = np.array(FIG10_DELAYS)
-    limit = np.asarray(stiffness_slope(delays, delay="fractional_power"))
+    limit = np.array([limit_slope(d) for d in FIG10_DELAYS])
 
     def excess(delta: np.ndarray) -> np.ndarray:
         """Return the largest relative difference from g among the curves, minus the allowed difference."""
         step = 0.008  # fourth-order central differences; their truncation and rounding errors move the root by 2e-10
-        deltas = np.asarray(delta)[..., None, None] + step * np.array([-2.0, -1.0, 1.0, 2.0])
-        values = np.asarray(alpha_max(deltas, delays[:, None], delay="fractional_power").alpha)
-        derivative = values @ np.array([1.0, -8.0, 8.0, -1.0]) / (12.0 * step)
-        return np.abs(derivative / limit - 1.0).max(axis=-1) - LINEAR_WITHIN
+        deltas = np.asarray(delta)[..., None] + step * np.array([-2.0, -1.0, 1.0, 2.0])
+        values = np.array([maximize_alpha(deltas, d)[0] for d in FIG10_DELAYS])
+        derivatives = values @ np.array([1.0, -8.0, 8.0, -1.0]) / (12.0 * step)
+        return np.abs(derivatives.T / limit - 1.0).max(axis=-1) - LINEAR_WITHIN
 
     grid = np.linspace(0.1, 50.0, 1000)
     last = np.flatnonzero(excess(grid) > 0)[-1]

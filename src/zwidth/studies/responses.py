@@ -25,7 +25,7 @@ from zwidth.config.scenes import (
     PhysicalWall,
     normalized_wall,
 )
-from zwidth.config.study import HeldStudy, refuse_parts, register
+from zwidth.config.study import refuse_parts, register
 from zwidth.config.values import Duration, Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.style import WIDTH, house_style, new_figure
@@ -35,13 +35,13 @@ from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.recommendation import Recommendation
-from zwidth.scenes.wall_search import RANGES
+from zwidth.scenes.wall_search import RANGES, Grasps
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range
 
 
-class ResponseStudy(ComputedStudy, HeldStudy):
+class ResponseStudy(ComputedStudy):
     """What the studies that compute responses share."""
 
     remedy_if_too_large = "shorten the duration, or lower substeps"
@@ -95,7 +95,7 @@ class StepStudy(WallsStudy, ResponseStudy):
     """Response of the position to a step of force, for one or more devices."""
 
     method = "Exact solution between the instants at which a force changes; rounding alone."
-    from_scene = ("devices", "delay_model")
+    from_scene = ("devices",)
 
     kind: Literal["step"]
 
@@ -172,7 +172,7 @@ class RecommendStudy(ResponseStudy):
     """The wall to set on a device in SI units, at wanted margins, and its response."""
 
     method = "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings."
-    from_scene = ("device", "delay_model")
+    from_scene = ("device",)
 
     takes_parts = True
 
@@ -182,8 +182,8 @@ class RecommendStudy(ResponseStudy):
     """Device in SI units."""
 
     stiffness_fraction: Fraction | None = None
-    """Largest stiffness of the recommended wall as a fraction of K_max. If no requirement is given, the defaults are
-    0.75 of K_max, a gain margin of 2, a phase margin of 30 degrees and stability in the soft reference grasps."""
+    """Largest stiffness of the recommended wall as a fraction of K_max. If neither a fraction, a margin nor passivity
+    is given, the defaults are 0.75 of K_max, a gain margin of 2, a phase margin of 30 degrees and soft grasps."""
 
     gain_margin: Annotated[float, Quantity(allowed=RANGES["gain_margin"])] | None = None
     """The factor on stiffness and damping together that the wall must bear, at least."""
@@ -194,6 +194,10 @@ class RecommendStudy(ResponseStudy):
     passive: bool = False
     """Whether the wall must be passive."""
 
+    grasps: Grasps | None = None
+    """Require stability in all reference grasps, in the soft ones, or in none. By default soft, with the default
+    margins; none if a requirement is given or the scene has a hand."""
+
     beyond_safe: bool = False
     """Ignore the safe limit of the device, which is usually set by a fit."""
 
@@ -203,7 +207,7 @@ class RecommendStudy(ResponseStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         stem, label = "recommendation" if alone else f"{self.name}_recommendation", self.device.label or self.name
         bare = self.device.to_scene()
-        wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive", "beyond_safe")
+        wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive", "grasps", "beyond_safe")
         found = bare.recommend(**{name: getattr(self, name) for name in wanted})
         told, notes, response = found.as_dict(), list(found.notes), None
         if not bare.parts_beyond and found.verdict is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from functools import cached_property, partial
-from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -16,10 +15,10 @@ from zwidth.config.device_table import DeviceTable, find_file, read_table
 from zwidth.config.devices import find_second_period, read_period
 from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import DelayModels, HeldStudy, register
+from zwidth.config.study import register
 from zwidth.config.values import Delay, quantity_of
 from zwidth.figures.stable_set import Outlines
-from zwidth.figures.table import SI_COLUMNS, stack
+from zwidth.figures.table import SI_COLUMNS
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.loops.rigid.verdict import is_stable
@@ -33,7 +32,6 @@ from zwidth.words.formatting import describe, header, name_wall, plain, round_sa
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.tables import read_columns
-from zwidth.words.types import DelayModel
 from zwidth.words.units import split_head
 
 # A path that goes this far shows what alpha_max/delta tends to: within some percent.
@@ -44,73 +42,55 @@ _SLOPE_SAMPLES = 64
 
 @register
 class RidgeStudy(CurvesStudy):
-    """Maximum stiffness over delta, one curve for every d and delay model."""
+    """Maximum stiffness over delta, one curve per d."""
 
     method = "Stationary points of the closed form and corners at z = -1, to some ten rounding errors."
-    from_scene = ("delta", "d", "delay_models")
 
     kind: Literal["ridge"]
-
-    delay_models: DelayModels = ("held",)
-    """Models of a delay that is not whole."""
 
     two_scalings: bool = False
     """Show the small deltas in a panel of their own, as fig. 10 of the paper does."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        needed = needed_models(self.delay_models, self.d.values())
-        parts, notes = zip(*(ridge_table(self.delta.values(), delays, model) for model, delays in needed), strict=True)
-        table = stack(parts)
+        table, notes = ridge_table(self.delta.values(), self.d.values())
         drawn: dict[str, Any] = {"": partial(figures.draw_ridge, table, two_scalings=self.two_scalings)}
         if table["delta"].max() >= _STRONG_DAMPING:
             drawn["_slope"] = partial(figures.draw_slope, table, slope_table(table))
-        return Outcome(table=table, figures=drawn, notes=tuple(chain(*notes)))
+        return Outcome(table=table, figures=drawn, notes=tuple(notes))
 
 
-def ridge_table(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The stiffest stable walls over ``delta``, delay by delay, and notes about points without an answer."""
+def ridge_table(delta: np.ndarray, d: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return the stiffest stable walls over ``delta`` per delay, and notes about points without a result."""
     deltas, delays = np.tile(delta, d.size), np.repeat(d, delta.size)
-    points = alpha_max(deltas, delays, delay=delay)
+    points = alpha_max(deltas, delays)
     columns = {"alpha_max": points.alpha, "beta": points.beta, "omega": points.omega}
     columns["kind"] = np.array([RidgeKind(int(code)).name.lower() for code in points.kind])
     notes = [
-        f"alpha_max: {count} of {delta.size} points have no answer for d = {value:g} ({delay})"
+        f"alpha_max: {count} of {delta.size} points have no result for d = {value:g}"
         for value in d
         if (count := np.count_nonzero(points.status[delays == value] != Status.OK))
     ]
-    return {"d": delays, "delay_model": np.full(delays.size, delay), "delta": deltas, **columns}, notes
-
-
-def needed_models(models: tuple[DelayModel, ...], d: np.ndarray) -> list[tuple[DelayModel, np.ndarray]]:
-    """The delays to compute in each model: for whole periods the models agree, and one of them is enough."""
-    chosen: list[tuple[DelayModel, np.ndarray]] = []
-    for model in models:
-        delays = d[d != np.floor(d)] if model == "fractional_power" and "held" in models else d
-        if delays.size:
-            chosen.append((model, delays))
-    return chosen
+    return {"d": delays, "delta": deltas, **columns}, notes
 
 
 def slope_table(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The slope g(d) that alpha_max/delta of a ridge's table tends to, over its delays and those between them."""
+    """Return the limit g(d) of alpha_max/delta at the delays of a ridge table and at delays between them."""
     longest = max(1, math.ceil(table["d"].max()))
     d = np.union1d(np.linspace(0.0, longest, longest * _SLOPE_SAMPLES + 1), table["d"])
-    models = dict.fromkeys(table["delay_model"].tolist())
-    return stack({"delay_model": model, "d": d, "slope": stiffness_slope(d, delay=model)} for model in models)
+    return {"d": d, "slope": np.asarray(stiffness_slope(d))}
 
 
 @register
-class PassivityStudy(CurvesStudy, HeldStudy):
+class PassivityStudy(CurvesStudy):
     """What passivity costs: the largest passive and the largest stable stiffness over delta."""
 
     method = "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms."
-    from_scene = ("delta", "d", "delay_model")
     reads_scene = True
 
     kind: Literal["passivity"]
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        ridge, notes = ridge_table(self.delta.values(), self.d.values(), self.delay_model)
+        ridge, notes = ridge_table(self.delta.values(), self.d.values())
         table = {name: ridge[name] for name in ("d", "delta", "alpha_max", "beta")}
         slopes = map(passive_stiffness_slope, self.d.values().tolist())
         own = share_of_device(self.delta, self.d, scene) * table["delta"]
@@ -133,20 +113,20 @@ def find_edges(scene: Scene) -> dict[str, Outlines]:
 
 
 def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0) -> Iterator[dict[str, Any]]:
-    """The edge of the passive set of every device that has damping, as columns; without it nothing is passive."""
+    """Return the edge of the passive set of each device with damping, as columns."""
     # ``share`` is the part of the damping that is the device's own: a hand's does not count.
     for d in delays:
         alpha, beta = unit_outline(float(d))
         for delta in deltas[share * deltas > 0]:
-            yield {"curve": "passive", "d": d, "delta": delta, "delay_model": "held",
+            yield {"curve": "passive", "d": d, "delta": delta,
                    "alpha": share * delta * alpha, "beta": share * delta * beta}  # fmt: skip
 
 
 def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:
-    """The virtual damping that is passive for alpha -> 0, over delta, as columns."""
+    """Return the passive interval of the virtual damping for alpha -> 0 over delta, as columns."""
     for d in delays:
         _, beta = unit_outline(float(d))
-        yield {"curve": "passive", "d": d, "delay_model": "held", "delta": deltas,
+        yield {"curve": "passive", "d": d, "delta": deltas,
                "beta_lower": deltas * beta[0], "beta_upper": deltas * beta[-1]}  # fmt: skip
 
 

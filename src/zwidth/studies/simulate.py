@@ -12,7 +12,7 @@ from zwidth import figures
 from zwidth.config.fields import LocatedProblem, Strict, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalWall, SimulatedDevice
-from zwidth.config.study import HeldStudy, register
+from zwidth.config.study import register
 from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.checks import Span
@@ -95,10 +95,10 @@ class Circumstances(Strict):
         return {**given, "periods": periods, "jitter": self.jitter.seconds(period)}
 
 
-class SimulatedStudy(ComputedStudy, HeldStudy):
+class SimulatedStudy(ComputedStudy):
     """What the studies that simulate share."""
 
-    from_scene = ("device", "delay_model")
+    from_scene = ("device",)
     takes_parts = True
     simulates = True
 

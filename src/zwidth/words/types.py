@@ -6,7 +6,7 @@ a name that begins with ``_`` may differ from one argument to the next.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import numpy as np
 
@@ -38,6 +38,3 @@ Matrices: TypeAlias = Inexact[Array, "*points roots roots"]
 # Along a curve, and along time.
 Vertices: TypeAlias = Float[np.ndarray, "vertices"]
 Samples: TypeAlias = Float[np.ndarray, "samples"]
-
-DelayModel: TypeAlias = Literal["held", "fractional_power"]
-DELAY_MODELS: tuple[DelayModel, ...] = ("held", "fractional_power")

@@ -135,7 +135,7 @@ def _read(text: str) -> list[UnitSize]:
 
 
 def _read_run(atom: str) -> Iterator[UnitSize]:
-    """Yield the sizes of adjacent symbols, as in "mNm", and of a single one; an exponent belongs to the last symbol."""
+    """Yield the possible SI sizes of unit symbols in a row, as in "mNm"; an exponent belongs to the last symbol."""
     match = _POWER.fullmatch(atom)
     letters, power = (match[1], int(match[2] or 1)) if match else (atom, 1)
     # Try long symbols first, so that interpretations with few symbols come first.
@@ -153,7 +153,7 @@ def _read_run(atom: str) -> Iterator[UnitSize]:
 
 
 def _raise_to(size: UnitSize, power: int) -> UnitSize:
-    """Return the power of a unit."""
+    """Return a unit raised to a power."""
     kg, m, s, rad = size.exponents
     return UnitSize(size.power * power, size.factor**power, (kg * power, m * power, s * power, rad * power))
 

@@ -22,9 +22,8 @@ def test_a_step_out_of_the_bracket_becomes_a_bisection():
         assert alone == together
 
 
-@pytest.mark.parametrize("geometric", [False, True])
-def test_bisection_ends_between_two_neighbors(geometric):
-    found = bisect(lambda x: x * x < 2, np.float64(1e-3), np.float64(8.0), geometric=geometric)
+def test_bisection_ends_between_two_neighbors():
+    found = bisect(lambda x: x * x < 2, np.float64(1e-3), np.float64(8.0))
     assert found == pytest.approx(np.sqrt(2), rel=4e-16)
 
 

@@ -250,7 +250,8 @@ def test_encoder_friction_and_motor_are_simulated():
     )
     found = zwidth.diagnose(scene, "0.3 N m/rad", "1.4 mN m s/rad", resolution="0.0005 rev", coulomb="0.1 mN m")
     out = run("check", *wall, *knob, *given).stdout
-    assert "simulated  LIMIT CYCLE: " in out
+    assert "CAUTION    LIMIT CYCLE: " in out
+    assert "CAUTION: limit cycle device" in " ".join(out.split())
     assert f"to stop it: {found.advise()}" in " ".join(out.split())
     printed = json.loads(run("check", *wall, *knob, *given, "--json").stdout)["diagnosis"]
     assert printed["cause"] == "quantization"

@@ -37,12 +37,45 @@ def test_a_person_reads_what_to_set_and_what_to_buy():
 def test_a_wall_on_the_brink_carries_a_caution():
     text = " ".join(recommend("--passive").stdout.split())
     assert "CAUTION phase margin 0.89 deg, gain margin 1.04, delay margin" in text
-    assert "rings for 470 ms; ask for --phase-margin 30 (costs 52 % of the stiffness)" in text
+    assert "rings for 470 ms; ask for --phase-margin 30: K = 3.979 kN/m, B = 7.75" in text
+    assert "N s/m (costs 52 % of the stiffness)" in text
+    assert "limited by passivity; CAUTION: small margins device" in text
+    assert "requirements (not checked in the reference grasps):" in text
+
+
+def test_a_wall_stable_in_every_grasp():
+    text = " ".join(recommend("--stiffness-fraction", "95%").stdout.split())
+    assert "CAUTION: small margins, unstable in a hand device" in text
+    assert "unstable in the hand (firm, light damping); ask for --grasps all: K = 15." in text
+    text = " ".join(recommend("--stiffness-fraction", "95%", "--grasps", "all").stdout.split())
+    assert "limited by stability in all six reference grasps" in text
+    assert "in a hand stable in all six reference grasps" in text
+    printed = json.loads(recommend("--stiffness-fraction", "95%", "--grasps", "all", "--json").stdout)
+    assert printed["wanted"]["grasps"] == "all"
+    assert printed["recommended"]["limited_by"] == "grasps"
+    assert all(printed["grasps"].values())
+    assert "Virtual wall: K = 15." in recommend("--stiffness-fraction", "95%", "--grasps", "all", "--code", "c").stdout
+
+
+def test_the_first_line_reports_a_limit_cycle():
+    lines = recommend("--resolution", "2 mm").stdout.splitlines()
+    assert "CAUTION: limit cycle" in " ".join(lines[:2])
+    assert "CAUTION    LIMIT CYCLE: " in "\n".join(lines)
+
+
+def test_a_delay_that_is_left_out_has_a_caution():
+    device, text = DEVICE[:6], "no delay given: the results hold only if the force acts at the sample"
+    for command, wall in (("recommend", []), ("ridge", []), ("check", ["--stiffness", "1 kN/m"])):
+        said = CliRunner().invoke(cli, [command, *device, *wall]).stdout
+        assert " ".join(said.split()).count(f"CAUTION {text}") == 1
+        assert text not in CliRunner().invoke(cli, [command, *DEVICE, *wall]).stdout
+    assert text in CliRunner().invoke(cli, ["recommend", *device, "--code", "c"]).stderr
+    assert text in json.loads(CliRunner().invoke(cli, ["recommend", *device, "--json"]).stdout)["cautions"][0]
 
 
 def test_encoder_and_motor_are_simulated():
     text = recommend("--resolution", "20 um", "--friction", "50 mN", "--max-force", "5 N").stdout
-    assert "simulated  " in text
+    assert "CAUTION    LIMIT CYCLE: " in text
     printed = json.loads(recommend("--resolution", "20 um", "--friction", "50 mN", "--json").stdout)
     assert printed["diagnosis"]["cause"] in ("none", "quantization")
 
@@ -69,6 +102,10 @@ def test_a_program_stands_alone():
     names = {}
     exec(recommend("--code", "python").stdout, names)
     assert names["Wall"](0.0).force(-1e-3) == 0.0
+    assert names["Wall"](0.0).force(0.1) < -3.0
+    exec(recommend("--code", "python", "--max-force", "3 N").stdout, names)
+    assert names["Wall"](0.0).force(0.1) == -3.0
+    assert names["Wall"](0.1).force(0.001) == 3.0
     assert "give only one of --code or --json" in recommend("--code", "c", "--json", code=2).output
 
 
@@ -80,10 +117,16 @@ def test_a_picture(ending, tmp_path):
     assert "there is no folder" in recommend("--figure", str(tmp_path / "none" / "a.png"), code=2).output
 
 
-def test_no_wall_is_said():
-    result = CliRunner().invoke(cli, ["recommend", "--mass", "0.1", "--rate", "1 kHz", "--passive"])
-    assert "NO WALL    no wall, however soft, has passivity" in result.stdout
-    assert "without physical damping no wall is passive" in " ".join(result.stdout.split())
+def test_no_wall_exits_with_1():
+    device = ["--mass", "0.1", "--rate", "1 kHz"]
+    result = CliRunner().invoke(cli, ["recommend", *device, "--passive"])
+    assert result.exit_code == 1
+    assert result.stdout.startswith("NO WALL    no passive wall exists, because the device has no physical damping\n")
+    code = CliRunner().invoke(cli, ["recommend", *device, "--passive", "--code", "c"])
+    assert (code.exit_code, code.stdout) == (1, "")
+    assert json.loads(CliRunner().invoke(cli, ["recommend", *device, "--passive", "--json"]).stdout)["reason"]
+    # An unstable wall is an answer.
+    assert CliRunner().invoke(cli, ["check", *device, "--stiffness", "1 MN/m"]).exit_code == 0
 
 
 @pytest.mark.parametrize("arguments", [["--gain-margin", "1"], ["--phase-margin", "0"], ["--stiffness-fraction", "x"]])

@@ -60,7 +60,7 @@ def test_a_study_asks_for_margins(run):
     found = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3)).recommend(phase_margin=30, passive=True)
     assert told.startswith(f"best {found.lines()[0]}")
     told = " ".join(run("scene: {mass: 0.1, period: 1e-3}\n" + MARGINS % (30, "true"), "--overwrite"))
-    assert "no wall: no wall, however soft, has 30 deg phase margin and passivity" in " ".join(told.split())
+    assert "no wall: no passive wall exists" in " ".join(told.split())
 
 
 def test_a_scene_that_no_device_has_is_doubted_before_anything_is_computed(tmp_path, monkeypatch, unpainted):

@@ -24,7 +24,7 @@ SCRAPS = [
     *"[]{}:,-?&*!|>'\"%@`#\t\n\r\0\\",
     *("- ", ": ", "\n---\n", "\n...\n", "&a ", "*a", "<<: ", "!!float ", "!<", "%YAML 1.", "? ", "|\n", ">-9\n"),
     *("null", "~", "true", ".nan", "-.inf", "1e999", "-1", "0x", "9" * 400, "1e-999", '"\\ud800"', '"\\U00110000"'),
-    *("1 periods", "1 kN/m", "kind: map", "delay_model: fractional_power", "{linear: {start: 0, stop: 1, num: 99999}}"),
+    *("1 periods", "1 kN/m", "kind: map", "kind: paper_fig6", "{linear: {start: 0, stop: 1, num: 99999}}"),
 ]
 
 

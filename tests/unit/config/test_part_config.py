@@ -87,10 +87,7 @@ FAULTS = {
     "operator: {mass: 1, coupling_damping: 1}": ("operator.coupling_damping", "without a spring"),
     "coupling: {mass: 1}": ("coupling.stiffness", "missing"),
     "coupling: {mass: 1, stiffness: 1 kN/m, sensor: middle}": ("coupling.sensor", "'motor', 'tip'"),
-    "velocity: {kind: butterworth, cutoff: 30}, delay_model: fractional_power": (
-        "delay_model",
-        "write 'delay_model: held'",
-    ),
+    "velocity: {kind: butterworth, cutoff: 30}, delay_model: held": ("delay_model", "remove it"),
 }
 
 

@@ -40,7 +40,7 @@ def test_the_paper_is_complete():
     np.testing.assert_array_equal(studies["fig5"].d.values(), [0, 1, 2, 4])
     np.testing.assert_array_equal(studies["fig6"].d.values(), [0, 0.25, 0.5, 1, 2, 4])
     np.testing.assert_array_equal(studies["fig10"].d.values(), [0, 0.125, 0.25, 0.5, 1, 2, 4])
-    assert studies["fig10"].delay_models == ("held", "fractional_power")
+    assert [studies[name].kind for name in ("fig6", "fig10")] == ["paper_fig6", "paper_fig10"]
     devices = studies["fig11"].devices
     assert [device.delta for device in devices] == pytest.approx([0, 0.1, 1])
     assert [device.d for device in devices] == [1, 1, 1]
@@ -67,11 +67,6 @@ def test_the_scene_supplies_what_a_study_leaves_out(load):
     assert (recommend.device.mass, recommend.device.period) == (0.1, 1e-3)
 
 
-def test_the_scene_supplies_its_delay_model_to_curves(load):
-    config = load("scene: {delta: 1, d: 0.5, delay_model: fractional_power}\n" + RIDGE)
-    assert config.studies[0].delay_models == ("fractional_power",)
-
-
 def test_the_scene_supplies_its_wall_to_a_step(load):
     wall = "scene: {mass: 100 g, rate: 1 kHz, stiffness: 10 kN/m, virtual_damping: 40 N s/m}\n"
     study = load(wall + "studies: [{kind: step, name: s}]\n").studies[0]
@@ -86,7 +81,7 @@ def test_a_physical_scene_in_si_units(load):
     made = scene.to_scene()
     assert isinstance(made, Scene)
     assert (made.device.mass, made.device.damping) == (0.1, 10.0)
-    assert (made.timing.period, made.timing.delay, made.timing.delay_model) == (1e-3, 1.5e-3, "held")
+    assert (made.timing.period, made.timing.delay) == (1e-3, 1.5e-3)
     assert (made.wall.stiffness, made.wall.virtual_damping) == (10e3, 0.0)
     assert scene.d == 1.5
     assert scene.delta == pytest.approx(0.1)
@@ -124,7 +119,6 @@ def test_defaults(load):
     assert (step.duration, step.substeps) == (Span(100.0, "periods"), 10)
     assert step.devices == (PhysicalDevice(mass=1.0, damping=0.0, period=1.0, delay=Span(0.0, "s")),)
     assert grid.outputs == ("stable",)
-    assert grid.delay_model == "held"
 
 
 @pytest.mark.parametrize(

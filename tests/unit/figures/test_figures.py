@@ -86,7 +86,7 @@ def test_a_figure_is_drawn_into_a_given_axes_which_is_returned(name):
     figure = Figure()
     ax = figure.subplots()
     drawn_into = draw(name, ax)
-    assert drawn_into is ax if name == "draw_zero_stiffness" else list(drawn_into) == [ax]
+    assert drawn_into is ax if name.startswith("draw_zero_stiffness") else list(drawn_into) == [ax]
     assert ax.has_data()
     assert ax.get_xlabel()
     assert ax.get_ylabel()
@@ -136,8 +136,7 @@ def test_every_function_takes_axes_last_and_returns_them():
 def test_a_figure_is_drawn_from_what_its_csv_file_holds():
     header, *rows = csv.reader(io.StringIO(csv_text(BOUNDARY)))
     read = {name: np.array(column) for name, column in zip(header, zip(*rows, strict=True), strict=True)}
-    words_of = {"curve", "delay_model"}
-    read = {name: column if name in words_of else column.astype(float) for name, column in read.items()}
+    read = {name: column if name == "curve" else column.astype(float) for name, column in read.items()}
     for ax, alike in zip(figures.draw_boundary(read), drawn("draw_boundary").axes, strict=True):
         assert {name: line.tolist() for name, line in curves(ax).items()} == {
             name: line.tolist() for name, line in curves(alike).items()
@@ -271,19 +270,22 @@ def test_the_ridge_comes_in_two_scalings():
         assert_drawn(near, label, each["delta"][inside], each["alpha_max"][inside])
 
 
+def test_one_scaling_is_drawn_if_no_delta_is_small():
+    large = {"d": [1.0, 1.0], "delta": [1.0, 2.0], "alpha_max": [1.0, 2.0]}
+    assert len(figures.draw_ridge(large, two_scalings=True)) == 1
+
+
 def test_the_slope_is_drawn_beside_its_limit():
     ratio, limit = drawn("draw_slope").axes
-    for each in (ridge(), ridge(0.5), ridge(0.5, "fractional_power")):
+    for each in (ridge(model=""), ridge(0.5, "")):
         shown = each["delta"] >= 0.1
-        label = f"alpha_max/delta, d = {each['d']:g}, {each['delay_model']}"
+        label = f"alpha_max/delta, d = {each['d']:g}"
         assert_drawn(ratio, label, each["delta"][shown], each["alpha_max"][shown] / each["delta"][shown])
-        value = LIMITS[each["delay_model"], each["d"]]
+        value = LIMITS[each["d"]]
         lines = [line for line in ratio.lines if line.get_label() == f"g, d = {each['d']:g}"]
         assert any(np.all(np.asarray(line.get_ydata()) == value) for line in lines)
-    for model in ("held", "fractional_power"):
-        rows = SLOPES["delay_model"] == model
-        assert_drawn(limit, f"g, {model}", SLOPES["d"][rows], SLOPES["slope"][rows])
-    # The name of a delay stands at the end of its held curve.
+    assert_drawn(limit, "g", SLOPES["d"], SLOPES["slope"])
+    # The name of a delay is at the end of its curve.
     places = {text.get_text(): text.xy[1] for text in ratio.texts if isinstance(text, Annotation)}
     low, high = np.log(ratio.get_ylim())
     assert places["$d = 0.5$"] == pytest.approx((np.log(2.5) - low) / (high - low), abs=0.03)

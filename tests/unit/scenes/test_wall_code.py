@@ -86,6 +86,21 @@ def test_programs_give_the_forces_of_the_simulation(name, motions, tmp_path):
         np.testing.assert_allclose(forces, expected, rtol=0, atol=CLOSE * scale)
 
 
+def test_the_force_limit_is_that_of_the_simulation(motions, tmp_path):
+    scene, (positions, expected) = scene_with(ESTIMATES["difference"]), motions["difference"]
+    limit = 0.3 * np.abs(expected).max()
+    for forces in (
+        drive_c(write_wall(scene, "c", max_force=limit), positions, tmp_path),
+        drive_python(write_wall(scene, "python", max_force=limit), positions),
+    ):
+        np.testing.assert_allclose(forces, np.clip(expected, -limit, limit), rtol=0, atol=CLOSE * limit)
+    found = scene.recommend(stiffness_fraction=0.5)
+    assert found.code(max_force="3 N") == found.code(max_force=3) != found.code()
+    assert "Force limited to 3.000 N." in found.code(max_force=3)
+    with pytest.raises(zwidth.InputError, match=r"^max_force: got 0"):
+        found.code(max_force=0)
+
+
 def test_a_recommendation_writes_its_own_wall():
     found = scene_with(zwidth.LowPass(cutoff=100)).recommend(stiffness_fraction=0.5)
     text = found.code("python")
@@ -97,7 +112,7 @@ def test_a_recommendation_writes_its_own_wall():
 
 def test_where_there_is_no_wall_there_is_no_program():
     bare = zwidth.Scene(zwidth.Device(0.1, 0.0), zwidth.Timing(1e-3, 1e-3))
-    with pytest.raises(zwidth.InputError, match="code: there is no wall: no wall, however soft"):
+    with pytest.raises(zwidth.InputError, match="code: there is no wall: no passive wall exists"):
         bare.recommend(passive=True).code()
 
 

@@ -140,7 +140,7 @@ def test_the_scene_supplies_device_and_wall(tmp_path):
         ({"stiffness_fraction": 0.5, "walls": [{"stiffness": 1}]}, "are both given"),
         ({"stiffness_fraction": -0.5}, "greater than 0"),
         ({"walls": [{"stiffness": 1}], "duration": "900000 periods", "substeps": 200}, "shorten the duration"),
-        ({"walls": [{"stiffness": 1}], "delay_model": "fractional_power"}, "write 'delay_model: held'"),
+        ({"walls": [{"stiffness": 1}], "delay_model": "held"}, "remove it; for the paper's"),
     ],
 )
 def test_bad_input_is_told(keys, said):

@@ -15,7 +15,7 @@ from zwidth.parts.checks import read_texts
 from zwidth.studies.boundary import BoundaryStudy, MapStudy, outline, stable_intervals
 from zwidth.studies.outcome import csv_text
 from zwidth.studies.responses import RecommendStudy, StepStudy
-from zwidth.studies.ridge import PassivityStudy, RidgeStudy, needed_models, ridge_table, slope_table, unit_outline
+from zwidth.studies.ridge import PassivityStudy, RidgeStudy, ridge_table, slope_table, unit_outline
 from zwidth.words.status import Status
 
 DELTAS = np.array([0.0, 0.5, 2.0, 2.5, 4.0])
@@ -31,28 +31,12 @@ def read_csv(text):
 def test_the_interval_at_zero_stiffness_is_where_poles_cross():
     # Close enough to alpha = 0 that beta moves by less than the step, far enough that the pole near 1 is counted.
     alpha, step = 1e-7, 1e-3
-    for found in stable_intervals(DELTAS, DELAYS, "held"):
+    for found in stable_intervals(DELTAS, DELAYS):
         lower, upper, d = found["beta_lower"], found["beta_upper"], found["d"]
         inside = radius_by_companion(alpha, np.stack([lower + step, upper - step]), DELTAS, d)
         beyond = radius_by_companion(alpha, np.stack([lower - step, upper + step]), DELTAS, d)
         assert np.all(inside < 1), d
         assert np.all(beyond >= 1), d
-
-
-def test_both_models_give_one_interval_for_whole_periods():
-    held, powers = (
-        stable_intervals(DELTAS, np.array([0.0, 1.0, 3.0]), model) for model in ("held", "fractional_power")
-    )
-    for one, other in zip(held, powers, strict=True):
-        np.testing.assert_allclose(one["beta_upper"], other["beta_upper"], rtol=1e-12)
-
-
-def test_the_fractional_power_ends_at_its_lobe():
-    (found,) = stable_intervals(np.array([0.5]), np.array([0.5]), "fractional_power")
-    omega = np.linspace(1e-3, np.pi, 200_001)
-    curve = zwidth.boundary(omega, 0.5, 0.5, delay="fractional_power")
-    end = np.flatnonzero(curve.alpha[1:] < 0)[0]
-    assert found["beta_upper"][0] == pytest.approx(curve.beta[end], abs=1e-4)
 
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.0, 2.0])
@@ -96,7 +80,7 @@ def test_a_hand_that_holds_the_device_makes_no_wall_passive():
 
 def test_ridges_are_those_of_the_library():
     delta, d = np.linspace(0.0, 10.0, 7), np.array([0.0, 0.125, 3.0])
-    table, notes = ridge_table(delta, d, "held")
+    table, notes = ridge_table(delta, d)
     assert notes == []
     expected = zwidth.alpha_max(np.tile(delta, 3), np.repeat(d, 7))
     np.testing.assert_array_equal(table["delta"], np.tile(delta, 3))
@@ -107,24 +91,15 @@ def test_ridges_are_those_of_the_library():
 
 
 def test_points_without_an_answer_are_noted():
-    _, notes = ridge_table(np.array([0.1, np.nan, np.inf]), np.array([0.0, 1.0]), "held")
-    assert notes == [f"alpha_max: 2 of 3 points have no answer for d = {d} (held)" for d in (0, 1)]
-
-
-def test_whole_delays_are_computed_in_one_model_alone():
-    d = np.array([0.0, 0.5, 1.0])
-    both = needed_models(("held", "fractional_power"), d)
-    assert [(name, list(delays)) for name, delays in both] == [("held", [0.0, 0.5, 1.0]), ("fractional_power", [0.5])]
-    assert needed_models(("held", "fractional_power"), np.array([1.0]))[-1][0] == "held"
-    assert list(needed_models(("fractional_power",), d)[0][1]) == [0.0, 0.5, 1.0]
+    _, notes = ridge_table(np.array([0.1, np.nan, np.inf]), np.array([0.0, 1.0]))
+    assert notes == [f"alpha_max: 2 of 3 points have no result for d = {d}" for d in (0, 1)]
 
 
 def test_a_ridge_study_tables_every_curve():
-    study = RidgeStudy.model_validate(
-        {"kind": "ridge", "name": "r", "delta": [0, 1], "d": [0.5, 1], "delay_models": ["held", "fractional_power"]}
-    )
+    study = RidgeStudy.model_validate({"kind": "ridge", "name": "r", "delta": [0, 1], "d": [0.5, 1]})
     outcome = study.compute(None, alone=True)
-    assert list(outcome.table["delay_model"]) == ["held"] * 4 + ["fractional_power"] * 2
+    assert list(outcome.table["d"]) == [0.5, 0.5, 1, 1]
+    assert "delay_model" not in outcome.table
     assert list(outcome.figures) == [""]
 
 
@@ -133,17 +108,16 @@ def test_strong_damping_is_drawn_with_its_limit():
     outcome = study.compute(None, alone=True)
     assert list(outcome.figures) == ["", "_slope"]
     slopes = slope_table(outcome.table)
-    assert set(slopes["delay_model"]) == {"held"}
     limits = [slopes["slope"][slopes["d"] == d][0] for d in (0.0, 1.0)]
     assert limits == pytest.approx((4.0, 1.0), rel=1e-14)
     strongest = outcome.table["alpha_max"][outcome.table["delta"] == 1e4] / 1e4
     assert strongest == pytest.approx(limits, rel=1e-3)
     # A delay that no sample meets is there as well.
-    assert 0.3 in slope_table({"d": np.array([0.3]), "delay_model": np.array(["held"])})["d"]
+    assert 0.3 in slope_table({"d": np.array([0.3])})["d"]
 
 
 def test_an_outline_has_names_for_its_pieces():
-    edge = outline(3.0, 0.0, "held")
+    edge = outline(3.0, 0.0)
     assert set(edge["piece"]) == {"complex_pair", "minus_one"}
 
 

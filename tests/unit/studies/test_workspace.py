@@ -42,6 +42,17 @@ def test_every_pose_has_the_wall_of_its_own_device(tmp_path, capsys):
     assert "stable in 4 of 4 poses" in said
 
 
+def test_a_table_of_inertias_is_rotary(tmp_path, capsys):
+    poses = "shoulder [deg],elbow [deg],mass [g cm^2],damping [mN m s/rad]\n0,30,77,0.02\n60,30,60,0.03\n"
+    assert main_of("run", write(tmp_path, poses=poses), "--out", tmp_path / "out") == 0
+    device = zwidth.Device("60 g cm^2", "0.03 mN m s/rad")
+    top = zwidth.Scene(device, zwidth.Timing("1 ms", "1 periods")).max_stiffness()
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"K_max from {1e3 * top.stiffness - 0.05:.1f} mN m/rad at shoulder 60 deg" in said
+    table = np.genfromtxt(tmp_path / "out" / "w.csv", delimiter=",", names=True)
+    assert table["stiffness_N_m_per_rad"].min() == pytest.approx(float(top.stiffness), rel=1e-12)
+
+
 @pytest.mark.parametrize("scene", ["", "scene: {mass: 1, period: 3 ms}\n"])
 def test_a_rate_says_the_period_and_comes_before_the_scene_s(scene, tmp_path):
     (study,) = load_config(write(tmp_path, STUDY.replace("period: 1 ms", "rate: 1 kHz"), scene=scene)).studies

@@ -80,7 +80,7 @@ def test_every_nan_has_a_reason():
     assert Status(int(nowhere.status)) == Status.NO_BOUNDARY
     assert "stiffness=NaN" in repr(nowhere)
     assert f"status=NO_BOUNDARY: {Status.NO_BOUNDARY.message}" in repr(nowhere)
-    assert "impact_velocity=NaN, no contact begins after the first sample" in repr(find("motion"))
+    assert "impact_velocity=NaN, the device does not enter the wall after the first sample" in repr(find("motion"))
     assert "[OK, INVALID_INPUT]" in repr(zwidth.alpha_max(np.array([0.1, -1.0]), 1))
     assert "stiffness_max=NaN, no wall is stable" in repr(zwidth.assess(NOWHERE.replace(stiffness=1e3)))
     assert "reason=no stiffness is stable at any damping" in repr(NOWHERE.recommend())
@@ -148,5 +148,5 @@ def test_modules_show_their_own_names():
 
 def test_an_array_says_why_it_has_nan_and_a_zero_has_no_sign():
     motions = repr(SCENE.simulate([10e3, 1e3], 40.0, start_velocity=0.1, periods=100))
-    assert "impact_velocity=[NaN, NaN]; NaN: no contact begins after the first sample" in motions
+    assert "impact_velocity=[NaN, NaN]; NaN: the device does not enter the wall after the first sample" in motions
     assert spell_value(np.array([-0.0, 1.0])) == "[0, 1]"

@@ -10,24 +10,21 @@ import numpy as np
 from zwidth.arrays.evaluate import as_number, check_scalars, evaluate
 from zwidth.arrays.held_mass import DelayClasses, classify_delays, valid_device
 from zwidth.arrays.roots import follow_root, integrate
-from zwidth.loops.rigid.curve import column_end, creeps, frequency, lobe, on_line, peak, row_end, wall
+from zwidth.loops.rigid.curve import column_end, frequency, lobe, on_line, peak, row_end, wall
 from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.polynomial import Wall, check_delay_model, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.polynomial import Wall, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.ridge import ridge_kernel
 from zwidth.parts.checks import check_whole
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
-from zwidth.words.types import Array, ArrayLike, DelayModel, Vertices
+from zwidth.words.types import Array, ArrayLike, Vertices
 from zwidth.words.xp import frozen, namespace, nan_with_nan_slopes, store_once, tree_map
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
 
-# Closer to pi the frequency of a fractional power of less than one has too few digits.
-_NEAREST_PI = 1e-3
 
-
-def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> Wall:
+def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Wall:
     """Return the wall that puts a pole pair of the loop at ``e^(+-j omega)``, in closed form.
 
     With ``q = -z^n (z - 1)(z - c)/(n0(z) + n1(z)/z)`` on ``z = e^(j omega)``: ``beta = Im q / sin omega``,
@@ -38,13 +35,11 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayMo
         omega: frequency in radians a period, 0 <= omega <= pi.
         delta: normalized physical damping b T/m, 0 to 1e12.
         d: delay in periods, 0 to 1e5, whole or not. All three broadcast.
-        delay: "held" (exact) or "fractional_power" (the paper's z^(1+d), principal branch).
 
     Returns:
         Wall with ``alpha`` and ``beta`` of the broadcast shape; NaN out of range. At omega = 0 and pi the
-        values are the limits. They are finite unless the curve runs to infinity at pi: where N(-1) = 0, as for
-        delta = 0 and whole d (for held delays between whole numbers it vanishes at one damping, if at all), and for a
-        fractional power.
+        values are the limits. They are finite unless N(-1) = 0, as for delta = 0 and integer d (for other d, N(-1)
+        vanishes at one damping, if at all); the curve then runs to infinity at pi.
 
     Numerics:
         A few units in the last place, at a cost that does not grow with d. Traceable, also in d (derivatives at whole
@@ -58,16 +53,15 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayMo
         >>> print(f"{zwidth.boundary(0.0, 0.25, 2).beta:.2f}")
         -0.25
     """
-    check_delay_model(delay)
-    return evaluate(_boundary_kernel, {"omega": omega, "delta": delta, "d": d}, delay)
+    return evaluate(_boundary_kernel, {"omega": omega, "delta": delta, "d": d})
 
 
-def _boundary_kernel(omega: Array, delta: Array, d: Array, delay_model: str) -> Wall:
+def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
     xp = namespace(omega, delta, d)
     ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     spoiled = nan_with_nan_slopes(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
-    curve = frequency_boundary(omega, frequency_loop(delta, d, delay_model))
+    curve = frequency_boundary(omega, frequency_loop(delta, d))
     return Wall(curve.alpha + spoiled, curve.beta + spoiled)
 
 
@@ -88,7 +82,6 @@ def boundary_point(
     beta: ArrayLike | None = None,
     alpha: ArrayLike | None = None,
     side: str = "lower",
-    delay: DelayModel = "held",
     method: PointMethod = "auto",
 ) -> BoundaryPoint:
     """Find the exact boundary point of a row or column: ``P(e^(j omega)) = 0`` on the edge of the stable set.
@@ -101,18 +94,17 @@ def boundary_point(
         d: delay in periods, 0 to 1e5, whole or not.
         beta: normalized virtual damping of a row.
         alpha: normalized stiffness of a column, > 0.
-        side: which end of the column. Everything broadcasts.
-        delay: "held" or "fractional_power".
-        method: "auto" solves the proved monotone functions of the lobe; "optimistix" the frequency response in real
-            unknowns, from a bracket by jaxopt, for any loop that has one: an independent judge, which compiles.
+        side: end of the column, "lower" or "upper". All arguments broadcast.
+        method: "auto" solves the functions of the lobe, which are monotone by theorem; "optimistix" solves the
+            frequency response in real unknowns from a bracket by jaxopt: an independent route, which compiles.
 
     Returns:
         BoundaryPoint: ``alpha``, ``beta``; ``omega`` of the pole on the circle (pi: a real one); ``status``, see
-        `zwidth.Status`, with NaN where it is not OK: NO_BOUNDARY where a row or column holds no stable wall, UNDECIDED
-        where the point lies closer to omega = pi than its digits allow (a fractional power of almost 0).
+        `zwidth.Status`: NO_BOUNDARY if the row or column contains no stable wall. The values are NaN unless it is OK.
 
     Raises:
-        InputError: not exactly one line is given, or as `zwidth.InputError` says.
+        InputError: none or both of ``beta`` and ``alpha`` are given, an argument is no real number or a scalar out of
+            range, shapes do not broadcast, or a name is unknown.
 
     Numerics:
         alpha and ``beta + delta`` to about 1e-15 relative, times the condition of the line: close to the ridge a column
@@ -128,7 +120,6 @@ def boundary_point(
         >>> print(f"{zwidth.boundary_point(0.0, 0, beta=0.5).alpha:.4f}")
         0.6000
     """
-    check_delay_model(delay)
     check_choice("side", side, ("lower", "upper"))
     check_choice("method", method, get_args(PointMethod))
     given = [(name, value) for name, value in (("beta", beta), ("alpha", alpha)) if value is not None]
@@ -141,19 +132,18 @@ def boundary_point(
         # Its solvers take a second to import.
         from zwidth.loops.rigid.exact_points import point_kernel
 
-        return BoundaryPoint(*evaluate(point_kernel, arguments, line, delay, ridge_kernel, route="jax"))
-    return evaluate(_point_kernel, arguments, line, delay, classify_delays(d))
+        return BoundaryPoint(*evaluate(point_kernel, arguments, line, ridge_kernel, route="jax"))
+    return evaluate(_point_kernel, arguments, line, classify_delays(d))
 
 
-def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model: str, kind: Any) -> BoundaryPoint:
-    """The end of the row of damping ``number``, or one of the column of that stiffness."""
+def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -> BoundaryPoint:
+    """Return the end of the row of damping ``number``, or one end of the column of that stiffness."""
     xp, is_row, zero = namespace(delta, d, number), line == "row", 0.0 * number
     given = wall_status(*((zero, number) if is_row else (number, zero)), delta, d)
-    curve = lobe(delta, d, delay_model, kind)
-    creeping = creeps(delay_model, kind)
+    curve = lobe(delta, d, kind)
     fixed, still = frozen((curve, number), xp)
     if is_row:
-        row = store_once(row_end(still, fixed, delay_model, kind), delta)
+        row = store_once(row_end(still, fixed), delta)
         x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
         x = follow_root(lambda x, curve, b: wall(x, curve).b - b, x, lambda *_: True, curve, number + delta)
         at = wall(x, curve)
@@ -161,10 +151,10 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
         alpha = row.alpha if xp is np else frozen(row.alpha, xp) + (at.alpha - frozen(at.alpha, xp))
         beta = number
     else:
-        top = peak(fixed, delay_model, kind)
+        top = peak(fixed, kind)
         exists = (still > 0) & (still < top.alpha)
         goal = xp.where(exists, still, 0.5 * top.alpha)
-        x, cut = store_once(column_end(goal, top, fixed, line == "upper", creeping), delta)
+        x, cut = store_once(column_end(goal, top, fixed, line == "upper"), delta)
         on_lobe = ~cut
         x = follow_root(lambda x, curve, alpha: wall(x, curve).alpha - alpha, x, lambda *_: True, curve, number)
         at = wall(x, curve)
@@ -178,10 +168,6 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
         beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * rest)
         omega = xp.where(on_lobe, omega, np.pi)
     status = xp.where(exists, int(Status.OK), int(Status.NO_BOUNDARY))
-    if creeping:
-        # The frequency of a fractional power of less than one is too close to pi.
-        undecided = on_lobe & (np.pi - x < _NEAREST_PI) & (d > 0) & (d < 1)
-        status = xp.where(exists & undecided, int(Status.UNDECIDED), status)
     status = xp.where(given == int(Status.OK), status, given)
     # NaN, derivatives included, where there is no point.
     spoiled = nan_with_nan_slopes(status == int(Status.OK), delta, d, number)
@@ -212,29 +198,26 @@ class StableRegion(NamedTuple):
         return float(0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
 
 
-def sample_lobe(
-    delta: float, d: float, *, delay: DelayModel = "held", points: int = 400
-) -> tuple[Vertices, Vertices, Vertices]:
-    """Frequencies along the first lobe of the boundary curve, and its alpha and beta there."""
-    check_delay_model(delay)
+def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices, Vertices, Vertices]:
+    """Return frequencies along the first lobe of the boundary curve, with its alpha and beta at these."""
     known = {"delta": as_number("delta", delta, 0.0), "d": as_number("d", d, 0.0)}
     check_scalars(known)
     points = check_whole("points", points, 8, 10**7)
     kind = classify_delays(d)
     with np.errstate(all="ignore"):
-        whole = lobe(np.float64(known["delta"]), np.float64(known["d"]), delay, kind)
-        top = peak(whole, delay, kind).x
+        whole = lobe(np.float64(known["delta"]), np.float64(known["d"]), kind)
+        top = peak(whole, kind).x
         first, last = (float(frequency(x, whole)) for x in (top, whole.end))
     # Closer together at both ends and round the ridge, where the outline bends most.
     half = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))
     omega = np.concatenate([first * half, first + (last - first) * half[1:]]) if first < last else last * half
     # The last product may round past its end.
     omega = np.minimum(omega, last)
-    wall = boundary(omega, delta, d, delay=delay)
+    wall = boundary(omega, delta, d)
     return omega, np.asarray(wall.alpha), np.asarray(wall.beta)
 
 
-def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points: int = 400) -> StableRegion:
+def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     """Return the outline of the stable set in the (alpha, beta) plane.
 
     The lobe of the boundary curve from (0, -delta) to its return to alpha = 0, cut by the line on which a real pole
@@ -243,8 +226,7 @@ def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points:
     Args:
         delta: normalized physical damping b T/m, >= 0, a single number.
         d: delay in periods, >= 0, a single number.
-        delay: "held" or "fractional_power".
-        points: how many points of the curve to take, 8 to 10,000,000.
+        points: number of points on the curve, 8 to 10,000,000.
 
     Returns:
         StableRegion: ``alpha``, ``beta``, ``omega`` (0 and pi on the straight parts), ``piece`` (see `Piece`); ``area``
@@ -258,7 +240,7 @@ def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points:
         >>> print(f"{zwidth.stable_region(0.0, 0).alpha.max():.4f}")
         0.6863
     """
-    omega, alpha, beta = sample_lobe(delta, d, delay=delay, points=points)
+    omega, alpha, beta = sample_lobe(delta, d, points=points)
     piece = np.full(omega.shape, Piece.COMPLEX_PAIR)
     if omega[-1] == np.pi and alpha[-1] > 0:
         # From the corner along the line alpha + 2 beta = const to alpha = 0.
@@ -303,7 +285,7 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
 
 def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
-    curve = lobe(delta, d, "held", kind)
+    curve = lobe(delta, d, kind)
     end = frozen(curve.end, xp)
     # From a corner, which stays, back to alpha = 0 along alpha + 2 beta = const.
     at = wall(end, curve)

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.held_mass import DelayClasses, DeviceTerms, device
-from zwidth.arrays.roots import bisect
 from zwidth.loops.rigid.crossover import short_curve
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (
@@ -35,8 +34,6 @@ from zwidth.words.xp import frozen, horner, namespace, repeat, store_once
 
 # From starts within 28 % (the cubic for n = 0) and 0.3 % of x.
 _CUBIC_STEPS, _COLUMN_STEPS = 4, 3
-# Where the logarithm of a place begins to be halved, in parts of the lobe.
-_SMALLEST = 1e-32
 
 
 class Lobe(NamedTuple):
@@ -67,36 +64,21 @@ class Peak(NamedTuple):
     alpha: Array
 
 
-def creeps(delay_model: str, kind: DelayClasses) -> bool:
-    """Whether a fractional power of less than one may occur, whose lobe ends next to pi: no fit holds, it is halved."""
-    return delay_model == "fractional_power" and kind.short and kind.fractional
-
-
-def lobe(delta: Array, d: Array, delay_model: str, kind: DelayClasses) -> Lobe:
-    """The lobe of a device, or of arrays of one shape, from the delays that `DelayClasses` says may occur."""
+def lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
+    """Return the lobe of one device, or of arrays of one shape, for the delays that `DelayClasses` allows."""
     xp = namespace(delta, d)
-    if delay_model == "held":
-        here = device(delta, d, kind)
-    else:
-        # The formula of whole delays at any other number.
-        here = device(delta, 0.0 * d, DelayClasses(True, False, False))._replace(whole=d)
-    here = store_once(here, delta)
-    creeping = creeps(delay_model, kind)
-    is_short = here.whole < 1 if delay_model == "held" else here.whole == 0
+    here = store_once(device(delta, d, kind), delta)
+    is_short = here.whole < 1
     short, long, ends = None, None, []
     to_corner = here.delta < 0
     if kind.short:
         short = short_curve(here)
         root, to_corner = _short_end(frozen(short, xp))
         ends.append(root)
-    if kind.long or creeping:
+    if kind.long:
         # The end and what follows it only start solvers: no derivative passes through them.
         still = long_lobe(frozen(here, xp))
         long = still if xp is np else LongLobe(*open_lobe(here)[:-5], *still[-5:])
-        if creeping:
-            limit = np.pi / xp.maximum(1.0, d + 0.5)
-            crept = bisect(lambda x: _long_wall(x, still).alpha > 0, _SMALLEST * limit, limit, geometric=True)
-            long = long._replace(end=xp.where(d < 1, crept, long.end))
         ends.append(long.end)
     if len(ends) < 2:
         return Lobe(here, d, None, short, long, ends[0], to_corner)
@@ -167,11 +149,11 @@ class RowEnd(NamedTuple):
     x: Array  # where it does not meet the lobe, the nearer end of it
     meets: Array
     beyond: Array
-    alpha: Array  # the stiffest stable one, for held delays what `zwidth.is_stable` compares with
+    alpha: Array  # the maximum stable alpha, with which `zwidth.is_stable` compares
 
 
-def row_end(beta: Array, lobe: Lobe, delay_model: str, kind: DelayClasses) -> RowEnd:
-    """The end of a row: the one zero of ``b - beta - delta``."""
+def row_end(beta: Array, lobe: Lobe) -> RowEnd:
+    """Return the end of a row: the only zero of ``b - beta - delta``."""
     xp = namespace(beta, lobe.d)
     b = beta + lobe.here.delta
     ends = []
@@ -180,26 +162,20 @@ def row_end(beta: Array, lobe: Lobe, delay_model: str, kind: DelayClasses) -> Ro
         ends.append(RowEnd(y, real & (y <= lobe.end), lobe.to_corner, short_row(beta, lobe.here)))
     if lobe.long is not None:
         alpha, x = long_row_point(beta, lobe.long)
-        top = lobe.long.top
-        if creeps(delay_model, kind):
-            x = bisect(lambda x: wall(x, lobe).b < b, _SMALLEST * lobe.end, lobe.end, geometric=True)
-            top = wall(lobe.end, lobe).b
-        ends.append(RowEnd(x, b < top, b != b, alpha))
+        ends.append(RowEnd(x, b < lobe.long.top, b != b, alpha))
     row = ends[0]
     if lobe.is_short is not None:
         row = RowEnd(*(xp.where(lobe.is_short, mine, other) for mine, other in zip(*ends, strict=True)))
     meets, beyond = (b > 0) & row.meets, (b > 0) & ~row.meets & row.beyond
     x = xp.where(meets, row.x, xp.where(b > 0, lobe.end, 0.0))
-    if delay_model == "held":
-        return RowEnd(x, meets, beyond, row.alpha)
-    return RowEnd(x, meets, beyond, xp.where(beyond, on_line(lobe) - 2.0 * beta, wall(x, lobe).alpha))
+    return RowEnd(x, meets, beyond, row.alpha)
 
 
-def peak(lobe: Lobe, delay_model: str, kind: DelayClasses) -> Peak:
-    """The largest alpha of the lobe: the ridge, which may be the corner."""
+def peak(lobe: Lobe, kind: DelayClasses) -> Peak:
+    """Return the largest alpha of the lobe: the ridge, which may be the corner."""
     here = lobe.here
     start = guess_start(here.delta, lobe.d, here.f, kind)
-    ridge = solve(here, here.whole, start, delay_model if kind.fractional else "held", kind)
+    ridge = solve(here, here.whole, start, kind)
     if lobe.short is None:
         return Peak(ridge.omega, ridge.alpha)
     y = ridge.s * ridge.s
@@ -207,17 +183,13 @@ def peak(lobe: Lobe, delay_model: str, kind: DelayClasses) -> Peak:
     return Peak(x, ridge.alpha)
 
 
-def column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool, creeping: bool = False) -> tuple[Array, Array]:
-    """The place where a column of 0 < alpha < ``top.alpha`` meets the lobe, and whether the line ends it instead."""
+def column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
+    """Return x where a column of 0 < alpha < ``top.alpha`` meets the lobe, and if the line z = -1 ends it instead."""
     xp = namespace(alpha, lobe.d)
     nowhere = alpha < 0
     if lobe.long is None:
         return _short_end_of_column(alpha, top, lobe, upper)
-    if creeping:
-        low, high = (top.x, lobe.end) if upper else (_SMALLEST * top.x, top.x)
-        x = bisect(lambda x: (wall(x, lobe).alpha < alpha) != upper, low, high, geometric=True)
-    else:
-        x = _long_end_of_column(alpha, top, lobe, upper)
+    x = _long_end_of_column(alpha, top, lobe, upper)
     if lobe.is_short is None:
         return x, nowhere
     y, on_line = _short_end_of_column(alpha, top, lobe, upper)

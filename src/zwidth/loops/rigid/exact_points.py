@@ -98,14 +98,14 @@ def _solve(line: str, start: Array, bracketed: Array, number: Array, loop: Frequ
     return omega, frequency_boundary(omega, loop)
 
 
-@partial(jnp.vectorize, excluded=(2,))
-def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
-    """The fields of `zwidth.alpha_max` for one point."""
+@jnp.vectorize
+def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
+    """Return the fields of `zwidth.alpha_max` for one point."""
     status = device_status(delta, d)
     ok, inputs = status == Status.OK, (delta, d)
     # A solver that sees NaN in one lane may stop the others.
     delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
-    loop = store_once(frequency_loop(delta, d, delay_model), delta)
+    loop = store_once(frequency_loop(delta, d), delta)
     summit = corner(expand_curve(loop.plant), loop.lag)
 
     def slope(omega: Array, loop: FrequencyLoop) -> Array:
@@ -132,17 +132,15 @@ def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
     )
 
 
-@partial(jnp.vectorize, excluded=(3, 4, 5))
-def point_kernel(
-    delta: Array, d: Array, number: Array, line: str, delay_model: str, find_ridge: Callable[..., Any]
-) -> tuple[Array, ...]:
-    """The fields of `zwidth.boundary_point` for one point; ``find_ridge`` parts the lower from the upper side."""
+@partial(jnp.vectorize, excluded=(3, 4))
+def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: Callable[..., Any]) -> tuple[Array, ...]:
+    """Return the fields of `zwidth.boundary_point` for one point; ``find_ridge`` separates its lower and upper side."""
     inputs, is_row = (delta, d, number), line == "row"
     given = wall_status(*((0.0 * number, number) if is_row else (number, 0.0 * number)), delta, d)
     ok = given == Status.OK
     delta, d, number = (jnp.where(ok, value, 1.0) for value in inputs)
-    loop = frequency_loop(delta, d, delay_model)
-    ridge, end = jax.lax.stop_gradient(find_ridge(delta, d, delay_model)), lobe_end(loop, d)
+    loop = frequency_loop(delta, d)
+    ridge, end = jax.lax.stop_gradient(find_ridge(delta, d)), lobe_end(loop, d)
 
     def offset(wall: Wall, number: Array) -> Array:
         return (wall.beta if is_row else wall.alpha) - number
@@ -172,8 +170,7 @@ def point_kernel(
         exists, converged = exists | is_real, converged | is_real
     if is_row:
         # A stable wall before the end.
-        stable = stable_kernel(0.5 * found, number, delta, d)
-        exists = exists & (stable if delay_model == "held" else jnp.where(d == 0, stable, on_lobe))
+        exists = exists & stable_kernel(0.5 * found, number, delta, d)
     else:
         exists = exists & (number > 0) & (number < ridge.alpha)
     status = jnp.where(exists, jnp.where(converged, int(Status.OK), int(Status.NOT_CONVERGED)), int(Status.NO_BOUNDARY))

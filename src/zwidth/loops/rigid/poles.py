@@ -21,7 +21,7 @@ from zwidth.loops.rigid.circle import Loop, factor_loop
 from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall, wall_status
 from zwidth.loops.rigid.pole_step import Pair, join
-from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
+from zwidth.loops.rigid.polynomial import coefficients
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
 from zwidth.words.status import Status
@@ -209,8 +209,7 @@ def check_degree(d: ArrayLike) -> None:
         )
 
 
-def _check(values: tuple[ArrayLike, ...], delay_model: str = "held", method: str = "companion") -> None:
-    check_has_poles(delay_model)
+def _check(values: tuple[ArrayLike, ...], method: str = "companion") -> None:
     check_choice("method", method, get_args(PoleMethod))
     check_degree(values[3])
 
@@ -241,15 +240,7 @@ def _compile_by_degree(kernel: Callable[..., Any], degree: Degree) -> Any:
     return jax.jit(lambda *arrays: kernel(*arrays, degree))
 
 
-def poles(
-    alpha: ArrayLike,
-    beta: ArrayLike,
-    delta: ArrayLike,
-    d: ArrayLike,
-    *,
-    method: PoleMethod = "auto",
-    delay: str = "held",
-) -> Roots:
+def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, method: PoleMethod = "auto") -> Roots:
     """Return the poles of the closed loop.
 
     ``P(z) = 0``, see `zwidth.char_poly`; the loop is stable when every ``|z| < 1``. In no particular order.
@@ -262,7 +253,6 @@ def poles(
         method: "companion" computes eigenvalues; "aberth" all poles at one time by the iteration of Aberth and Ehrlich,
             and eigenvalues where it has no proof that each pole was found; "auto" takes that for many walls with up to
             24 poles, and eigenvalues otherwise and inside `jit`.
-        delay: only "held" has poles.
 
     Returns:
         Complex array of the broadcast shape with one more axis at the end: 3 + d poles for whole d, 4 + n for
@@ -270,8 +260,8 @@ def poles(
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, a name is unknown,
-            ``delay="fractional_power"``, there are more than 4,000 poles: what their memory and time would be; or
-            "aberth" is asked for inside a JAX transformation.
+            there are more than 4,000 poles (the message states their memory and time), or the method is "aberth"
+            inside a JAX transformation.
         TracedDelayError: d is traced.
 
     Numerics:
@@ -289,7 +279,7 @@ def poles(
         np.True_
     """
     values = (alpha, beta, delta, d)
-    _check(values, delay, method)
+    _check(values, method)
     if is_traced(*values) and method == "aberth":
         raise InputError(
             "method: 'aberth' falls back on the host; inside a JAX transformation use 'auto' or 'companion'"

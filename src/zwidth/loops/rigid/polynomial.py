@@ -17,8 +17,7 @@ from zwidth.arrays.polynomials import Affine
 from zwidth.loops.rigid.folding import Degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.loops.rigid.ridge_newton import expand_curve, wall, wave_at
-from zwidth.words.errors import InputError, check_choice
-from zwidth.words.types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
+from zwidth.words.types import Array, ArrayLike, Coefficients, Reals
 from zwidth.words.xp import namespace, nan_with_nan_slopes
 
 
@@ -57,16 +56,14 @@ class Wall(NamedTuple):
 
 
 class FrequencyLoop(NamedTuple):
-    """What the frequency methods need of a point: computed once, then evaluated at many frequencies."""
+    """The parameters of one loop for the frequency methods: computed once, then evaluated at many frequencies."""
 
     plant: Plant
-    lag: Array  # whole periods of delay; the whole exponent d in the fractional-power model
+    lag: Array  # integer periods of delay
 
 
-def frequency_loop(delta: Array, d: Array, delay_model: str) -> FrequencyLoop:
-    """The loop of one (delta, d) for evaluation on the unit circle."""
-    if delay_model == "fractional_power":
-        return FrequencyLoop(held_plant(delta), d)
+def frequency_loop(delta: Array, d: Array) -> FrequencyLoop:
+    """Return the loop of one (delta, d) for evaluation on the unit circle."""
     whole, fraction = split_delay(d)
     return FrequencyLoop(held_plant(delta, fraction), whole)
 
@@ -76,24 +73,7 @@ def frequency_boundary(omega: Reals, loop: FrequencyLoop) -> Wall:
     return Wall(*wall(wave_at(omega, loop.lag), expand_curve(loop.plant)))
 
 
-def check_delay_model(delay_model: str) -> None:
-    """Raise `InputError` unless the name of a delay model is known."""
-    check_choice("delay", delay_model, DELAY_MODELS)
-
-
-def check_has_poles(delay_model: str) -> None:
-    """Refuse the fractional power where poles are asked for."""
-    check_delay_model(delay_model)
-    if delay_model == "fractional_power":
-        raise InputError(
-            "delay: 'fractional_power' has no poles (z^d has other sheets, always with roots outside the unit "
-            "circle); use delay='held' for poles, radius and stability, or ask for the boundary or the ridge"
-        )
-
-
-def char_poly(
-    alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: str = "held"
-) -> Coefficients:
+def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Coefficients:
     """Return the coefficients of the monic characteristic polynomial, highest power first.
 
     ``P(z) = z^(2+n) (z - 1)(z - c) + (z n0(z) + n1(z)) (alpha z + beta (z - 1))``, d = n + f, ``c = e^-delta``; for
@@ -105,15 +85,13 @@ def char_poly(
         delta: normalized physical damping b T/m, >= 0.
         d: delay in periods, >= 0, whole or not; concrete also inside `jit`, because it decides the degree.
             All four broadcast.
-        delay: only "held" has a polynomial.
 
     Returns:
         Array of the broadcast shape with one more axis at the end: 4 + d coefficients for whole d, 5 + n
         otherwise. Where degrees are mixed, shorter polynomials have zeros in front. A point out of range is NaN.
 
     Raises:
-        InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, or
-            ``delay="fractional_power"``.
+        InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
         TracedDelayError: d is traced.
 
     Numerics:
@@ -127,7 +105,6 @@ def char_poly(
         >>> print(np.array2string(zwidth.char_poly(0.5, 0.5, 0.0, 0), precision=2))
         [ 1.   -1.5   1.25 -0.25]
     """
-    check_has_poles(delay)
     return map_by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True)
 
 

@@ -20,13 +20,11 @@ from zwidth.arrays.held_mass import (
     valid_device,
 )
 from zwidth.loops.rigid.normalization import device_status
-from zwidth.loops.rigid.polynomial import check_delay_model
 from zwidth.loops.rigid.ridge_newton import (
     Ridge,
     Start,
     expand_curve,
     guess_start,
-    is_undelayed,
     solve,
     stationarity,
     wall,
@@ -35,8 +33,8 @@ from zwidth.loops.rigid.ridge_newton import (
 from zwidth.words.errors import check_choice
 from zwidth.words.results import RidgePoint
 from zwidth.words.status import RidgeKind, Status
-from zwidth.words.types import Array, ArrayLike, DelayModel
-from zwidth.words.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward, store_once
+from zwidth.words.types import Array, ArrayLike
+from zwidth.words.xp import epsilon, horner, namespace, nan_unless, push_forward, store_once
 
 
 def _chi(x: Array, gap: Array) -> Array:
@@ -63,14 +61,12 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
 
 
-def follow(
-    s: Array, plant: Plant, lag: Array, delay_model: str, kind: DelayClasses
-) -> tuple[Array, Array, Array, Array]:
-    """alpha, beta, omega and s of a ridge known to be at ``s``, as they move with plant and lag."""
+def follow(s: Array, plant: Plant, lag: Array, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
+    """Return alpha, beta, omega and s of a ridge at ``s``, with their derivatives in plant and lag."""
     # One step of Newton's method, through which derivatives pass: it is exact to the first order. A corner stays at 1,
     # and at a maximum alpha moves as if s stood still.
     xp = namespace(s, plant.a2, lag)
-    undelayed, curve, corner = is_undelayed(delay_model, kind), expand_curve(plant), s >= 1.0
+    undelayed, curve, corner = not kind.long, expand_curve(plant), s >= 1.0
     inside = xp.where(corner, 0.5, s)
     first, second = stationarity(inside, curve, lag, undelayed)
     inside = xp.where(corner, 0.5, inside - first / xp.where(corner, 1.0, second))
@@ -81,24 +77,10 @@ def follow(
     return alpha[0], beta[1], omega, moved
 
 
-def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: str, kind: DelayClasses) -> Ridge:
-    """`loops.rigid.ridge_newton.solve`, in JAX with derivatives in plant and lag to any order."""
-    if namespace(plant.a2, lag) is np:
-        return solve(plant, lag, start, delay_model, kind)
-    import jax.numpy as jnp
-
-    ridge = _jax_ridge()(plant, lag, start, delay_model, kind)
-    if delay_model == "held":
-        return ridge
-    # The corner is left as soon as d > 0, alpha like -d^(2/3), omega like -d^(1/3), with infinite slopes.
-    corner = ridge.s >= 1.0
-    fall = jnp.where(corner, jnp.sqrt(jnp.where(corner, lag, 1.0)), 0.0)
-    # Turned by pi d the curve's alpha(q) and beta(q), q = 1 - s^2, become alpha + a1 q - 2 t, beta + b1 q + t, and the
-    # largest alpha has t = -a1 q: it moves by 3 a1 q, beta by (b1 - a1) q.
-    phi1, body = plant.a2 + plant.a1, plant.a1 * (1.0 + plant.a2 * ridge.beta)
-    lean = plant.a2 + plant.c * plant.a1 - plant.a1 * (2.0 * ridge.beta * phi1 + ridge.alpha * plant.a2)
-    share = frozen(jnp.where(corner, (body / lean - 1.0) / 3.0, 0.0), jnp)
-    return ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - share * fall, omega=ridge.omega - fall)
+def differentiable_ridge(plant: Plant, lag: Array, start: Start, kind: DelayClasses) -> Ridge:
+    """Return `loops.rigid.ridge_newton.solve`, in JAX with derivatives in plant and lag to any order."""
+    ridge = solve if namespace(plant.a2, lag) is np else _jax_ridge()
+    return ridge(plant, lag, start, kind)
 
 
 @cache
@@ -121,14 +103,14 @@ def _jax_plant() -> Any:
 def _jax_ridge() -> Any:
     import jax
 
-    function = jax.custom_jvp(solve, nondiff_argnums=(3, 4))
+    function = jax.custom_jvp(solve, nondiff_argnums=(3,))
 
-    def rule(delay_model: str, kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
-        # s moves by this rule again: hence right to any order.
-        ridge = function(*primals, delay_model, kind)
+    def rule(kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
+        # The derivative of s follows from the same rule, so derivatives of every order are exact.
+        ridge = function(*primals, kind)
 
         def moving(plant: Plant, lag: Array) -> Ridge:
-            return Ridge(*follow(ridge.s, plant, lag, delay_model, kind), ridge.last)
+            return Ridge(*follow(ridge.s, plant, lag, kind), ridge.last)
 
         return ridge, jax.jvp(moving, primals[:2], tangents[:2])[1]
 
@@ -139,17 +121,14 @@ def _jax_ridge() -> Any:
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 
 
-def alpha_max(
-    delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held", method: RidgeMethod = "auto"
-) -> RidgePoint:
-    """Find the stiffest stable virtual wall.
+def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -> RidgePoint:
+    """Return the maximum stiffness of a stable virtual wall.
 
     ``alpha_max(delta, d) = sup {alpha : some beta is stable}``; in SI units ``K_max = alpha_max m/T^2``.
 
     Args:
         delta: normalized physical damping b T/m, 0 to 1e12.
-        d: delay in periods, 0 to 1e5, whole or not. Both broadcast.
-        delay: "held" (exact) or "fractional_power" (the paper's z^(1+d)); the same for whole d.
+        d: delay in periods, 0 to 1e5, integer or fractional. Both broadcast.
         method: "newton" solves the stationarity of the paper's loop in closed form, "kkt" the general conditions with
             optimistix; "auto" is "newton".
 
@@ -161,14 +140,14 @@ def alpha_max(
 
     Numerics:
         alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable in delta and d, also
-        twice. alpha's first derivatives are continuous, also where the corner takes over (d = 0:
-        delta = 3.65936162742...) and at whole d > 0; its second ones and the first ones of beta and omega jump there,
-        and at a whole d are those from the right. A fractional power has a corner at d = 0 only, with -inf in d.
-        For strong damping the second one in delta falls like delta^-3, below the rounding of what it is the difference
-        of, 1e-15 (d = 0) to 1e-12 (d = 500) of alpha/delta^2: at delta = 1e6 none of its digits are sure.
+        twice. The first derivatives of alpha are continuous, also at the transition to the corner (d = 0:
+        delta = 3.65936162742...) and at integer d > 0. The second derivatives of alpha and the first ones of beta and
+        omega jump there; at integer d they are those from the right. For strong damping the second derivative in delta
+        falls like delta^-3, below its rounding error of 1e-15 (d = 0) to 1e-12 (d = 500) times alpha/delta^2: at
+        delta = 1e6 none of its digits is reliable.
 
-        Float64 when called directly. Inside a transformation, `jax.grad` included, JAX's own precision holds: float32
-        unless ``jax.config.update("jax_enable_x64", True)`` was called, which a `zwidth.PrecisionWarning` says once.
+        Float64 when called directly. Inside a transformation, also `jax.grad`, JAX's default precision applies: float32
+        unless ``jax.config.update("jax_enable_x64", True)`` was called; a `zwidth.PrecisionWarning` reports it once.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII, eqs. (24), (25).
@@ -178,31 +157,28 @@ def alpha_max(
         >>> print(f"{zwidth.alpha_max(0.0, 1).alpha:.4f}")
         0.1445
     """
-    check_delay_model(delay)
     check_choice("method", method, get_args(RidgeMethod))
     arguments = {"delta": delta, "d": d}
     if method == "kkt":
         # The general route iterates over long formulas; its solvers take a second to import.
         from zwidth.loops.rigid.exact_points import kkt_kernel
 
-        return RidgePoint(*evaluate(kkt_kernel, arguments, delay, route="jax"))
-    return evaluate(ridge_kernel, arguments, delay, classify_delays(d), slopes=move_point if delay == "held" else None)
+        return RidgePoint(*evaluate(kkt_kernel, arguments, route="jax"))
+    return evaluate(ridge_kernel, arguments, classify_delays(d), slopes=move_point)
 
 
-def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY) -> RidgePoint:
-    """`alpha_max`, elementwise."""
-    return _point(*_solve_ridge(delta, d, delay_model, kind)[:2])
+def ridge_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgePoint:
+    """Return `alpha_max`, elementwise."""
+    return _point(*_solve_ridge(delta, d, kind)[:2])
 
 
-def move_point(
-    delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY
-) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
-    """`ridge_kernel` of a held delay, and how it moves with delta and d."""
-    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
+def move_point(delta: Array, d: Array, kind: DelayClasses = ANY) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
+    """Return `ridge_kernel` and its derivatives in delta and d."""
+    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, kind)
     point, arrived = _point(ridge, status), converged(ridge)
 
     def move(change: Plant) -> RidgePoint:
-        moved = push_forward(lambda plant: follow(ridge.s, plant, lag, delay_model, kind), (plant,), (change,), np)
+        moved = push_forward(lambda plant: follow(ridge.s, plant, lag, kind), (plant,), (change,), np)
         return point._replace(**dict(zip(RidgePoint._fields, nan_unless(arrived, *moved[:3]), strict=False)))
 
     by_delta, by_f = plant_slopes(delta, f)
@@ -217,19 +193,16 @@ class RidgeSlopes(NamedTuple):
     by_d: Array
 
 
-def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY) -> RidgeSlopes:
-    """`alpha_max` and the derivatives of alpha in delta and d, elementwise; at whole delays those from the right."""
-    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
-    xp, at = namespace(ridge.s), wave(ridge.s, lag, is_undelayed(delay_model, kind))
+def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlopes:
+    """Return `alpha_max` and the derivatives of alpha, elementwise; in d those from the right at integer d."""
+    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, kind)
+    xp, at = namespace(ridge.s), wave(ridge.s, lag, not kind.long)
 
     def move(change: Plant) -> Array:
         return push_forward(lambda plant: wall(at, expand_curve(plant))[0], (plant,), (change,), xp)
 
-    by_delta, by_d = map(move, store_once(plant_slopes(delta, f), ridge.s))
-    if delay_model == "fractional_power":
-        by_d = -8.0 * at.y * at.half * at.per_sin * (ridge.beta + 0.5 * ridge.alpha)
-        by_d = xp.where(ridge.s >= 1.0, -np.inf, by_d)
-    by_delta, by_d = nan_unless(converged(ridge), by_delta, by_d)
+    slopes = map(move, store_once(plant_slopes(delta, f), ridge.s))
+    by_delta, by_d = nan_unless(converged(ridge), *slopes)
     return RidgeSlopes(_point(ridge, status), by_delta, by_d)
 
 
@@ -238,35 +211,26 @@ def stiffness_slopes(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """K_max and its derivatives in mass, damping, period and delay: see `zwidth.sensitivities`."""
     alpha, rate, change = found.point.alpha, 1.0 / period, delta * found.by_delta
-    # No delay needs no product, which an infinite slope would make NaN.
-    delayed = namespace(alpha).where(d > 0.0, d * found.by_d, 0.0)
     return (
         alpha * mass * rate * rate,
         (alpha - change) * rate * rate,
         found.by_delta * rate,
-        (change - delayed - 2.0 * alpha) * mass * rate**3,
+        (change - d * found.by_d - 2.0 * alpha) * mass * rate**3,
         found.by_d * mass * rate**3,
     )
 
 
-def _solve_ridge(
-    delta: Array, d: Array, delay_model: str, kind: DelayClasses
-) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
-    """The ridge, its status, the plant behind a lag, and the plant's damping and fraction."""
+def _solve_ridge(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
+    """Return the ridge, its status, the plant, its integer delay, and delta and the fraction of the delay."""
     status = device_status(delta, d)
     delta, d = nan_unless(status == Status.OK, delta, d)
     whole, f = split_delay(d)
-    if not kind.fractional:
-        # Both models are one, except for derivatives in d, which nobody can ask for where `kind` is known.
-        delay_model = "held"
-    if delay_model == "fractional_power":
-        whole, f = d, 0.0 * d
     start = guess_start(delta, d, f, kind)
-    if kind.fractional and delay_model == "held":
+    if kind.fractional:
         plant = held_plant(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
     else:
         plant = held_plant(delta)
-    ridge = store_once(differentiable_ridge(plant, whole, start, delay_model, kind), delta)
+    ridge = store_once(differentiable_ridge(plant, whole, start, kind), delta)
     return ridge, status, plant, whole, (delta, f)
 
 
@@ -286,31 +250,29 @@ def _point(ridge: Ridge, status: Array) -> RidgePoint:
     return RidgePoint(alpha, beta, omega, kind.astype(np.int32), status.astype(np.int32))
 
 
-def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
-    """Return the slope of the stiffest stable wall over physical damping, in the limit of strong damping.
+def stiffness_slope(d: ArrayLike) -> Array:
+    """Return the derivative of the maximum stiffness in physical damping, in the limit of strong damping.
 
     ``g(d) = lim alpha_max(delta, d)/delta`` for ``delta -> infinity``; in SI units ``K_max T/b -> g(d)``. With
-    ``alpha = g delta``, ``beta = h delta`` the loop becomes, for a held delay d = n + f,
+    ``alpha = g delta``, ``beta = h delta`` the loop becomes, for d = n + f,
 
         z^(2+n) (z - 1) + ((1 - f) z + f) ((g + h) z - h) = 0
 
-    (whole d: ``z^(2+d) - z^(1+d) + (g + h) z - h = 0``), for the fractional power the latter with z^d for every d.
-    g is the largest one for which some h keeps every zero inside the unit circle.
+    (integer d: ``z^(2+d) - z^(1+d) + (g + h) z - h = 0``). g is the largest value for which some h keeps every zero
+    inside the unit circle.
 
     Args:
-        d: delay in periods, 0 to 1e5, whole or not; any shape.
-        delay: "held" (exact) or "fractional_power" (the paper's z^(1+d)); the same for whole d.
+        d: delay in periods, 0 to 1e5, integer or fractional; any shape.
 
     Returns:
         Array of d's shape: 4, 1, 0.631130, 0.465011, 0.369041 for d = 0, 1, 2, 3, 4. NaN where d is NaN, negative,
         infinite or too long.
 
     Numerics:
-        About 1e-15 relative. Traceable, with derivatives of every order in d. The held slope is
-        ``4 (1 - 3 d)/(1 - 2 d)^2`` (a corner, with its maximum 4.5 at d = 1/6) up to d = 1/4, ``1/d`` up to d = 1. It
-        is continuous, with a kink at every whole d > 0: derivatives there are those from the right (0 at d = 1,
-        where the one from the left is -1). For finite delta alpha_max has no kink: its derivative in d turns within
-        about 1/delta of a whole d. The fractional power's slope has one kink, at d = 0: its derivative is -inf.
+        About 1e-15 relative. Traceable, with derivatives of every order in d. g is ``4 (1 - 3 d)/(1 - 2 d)^2``
+        (a corner, with its maximum 4.5 at d = 1/6) up to d = 1/4 and ``1/d`` up to d = 1. It is continuous, with a kink
+        at every integer d > 0: derivatives there are those from the right (0 at d = 1, where the one from the left is
+        -1). For finite delta alpha_max has no kink: its derivative in d turns within about 1/delta of an integer d.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (22).
@@ -320,17 +282,16 @@ def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
         >>> print(f"{zwidth.loops.rigid.ridge.stiffness_slope(2):.6f}")
         0.631130
     """
-    check_delay_model(delay)
-    return evaluate(slope_kernel, {"d": d}, delay, classify_delays(d))
+    return evaluate(slope_kernel, {"d": d}, classify_delays(d))
 
 
-def slope_kernel(d: Array, delay_model: str, kind: DelayClasses = ANY) -> Array:
-    """`stiffness_slope`, elementwise."""
+def slope_kernel(d: Array, kind: DelayClasses = ANY) -> Array:
+    """Return `stiffness_slope`, elementwise."""
     (d,) = nan_unless(valid_device(0.0 * d, d), d)
     zero = 0.0 * d
-    lag, f = split_delay(d) if delay_model == "held" else (d, zero)
+    lag, f = split_delay(d)
     # delta N(z) for delta -> infinity: the velocity follows the force at once, e^-delta and its like vanish.
     plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
     start = guess_start(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
-    ridge = differentiable_ridge(plant, lag, start, delay_model, kind)
+    ridge = differentiable_ridge(plant, lag, start, kind)
     return nan_unless(converged(ridge), ridge.alpha)[0]

@@ -1,7 +1,7 @@
 """The ridge of the rigid loop by Newton's method on its closed-form optimality condition.
 
-Curve and condition are written in ``y = s^2``, ``s = sin(omega/2)``, with D = lag + 1, lag = n (held) or d (fractional
-power), and the letters of docs/theory/boundary.md, B1 and B2. A prime there is a trailing digit or a leading d here.
+Curve and condition are written in ``y = s^2``, ``s = sin(omega/2)``, with D = lag + 1, lag = n, and the letters of
+docs/theory/boundary.md, B1 and B2. A prime there is a trailing digit or a leading d here.
 
 The lobe has one maximum (docs/theory/one-lobe.md, Theorem B), so nothing is searched. The number of steps is fixed:
 no point waits for another.
@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.held_mass import ANY, DelayClasses, DeviceTerms, Plant
-from zwidth.arrays.roots import newton
 from zwidth.words.types import Array
 from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
 
@@ -80,22 +79,16 @@ def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
 
 
 def wave_at(omega: Array, lag: Array) -> Wave:
-    """The factors that `wall` needs at a frequency from 0 to pi, for any lag >= 0."""
+    """Return the factors that `wall` needs at a frequency from 0 to pi, for an integer lag."""
     xp = namespace(omega, lag)
     s, cos_half = xp.sin(0.5 * omega), xp.abs(xp.cos(0.5 * omega))
     y, q = s * s, cos_half * cos_half
-    nearest = xp.round(lag)
-    whole, excess = nearest + 1.0, lag - nearest
-    # Whole turns are counted from pi where that is nearer; it is no float64, its second half keeps the last digits.
-    sign, beyond = 1.0 - 2.0 * xp.mod(whole, 2.0), omega > 2.0
+    D = lag + 1.0
+    # Above 2 the phase is counted from pi, whose second float64 keeps the last digits.
+    sign, beyond = 1.0 - 2.0 * xp.mod(D, 2.0), omega > 2.0
     x = xp.where(beyond, (np.pi - omega) + 1.2246467991473532e-16, omega)
-    tau = xp.where(beyond, -sign, 1.0) * whole * _cardinal_sine(whole * x) / _cardinal_sine(x)
-    kappa = xp.where(beyond, sign, 1.0) * xp.cos(whole * x)
-    # sin(excess omega)/sin omega: what is unbounded towards pi vanishes with the excess.
-    turn = excess * omega
-    rest = excess * _cardinal_sine(turn) / (_cardinal_sine(0.5 * omega) * cos_half)
-    level = xp.cos(turn)
-    return Wave(y, q, tau * level + kappa * rest, kappa * level - 4.0 * y * q * tau * rest)
+    tau = xp.where(beyond, -sign, 1.0) * D * _cardinal_sine(D * x) / _cardinal_sine(x)
+    return Wave(y, q, tau, xp.where(beyond, sign, 1.0) * xp.cos(D * x))
 
 
 def _cardinal_sine(x: Array) -> Array:
@@ -191,8 +184,7 @@ _SHORT = (
 _LONG = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
 # Below one period T bends more; so much that the power matters.
 _POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
-_HELD_STEPS = 3
-_FRACTIONAL_STEPS = 16
+_STEPS = 3
 
 
 def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
@@ -227,8 +219,8 @@ class Ridge(NamedTuple):
     last: Array
 
 
-def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
-    """Newton's method clipped to a bracket that holds every ridge; the last step comes back too."""
+def _find_stationary(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
+    """Return s at the smooth maximum and the last step, by Newton's method in a bracket that contains every ridge."""
     xp = namespace(curve.sigma, lag)
     lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
     s = xp.minimum(xp.maximum(start.s, lower), upper)
@@ -239,39 +231,16 @@ def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tupl
         new = s - first * s / (second * s + start.power * first)
         return xp.minimum(xp.maximum(new, lower), upper), s
 
-    s, before = repeat(_HELD_STEPS, step, (s, s), xp)
+    s, before = repeat(_STEPS, step, (s, s), xp)
     return s, s - before
 
 
-def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Array]:
-    """The same with a shrinking bracket."""
-    # For small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2).
-    xp = namespace(curve.sigma, lag)
-    # d = 0 may end at pi itself, where 1/sin omega is infinite.
-    rest = xp.maximum(0.3 * xp.minimum(lag, 0.05) ** (2.0 / 3.0), epsilon(lag))
-    lower, upper = 0.5 * start.scale, xp.minimum(xp.sqrt(1.0 - rest), 1.05 * start.scale)
-
-    def falling(s: Array) -> tuple[Array, Array]:
-        value, slope = stationarity(s, curve, lag)
-        return -value, -slope
-
-    return newton(falling, lower, upper, xp.minimum(xp.maximum(start.s, lower), upper), _FRACTIONAL_STEPS)
-
-
-def is_undelayed(delay_model: str, kind: DelayClasses) -> bool:
-    """Whether every D is 1."""
-    return delay_model == "held" and not kind.long
-
-
-def solve(plant: Plant | DeviceTerms, lag: Array, start: Start, delay_model: str, kind: DelayClasses) -> Ridge:
-    """The ridge of one plant behind ``lag`` periods (whole in the held model)."""
+def solve(plant: Plant | DeviceTerms, lag: Array, start: Start, kind: DelayClasses) -> Ridge:
+    """Return the ridge of one plant with an integer delay of ``lag`` periods."""
     xp = namespace(plant.a2, lag)
-    undelayed = is_undelayed(delay_model, kind)
+    undelayed = not kind.long
     curve = expand_curve(store_once(plant, start.scale))
-    if delay_model == "fractional_power":
-        s, last = _solve_fractional(curve, lag, start)
-    else:
-        s, last = _solve_held(curve, lag, start, undelayed)
+    s, last = _find_stationary(curve, lag, start, undelayed)
     # Just before the take-over a smooth optimum may round to the corner's place.
     s = xp.minimum(s, 1.0 - 0.5 * epsilon(s))
     at = wave(s, lag, undelayed)

@@ -12,9 +12,8 @@ from zwidth.loops.rigid.folding import NAMES
 from zwidth.loops.rigid.outermost_poles import ACCURACY, find_poles
 from zwidth.loops.rigid.pole_search import traced_kernel
 from zwidth.loops.rigid.poles import radius_by_companion
-from zwidth.loops.rigid.polynomial import check_has_poles
 from zwidth.words.errors import InputError, check_choice
-from zwidth.words.types import Array, ArrayLike, DelayModel
+from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import is_traced, namespace
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
@@ -31,7 +30,6 @@ def spectral_radius(
     *,
     method: RadiusMethod = "auto",
     accuracy: float | None = None,
-    delay: DelayModel = "held",
 ) -> Array:
     """Return the spectral radius of the loop: the modulus of its dominant pole.
 
@@ -50,7 +48,6 @@ def spectral_radius(
             (2.8e-9 was observed near a double pole at z = -1). On large grids (alpha along one axis, beta along the
             other) and lines, a larger value saves time, mostly at long delays, and errors come close to it at some
             points; single walls are more accurate than required. Has no effect on "companion".
-        delay: only "held" has poles.
 
     Returns:
         Array of the broadcast shape: below 1 if and only if `zwidth.is_stable` returns True. NaN for a point out of
@@ -78,7 +75,7 @@ def spectral_radius(
         1.207346
     """
     values = (alpha, beta, delta, d)
-    wanted = _check_radius(method, accuracy, delay)
+    wanted = _check_radius(method, accuracy)
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
     if method == "companion":
@@ -132,8 +129,7 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     return to_caller(find_poles(broadcast(arguments), ACCURACY, with_rate=True).rate, values)
 
 
-def _check_radius(method: str, accuracy: float | None, delay_model: str) -> float:
-    check_has_poles(delay_model)
+def _check_radius(method: str, accuracy: float | None) -> float:
     check_choice("method", method, get_args(RadiusMethod))
     if accuracy is None:
         return ACCURACY

@@ -12,12 +12,11 @@ from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, spread
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.loops.rigid.poles import radius_by_companion
-from zwidth.loops.rigid.polynomial import check_has_poles
 from zwidth.loops.rigid.row_limit import boundary_map
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.results import Stability
 from zwidth.words.status import Method, Status
-from zwidth.words.types import Array, ArrayLike, DelayModel
+from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import is_traced
 
 StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
@@ -29,13 +28,7 @@ _ROUGH = 2e-8
 
 
 def is_stable(
-    alpha: ArrayLike,
-    beta: ArrayLike,
-    delta: ArrayLike,
-    d: ArrayLike,
-    *,
-    method: StabilityMethod = "auto",
-    delay: DelayModel = "held",
+    alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, method: StabilityMethod = "auto"
 ) -> Array:
     """Return whether each wall is stable: all poles are strictly inside the unit circle.
 
@@ -51,7 +44,6 @@ def is_stable(
             "certified" returns True only with a certificate (`zwidth.decide_stability` returns the status of undecided
             points). "auto" is "crossover". On a grid of one device it compares alpha with the stability limit at each
             beta, by the same closed form.
-        delay: only "held" has poles.
 
     Returns:
         Boolean array of the broadcast shape, possibly read-only. False for unstable walls and for invalid input (NaN,
@@ -78,8 +70,7 @@ def is_stable(
     """
     values = (alpha, beta, delta, d)
     arguments, numbers = dict(zip(NAMES, values, strict=True)), are_numbers(*values)
-    if not (numbers and method == "auto" and delay == "held"):
-        _check(method, delay)
+    check_choice("method", method, STABILITY_METHODS)
     if method in ("auto", "crossover") and (numbers or is_traced(*values)):
         return evaluate(stable_kernel, arguments, classify_delays(d))
     check_scalars(arguments)
@@ -95,18 +86,12 @@ def is_stable(
 
 
 def decide_stability(
-    alpha: ArrayLike,
-    beta: ArrayLike,
-    delta: ArrayLike,
-    d: ArrayLike,
-    *,
-    method: StabilityMethod = "auto",
-    delay: DelayModel = "held",
+    alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, method: StabilityMethod = "auto"
 ) -> Stability:
-    """Tell which walls are stable, and for each point how that was decided.
+    """Return the stability of each wall with the method that decided it.
 
     Args:
-        alpha, beta, delta, d, method, delay: as for `zwidth.is_stable`.
+        alpha, beta, delta, d, method: as for `zwidth.is_stable`.
 
     Returns:
         Stability: ``stable``, boolean; ``status``, see `zwidth.Status`: INVALID_INPUT or OUT_OF_RANGE for a point that
@@ -126,7 +111,7 @@ def decide_stability(
         array([0, 1], dtype=int32)
     """
     values = (alpha, beta, delta, d)
-    _check(method, delay)
+    check_choice("method", method, STABILITY_METHODS)
     check_scalars(dict(zip(NAMES, values, strict=True)))
     if is_traced(*values):
         raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
@@ -136,13 +121,6 @@ def decide_stability(
     status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
     codes = np.broadcast_to(status, points.shape).astype(np.int32), np.asarray(used, np.int32)
     return to_caller(Stability(*(spread(leaf, shape) for leaf in (stable, *codes))), values)
-
-
-def _check(method: str, delay_model: str) -> None:
-    if delay_model != "held":
-        check_has_poles(delay_model)
-    if method != "auto":
-        check_choice("method", method, STABILITY_METHODS)
 
 
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:

@@ -273,11 +273,6 @@ def _in_seconds(scene: Scene) -> Scene:
 
 def _show_scene(given: Any, origin: Any) -> Controls:
     """The scene of a configuration; where it has no wall, one well inside of the stable set, if there is one."""
-    if given.delay_model != "held":
-        raise InputError(
-            f"{origin}: scene.delay_model: got {given.delay_model!r}; the page computes the model 'held' alone, "
-            "zwidth run draws both"
-        )
     device = getattr(given, "device", None)
     if device is not None and (isinstance(device, ResponseSection) or device.sampled):
         raise InputError(

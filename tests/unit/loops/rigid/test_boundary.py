@@ -32,42 +32,32 @@ def digits(omega, delta):
     return oracles.digits_for(delta) + 40 + max(0, math.ceil(-3 * math.log10(omega)))
 
 
-def exact_and_condition(omega, delta, d, delay):
+def exact_and_condition(omega, delta, d):
     """alpha and beta, and what one rounding error of every input can do to each: |f| + sum |x df/dx|."""
-    exact = oracles.boundary(omega, delta, d, delay)
+    exact = oracles.boundary(omega, delta, d)
     h = mpf(10) ** -30
     # Inwards in omega and delta, to the right in d, where a whole delay belongs.
     shifted = [(omega * (1 - h), delta, d), (omega, delta * (1 - h), d), (omega, delta, d * (1 + h))]
-    moved = [oracles.boundary(*map(mpf, point), delay=delay) for point in shifted]
+    moved = [oracles.boundary(*map(mpf, point)) for point in shifted]
     return [(value, abs(value) + sum(abs(m[k] - value) for m in moved) / h) for k, value in enumerate(exact)]
 
 
-@pytest.mark.parametrize("delay", ["held", "fractional_power"])
-def test_closed_form(delay):
-    got = zwidth.boundary(*GRID.T, delay=delay)
+def test_closed_form():
+    got = zwidth.boundary(*GRID.T)
     for point, *walls in zip(GRID, got.alpha, got.beta, strict=True):
         omega, delta, d = map(float, point)
         with mp.workdps(digits(omega, delta)):
-            both = exact_and_condition(omega, delta, d, delay)
+            both = exact_and_condition(omega, delta, d)
             # alpha is formed from beta: next to a zero of alpha it carries beta's rounding.
             floor = mpf(1e-290) + (abs(both[1][0]) if omega > 1 else 0)
             for value, (exact, condition) in zip(walls, both, strict=True):
                 assert abs(mpf(float(value)) - exact) <= tol.BOUNDARY.float64 * (condition + floor), point
 
 
-def test_models_agree_for_whole_delays():
-    omega = np.array(FREQUENCIES)[:, None]
-    whole = np.array([0, 1, 2, 7])
-    held, power = (zwidth.boundary(omega, 0.3, whole, delay=delay) for delay in ("held", "fractional_power"))
-    np.testing.assert_allclose(held.alpha, power.alpha, rtol=1e-13)
-    np.testing.assert_allclose(held.beta, power.beta, rtol=1e-12, atol=1e-14)
-
-
-@pytest.mark.parametrize("delay", ["held", "fractional_power"])
 @pytest.mark.parametrize("omega", [0.0, -0.0, 5e-324])
-def test_the_curve_starts_at_eq_19(omega, delay):
+def test_the_curve_starts_at_eq_19(omega):
     delta = np.array([0.0, 1e-300, 0.25, 2.31, 1e6])[:, None]
-    got = zwidth.boundary(omega, delta, np.array([0.0, 0.5, 1.0, 500.0]), delay=delay)
+    got = zwidth.boundary(omega, delta, np.array([0.0, 0.5, 1.0, 500.0]))
     np.testing.assert_array_equal(got.alpha, np.zeros((5, 4)))
     np.testing.assert_allclose(got.beta, np.broadcast_to(-delta, (5, 4)), rtol=tol.BOUNDARY_LIMIT.float64)
 
@@ -141,12 +131,12 @@ DIRECTIONS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)], dtype=float)
 
 
 @cache
-def along(delay):
+def along():
     """Value, first and second derivative of (alpha, beta) in one direction of (omega, delta, d)."""
 
     def derivatives(point, direction):
         def value(step):
-            return jnp.stack(zwidth.boundary(*(point + step * direction), delay=delay))
+            return jnp.stack(zwidth.boundary(*(point + step * direction)))
 
         def slope(step):
             return jax.jvp(value, (step,), (1.0,))
@@ -164,17 +154,14 @@ def along(delay):
     return each
 
 
-@pytest.mark.parametrize("delay", ["held", "fractional_power"])
-def test_derivatives(delay, x64):
-    _, first, second = along(delay)(np.array(SLOPE_POINTS), DIRECTIONS)
+def test_derivatives(x64):
+    _, first, second = along()(np.array(SLOPE_POINTS), DIRECTIONS)
     h = mpf(10) ** -25
     with mp.workdps(140):
         for (row, point), (column, direction) in itertools.product(enumerate(SLOPE_POINTS), enumerate(DIRECTIONS)):
 
             def at(steps, point=point, direction=direction):
-                return oracles.boundary(
-                    *(mpf(x) + steps * h * mpf(u) for x, u in zip(point, direction, strict=True)), delay=delay
-                )
+                return oracles.boundary(*(mpf(x) + steps * h * mpf(u) for x, u in zip(point, direction, strict=True)))
 
             for part, (f0, f1, f2, f3) in enumerate(zip(*(at(steps) for steps in range(4)), strict=True)):
                 slope, bend = (4 * f1 - f2 - 3 * f0) / (2 * h), (2 * f0 - 5 * f1 + 4 * f2 - f3) / h**2
@@ -205,18 +192,13 @@ def test_derivatives_in_omega_beside_pi(x64):
 
 def test_points_out_of_range_are_nan_with_all_derivatives(x64):
     assert np.isnan(zwidth.boundary(*np.array(BAD).T)).all()
-    for part in along("held")(np.array(BAD), DIRECTIONS):
+    for part in along()(np.array(BAD), DIRECTIONS):
         assert np.isnan(part).all()
-
-
-def test_an_unknown_delay_model_is_refused():
-    with pytest.raises(InputError, match="delay: got 'power', allowed are 'held', 'fractional_power'"):
-        zwidth.boundary(0.1, 0.1, 1, delay="power")  # pyright: ignore[reportArgumentType]
 
 
 # --- points on lines ---------------------------------------------------------------------------------------------
 
-# All calls hold as many points, so that they share one compilation a delay model.
+# All calls hold as many points, so that they share one compilation.
 DEVICES = np.array(list(itertools.product([0.0, 0.1, 2.4, 100.0], [0.0, 0.5, 1.0, 1.3, 4.0])))
 DELTA, D = DEVICES.T
 SHARES = [1e-9, 0.3, 0.9]
@@ -224,10 +206,10 @@ SHARES = [1e-9, 0.3, 0.9]
 
 @pytest.fixture(scope="module")
 def ridge():
-    return {delay: zwidth.alpha_max(DELTA, D, delay=delay) for delay in ("held", "fractional_power")}
+    return zwidth.alpha_max(DELTA, D)
 
 
-def assert_on_curve(points, rows, fixed, delay="held"):
+def assert_on_curve(points, rows, fixed):
     """The wall is the exact point of the curve with this alpha (or beta), found anew by mpmath from the frequency."""
     for row in rows:
         omega, delta, d = float(points.omega[row]), DELTA[row], D[row]
@@ -237,12 +219,12 @@ def assert_on_curve(points, rows, fixed, delay="held"):
         with mp.workdps(80):
 
             def offset(w, delta=delta, d=d, wall=wall):
-                return oracles.boundary(w, delta, d, delay)[fixed] - wall[fixed]
+                return oracles.boundary(w, delta, d)[fixed] - wall[fixed]
 
             exact_omega = mp.findroot(offset, (mpf(omega), mpf(omega) * (1 - mpf(10) ** -10)), solver="secant")
-            exact = oracles.boundary(exact_omega, delta, d, delay)
+            exact = oracles.boundary(exact_omega, delta, d)
             step = exact_omega * mpf(10) ** -20
-            near = oracles.boundary(exact_omega - step, delta, d, delay)
+            near = oracles.boundary(exact_omega - step, delta, d)
             slope = (near[1 - fixed] - exact[1 - fixed]) / (near[fixed] - exact[fixed])
             size = abs(exact[0]) + abs(exact[1])
             condition = size + abs(slope * exact[fixed]) * tol.EPS64 / tol.BOUNDARY_POINT.float64
@@ -260,7 +242,7 @@ def radius(alpha, beta, delta, d):
 
 @pytest.mark.parametrize("share", SHARES)
 def test_columns(ridge, share):
-    alpha = share * ridge["held"].alpha
+    alpha = share * ridge.alpha
     lower = zwidth.boundary_point(DELTA, D, alpha=alpha, side="lower")
     upper = zwidth.boundary_point(DELTA, D, alpha=alpha, side="upper")
     for points in (lower, upper):
@@ -278,7 +260,7 @@ def test_columns(ridge, share):
 
 @pytest.mark.parametrize("height", [0.05, 0.5, 0.97])
 def test_rows(ridge, height):
-    beta = -DELTA + height * (ridge["held"].beta + DELTA)
+    beta = -DELTA + height * (ridge.beta + DELTA)
     points = zwidth.boundary_point(DELTA, D, beta=beta)
     assert (points.status == Status.OK).all()
     np.testing.assert_allclose(points.beta, beta, rtol=1e-14)
@@ -299,21 +281,11 @@ def test_a_strongly_damped_device_is_bounded_by_a_pole_at_minus_one():
     np.testing.assert_allclose(points.alpha, float(alpha), rtol=1e-14)
 
 
-def test_fractional_power_points(ridge):
-    top = ridge["fractional_power"]
-    alpha = 0.6 * top.alpha
-    for side in ("lower", "upper"):
-        points = zwidth.boundary_point(DELTA, D, alpha=alpha, side=side, delay="fractional_power")
-        rows = np.flatnonzero(D % 1)
-        assert (points.status[rows] == Status.OK).all()
-        assert_on_curve(points, rows, fixed=0, delay="fractional_power")
-
-
 def test_lines_without_a_stable_part(ridge):
     nan = np.full(DELTA.size, np.nan)
     lines: tuple[dict[str, Any], ...] = (
-        {"alpha": 1.001 * ridge["held"].alpha},
-        {"alpha": 1.001 * ridge["held"].alpha, "side": "upper"},
+        {"alpha": 1.001 * ridge.alpha},
+        {"alpha": 1.001 * ridge.alpha, "side": "upper"},
         {"alpha": np.zeros(DELTA.size)},
         {"alpha": -np.ones(DELTA.size), "side": "upper"},
         {"beta": -1.001 * DELTA - 0.01},
@@ -327,7 +299,7 @@ def test_lines_without_a_stable_part(ridge):
 
 
 def test_bad_points_are_marked_and_leave_the_others_alone(ridge):
-    alpha = 0.3 * ridge["held"].alpha
+    alpha = 0.3 * ridge.alpha
     clean = zwidth.boundary_point(DELTA, D, alpha=alpha)
     for name, value in (("delta", -1.0), ("delta", np.inf), ("d", np.nan), ("alpha", np.nan), ("alpha", np.inf)):
         arguments = {"delta": DELTA, "d": D, "alpha": alpha}

@@ -111,7 +111,6 @@ def test_double_poles_are_not_certified():
         ({"accuracy": "x"}, "accuracy"),
         ({"accuracy": 0.0}, "accuracy"),
         ({"accuracy": float("nan")}, "accuracy"),
-        ({"delay": "fractional_power"}, "held"),
     ],
 )
 def test_what_cannot_be_asked_is_refused(arguments, message):

@@ -13,7 +13,7 @@ import zwidth
 from zwidth.arrays.held_mass import held_plant
 from zwidth.loops.rigid.folding import find_degree
 from zwidth.loops.rigid.polynomial import affine
-from zwidth.words.errors import InputError, TracedDelayError
+from zwidth.words.errors import TracedDelayError
 
 WALLS = [(0.5, 0.5), (1e-8, -0.3), (40.0, -7.0), (-0.1, 0.0), (0.0, 1.0)]
 DAMPINGS = [1e-300, 1e-12, 1e-8, 1e-3, 0.1, 1.0, 2.31, 30.0, 700.0, 1e4, 1e6]
@@ -156,11 +156,3 @@ def test_the_undamped_mass_is_exact():
 def test_a_traced_delay_has_no_degree():
     with pytest.raises(TracedDelayError, match="d: got a traced value, but the number of poles depends on it"):
         jax.jit(lambda d: zwidth.char_poly(0.1, 0.1, 0.1, d))(1.0)
-
-
-@pytest.mark.parametrize("function", [zwidth.char_poly, zwidth.poles])
-def test_a_fractional_power_has_no_poles(function):
-    with pytest.raises(InputError, match=r"delay: 'fractional_power' has no poles .* use delay='held'"):
-        function(0.1, 0.1, 0.1, 0.5, delay="fractional_power")
-    with pytest.raises(InputError, match="got 'hold', allowed are 'held', 'fractional_power'; did you mean 'held'"):
-        function(0.1, 0.1, 0.1, 0.5, delay="hold")

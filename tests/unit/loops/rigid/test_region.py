@@ -120,11 +120,6 @@ def test_few_points_do_too(device, points):
     assert region.alpha.max() <= zwidth.alpha_max(*device).alpha * (1 + 1e-12)
 
 
-def test_a_fractional_power_has_an_outline():
-    region = stable_region(0.5, 0.5, delay="fractional_power")
-    assert region.alpha.max() == pytest.approx(zwidth.alpha_max(0.5, 0.5, delay="fractional_power").alpha, rel=1e-4)
-
-
 def test_the_lobe_is_the_closed_form():
     omega, alpha, beta = sample_lobe(0.5, 1, points=20)
     curve = zwidth.boundary(omega, 0.5, 1)

@@ -18,18 +18,17 @@ from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.loops.rigid.ridge import ridge_kernel
 from zwidth.words.errors import InputError
 from zwidth.words.status import RidgeKind, Status
-from zwidth.words.types import DELAY_MODELS as MODELS
 
 REFERENCE = Path(__file__).resolve().parents[3] / "reference" / "ridge_extended.json"
 # The corner takes over at d = 0: this float64 is the last smooth one, 4e-18 below.
 TAKE_OVER = 3.659361627421783507
-# One size for all derivatives of a model: one compilation.
+# One size for all derivatives: one compilation.
 SIZE = 320
 
 
 @cache
-def reference(model):
-    rows = [row for row in json.loads(REFERENCE.read_text()) if row["model"] == model]
+def reference():
+    rows = [row for row in json.loads(REFERENCE.read_text()) if row["model"] == "held"]
     columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name not in ("model", "kind")}
     columns["corner"] = np.array([row["kind"] == "corner" for row in rows])
     assert len(rows) > 70
@@ -37,10 +36,10 @@ def reference(model):
 
 
 @cache
-def compiled_derivatives(model):
+def compiled_derivatives():
     def slopes(point):
         def three(point):
-            values = jnp.stack(ridge_kernel(point[0], point[1], model)[:3])
+            values = jnp.stack(ridge_kernel(point[0], point[1])[:3])
             return values[0], values
 
         gradient, values = jax.grad(three, has_aux=True)(point)
@@ -49,11 +48,11 @@ def compiled_derivatives(model):
     return compile_bends(slopes)
 
 
-def derivatives(model, delta, d):
+def derivatives(delta, d):
     """Jacobian of (alpha, beta, omega), gradient and Hessian of alpha in (delta, d), at every point."""
     with jax.enable_x64(True):
         points = np.resize(np.stack(np.broadcast_arrays(delta, d), axis=1), (SIZE, 2))
-        values, changes = (each[: np.size(delta)] for each in compiled_derivatives(model)(points))
+        values, changes = (each[: np.size(delta)] for each in compiled_derivatives()(points))
         return changes[:, 2:], values[:, :2], changes[:, :2]
 
 
@@ -63,10 +62,9 @@ def excess(got, exact, relative, floor):
     return np.max(error / (relative * np.abs(exact) + floor))
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_values_and_kind(model):
-    exact = reference(model)
-    got = zwidth.alpha_max(exact["delta"], exact["d"], delay=model)
+def test_values_and_kind():
+    exact = reference()
+    got = zwidth.alpha_max(exact["delta"], exact["d"])
     size = exact["alpha"] + np.abs(exact["beta"])
     assert excess(got.alpha, exact["alpha"], tol.RIDGE.float64, 0) <= 1
     assert excess(got.beta, exact["beta"], 0, tol.RIDGE_BETA.float64 * size) <= 1
@@ -77,10 +75,9 @@ def test_values_and_kind(model):
     assert (got.status == Status.OK).all()
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_derivatives(model):
-    exact = reference(model)
-    jacobian, gradient, hessian = derivatives(model, exact["delta"], exact["d"])
+def test_derivatives():
+    exact = reference()
+    jacobian, gradient, hessian = derivatives(exact["delta"], exact["d"])
     delta, alpha, omega = exact["delta"], exact["alpha"], exact["omega"]
     size = alpha + np.abs(exact["beta"])
     with np.errstate(divide="ignore"):
@@ -109,25 +106,24 @@ def test_derivatives(model):
             assert excess(got, exact[f"alpha_{name}"], tol.RIDGE_CURVATURE.float64, floor) <= 1, name
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_the_kind_is_right_to_the_last_place_of_delta(model):
+def test_the_kind_is_right_to_the_last_place_of_delta():
     spacing = np.spacing(TAKE_OVER)
     delta = TAKE_OVER + spacing * np.concatenate(
         [np.arange(-40, 41), 10.0 ** np.arange(2, 9), -(10.0 ** np.arange(2, 9))]
     )
-    got = zwidth.alpha_max(delta, 0.0, delay=model)
+    got = zwidth.alpha_max(delta, 0.0)
     np.testing.assert_array_equal(got.kind == RidgeKind.CORNER, delta > TAKE_OVER)
     np.testing.assert_array_equal(got.omega == np.pi, delta > TAKE_OVER)
     with mp.workdps(60):
-        exact = [float(precise_curve(mp.pi - mp.mpf(10) ** -25, mp.mpf(float(x)), mp.mpf(0), model)[0]) for x in delta]
+        exact = [float(precise_curve(mp.pi - mp.mpf(10) ** -25, mp.mpf(float(x)), mp.mpf(0))[0]) for x in delta]
     # So near the take-over the smooth optimum and the corner differ by less than a rounding error.
     close = np.abs(delta - TAKE_OVER) < 1e-9
     np.testing.assert_allclose(got.alpha[close], np.array(exact)[close], rtol=tol.RIDGE.float64)
 
 
-def precise_curve(omega, delta, d, model):
+def precise_curve(omega, delta, d):
     """(alpha, beta) in mpmath, from the matrices of the held loop: a route of its own."""
-    n = mp.floor(d) if model == "held" else d
+    n = mp.floor(d)
     f = d - n
     c = mp.exp(-delta)
 
@@ -155,25 +151,24 @@ def test_values_against_60_digits_at_random():
     rng = np.random.default_rng(8)
     delta = np.where(rng.random(60) < 0.1, 0.0, 10 ** rng.uniform(-6, 4, 60))
     d = np.concatenate([rng.uniform(0, 3, 20), 10 ** rng.uniform(-3, np.log10(500), 20), rng.integers(0, 501, 20)])
-    for model in MODELS:
-        got = zwidth.alpha_max(delta, d, delay=model)
-        for i in range(60):
-            with mp.workdps(60):
-                point = (mp.mpf(float(delta[i])), mp.mpf(float(d[i])), model)
+    got = zwidth.alpha_max(delta, d)
+    for i in range(60):
+        with mp.workdps(60):
+            point = (mp.mpf(float(delta[i])), mp.mpf(float(d[i])))
 
-                def height(omega, point=point):
-                    return precise_curve(omega, *point)[0]
+            def height(omega, point=point):
+                return precise_curve(omega, *point)[0]
 
-                near_pi = height(mp.pi - mp.mpf(10) ** -12), height(mp.pi - 2 * mp.mpf(10) ** -12)
-                is_corner = near_pi[0] > near_pi[1] and height(mp.pi - mp.mpf(10) ** -3) > 0 and d[i] < 1
-                if got.kind[i] == RidgeKind.CORNER:
-                    assert is_corner
-                    top = near_pi[0]
-                else:
-                    omega = mp.findroot(lambda w: mp.diff(height, w), mp.mpf(float(got.omega[i])), tol=1e-40)
-                    assert abs(omega - float(got.omega[i])) < 1e-9
-                    top = height(omega)
-                assert abs(float(got.alpha[i]) / top - 1) <= tol.RIDGE.float64, (model, delta[i], d[i])
+            near_pi = height(mp.pi - mp.mpf(10) ** -12), height(mp.pi - 2 * mp.mpf(10) ** -12)
+            is_corner = near_pi[0] > near_pi[1] and height(mp.pi - mp.mpf(10) ** -3) > 0 and d[i] < 1
+            if got.kind[i] == RidgeKind.CORNER:
+                assert is_corner
+                top = near_pi[0]
+            else:
+                omega = mp.findroot(lambda w: mp.diff(height, w), mp.mpf(float(got.omega[i])), tol=1e-40)
+                assert abs(omega - float(got.omega[i])) < 1e-9
+                top = height(omega)
+            assert abs(float(got.alpha[i]) / top - 1) <= tol.RIDGE.float64, (delta[i], d[i])
 
 
 def test_published_values():
@@ -185,26 +180,19 @@ def test_published_values():
     assert corner_point.omega == np.pi
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_agrees_with_the_general_solver(model):
+def test_agrees_with_the_general_solver():
     rng = np.random.default_rng(4)
     delta = np.concatenate([[0.0, 1e-9, 3.6, 3.7, 40.0, 1e4], 10 ** rng.uniform(-3, 3, 58)])
     d = np.concatenate([[0.0, 1.0, 0.0, 0.0, 0.125, 3.0], rng.uniform(0, 6, 58)])
-    fast = zwidth.alpha_max(delta, d, delay=model, method="newton")
-    if model == "held":
-        general = zwidth.alpha_max(delta, d, method="kkt")
-    else:
-        # As somebody's own program, which is compiled in a third of the time.
-        solve = jax.jit(lambda *at: zwidth.alpha_max(*at, delay=model, method="kkt"), compiler_options=QUICKLY)
-        with jax.enable_x64(True):
-            general = jax.tree.map(np.asarray, solve(delta, d))
+    fast = zwidth.alpha_max(delta, d, method="newton")
+    general = zwidth.alpha_max(delta, d, method="kkt")
     np.testing.assert_array_equal(general.status, Status.OK)
     np.testing.assert_array_equal(general.kind, fast.kind)
     np.testing.assert_allclose(general.alpha, fast.alpha, rtol=tol.RIDGE.float64)
     np.testing.assert_allclose(general.omega, fast.omega, rtol=1e-9)
 
 
-def independent_curve(omega, point, model):
+def independent_curve(omega, point):
     """(alpha, beta) straight from the definitions, in complex arithmetic; for delta well above 0."""
     delta, d = point
     c, z = jnp.exp(-delta), jnp.exp(1j * omega)
@@ -215,7 +203,7 @@ def independent_curve(omega, point, model):
     def position(t):
         return (t - velocity(t)) / delta
 
-    n = jnp.floor(d) if model == "held" else d
+    n = jnp.floor(d)
     f = d - n
     t = 1 - f
     x0, v0 = position(t), velocity(t)
@@ -225,7 +213,7 @@ def independent_curve(omega, point, model):
     return q.real - jnp.tan(omega / 2) * q.imag, q.imag / jnp.sin(omega)
 
 
-def independent_ridge(model):
+def independent_ridge():
     """Bisection of the curve's slope in omega; its implicit derivative from jaxopt."""
     with warnings.catch_warnings():
         # jaxopt announces at import that it is no longer maintained.
@@ -233,7 +221,7 @@ def independent_ridge(model):
         from jaxopt import implicit_diff
 
     def slope(omega, point):
-        return jax.grad(lambda w: independent_curve(w, point, model)[0])(omega)
+        return jax.grad(lambda w: independent_curve(w, point)[0])(omega)
 
     def solve(_, point):
         limit = jnp.minimum(jnp.pi, jnp.pi / (point[1] + 0.5))
@@ -248,19 +236,18 @@ def independent_ridge(model):
 
     def three(point):
         omega = implicit_diff.custom_root(slope)(solve)(None, point)
-        return jnp.stack([*independent_curve(omega, point, model), omega])
+        return jnp.stack([*independent_curve(omega, point), omega])
 
     return three
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_gradient_agrees_with_an_independent_implicit_derivative(model):
+def test_gradient_agrees_with_an_independent_implicit_derivative():
     rng = np.random.default_rng(5)
     delta, d = 10 ** rng.uniform(-0.5, 1, 24), rng.uniform(0.3, 5, 24)
     with jax.enable_x64(True):
-        three = jax.vmap(jax.jacrev(independent_ridge(model)))
+        three = jax.vmap(jax.jacrev(independent_ridge()))
         oracle = jax.jit(three, compiler_options=QUICKLY)(np.stack([delta, d], axis=1))
-    got = derivatives(model, delta, d)[0]
+    got = derivatives(delta, d)[0]
     # alpha's slope sees the oracle's omega only to second order.
     np.testing.assert_allclose(got[:, 0], oracle[:, 0], rtol=tol.RIDGE_ORACLE.float64)
     np.testing.assert_allclose(got, oracle, rtol=1e-7, atol=1e-9)
@@ -268,7 +255,7 @@ def test_gradient_agrees_with_an_independent_implicit_derivative(model):
 
 def test_slopes_are_continuous_where_the_corner_takes_over():
     step = 1e-7
-    jacobian, gradient, hessian = derivatives("held", np.array([TAKE_OVER - step, TAKE_OVER + step]), np.zeros(2))
+    jacobian, gradient, hessian = derivatives(np.array([TAKE_OVER - step, TAKE_OVER + step]), np.zeros(2))
     np.testing.assert_allclose(gradient[1], gradient[0], atol=5e3 * step)
     assert np.isfinite(jacobian).all()
     # Curvatures jump, omega leaves pi with a vertical tangent.
@@ -281,8 +268,8 @@ def test_slopes_are_continuous_at_whole_delays():
     step = 1e-8
     whole = np.array([1.0, 2.0, 5.0])
     for delta in (0.0, 0.3, 8.0):
-        _, right, at = derivatives("held", np.full(3, delta), whole)
-        _, left, before = derivatives("held", np.full(3, delta), whole - step)
+        _, right, at = derivatives(np.full(3, delta), whole)
+        _, left, before = derivatives(np.full(3, delta), whole - step)
         np.testing.assert_allclose(left, right, rtol=1e-5)
         # The second derivative is the one from the right: it differs from the one from the left.
         assert (np.abs(before[:, 1, 1] / at[:, 1, 1] - 1) > 1e-2).all()
@@ -291,21 +278,20 @@ def test_slopes_are_continuous_at_whole_delays():
 BAD = [(np.nan, 1.0), (-1.0, 1.0), (np.inf, 0.5), (1.0, np.nan), (1.0, -0.5), (0.2, np.inf), (-np.inf, -np.inf)]
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_bad_points_spoil_nothing(model):
+def test_bad_points_spoil_nothing():
     rng = np.random.default_rng(6)
     good = np.stack([10 ** rng.uniform(-3, 3, 41), rng.uniform(0, 9, 41)])
     place = np.sort(rng.choice(41, len(BAD)))
     mixed = np.insert(good, place, np.transpose(BAD), axis=1)
     is_bad = np.insert(np.zeros(41, bool), place, True)
-    alone = zwidth.alpha_max(*good, delay=model)
-    among = zwidth.alpha_max(*mixed, delay=model)
+    alone = zwidth.alpha_max(*good)
+    among = zwidth.alpha_max(*mixed)
     for clean, spoiled in zip(alone, among, strict=True):
         np.testing.assert_array_equal(spoiled[~is_bad], clean)
     np.testing.assert_array_equal(among.status[is_bad], Status.INVALID_INPUT)
     for leaf in among[:3]:
         assert np.isnan(leaf[is_bad]).all()
-    for clean, spoiled in zip(derivatives(model, *good), derivatives(model, *mixed), strict=True):
+    for clean, spoiled in zip(derivatives(*good), derivatives(*mixed), strict=True):
         np.testing.assert_array_equal(spoiled[~is_bad], clean)
         assert np.isnan(spoiled[is_bad]).all()
 
@@ -316,16 +302,15 @@ def test_every_device_is_answered():
     delta = np.where(rng.random(4000) < 0.05, 0.0, 10 ** rng.uniform(-12, 8, 4000))
     d = np.concatenate([rng.uniform(0, 4, 1000), 10 ** rng.uniform(-12, 3, 1000), rng.integers(0, 501, 1000)])
     d = np.concatenate([d, rng.integers(1, 9, 1000) - 10 ** rng.uniform(-15, -2, 1000)])
-    for model in MODELS:
-        got = zwidth.alpha_max(delta, d, delay=model)
-        np.testing.assert_array_equal(got.status, Status.OK)
-        limit = np.minimum(np.pi, np.pi / (d + 0.5))
-        lobe = np.full(4000, True)
-        # Up to the first return to alpha = 0 the scan sees nothing stiffer.
-        for fraction in np.linspace(0, 1, 120)[1:-1]:
-            scanned = zwidth.boundary(fraction * limit, delta, d, delay=model).alpha
-            lobe &= scanned > 0
-            assert (scanned[lobe] <= got.alpha[lobe] * (1 + 1e-13)).all()
+    got = zwidth.alpha_max(delta, d)
+    np.testing.assert_array_equal(got.status, Status.OK)
+    limit = np.minimum(np.pi, np.pi / (d + 0.5))
+    lobe = np.full(4000, True)
+    # Up to the first return to alpha = 0 the scan sees nothing stiffer.
+    for fraction in np.linspace(0, 1, 120)[1:-1]:
+        scanned = zwidth.boundary(fraction * limit, delta, d).alpha
+        lobe &= scanned > 0
+        assert (scanned[lobe] <= got.alpha[lobe] * (1 + 1e-13)).all()
 
 
 # Few whole parts of d: each is another polynomial, hence another compilation.
@@ -363,15 +348,14 @@ def test_shapes_types_and_precision():
     assert isinstance(zwidth.alpha_max(jnp.ones(2), 1).alpha, jax.Array)
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_ambient_precision_inside_jit(model):
-    exact = reference(model)
+def test_ambient_precision_inside_jit():
+    exact = reference()
     usual = (exact["delta"] <= 1e4) & (exact["d"] % 1 < 0.99)
     delta, d = np.float32(exact["delta"][usual]), np.float32(exact["d"][usual])
-    got = jax.jit(lambda *point: zwidth.alpha_max(*point, delay=model), compiler_options=QUICKLY)(delta, d)
+    got = jax.jit(lambda *point: zwidth.alpha_max(*point), compiler_options=QUICKLY)(delta, d)
     assert got.alpha.dtype == jnp.float32
     # float32 inputs are other numbers.
-    truth = zwidth.alpha_max(np.float64(delta), np.float64(d), delay=model)
+    truth = zwidth.alpha_max(np.float64(delta), np.float64(d))
     np.testing.assert_allclose(got.alpha, truth.alpha, rtol=tol.RIDGE.float32)
     np.testing.assert_array_equal(got.status, Status.OK)
 
@@ -379,8 +363,6 @@ def test_ambient_precision_inside_jit(model):
 def test_arguments_are_checked():
     with pytest.raises(InputError, match=r"method: got 'newtno', .* did you mean 'newton'"):
         zwidth.alpha_max(1.0, 1, method="newtno")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="delay"):
-        zwidth.alpha_max(1.0, 1, delay="padé")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="delta"):
         zwidth.alpha_max("much", 1)
 

@@ -11,8 +11,6 @@ from compiling import QUICKLY
 
 import zwidth
 from zwidth.loops.rigid.ridge import slope_kernel, stiffness_slope
-from zwidth.words.errors import InputError
-from zwidth.words.types import DELAY_MODELS as MODELS
 
 
 def limit_polynomial(g, h, d):
@@ -41,8 +39,7 @@ def test_largest_slope_with_a_stable_limit_polynomial(d):
 def test_published_values():
     got = stiffness_slope(np.arange(5))
     np.testing.assert_allclose(got, [4, 1, 0.631130, 0.465011, 0.369041], atol=5e-7)
-    for model in MODELS:
-        np.testing.assert_allclose(stiffness_slope(np.arange(5.0), delay=model), got, rtol=tol.LIMIT_SLOPE.float64)
+    np.testing.assert_allclose(stiffness_slope(np.arange(5.0)), got, rtol=tol.LIMIT_SLOPE.float64)
 
 
 def test_closed_forms_below_one_period():
@@ -54,54 +51,51 @@ def test_closed_forms_below_one_period():
     assert stiffness_slope(1 / 6) == pytest.approx(4.5, rel=1e-15)
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_is_the_limit_of_the_ridge(model):
+def test_is_the_limit_of_the_ridge():
     d = np.array([0.0, 0.05, 0.2, 0.5, 0.8, 1.0, 1.3, 2.0, 2.6, 10.0, 100.5])
-    slope = stiffness_slope(d, delay=model)
+    slope = stiffness_slope(d)
     for delta in (1e6, 1e7, 1e8):
-        ratio = zwidth.alpha_max(delta, d, delay=model).alpha / delta
+        ratio = zwidth.alpha_max(delta, d).alpha / delta
         # alpha_max = g delta + O(1).
         np.testing.assert_allclose(ratio, slope, rtol=30 / delta)
 
 
 @cache
-def compiled_slopes(model):
-    return jax.jit(jax.vmap(jax.value_and_grad(lambda d: slope_kernel(d, model))), compiler_options=QUICKLY)
+def compiled_slopes():
+    return jax.jit(jax.vmap(jax.value_and_grad(lambda d: slope_kernel(d))), compiler_options=QUICKLY)
 
 
-def slopes_of_slope(d, model):
-    """The slope and its derivative; padded, so that every model is compiled once."""
+def slopes_of_slope(d):
+    """Return the slope and its derivative; padded to one size, for a single compilation."""
     with jax.enable_x64(True):
         padded = np.resize(np.asarray(d, dtype=float), 16)
-        return [np.asarray(leaf)[: len(d)] for leaf in compiled_slopes(model)(padded)]
+        return [np.asarray(leaf)[: len(d)] for leaf in compiled_slopes()(padded)]
 
 
 def test_derivative_in_d():
     d = np.array([0.0, 0.1, 0.2, 0.3, 0.6, 0.95])
     exact = np.where(d < 0.25, 4 * (1 - 6 * d) / (1 - 2 * d) ** 3, -1 / np.maximum(d, 0.25) ** 2)
-    np.testing.assert_allclose(slopes_of_slope(d, "held")[1], exact, rtol=1e-13)
+    np.testing.assert_allclose(slopes_of_slope(d)[1], exact, rtol=1e-13)
     d = np.array([0.3, 1.2, 2.7, 8.5])
     step = 1e-5
-    for model in MODELS:
-        up, down = (stiffness_slope(d + sign * step, delay=model) for sign in (1, -1))
-        np.testing.assert_allclose(slopes_of_slope(d, model)[1], (up - down) / (2 * step), rtol=1e-7)
+    up, down = (stiffness_slope(d + sign * step) for sign in (1, -1))
+    np.testing.assert_allclose(slopes_of_slope(d)[1], (up - down) / (2 * step), rtol=1e-7)
 
 
 def test_one_sided_at_whole_delays():
     whole = np.array([1.0, 2.0, 3.0])
-    before, at, after = (slopes_of_slope(whole + step, "held") for step in (-1e-9, 0.0, 1e-9))
+    before, at, after = (slopes_of_slope(whole + step) for step in (-1e-9, 0.0, 1e-9))
     np.testing.assert_allclose(before[0], at[0], rtol=1e-8)
     np.testing.assert_allclose(after[1], at[1], atol=1e-7)
     assert (before[1] < at[1] - 0.1).all()
     assert at[1][0] == pytest.approx(0, abs=1e-14)
     assert before[1][0] == pytest.approx(-1, rel=1e-8)
-    assert slopes_of_slope([0.0], "fractional_power")[1][0] == -np.inf
 
 
 def test_shapes_bad_input_and_precision():
     got = stiffness_slope(np.array([[1.0, np.nan], [-1.0, np.inf]]))
     np.testing.assert_array_equal(np.isnan(got), [[False, True], [True, True]])
-    values, slopes = slopes_of_slope([1.5, np.nan, -1.0, np.inf], "held")
+    values, slopes = slopes_of_slope([1.5, np.nan, -1.0, np.inf])
     assert np.isnan(values[1:]).all()
     assert np.isnan(slopes[1:]).all()
     assert np.isfinite(slopes[0])
@@ -109,5 +103,3 @@ def test_shapes_bad_input_and_precision():
     single = jax.jit(stiffness_slope)(jnp.float32(2.0))
     assert single.dtype == jnp.float32
     assert single == pytest.approx(0.631130, abs=1e-5)
-    with pytest.raises(InputError, match="delay"):
-        stiffness_slope(1.0, delay="none")  # pyright: ignore[reportArgumentType]

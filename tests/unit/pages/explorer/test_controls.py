@@ -134,8 +134,8 @@ def test_a_normalized_scene_is_shown_as_it_is(tmp_path):
     )
 
 
-def test_the_other_model_of_delays_and_other_folders_are_refused(tmp_path):
-    with pytest.raises(zwidth.InputError, match="delay_model"):
+def test_a_delay_model_and_other_folders_are_refused(tmp_path):
+    with pytest.raises(zwidth.ConfigError, match="delay_model: key of an earlier release"):
         read_controls(written(tmp_path, f"{DEVICE}, delay_model: fractional_power"))
     with pytest.raises(zwidth.InputError, match="no run with a recorded configuration"):
         find_config(tmp_path)

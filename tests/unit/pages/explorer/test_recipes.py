@@ -84,7 +84,7 @@ def test_the_address_is_the_view(view):
         ("mass=-1&period=1+ms", "scene.mass: got -1 kg"),
         ("mass=NaN&period=1+ms", "scene.mass: got .nan"),
         ("mass=100+g&period=1+ms&stiffness=1&delay=10+s", "delay"),
-        ("mass=100+g&period=1+ms&delay_model=fractional_power", "address: scene.delay_model"),
+        ("mass=100+g&period=1+ms&delay_model=fractional_power", "scene.delay_model: key of an earlier release"),
         ("file=/etc/passwd", "scene.file: unknown key"),
     ],
 )

@@ -1,0 +1,126 @@
+"""Figs. 6 and 10 of the paper: exact fractional delays and, in addition, the paper's z^(1+d) with real d.
+
+For integer d both are the same. For other d, z^d has several branches, so poles are not defined. On the principal
+branch the boundary is the closed form of integer delays at a real lag d, in the letters of `loops.rigid.ridge_newton`:
+``s = sin(omega/2)``.
+
+References:
+    Hulin, Preusche, Hirzinger 2006, sections V and VII.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from zwidth import figures
+from zwidth.arrays.held_mass import Plant, held_plant
+from zwidth.arrays.roots import bisect, newton
+from zwidth.config.scenes import AnyScene
+from zwidth.config.study import register
+from zwidth.figures.table import stack
+from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
+from zwidth.loops.rigid.ridge_newton import Curve, Start, expand_curve, guess_start, stationarity, wall, wave
+from zwidth.studies.boundary import stable_intervals
+from zwidth.studies.outcome import CurvesStudy, Outcome
+from zwidth.studies.ridge import ridge_table
+from zwidth.words.quantities import WALL_RANGE
+
+_STEPS = 16  # Newton steps; enough for the shortest delays, with the maximum close to omega = pi
+
+
+def _find_maximum(curve: Curve, lag: Any, start: Start) -> Any:
+    """Return s at the maximum of alpha along the boundary, for a fractional lag."""
+    # For short delays the maximum is close to omega = pi, where the condition behaves like A + B q - C d q^(-3/2).
+    rest = 0.3 * np.minimum(lag, 0.05) ** (2.0 / 3.0)
+    lower, upper = 0.5 * start.scale, np.minimum(np.sqrt(1.0 - rest), 1.05 * start.scale)
+
+    def fall(s: Any) -> tuple[Any, Any]:
+        value, slope = stationarity(s, curve, lag)
+        return -value, -slope
+
+    return newton(fall, lower, upper, np.clip(start.s, lower, upper), _STEPS)[0]
+
+
+def maximize_alpha(delta: np.ndarray, d: float) -> tuple[Any, Any, Any]:
+    """Return the maximum of alpha with the paper's z^(1+d), and beta and omega there."""
+    if d.is_integer():
+        return alpha_max(delta, d)[:3]
+    curve, lag = expand_curve(held_plant(delta)), np.full_like(delta, d)
+    at = wave(_find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta)), lag, False)
+    return *wall(at, curve), 2.0 * at.half
+
+
+def limit_slope(d: float) -> float:
+    """Return the limit of alpha_max/delta for strong damping with the paper's z^(1+d)."""
+    if d.is_integer():
+        return float(stiffness_slope(d))
+    zero, lag = np.zeros(1), np.full(1, d)
+    # For delta -> infinity the velocity follows the force without delay: delta N(z) becomes z.
+    curve = expand_curve(Plant(c=zero, em=zero + 1.0, a2=zero + 1.0, a1=zero, a0=zero, gap=zero + 1.0))
+    s = _find_maximum(curve, lag, guess_start(zero, lag, zero, strength=zero + 1.0))
+    return float(wall(wave(s, lag, False), curve)[0][0])
+
+
+def find_upper_damping(delta: np.ndarray, d: float) -> np.ndarray:
+    """Return the largest stable beta for alpha -> 0 with the paper's z^(1+d), for a fractional d."""
+    curve, lag = expand_curve(held_plant(delta)), np.full_like(delta, d)
+    top = _find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta))
+    limit = np.full_like(delta, np.sin(0.5 * np.pi / max(1.0, d + 0.5)))  # an upper bound of the end of the lobe
+    s = bisect(lambda s: wall(wave(s, lag, False), curve)[0] > WALL_RANGE[0], top, limit)
+    return wall(wave(s, lag, False), curve)[1]
+
+
+class _PaperStudy(CurvesStudy):
+    """Base of the studies that draw the exact delay and the paper's z^(1+d)."""
+
+    method = "Closed forms of the exact delay, and of integer delays evaluated at real d, to a few rounding errors."
+
+    @property
+    def fractional(self) -> list[float]:
+        """The delays for which the paper's z^(1+d) is not exact."""
+        return [d for d in self.d.values().tolist() if not d.is_integer()]
+
+
+def _tabulate(columns: Iterable[str], exact: Iterable[Mapping[str, Any]], power: Iterable[Mapping[str, Any]]) -> Any:
+    """Return a table of both delay models with columns in the given order."""
+    models = {"held": exact, "fractional_power": power}
+    table = stack({"delay_model": model, **part} for model, parts in models.items() for part in parts)
+    return {name: table[name] for name in columns}
+
+
+@register
+class Fig6Study(_PaperStudy):
+    """Fig. 6 of the paper: stable virtual damping for alpha -> 0 over delta, also with the paper's z^(1+d)."""
+
+    kind: Literal["paper_fig6"]
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        delta = np.sort(self.delta.values())
+        shared = {"curve": "stable", "delta": delta, "beta_lower": -delta}
+        power = ({"d": d, **shared, "beta_upper": find_upper_damping(delta, d)} for d in self.fractional)
+        columns = "curve", "d", "delay_model", "delta", "beta_lower", "beta_upper"
+        table = _tabulate(columns, stable_intervals(delta, self.d.values()), power)
+        return Outcome(table=table, figures={"": partial(figures.draw_zero_stiffness, table)})
+
+
+@register
+class Fig10Study(_PaperStudy):
+    """Fig. 10 of the paper: maximum stiffness over delta in two scalings, also with the paper's z^(1+d)."""
+
+    kind: Literal["paper_fig10"]
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        delta = self.delta.values()
+        exact, notes = ridge_table(delta, self.d.values())
+        names = "alpha_max", "beta", "omega"
+        power = (
+            {"d": d, "delta": delta, **dict(zip(names, maximize_alpha(delta, d), strict=True)), "kind": "smooth"}
+            for d in self.fractional
+        )
+        table = _tabulate(("d", "delay_model", "delta", *names, "kind"), [exact], power)
+        drawn = {"": partial(figures.draw_ridge, table, two_scalings=True)}
+        return Outcome(table=table, figures=drawn, notes=tuple(notes))
