@@ -135,8 +135,8 @@ class Part:
 
     def __post_init__(self) -> None:
         """Put every number in its SI unit, where `words.quantities` allows it; else raise `InputError`."""
-        # One that is None by default may be left out. A part that was told in units of one kind of device, linear or
-        # rotary, has that as ``rotary``.
+        # Values that are None by default may be omitted. A part with linear or rotary units stores the kind in
+        # ``rotary``.
         own = {f"{self._owner}.{item.name}".lstrip("."): item for item in fields(self)}  # pyright: ignore[reportArgumentType]
         told = find_kind({path: getattr(self, item.name) for path, item in own.items()})
         if told is not None:
@@ -171,7 +171,7 @@ class Part:
 
 
 def _list_told(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """What may tell a kind of device: every value by its name, each text of a list."""
+    """Yield each value with its name, and each text of a list separately."""
     for name, value in given.items():
         if isinstance(value, list | tuple) and _has_text(value):
             for each in value:
@@ -180,15 +180,20 @@ def _list_told(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
+def _kind_of(value: Any) -> bool | None:
+    """Return True for a quantity or part of a rotary device, False for that of a linear device, None otherwise."""
+    return tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
+
+
 def find_kind(given: dict[str, Any]) -> bool | None:
-    """Whether quantities and parts, by name, are those of a rotary device; None where none says.
+    """Return True if quantities and parts, by name, belong to a rotary device, False for a linear one, None otherwise.
 
     Raises:
         InputError: some are of a rotary device, others of a linear one.
     """
     told: dict[bool, str] = {}
     for name, value in _list_told(given):
-        kind = tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
+        kind = _kind_of(value)
         if kind is None:
             continue
         if told and kind not in told:
@@ -201,9 +206,9 @@ def find_kind(given: dict[str, Any]) -> bool | None:
 
 
 def check_kind(rotary: bool, given: dict[str, Any]) -> None:
-    """Refuse quantities and parts of a device, by name, that are told in units of the other kind of device."""
+    """Raise `InputError` if a quantity or part, by name, has units of the other kind of device."""
     for name, value in given.items():
-        kind = tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
+        kind = _kind_of(value)
         if kind is not None and bool(kind) != rotary:
             raise InputError(
                 f"{name}: got {value!r}, in units of a {_KINDS[kind]} device, for a {_KINDS[rotary]} one; write it in "

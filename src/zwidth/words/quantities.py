@@ -1,7 +1,6 @@
-"""Every parameter of the loop and every output of a sweep, declared once.
+"""Registry of quantities: every parameter and every output of a sweep, with unit, range, symbol and description.
 
-From here come the admissible range of a value in a configuration and on the command line, its unit in files and stores,
-what a store says of it, and what a figure writes beside it.
+Configurations, options of the command line, stores and figures are generated from the entries.
 """
 
 from __future__ import annotations
@@ -47,19 +46,16 @@ FRACTION = Range(0.0, 1.0, low_open=True, high_open=True)
 # Wide enough for any sampled loop, narrow enough that T^2 and 1/T^2 stay within float64.
 PERIODS = Range(1e-12, 1e9)
 RATES = Range(1e-9, 1e12)
-# Where the model is computed: SI quantities, alpha and beta are 0 or of these magnitudes, delta and d at most so large.
+# Range of the model: SI quantities, alpha and beta are 0 or of these magnitudes; largest delta and d.
 SI_RANGE = (1e-30, 1e30)
 WALL_RANGE = (1e-60, 1e60)
 LARGEST_DAMPING = 1e12
 LONGEST_DELAY = 1e5
 SIZES = {"alpha": WALL_RANGE, "beta": WALL_RANGE, "delta": (0.0, LARGEST_DAMPING), "d": (0.0, LONGEST_DELAY)}
-# Shorter limits of the delay: in files, where more is a slip of a unit; of all poles, which take degree^3 operations
-# and degree^2 numbers (4,000 take minutes and 0.3 GB); and of settling times, which take them at once.
-MAX_DELAY_PERIODS = 10_000.0
-MOST_POLES = 4000
-LONGEST_SETTLING = 500
-# Stiffness of a recommended wall over that of the stiffest stable one.
-RECOMMENDED_SHARE = 0.75
+MAX_DELAY_PERIODS = 10_000.0  # longest delay in files, in periods; a longer one has a wrong unit
+MOST_POLES = 4000  # their computation takes minutes and 0.3 GB
+LONGEST_SETTLING = 500  # longest delay with a settling time, in periods; the computation needs all poles
+RECOMMENDED_SHARE = 0.75  # stiffness of a recommended wall relative to K_max
 
 
 @dataclass(frozen=True)
@@ -114,8 +110,7 @@ class Parameter:
         return self.long_name[0].upper() + self.long_name[1:]
 
 
-# Modes that files, axes and the command line name; in Python there may be more.
-MOST_MODES = 3
+MOST_MODES = 3  # modes in files, on axes and on the command line; in Python there is no limit
 
 
 def _describe_mode(path: str, name: str, index: str) -> tuple[Parameter, ...]:
@@ -128,7 +123,7 @@ def _describe_mode(path: str, name: str, index: str) -> tuple[Parameter, ...]:
     )
 
 
-# In the order of a store's dimensions: a plane of walls lies together, at the end.
+# In the order of a store's dimensions, the wall last, so that a plane of walls is contiguous.
 _PARAMETERS = (
     Parameter("period", "sampling period T", "T", PERIODS, "s", (5e-5, 0.02), short_name="sampling period"),
     Parameter("rate", "sampling rate 1/T", "1/T", RATES, "Hz", None, "in place of the period", "sampling rate"),
@@ -225,12 +220,10 @@ _PARAMETERS = (
 PARAMETERS = {parameter.name: parameter for parameter in _PARAMETERS}
 NORMALIZED = ("alpha", "beta", "delta", "d")
 PHYSICAL = tuple(name for name in PARAMETERS if name not in NORMALIZED)
-OF_PARTS = tuple(name for name in PARAMETERS if "." in name)
-"""Parameters of the parts beside device and timing, by the path that leads to them in a scene."""
-VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}
-"""The same by their names in a store."""
+OF_PARTS = tuple(name for name in PARAMETERS if "." in name)  # paths of the parameters of parts, as in a scene
+VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}  # parameters by their names in a store
 _NOISE = Parameter("velocity.noise", "largest error of a measured position", "", POSITIVE, "m", note="one count")
-# Of a simulated motion, beside its scene.
+# Arguments of simulations.
 _OF_MOTIONS = (
     Parameter(
         "start_position", "where the motion starts", "x_0", ANY, "m",
@@ -251,8 +244,8 @@ _OF_MOTIONS = (
     Parameter("max_rate", "the fastest that the command changes", "R_m", POSITIVE, "N/s", note="without one no limit"),
 )  # fmt: skip
 OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
+# Every number of a part or a motion. The noise of an estimate is no axis of a sweep.
 FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
-"""Every number of a part or a motion by its name; the noise of an estimate without stable walls is no axis."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 
 
@@ -269,6 +262,7 @@ CHOICES = {
     "coupling.sensor": Choice(("motor", "tip"), "Where the position is measured; at the motor by default"),
 }
 
+# Options of log files.
 OF_LOGS = {
     "time": "Time column: its header, or HEADER:ms; HEADER:s+HEADER:ns for two columns. Default: by the headers.",
     "position": "Column of the position: its header, or HEADER:mm, :counts, :deg.",
@@ -276,16 +270,11 @@ OF_LOGS = {
     "resolution": "Encoder step, as 0.03mm, 0.09deg or '4000 counts/rev'.",
     "motor_constant": "What an ampere of a force in A makes, as 5N/A.",
 }
-"""What stands in the columns of a log, and what counts and amperes stand for."""
 
-Family: TypeAlias = Literal["wall", "device"]
-"""Whether an output belongs to each wall, or to each device and delay whatever its wall."""
-
+Family: TypeAlias = Literal["wall", "device"]  # an output per wall, or per device and delay
+# Color scales: truth values; numbers with a good and a bad side; other numbers; positive numbers; unbounded ones.
 Look: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
-"""Truth values; numbers with a good and a bad side; numbers; positive ones; and those that grow without end."""
-
-NOT_COMPUTED = 255
-"""The status of a point whose chunk is not there yet; the other codes are those of `zwidth.Status`."""
+NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other codes are those of `zwidth.Status`
 
 
 @dataclass(frozen=True)
@@ -396,12 +385,12 @@ _OUTPUTS = (
 OUTPUTS = {output.name: output for output in _OUTPUTS}
 
 RADIUS_OUTPUTS = frozenset(name for name, output in OUTPUTS.items() if "spectral_radius" in (name, output.source))
+# NaN means that the wall has no such margin (`zwidth.margins`).
 MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
-"""NaN there means that the wall has no such margin, as `zwidth.margins` says."""
 OUTPUTS_WITH_PARTS = tuple(name for name, output in OUTPUTS.items() if output.with_parts)
 
+# Name of the status variable of each family.
 STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
-"""The variable that says for each point of a family why it has the values it has."""
 
 
 def status_flags() -> dict[str, Any]:

@@ -62,29 +62,24 @@ def shown(
         )
         known = _USUAL | units
 
-        def spell(self: Any) -> dict[str, str]:
-            texts = {name: spell_value(getattr(self, name), find_unit(self, known.get(name, ""))) for name in fields}
-            return {
-                name: f"{text}{',' if text == 'NaN' else '; NaN:'} {missing[name]}"
-                if name in missing and "NaN" in text
-                else text
-                for name, text in texts.items()
-            }
+        def spell(self: Any, name: str, value: Any) -> str:
+            text = spell_value(value, find_unit(self, known.get(name, "")))
+            if name in missing and "NaN" in text:
+                text += f"{',' if text == 'NaN' else '; NaN:'} {missing[name]}"
+            return text
 
         def as_text(self: Any) -> str:
-            parts = [f"{name}={text}" for name, text in spell(self).items()]
+            parts = [f"{name}={spell(self, name, getattr(self, name))}" for name in fields]
             line = f"{kind.__name__}({', '.join(parts)})"
             return line if len(line) <= _LINE else f"{kind.__name__}(\n    " + ",\n    ".join(parts) + ",\n)"
 
         def as_html(self: Any) -> str:
             columns, below = {name: getattr(self, name) for name in fields}, picture(self) if picture else ""
             if _is_table(columns.values()):
-                cells = [
-                    [spell_value(each, find_unit(self, known.get(name, ""))) for each in column]
-                    for name, column in columns.items()
-                ]
+                cells = [[spell(self, name, each) for each in column] for name, column in columns.items()]
                 return write_table(kind.__name__, list(zip(*cells, strict=True)), fields) + below
-            return write_table(kind.__name__, spell(self).items()) + below
+            rows = [(name, spell(self, name, value)) for name, value in columns.items()]
+            return write_table(kind.__name__, rows) + below
 
         shown_kind.__repr__, shown_kind._repr_html_ = as_text, as_html
         return shown_kind
