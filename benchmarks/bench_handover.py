@@ -11,7 +11,6 @@ of softer ones with the same damping.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import sys
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 
 import zwidth
+from device_counts import build_parser, count_devices
 from zwidth.fitting.words import write_scene
 from zwidth.studies.document import load_config, load_scene
 
@@ -30,7 +30,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 
 from measured_devices import TrueDevice, draw_hidden
 
-PRINTED = 10  # devices between two lines of totals
 DRAWN = 40  # walls within the safe limit of each device
 SOFTER = (1.0, 0.7, 0.4, 0.1, 0.01)  # shares of a stiffness at which stability is checked
 REQUIREMENTS: tuple[dict[str, Any], ...] = ({"stiffness_fraction": 0.9}, {"phase_margin": 10.0, "gain_margin": 1.3})
@@ -103,23 +102,21 @@ def hand_over(seed: int, folder: Path, with_run: bool) -> Counter[str]:
     return counts
 
 
+def check_device(seed: int, folder: Path, every: int) -> tuple[Counter[str], list[str]]:
+    """Return the counts of one device, and its results that differ or its unstable wall."""
+    counts = hand_over(seed, folder, seed % every == 0)
+    broken = [name for name in counts if name.startswith("same") and not counts[name]]
+    if counts["walls"] and not counts["stable on the true device"]:
+        broken.append("unstable")
+    return counts, broken
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--devices", type=int, default=300)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first device")
+    parser = build_parser(__doc__, 300)
     parser.add_argument("--every", type=int, default=10, help="a run with a report for every so many devices")
     given = parser.parse_args()
-    total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
-        for seed in range(given.first, given.first + given.devices):
-            counts = hand_over(seed, Path(folder), seed % given.every == 0)
-            broken = [name for name in counts if name.startswith("same") and not counts[name]]
-            if broken or (counts["walls"] and not counts["stable on the true device"]):
-                print(f"seed {seed}: {broken or 'unstable'}", flush=True)
-            total.update(counts)
-            if (seed + 1) % PRINTED == 0:
-                print("; ".join(f"{name} {count}" for name, count in total.items()), flush=True)
-    print("".join(f"\n{name:<32}{count}" for name, count in total.items()))
+        count_devices(given, lambda seed: check_device(seed, Path(folder), given.every))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Check recommended walls of random ordinary devices by eigenvalues and frequency responses computed without zwidth.
 
-    python benchmarks/bench_recommend.py [--count 400] [--first 0]
+    python benchmarks/bench_recommend.py [--devices 400] [--first 0]
 
 Checks per device: the printed wall is stable, alone and in the soft reference grasps; the labels of all grasps are
 right; cautions appear if and only if a margin is thin or a grasp is unstable; the printed range of B is stable and
@@ -10,7 +10,6 @@ contains the printed B; the stiffness of each improvement agrees with the recomm
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
 import sys
@@ -22,13 +21,13 @@ from typing import Any
 import numpy as np
 
 import zwidth
+from device_counts import build_parser, count_devices
 from zwidth.scenes.cautions import LEAST_DELAY_MARGIN, LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN, LONGEST_TIME_CONSTANT
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 
 from independent_scenes import closed_loop_matrix, continuous, flow, velocity_polynomials
 
-PRINTED = 10  # devices between two lines of totals
 POINTS = 40_000  # frequencies of an open-loop response
 NEAR = 0.02  # relative distance from a threshold within which no caution is checked
 PREFIXES = {"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6}
@@ -223,21 +222,5 @@ def read_range(line: str) -> tuple[float, float] | None:
     return float(low) * PREFIXES[high_prefix if low_prefix is None else low_prefix], float(high) * PREFIXES[high_prefix]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=400)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first device")
-    given = parser.parse_args()
-    total: Counter[str] = Counter()
-    for seed in range(given.first, given.first + given.count):
-        counts, failures = check_device(seed)
-        for failure in failures:
-            print(f"seed {seed}: {failure}", flush=True)
-        total.update(counts)
-        if (seed + 1) % PRINTED == 0:
-            print("; ".join(f"{name} {count}" for name, count in total.items()), flush=True)
-    print("".join(f"\n{name:<32}{count}" for name, count in total.items()))
-
-
 if __name__ == "__main__":
-    main()
+    count_devices(build_parser(__doc__, 400).parse_args(), check_device)

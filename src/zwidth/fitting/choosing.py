@@ -8,7 +8,8 @@ from itertools import islice
 
 import numpy as np
 
-from zwidth.fitting.hidden import HiddenPole, LagTest, PoleBank, find_hidden, list_likeliest, look_for_lags
+from zwidth.fitting.hidden import HiddenPole, PoleBank, detect_missing_pole, rank_poles
+from zwidth.fitting.hidden_lag import LagTest, score_lags
 from zwidth.fitting.output_error import CLOSELY, NEARLY, FittedModel, refine, settle
 from zwidth.fitting.structure import Recordings
 
@@ -27,7 +28,7 @@ _LAGS, _RATIO = (0.3, 1.5), 0.7
 # So many resonances are started from, their frequencies so far apart.
 _PARTED, _APART = 2, float(np.exp(0.2))
 
-_Looked = tuple[FittedModel, HiddenPole | None, list[PoleBank], LagTest | None]
+_Looked = tuple[FittedModel, HiddenPole | None, PoleBank | None, LagTest | None]
 
 
 def choose_structure(best: FittedModel) -> _Looked:
@@ -35,37 +36,37 @@ def choose_structure(best: FittedModel) -> _Looked:
     # Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
     way = max(float(np.ptp(log.position)) for log in best.model.logs)
     if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * way**2:
-        return best, None, [], None
-    rigid = best, pole, banks, lags = _look(best)
+        return best, None, None, None
+    rigid = best, pole, bank, lags = _look(best)
     rival = None
     for _ in range(_MOST):
         # A lag has no size of its own, and so is seen where a pole of any size is not.
-        late = lags is not None and lags.toward.max() ** 2 > 2.0 * np.log(best.count)
-        if rival is not None or (pole is None and not late):
+        late = lags is not None and lags.projection.max() ** 2 > 2.0 * np.log(best.count)
+        if bank is None or rival or (pole is None and not late):
             break
-        richer, rival = _grow(best, banks)
+        richer, rival = _grow(best, bank)
         if richer is None:
             break
-        best, pole, banks, lags = _look(richer)
+        best, pole, bank, lags = _look(richer)
     if best is rigid[0] or not (rival or (pole is None and best.excess <= ALIKE)):
         return rigid
     best = settle(best.model, best.theta)
     known = best.arrived and not best.inverse.open[: best.model.parts.stop].any()
-    return (best, rival or pole, banks, lags) if known else rigid
+    return (best, rival or pole, bank, lags) if known else rigid
 
 
 def _look(best: FittedModel) -> _Looked:
     """What the residuals show; of lags where they show no pole and the device has none."""
-    pole, banks = find_hidden(best)
-    return best, pole, banks, None if pole or best.model.lag else look_for_lags(best)
+    pole, bank = detect_missing_pole(best)
+    return best, pole, bank, None if pole or best.model.lag else score_lags(best)
 
 
-def _grow(best: FittedModel, banks: list[PoleBank]) -> tuple[FittedModel | None, HiddenPole | None]:
+def _grow(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, HiddenPole | None]:
     """The likeliest device with one part more, None where none is as likely as without; and what else it may be."""
     # A resonance that a log hardly shows looks like a lag, which has fewer numbers, but quite another K_max. So a lag
     # is doubted where the further numbers of a resonance explain more than chance does.
     begun: dict[tuple[int, int], tuple[float, Recordings, np.ndarray]] = {}
-    for lag, modes, start in _start(best, banks):
+    for lag, modes, start in _start(best, bank):
         model = replace(best.model, lag=lag, modes=modes).begin(_TOLD)
         theta, squares, _ = refine(model, start, (), _BEGUN, CLOSELY)
         if squares < begun.get((lag, modes), (np.inf,))[0]:
@@ -89,7 +90,7 @@ def _grow(best: FittedModel, banks: list[PoleBank]) -> tuple[FittedModel | None,
     return found, None
 
 
-def _start(best: FittedModel, banks: list[PoleBank]) -> Iterator[tuple[int, int, np.ndarray]]:
+def _start(best: FittedModel, bank: PoleBank) -> Iterator[tuple[int, int, np.ndarray]]:
     """Devices with one part more: the amplifier's order, how many modes, and theta to begin with."""
     model, theta = best.model, best.theta
     lag, modes, logs, first = model.lag, model.modes, len(model.logs), model.parts.stop
@@ -103,7 +104,7 @@ def _start(best: FittedModel, banks: list[PoleBank]) -> Iterator[tuple[int, int,
         yield 2, modes, np.r_[theta[:4], _RATIO, theta[4:]]
     speeds, states = np.split(theta[first:-2], [2 * logs])
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
-    ringing_banks = [bank for bank in banks if bank.ratio < 1.0]
-    for _, frequency, ratio in islice(list_likeliest(ringing_banks, _APART), _PARTED):
+    complex_poles = bank.select(bank.ratio < 1.0)
+    for _, frequency, ratio in islice(rank_poles(complex_poles, _APART), _PARTED):
         mode = [2.0 * np.pi * frequency, ratio, 0.0]
         yield lag, modes + 1, np.r_[theta[:first], mode, speeds, states, theta[-2:]]

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.fitting.device_estimate import RELIABILITY, UPPER, DeviceEstimate, find_stiffest
-from zwidth.fitting.hidden import HiddenLag, HiddenResonances
+from zwidth.fitting.hidden import HiddenResonances
+from zwidth.fitting.hidden_lag import HiddenLag
 from zwidth.fitting.safe_scene import limit_walls, round_scene
 from zwidth.fitting.safe_wall import SafeWall, find_safe_wall
 from zwidth.scenes.recommendation import Recommendation

@@ -1,15 +1,38 @@
-"""What follows the force in the residuals of a fit and no rigid device explains: lags and resonances.
+"""Detect actuator lags and structural resonances missing from a fitted model, and bound the undetected ones.
 
-A pole that the model lacks leaves in the positions the force, filtered by it. So the residuals are compared with the
-forces filtered by a bank of poles, each cleared of what the numbers of the model explain as well (a score test). That
-sees far less than the spread of the residuals shows, below the step of the encoder too. What it would not see may be
-in the device nevertheless: how large, at most, is the radius in which the true response lies.
+Model. The weighted residuals of a fit are ``e = r s + n``: s is the signature of one missing pole, r its size, and n
+noise of variance ``sigma^2``. The *signature* of a mode or lag is the part of its effect on the positions that no
+change of the fitted parameters ``theta`` reproduces. A mode of *mass ratio* r has the modal mass
+``m/(r sqrt(1 - zeta^2))``, with the mass m of the device and the damping ratio zeta of the mode; r is negative if
+actuator and sensor are on opposite sides of a node. A *unit mode* has mass ratio 1.
+
+The candidates are a bank of poles: a grid of frequencies for each of a few damping ratios, and real poles for actuator
+lags. No model with a candidate is fitted. Steps, explained in docs/theory/hidden.md:
+
+1. Score: the reduction of the sum of squares, in sigma^2, if the real and imaginary part of the force filtered by the
+   pole are added to the model (Rao 1948). It is a chi-square variable if no pole is missing.
+2. Detection: `detect_missing_pole` returns the pole of the highest score if it satisfies Schwarz's criterion (BIC,
+   Schwarz 1978) for white noise and for the autocorrelated errors of the encoder.
+3. Bound: without a detection, |r| is at most ``(sqrt(score) + 4)/size``, with ``size = |s|/sigma`` of the unit mode.
+   `bound_response` adds the largest such mode to the response of the device; that radius limits the safe walls.
+4. Averaging: with ``t = s'e/(sigma^2 size)``, the likelihood ratio of one more mode to none is
+   ``exp(t r size - (r size)^2/2)``. Its mean over the prior is the posterior odds; `sample_resonances` draws modes from
+   the posterior and computes K_max with each (Bayesian model averaging, Hoeting et al. 1999).
+5. Lags: `bound_lag` returns the longest first-order actuator lag that the data cannot distinguish from pure delay.
+
+Unless stated otherwise, times are in sampling periods, frequencies are relative to the sampling rate, and ``theta`` is
+the parameter vector of `fitting.structure.Recordings`.
+
+References:
+    Rao 1948, Proc. Cambridge Philos. Soc. 44, 50-57 (score test). Schwarz 1978, Annals of Statistics 6, 461-464
+    (criterion for further parameters). Hoeting, Madigan, Raftery, Volinsky 1999, Statistical Science 14, 382-417 (model
+    averaging).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -18,305 +41,331 @@ import numpy as np
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall
-from zwidth.fitting.structure import Recordings
-from zwidth.parts.actuator import Actuator
 from zwidth.parts.circle import circle
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.measured_curve import LEAST_DAMPING_RATIO
 from zwidth.scenes.scene import Scene
 
-# Frequencies of the bank over the sampling rate; damping ratios with the steps of their frequencies, the last one that
-# of a real pole. Resonances of the first two and all between are those that may hide.
-_LOWEST, _HIGHEST, _APART = 0.005, 0.49, {LEAST_DAMPING_RATIO: 1.01, 0.03: 1.06, 0.2: 1.06, 1.0: 1.06}
-_RINGING = 2
-# What the model explains of a filtered force but for this share is its own.
-_OWN = 1e-6
-# So many poles are tried, the likeliest first and so far apart: an encoder errs alike in neighboring samples, which may
-# look like one.
-_TRIED, _ELSEWHERE = 3, 1.1
-# So many of the first samples of each log are looked at, and so many numbers at once.
-_LOOKED, _AT_ONCE = 20_000, 400_000
-# A resonance may be larger than the residuals say by so many standard errors; these are those of frequencies so near.
-_SURELY, _NEAR = 4.0, 15
-# Of the response: its lowest line, how many there are below the bank, and by what its delay turns it between two lines,
-# of a band and where lines are drawn between them.
-_FIRST, _BELOW, _TURN, _LITTLE = 2e-4, 40, 0.3, 0.06
-# Resonances that a device is as likely to have as not: frequencies over the sampling rate; what they move beside the
-# whole mass, those beyond nodes less often; and how many of them are drawn.
-_MODES, _SHARES, _BEYOND_NODES, _DRAWN = (0.03, 0.4), np.geomspace(1.0 / 30.0, 1.0, 9), 0.3, 200
-# Lags that are looked for, in periods, as long as the delay and this at least.
-_SHORTEST, _LONGEST, _LONGEST_LAG, _LAGS = 0.03, 0.05, 3.0, 40
-# Beside a resonance, in half-widths; steps of theta's differences.
-_BESIDE, _STEP = np.sinh(np.linspace(-4.0, 4.0, 61)), 1e-6
+# The pole bank. Frequencies are relative to the sampling rate.
+MIN_FREQUENCY = 0.005
+MAX_FREQUENCY = 0.49  # just below the Nyquist frequency
+# Ratio of neighboring frequencies for each damping ratio; damping ratio 1.0 denotes real poles, i.e. actuator lags.
+FREQUENCY_SPACING = {LEAST_DAMPING_RATIO: 1.01, 0.03: 1.06, 0.2: 1.06, 1.0: 1.06}
+BOUNDED_RATIOS = (LEAST_DAMPING_RATIO, 0.03)  # damping ratios of the undetected modes that bound the response
+ABSORBED_NORM = 1e-6  # a filtered force is absorbed by the model if less than this share of its norm is left
 
+# Detection of a missing pole.
+N_CANDIDATES = 3  # highest scores that are tested with autocorrelated errors, because those errors can mimic one pole
+CANDIDATE_SPACING = 1.1  # least ratio of the frequencies of two candidates
+MAX_SAMPLES = 20_000  # leading samples inspected per log
+BATCH_SIZE = 400_000  # values per batch of filtered forces; bounds the memory
 
-class HiddenLag(NamedTuple):
-    """The longest lag of an amplifier that a log does not tell from a delay, both in s, and K_max with it in N/m."""
+# Upper bound of an undetected mode.
+BOUND_ERRORS = 4.0  # standard errors added to the observed amplitude
+N_NEIGHBORS = 15  # poles on each side from which the local standard error is estimated
 
-    time_constant: float
-    delay: float
-    stiffness_max: float
+# Frequency grid of the response, relative to the sampling rate.
+MIN_RESPONSE_FREQUENCY = 2e-4
+N_BELOW_BANK = 40  # frequencies below the pole bank
+BAND_PHASE_STEP = 0.3  # rad; most phase by the delay between two frequencies of the band
+INTERPOLATION_PHASE_STEP = 0.06  # rad; the same if the response is interpolated linearly
+RESONANCE_OFFSETS = np.sinh(np.linspace(-4.0, 4.0, 61))  # grid around a resonance, in half-widths
+DIFFERENCE_STEP = 1e-6  # relative step of finite differences in theta
+
+# Prior distribution of one more resonance.
+PRIOR_FREQUENCIES = (0.03, 0.4)  # relative to the sampling rate
+PRIOR_MASS_RATIOS = np.geomspace(1.0 / 30.0, 1.0, 9)  # magnitudes, equally likely
+NEGATIVE_PROBABILITY = 0.3  # of a negative mass ratio
+N_SAMPLES = 200  # samples of the posterior distribution
 
 
 class HiddenResonances(NamedTuple):
-    """How likely one resonance more is against none, and K_max with it over that without, for equally likely ones."""
+    """The posterior odds of one more resonance, and equally likely samples of the maximum stiffness with it."""
 
-    odds: float
-    stiffness_max: np.ndarray
+    odds: float  # one more resonance against none
+    stiffness_max: np.ndarray  # K_max with a sampled resonance, relative to K_max without
 
 
 class HiddenPole(NamedTuple):
-    """The pole that the residuals show: its frequency in turns a period, and whether it rings, as no lag does.
+    """A pole missing from the model according to the residuals; or a resonance that fits as well as the model's lag."""
 
-    Or one that explains as well as the lag ``instead`` of which it may be there.
-    """
-
-    frequency: float
-    rings: bool
-    instead: bool = False
+    frequency: float  # relative to the sampling rate
+    rings: bool  # complex pole (resonance); otherwise real (lag)
+    instead: bool = False  # alternative to the actuator lag of the model, which explains the log equally well
 
 
-@dataclass(frozen=True)
-class PoleBank:
-    """Poles of one damping ratio and what the residuals say of them, in standard errors of white noise."""
+class PoleBank(NamedTuple):
+    """Score test of the residuals for the candidate poles, along the first axis; standard errors are of white noise."""
 
-    ratio: float
-    frequency: np.ndarray
-    explained: np.ndarray  # squares of the residuals that each pole explains
-    whole: np.ndarray  # what a mode of each would leave that moves as the whole mass does
-    toward: np.ndarray  # how much of the residuals is such as that mode would leave
-    kindred: np.ndarray  # how many times as large its errors are, as kindred as the encoder's
-    absorbed: np.ndarray  # by how much it would move each number of theta
+    ratio: np.ndarray  # damping ratio of each pole, 1 for real poles
+    frequency: np.ndarray  # natural frequency
+    score: np.ndarray  # reduction of the sum of squares, in noise variances; chi-square for white noise alone
+    signature_size: np.ndarray  # norm of the signature of the unit mode, in standard errors
+    projection: np.ndarray  # residuals projected onto that signature, in standard errors
+    error_inflation: np.ndarray  # standard error under the encoder's autocorrelation over that of white noise; >= 1
+    absorbed: np.ndarray  # bias of the fitted parameters by the unit mode; a column per parameter
 
-    def bound_modes(self) -> np.ndarray:
-        """How much more than the whole mass a mode of each pole may move, at most."""
-        near = np.convolve(
-            np.pad(self.explained, _NEAR, "edge"), np.full(2 * _NEAR + 1, 1.0 / (2 * _NEAR + 1)), "valid"
-        )
+    def select(self, mask: np.ndarray) -> PoleBank:
+        """Return the poles of a mask."""
+        return PoleBank(*(field[mask] for field in self))
+
+    def bound_mass_ratios(self) -> np.ndarray:
+        """Return the largest mass ratio of an undetected mode, for each of the complex poles of one damping ratio."""
+        # The expected score of a complex pole is 2 for white noise. Therefore half the mean score of the neighboring
+        # poles is the local noise variance, relative to the assumed one.
+        width = 2 * N_NEIGHBORS + 1
+        mean_score = np.convolve(np.pad(self.score, N_NEIGHBORS, "edge"), np.full(width, 1.0 / width), "valid")
         with np.errstate(divide="ignore"):
-            return (np.sqrt(self.explained) + _SURELY * np.sqrt(np.maximum(0.5 * near, 1.0))) / self.whole
+            local_error = np.sqrt(np.maximum(0.5 * mean_score, 1.0))
+            return (np.sqrt(self.score) + BOUND_ERRORS * local_error) / self.signature_size
 
 
-def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
-    """Look for the pole whose filtered force explains most of the residuals; None where chance explains as much."""
-    # Schwarz's criterion with the numbers that the pole adds, two rates and two sizes; one of each of a real pole.
-    best = _glimpse(best)
-    basis, rest = best.inverse.basis, best.model.weigh(best.residuals)
-    rest = rest - basis @ (basis.T @ rest)
-    noise = best.variance * best.excess
-    banks = [_test(best, basis, rest, ratio, noise) for ratio in _APART]
-    total, chance = float(rest @ rest), 2.0 * np.log(best.count)
-    for share, frequency, ratio in islice(list_likeliest(banks, _ELSEWHERE), _TRIED):
-        explained = share * noise
-        cleared = _filter_forces(best, _lay_poles(ratio, np.array([frequency])))[..., 0].T
-        cleared, _ = np.linalg.qr(cleared - basis @ (basis.T @ cleared))
-        along = cleared.T @ rest
-        # In squares of standard errors, of errors as kindred as the encoder's and as the sums of neighbors are.
-        errors = best.noise.spread(best.model.weigh(cleared))
-        known = float(along @ np.linalg.solve(errors, along))
-        white = best.count * np.log(total / (total - explained)) if explained < total else np.inf
-        if min(known, white) > along.size * chance:
-            return HiddenPole(float(frequency), ratio < 1.0), banks
-    return None, banks
+def detect_missing_pole(fit: FittedModel) -> tuple[HiddenPole | None, PoleBank]:
+    """Search the residuals of a fit for a pole that the model lacks.
+
+    Args:
+        fit: A model at its least squares.
+
+    Returns:
+        The pole with the highest score that satisfies Schwarz's criterion (BIC), or None; and the scores of all poles.
+    """
+    fit = truncate_logs(fit)
+    basis, residuals = fit.inverse.basis, fit.model.weigh(fit.residuals)
+    residuals = residuals - basis @ (basis.T @ residuals)
+    noise_variance = fit.variance * fit.excess
+    bank = _score_poles(fit, basis, residuals, noise_variance)
+    squares = float(residuals @ residuals)
+    # Schwarz's criterion (BIC): each further parameter must reduce -2 log(likelihood) by log(count). A complex pole has
+    # two parameters and two amplitudes, a real pole one of each: two parameters per amplitude.
+    threshold_per_amplitude = 2.0 * np.log(fit.count)
+    for score, frequency, ratio in islice(rank_poles(bank, CANDIDATE_SPACING), N_CANDIDATES):
+        reduction = score * noise_variance
+        filtered = _filter_forces(fit, _build_poles(ratio, np.array([frequency])))[..., 0].T
+        directions, _ = np.linalg.qr(filtered - basis @ (basis.T @ filtered))
+        amplitudes = directions.T @ residuals
+        # The amplitudes are D^T W e, with directions D, symmetric weights W and errors e. Their covariance is therefore
+        # that of the unweighted errors along the columns of W D. The excess of block sums is not applied, because a
+        # missing pole itself raises it.
+        covariance = fit.noise.spread(fit.model.weigh(directions))
+        autocorrelated = float(amplitudes @ np.linalg.solve(covariance, amplitudes))
+        white = fit.count * np.log(squares / (squares - reduction)) if reduction < squares else np.inf
+        # Both noise models must reject the hypothesis that no pole is missing.
+        if min(autocorrelated, white) > amplitudes.size * threshold_per_amplitude:
+            return HiddenPole(float(frequency), ratio < 1.0), bank
+    return None, bank
 
 
-def list_likeliest(banks: list[PoleBank], apart: float) -> Iterator[tuple[float, float, float]]:
-    """What each pole explains, its frequency and damping ratio, the likeliest first, frequencies so far apart."""
-    found = [(e, f, bank.ratio) for bank in banks for e, f in zip(bank.explained, bank.frequency, strict=True)]
-    told: list[float] = []
-    for explained, frequency, ratio in sorted(found, reverse=True):
-        if all(max(frequency / other, other / frequency) >= apart for other in told):
-            told.append(frequency)
-            yield explained, frequency, ratio
+def rank_poles(bank: PoleBank, spacing: float) -> Iterator[tuple[float, float, float]]:
+    """Yield score, frequency and damping ratio of the poles by descending score.
+
+    Poles whose frequency is within a factor of ``spacing`` of one already yielded are skipped.
+    """
+    yielded: list[float] = []
+    for score, frequency, ratio in sorted(zip(bank.score, bank.frequency, bank.ratio, strict=True), reverse=True):
+        if all(max(frequency / other, other / frequency) >= spacing for other in yielded):
+            yielded.append(frequency)
+            yield score, frequency, ratio
 
 
-@dataclass(frozen=True)
-class LagTest:
-    """Lags of an amplifier in periods, in place of as much delay, and what the residuals say of them."""
-
-    lag: np.ndarray
-    whole: np.ndarray  # what each would leave, in standard errors
-    toward: np.ndarray  # what of that is left
-    theta: np.ndarray  # the device's numbers with it, a column each
-
-
-def look_for_lags(best: FittedModel) -> LagTest:
-    """Compare the residuals with what lags of first order would leave that were taken for a delay."""
-    best = _glimpse(best)
-    lags = np.geomspace(_SHORTEST, max(_LONGEST, min(_LONGEST_LAG, best.theta[2])), _LAGS)
-    # Of the mass alone: what resonances add turns hardly.
-    (g, delta, d), model = best.theta[:3], Recordings(best.model.logs, lag=1)
-    thetas = [np.pad([g, delta, d - lag, lag], (0, model.size - 4)) for lag in lags]
-    columns = [[model.add_parts(theta, k).position for k in range(len(model.logs))] for theta in thetas]
-    columns = best.model.weigh(np.stack([np.concatenate(column) for column in columns], -1))
-    absorbed = best.inverse.matrix @ columns
-    left, rest = columns - best.columns[0] @ absorbed, best.model.weigh(best.residuals)
-    whole = np.linalg.norm(left, axis=0)
-    # Of errors as kindred as the encoder's, where these are larger.
-    kindred = best.noise.spread_each(best.model.weigh(left)) / whole**2
-    error = np.sqrt(np.maximum(kindred, best.variance) * best.excess)
-    moved = best.theta[:, None] - absorbed / best.columns[1][:, None]
-    moved[2] -= lags
-    return LagTest(lags, whole / error, left.T @ rest / whole / error, moved)
+def bound_response(fit: FittedModel, scene: Scene, bank: PoleBank) -> MeasuredDevice:
+    """Return the response of the fitted device, with the largest change by an undetected mode as its deviation."""
+    banks = [bank.select(bank.ratio == ratio) for ratio in BOUNDED_RATIOS]
+    grid = np.unique(np.concatenate([_build_frequency_grid(scene, BAND_PHASE_STEP), banks[0].frequency]))
+    response, derivatives = _evaluate_response(fit, scene.timing.period, grid)
+    deviation = np.zeros(grid.size)
+    for poles in banks:
+        # The mode has also biased the fitted parameters; remove that bias.
+        bias = poles.absorbed[:, : fit.model.parts.stop] @ derivatives.T
+        change = _evaluate_unit_modes(fit, grid, poles.frequency[:, None], poles.ratio[:, None]) - bias
+        deviation = np.maximum(deviation, np.max(np.abs(change) * poles.bound_mass_ratios()[:, None], 0))
+    return MeasuredDevice(grid / scene.timing.period, response, deviation, scene.unit_system.rotary)
 
 
-def bound_lag(best: FittedModel, test: LagTest | None, scene: Scene, reach: float) -> HiddenLag | None:
-    """The longest lag, a first-order one of the amplifier, with which the log goes as well; None where it shows all."""
-    # The delay is less by the lag and has to remain.
-    if test is None:
-        return None
-    period = scene.timing.period
-    may = (test.whole - test.toward <= reach) & (test.theta[1] >= 0) & (test.theta[2] >= 0)
-    count = int(np.argmin(np.append(may, False)))
-    if not count:
-        return None
-    lag = float(test.lag[count - 1] * period)
-    # What a lag moves of resonances is small, and may be more than there is.
-    theta = np.clip(test.theta[:, count - 1], *best.model.bounds())
-    there = best.model.normalize(theta, period).to_scene(period, scene.velocity, scene.unit_system)
-    there = replace(there, device=replace(there.device, actuator=Actuator(time_constant=lag)))
-    return HiddenLag(lag, float(there.timing.delay), float(there.max_stiffness().stiffness))
+def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenResonances | None:
+    """Return the posterior odds of one more resonance, and samples of the maximum stiffness with it.
+
+    Args:
+        fit: The fitted model.
+        scene: The fitted device in its loop.
+        bank: Scores of all poles.
+
+    Returns:
+        Odds and samples, for prior odds of one; None if no wall with virtual damping B >= 0 is stable.
+    """
+    odds, modes, mass_ratio = _draw_modes(bank.select(bank.ratio < 1.0))
+    # The first sample, with mass ratio 0, is the device without a further mode; its K_max is the reference.
+    frequency, damping_ratio = modes.frequency[:, None], modes.ratio[:, None]
+    # A grid common to all samples, and for each sample a fine grid around its own resonance.
+    common = _build_frequency_grid(scene, INTERPOLATION_PHASE_STEP)[None]
+    local = frequency * (1.0 + damping_ratio * RESONANCE_OFFSETS[::2])
+    local = np.clip(local, MIN_RESPONSE_FREQUENCY, MAX_FREQUENCY)
+    responses, period = [], scene.timing.period
+    for grid in (common, local):
+        response, derivatives = _evaluate_response(fit, period, grid)
+        # The mode has also biased the fitted parameters; remove that bias.
+        bias = (derivatives @ modes.absorbed[:, : fit.model.parts.stop, None])[..., 0]
+        change = _evaluate_unit_modes(fit, grid, frequency, damping_ratio) - bias
+        responses.append(response + mass_ratio[:, None] * change)
+    grid = np.concatenate([np.broadcast_to(common, (len(local), common.size)), local], -1)
+    order = np.argsort(grid, -1)
+    grid, response = (np.take_along_axis(each, order, -1) for each in (grid, np.concatenate(responses, -1)))
+    velocity = scene.velocity.estimate(period).jet(circle(2.0 * np.pi * grid)).value
+    reference, *stiffness = DeviceRows(-1.0 / response, velocity / period).stiffest()
+    return HiddenResonances(odds, np.array(stiffness) / reference) if reference > 0 else None
 
 
-def respond_as_fitted(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> MeasuredDevice:
-    """The response of a fitted device, with the radius by which a resonance may move it that the log does not show."""
-    # What such a resonance moves the other numbers by, they have been found with.
-    lines = np.unique(np.concatenate([_lay_lines(scene, _TURN), banks[0].frequency]))
-    response, slopes = _respond(best, scene.timing.period, lines)
-    radius = np.zeros(lines.size)
-    for bank in banks[:_RINGING]:
-        moved = (
-            _add_modes(best, lines, bank.frequency[:, None], bank.ratio)
-            - bank.absorbed[: best.model.parts.stop].T @ slopes.T
-        )
-        radius = np.maximum(radius, np.max(np.abs(moved) * bank.bound_modes()[:, None], 0))
-    return MeasuredDevice(lines / scene.timing.period, response, radius, scene.unit_system.rotary)
+def _draw_modes(bank: PoleBank) -> tuple[float, PoleBank, np.ndarray]:
+    """Draw modes from the posterior distribution on the grid of poles and mass ratios.
+
+    The prior is one mode or none, with probability 1/2 each; equally likely damping ratios; equally likely poles of a
+    damping ratio within `PRIOR_FREQUENCIES`; and the mass ratios `PRIOR_MASS_RATIOS` with either sign.
+
+    Returns:
+        The posterior odds of one mode against none; and for each of `N_SAMPLES` equally likely samples, preceded by one
+        with mass ratio 0, its pole and its mass ratio.
+    """
+    in_range = (bank.frequency >= PRIOR_FREQUENCIES[0]) & (bank.frequency <= PRIOR_FREQUENCIES[1])
+    ratios, which = np.unique(bank.ratio, return_inverse=True)
+    pole_prior = in_range / np.bincount(which, in_range)[which] / ratios.size
+    sign_prior = [1.0 - NEGATIVE_PROBABILITY, NEGATIVE_PROBABILITY]
+    mass_ratio_prior = np.repeat(sign_prior, PRIOR_MASS_RATIOS.size) / PRIOR_MASS_RATIOS.size
+    mass_ratios = np.concatenate([PRIOR_MASS_RATIOS, -PRIOR_MASS_RATIOS])
+    # In standard errors with autocorrelation the projection is normal with variance 1; a mode shifts its mean from 0.
+    shift = np.outer(bank.signature_size / bank.error_inflation, mass_ratios)
+    likelihood_ratio = np.exp((bank.projection / bank.error_inflation)[:, None] * shift - 0.5 * shift**2)
+    cumulative = np.cumsum(np.outer(pole_prior, mass_ratio_prior) * likelihood_ratio)
+    # Systematic sampling: equidistant quantiles of the discrete distribution.
+    sampled = np.searchsorted(cumulative, cumulative[-1] * (np.arange(N_SAMPLES) + 0.5) / N_SAMPLES)
+    poles, mass_ratio = np.divmod(sampled, mass_ratios.size)
+    return float(cumulative[-1]), bank.select(np.append(poles[0], poles)), np.append(0.0, mass_ratios[mass_ratio])
 
 
-def weigh_resonances(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> HiddenResonances | None:
-    """What one resonance more may make of K_max, as likely as none before the log; None where no damper helps."""
-    banks, period = banks[:-1], scene.timing.period
-    odds, drawn, share = _draw_modes(banks)
-    # The first one is none, to compare with.
-    which, share = np.append(drawn[0], drawn), np.append(0.0, share)[:, None]
-    poles = [[bank.frequency, np.full_like(bank.frequency, bank.ratio)] for bank in banks]
-    frequency, ratio = np.concatenate(poles, 1)[:, which, None]
-    absorbed = np.concatenate([bank.absorbed[: best.model.parts.stop] for bank in banks], 1)[:, which].T[..., None]
-    # Every resonance has lines of its own, within its width.
-    beside = np.clip(frequency * (1.0 + ratio * _BESIDE[::2]), _FIRST, _HIGHEST)
-    all_lines = _lay_lines(scene, _LITTLE)[None], beside
-    responses, count = [], len(which)
-    for lines in all_lines:
-        response, slopes = _respond(best, period, lines)
-        responses.append(response + share * (_add_modes(best, lines, frequency, ratio) - (slopes @ absorbed)[..., 0]))
-    lines = np.concatenate([np.broadcast_to(all_lines[0], (count, all_lines[0].size)), all_lines[1]], -1)
-    order = np.argsort(lines, -1)
-    lines, response = (np.take_along_axis(each, order, -1) for each in (lines, np.concatenate(responses, -1)))
-    velocity = scene.velocity.estimate(period).jet(circle(2.0 * np.pi * lines)).value
-    own, *others = DeviceRows(-1.0 / response, velocity / period).stiffest()
-    return HiddenResonances(odds, np.array(others) / own) if own > 0 else None
+def _build_frequency_grid(scene: Scene, phase_step: float) -> np.ndarray:
+    """Build a frequency grid for the response of the fitted device.
+
+    The delay changes the phase by at most ``phase_step`` between neighboring frequencies. The grid is logarithmic below
+    the pole bank and has further points around the resonances of the device.
+    """
+    count = 2.0 * np.pi * MAX_FREQUENCY * (1.0 + scene.d) / phase_step
+    even = np.arange(1.0, count) * phase_step / (2.0 * np.pi * (1.0 + scene.d))
+    below = np.geomspace(MIN_RESPONSE_FREQUENCY, MIN_FREQUENCY, N_BELOW_BANK)[:-1]
+    around_modes = [
+        mode.frequency * scene.timing.period * (1.0 + mode.damping_ratio * RESONANCE_OFFSETS)
+        for mode in scene.device.modes
+    ]
+    grid = np.concatenate([below, even[even > MIN_FREQUENCY], *around_modes])
+    return grid[(grid >= MIN_RESPONSE_FREQUENCY) & (grid <= MAX_FREQUENCY)]
 
 
-def _lay_lines(scene: Scene, turn: float) -> np.ndarray:
-    """Lines over the sampling rate between which the delay turns a fitted response by no more."""
-    even = np.arange(1.0, 2.0 * np.pi * _HIGHEST * (1.0 + scene.d) / turn) * turn / (2.0 * np.pi * (1.0 + scene.d))
-    below = np.geomspace(_FIRST, _LOWEST, _BELOW)[:-1]
-    widths = [(mode.frequency * scene.timing.period, mode.damping_ratio * _BESIDE) for mode in scene.device.modes]
-    lines = np.concatenate([below, even[even > _LOWEST], *[middle * (1.0 + width) for middle, width in widths]])
-    return lines[(lines >= _FIRST) & (lines <= _HIGHEST)]
+def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """Return the contribution of unit modes to the frequency response."""
+    (g, delta, d), mode = fit.theta[:3], (2.0 * np.pi * frequency, ratio, np.sqrt(1.0 - ratio**2))
+    return g * RequiredWall(delta, d, (), [mode]).add(circle(2.0 * np.pi * grid)).value
 
 
-def _add_modes(best: FittedModel, lines: np.ndarray, frequency: np.ndarray, ratio: Any) -> np.ndarray:
-    """What modes that move as the whole mass does add to its response."""
-    (g, delta, d), mode = best.theta[:3], (2.0 * np.pi * frequency, ratio, np.sqrt(1.0 - ratio**2))
-    return g * RequiredWall(delta, d, (), [mode]).add(circle(2.0 * np.pi * lines)).value
+def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the response of the fitted device, and its derivatives in the device's parameters along the last axis."""
+    points = circle(2.0 * np.pi * grid.ravel())
+
+    def evaluate(theta: np.ndarray) -> np.ndarray:
+        wall = RequiredWall(*fit.model.normalize(theta, period)[1:])
+        return (-theta[0] / wall.jet(points).value).reshape(grid.shape)
+
+    count, response = fit.model.parts.stop, evaluate(fit.theta)
+    steps = np.abs(fit.theta[:count])
+    steps[1:3] = np.maximum(steps[1:3], 1e-3)  # damping and delay may be 0 and need a least step
+    steps *= DIFFERENCE_STEP
+    units = np.eye(count, fit.theta.size)
+    shifted = [evaluate(fit.theta + step * unit) for step, unit in zip(steps, units, strict=True)]
+    return response, (np.stack(shifted, -1) - response[..., None]) / steps
 
 
-def _draw_modes(banks: list[PoleBank]) -> tuple[float, np.ndarray, np.ndarray]:
-    """How likely a mode is against none after the log, if it was as likely before; equally likely poles and shares."""
-    inside = [(bank.frequency >= _MODES[0]) & (bank.frequency <= _MODES[1]) for bank in banks]
-    before = np.concatenate([each / each.sum() for each in inside]) / len(banks)
-    chance = np.repeat([1.0 - _BEYOND_NODES, _BEYOND_NODES], _SHARES.size) / _SHARES.size
-    whole, toward = (
-        np.concatenate([getattr(bank, name) / bank.kindred for bank in banks]) for name in ("whole", "toward")
-    )
-    shares = np.concatenate([_SHARES, -_SHARES])
-    left = np.outer(whole, shares)
-    reached = np.cumsum(np.outer(before, chance) * np.exp(toward[:, None] * left - 0.5 * left**2))
-    drawn = np.searchsorted(reached, reached[-1] * (np.arange(_DRAWN) + 0.5) / _DRAWN)
-    return float(reached[-1]), drawn // shares.size, shares[drawn % shares.size]
-
-
-def _respond(best: FittedModel, period: float, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The response at lines, and its derivatives in the first numbers of theta, along the last axis."""
-    at = circle(2.0 * np.pi * lines.ravel())
-
-    def answer(theta: np.ndarray) -> np.ndarray:
-        wall = RequiredWall(*best.model.normalize(theta, period)[1:])
-        return (-theta[0] / wall.jet(at).value).reshape(lines.shape)
-
-    count, response = best.model.parts.stop, answer(best.theta)
-    steps = _STEP * np.maximum(np.abs(best.theta[:count]), [1e-3 if k in (1, 2) else 0.0 for k in range(count)])
-    moved = [answer(best.theta + step * unit) for step, unit in zip(steps, np.eye(count, best.theta.size), strict=True)]
-    return response, (np.stack(moved, -1) - response[..., None]) / steps
-
-
-def _glimpse(best: FittedModel) -> FittedModel:
-    """The same device on the beginnings of its logs, where these are long."""
-    if max(log.position.size for log in best.model.logs) <= _LOOKED:
-        return best
-    part = replace(best, model=best.model.begin(_LOOKED), rivals=())
+def truncate_logs(fit: FittedModel) -> FittedModel:
+    """Return the fit restricted to the first `MAX_SAMPLES` positions of each log."""
+    if max(log.position.size for log in fit.model.logs) <= MAX_SAMPLES:
+        return fit
+    part = replace(fit, model=fit.model.begin(MAX_SAMPLES), rivals=())
     part = replace(part, squares=float(part.residuals @ part.residuals))
-    return replace(part, model=replace(part.model, noise=part.noise)) if best.model.noise is not None else part
+    return replace(part, model=replace(part.model, noise=part.noise)) if fit.model.noise is not None else part
 
 
-def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, noise: float) -> PoleBank:
-    """Compare the residuals with the forces filtered by poles of one damping ratio."""
-    # A mode of each pole that moves as the whole mass does: what the pole makes of the forces, and of the last one,
-    # which moves it for less than a period.
-    frequency = np.geomspace(_LOWEST, _HIGHEST, 1 + round(np.log(_HIGHEST / _LOWEST) / np.log(_APART[ratio])))
-    bank = PoleBank(
-        ratio, frequency, *np.zeros((4, frequency.size)), absorbed=np.zeros((best.theta.size, frequency.size))
-    )
-    poles = _lay_poles(ratio, frequency)
-    unit, late = best.theta[0] / np.abs(poles) / poles, np.exp(-(best.theta[2] % 1.0) * poles)
-    size, late = unit * np.expm1(poles) * late, (unit * (1.0 - late)).imag
-    last = _filter_forces(best, np.array([-np.inf]))[0]
-    last_shares = basis.T @ last
-    last_cleared, numbers = last - basis @ last_shares, best.inverse.matrix @ basis / best.columns[1][:, None]
-    modes = np.array([size.real] if ratio == 1.0 else [size.imag, size.real])
-    count = max(1, _AT_ONCE // (2 * rest.size))
-    for first in range(0, frequency.size, count):
-        part = slice(first, first + count)
-        columns, mode = _filter_forces(best, poles[part]), modes[:, part]
-        shares = basis.T @ columns
-        cleared = columns - basis @ shares
-        own = np.linalg.norm(cleared, axis=1).min(0) <= _OWN * np.linalg.norm(columns, axis=1).max(0)
-        square = np.array([[np.sum(one * other, 0) for other in cleared] for one in cleared]).T
-        along, by = (rest @ cleared).T, np.linalg.pinv(square, rcond=_OWN**2, hermitian=True)
-        bank.explained[part] = np.where(own, 0.0, np.einsum("ki,kij,kj->k", along, by, along)) / noise
-        left = np.sum(cleared * mode[:, None], 0) - last_cleared * late[part]
-        size = np.linalg.norm(left, axis=0)
-        bank.whole[part], size = size / np.sqrt(noise), np.where(own | (size == 0), np.inf, size)
-        bank.toward[part] = rest @ left / size / np.sqrt(noise)
-        errors = best.noise.spread_each(best.model.weigh(left)) * best.excess
-        bank.kindred[part] = np.sqrt(np.maximum(errors / size**2 / noise, 1.0))
-        bank.absorbed[:, part] = numbers @ (np.sum(shares * mode[:, None], 0) - last_shares * late[part])
-    return bank
+def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noise_variance: float) -> PoleBank:
+    """Compute the score test of all candidate poles.
+
+    Args:
+        fit: The fitted model.
+        basis: Orthonormal basis of the directions that the parameters absorb.
+        residuals: Weighted residuals, orthogonal to ``basis``.
+        noise_variance: Variance of white noise.
+    """
+    # The pole -inf passes the force of the last period only.
+    last = _filter_forces(fit, np.array([-np.inf]))[0]
+    last_in_basis = basis.T @ last
+    last_outside = last - basis @ last_in_basis
+    basis_to_theta = fit.inverse.matrix @ basis / fit.columns[1][:, None]
+    batch_size = max(1, BATCH_SIZE // (2 * residuals.size))
+    batches = []
+    for ratio, spacing in FREQUENCY_SPACING.items():
+        count = 1 + round(np.log(MAX_FREQUENCY / MIN_FREQUENCY) / np.log(spacing))
+        frequencies = np.geomspace(MIN_FREQUENCY, MAX_FREQUENCY, count)
+        for frequency in np.split(frequencies, range(batch_size, count, batch_size)):
+            poles = _build_poles(ratio, frequency)
+            filtered, (gain, last_gain) = _filter_forces(fit, poles), _expand_unit_modes(fit, poles)
+            in_basis = basis.T @ filtered
+            outside = filtered - basis @ in_basis
+            remaining = np.linalg.norm(outside, axis=1).min(0)
+            is_absorbed = remaining <= ABSORBED_NORM * np.linalg.norm(filtered, axis=1).max(0)
+            # Least squares of the residuals by the real and imaginary part of each filtered force.
+            gram = np.array([[np.sum(one * other, 0) for other in outside] for one in outside]).T
+            inner, inverse = (residuals @ outside).T, np.linalg.pinv(gram, rcond=ABSORBED_NORM**2, hermitian=True)
+            reduction = np.where(is_absorbed, 0.0, np.einsum("ki,kij,kj->k", inner, inverse, inner))
+            # The signature of the unit mode. For absorbed poles an infinite norm makes the projection 0 and the error
+            # inflation 1.
+            signature = np.sum(outside * gain[:, None], 0) - last_outside * last_gain
+            norm = np.linalg.norm(signature, axis=0)
+            size, norm = norm / np.sqrt(noise_variance), np.where(is_absorbed | (norm == 0), np.inf, norm)
+            projection = residuals @ signature / norm / np.sqrt(noise_variance)
+            variance = fit.noise.spread_each(fit.model.weigh(signature)) * fit.excess
+            inflation = np.sqrt(np.maximum(variance / norm**2 / noise_variance, 1.0))
+            absorbed = basis_to_theta @ (np.sum(in_basis * gain[:, None], 0) - last_in_basis * last_gain)
+            scores = reduction / noise_variance, size, projection, inflation, absorbed.T
+            batches.append(PoleBank(np.full_like(frequency, ratio), frequency, *scores))
+    return PoleBank(*map(np.concatenate, zip(*batches, strict=True)))
 
 
-def _lay_poles(ratio: float, frequency: np.ndarray) -> Any:
-    """Poles of a damping ratio, real ones as such."""
+def _expand_unit_modes(fit: FittedModel, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Expand the position of each unit mode in the filtered forces of `_filter_forces`.
+
+    A held force that has acted for a whole period contributes ``(e^p - 1) e^(-f p)/p`` times the filtered force, with f
+    the fractional part of the delay. The latest force has acted for 1 - f periods only, which subtracts
+    ``(1 - e^(-f p))/p`` times that force. The position is the imaginary part, multiplied by g/|p|.
+
+    Returns:
+        The gains of the real and the imaginary part of the filtered force, a row each; and the gain of the latest
+        force, to be subtracted. They are 0 for real poles, of which only the score is used.
+    """
+    unit, held = fit.theta[0] / np.abs(poles) / poles, np.exp(-(fit.theta[2] % 1.0) * poles)
+    gain = unit * np.expm1(poles) * held
+    # Im(gain (x + j y)) = Im(gain) x + Re(gain) y.
+    return np.array([gain.imag, gain.real] if np.iscomplexobj(poles) else [gain.imag]), (unit * (1.0 - held)).imag
+
+
+def _build_poles(ratio: float, frequency: np.ndarray) -> Any:
+    """Return the poles s T of one damping ratio; they are real for damping ratio 1."""
     return 2.0 * np.pi * frequency * (-1.0 if ratio == 1.0 else complex(-ratio, np.sqrt(1.0 - ratio**2)))
 
 
-def _filter_forces(best: FittedModel, poles: np.ndarray) -> np.ndarray:
-    """What poles make of all forces, at the positions, a column each; imaginary parts behind the real ones."""
-    whole, logs = int(best.theta[2]), best.model.logs
-    found = [
-        [recur(turn, np.append(0.0, log.force[:-1]))[log.skip - whole :][: log.position.size] for log in logs]
-        for turn in np.exp(poles).tolist()
+def _filter_forces(fit: FittedModel, poles: np.ndarray) -> np.ndarray:
+    """Filter the forces of all logs by each pole, delayed by the integer part of the delay, and weight the samples.
+
+    Returns:
+        An array of shape (parts, samples, poles): the real and, for complex poles, the imaginary part.
+    """
+    n, logs = int(fit.theta[2]), fit.model.logs
+    filtered = [
+        [recur(decay, np.append(0.0, log.force[:-1]))[log.skip - n :][: log.position.size] for log in logs]
+        for decay in np.exp(poles).tolist()
     ]
-    late: Any = np.array([np.concatenate(each) for each in found])
-    parts = [late.real, late.imag] if np.iscomplexobj(late) else [late]
-    return np.array([best.model.weigh(part.T) for part in parts])
+    joined: Any = np.array([np.concatenate(each) for each in filtered])
+    parts = [joined.real, joined.imag] if np.iscomplexobj(joined) else [joined]
+    return np.array([fit.model.weigh(part.T) for part in parts])

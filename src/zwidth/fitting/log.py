@@ -11,7 +11,8 @@ from zwidth.fitting.choosing import ALIKE, EXACT, choose_structure
 from zwidth.fitting.device_estimate import differentiate, reach_of
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, doubt_period
 from zwidth.fitting.encoder import fits_steps
-from zwidth.fitting.hidden import HiddenPole, bound_lag, respond_as_fitted, weigh_resonances
+from zwidth.fitting.hidden import HiddenPole, bound_response, sample_resonances
+from zwidth.fitting.hidden_lag import bound_lag
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
 from zwidth.fitting.recordings import ReadLogs, find_even, find_stretches, read_logs
@@ -150,10 +151,11 @@ def _fit(
     )
     doubts = [doubt for log in logs for doubt in find_stretches(log, system)]
     steps, odd = _list_steps(resolution, read, system)
-    for step in steps:
-        best, pole, banks, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
-        if best.variance > (_FINER * step) ** 2 / 12.0:
-            break
+    step, *finer = steps
+    best, pole, bank, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
+    while finer and best.variance <= (_FINER * step) ** 2 / 12.0:
+        step = finer.pop(0)
+        best, pole, bank, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
     model, theta = best.model, best.theta
     _refuse_unmoved(best, period, system)
     if best.inverse.open[:3].any():
@@ -167,7 +169,7 @@ def _fit(
     late = wavers * period * by_period
     covariance = by_theta @ best.covariance[known, known] @ by_theta.T + np.outer(late, late)
     freedom = max(1, best.count - theta.size)
-    unexplained = _find_unexplained(best, pole, period, system) if banks else []
+    unexplained = _find_unexplained(best, pole, period, system) if bank else []
     doubts = odd + doubts + _doubt(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     # The device that bears K_max is another one then.
@@ -180,8 +182,8 @@ def _fit(
     motions = _place(best, logs, places, stretches, skip, period)
     offset, friction = (_in_newton(best, k) for k in (-2, -1))
     shown: dict[str, Any] = {}
-    if banks and not unexplained:
-        shown = {"response": respond_as_fitted(best, scene, banks), "hidden": weigh_resonances(best, scene, banks)}
+    if bank and not unexplained:
+        shown = {"response": bound_response(best, scene, bank), "hidden": sample_resonances(best, scene, bank)}
         shown |= {"lag": bound_lag(best, lags, scene, reach_of(freedom))}
     return DeviceFit(
         nominal=scene,

@@ -199,7 +199,7 @@ def test_rounding_decides_nothing_where_a_log_has_one_push(seed):
 
 
 def test_long_logs_are_looked_at_in_part(monkeypatch):
-    monkeypatch.setattr("zwidth.fitting.hidden._LOOKED", 2000)
+    monkeypatch.setattr("zwidth.fitting.hidden.MAX_SAMPLES", 2000)
     rng = np.random.default_rng(4)
     force = 3 * np.repeat(rng.choice([-1.0, 1.0], 100), 25)
     position = OtherDevice.of(OTHERS["two resonances"]).play(force) + 1e-5 * rng.standard_normal(force.size)

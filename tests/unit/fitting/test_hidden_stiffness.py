@@ -8,7 +8,7 @@ from measured_devices import PERIOD, TrueDevice
 
 import zwidth
 from zwidth.fitting.choosing import choose_structure
-from zwidth.fitting.hidden import HiddenResonances, weigh_resonances
+from zwidth.fitting.hidden import HiddenResonances, sample_resonances
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import fit_model
 from zwidth.fitting.required_wall import DeviceRows
@@ -47,21 +47,21 @@ def play(modes, encoder, seed=0, count=2000):
 def test_what_a_resonance_makes_of_the_stiffest_wall_is_that_of_the_scene_with_it(monkeypatch):
     _, force, position = play((), 1e-4)
     best = fit_model(Recordings((Recording(force, position[SKIP:], SKIP),), resolution=1e-4))
-    best, _, banks, _ = choose_structure(best)
+    best, _, bank, _ = choose_structure(best)
     velocity = zwidth.BackwardDifference()
     scene = best.model.normalize(best.theta, PERIOD).to_scene(PERIOD, velocity)
-    share, places = 0.05, [(0, 300), (0, 360), (1, 45), (2, 50)]
-    ends = np.cumsum([0, *(bank.frequency.size for bank in banks)])
-    rows = np.array([ends[k] + j for k, j in places])
-    monkeypatch.setattr("zwidth.fitting.hidden._draw_modes", lambda _: (1.0, rows, np.full(len(rows), share)))
-    found = weigh_resonances(best, scene, banks)
+    assert bank is not None
+    share, rows = 0.05, [300, 360, *(np.flatnonzero(bank.ratio == ratio)[k] for ratio, k in ((0.03, 45), (0.2, 50)))]
+    drawn = bank.select(np.array([rows[0], *rows])), share * np.array([0.0, 1.0, 1.0, 1.0, 1.0])
+    monkeypatch.setattr("zwidth.fitting.hidden._draw_modes", lambda _: (1.0, *drawn))
+    found = sample_resonances(best, scene, bank)
     assert found is not None
     ratios = found.stiffness_max
-    for ratio, (k, j) in zip(ratios, places, strict=True):
-        # The other numbers move as the log asks with such a resonance in it.
-        theta = best.theta - share * np.append(banks[k].absorbed[:3, j], np.zeros(4))
+    for ratio, row in zip(ratios, rows, strict=True):
+        # Correct the other parameters for the bias by the resonance.
+        theta = best.theta - share * np.append(bank.absorbed[row, :3], np.zeros(4))
         moved = best.model.normalize(theta, PERIOD).to_scene(PERIOD, velocity)
-        mode = zwidth.Mode(banks[k].frequency[j] / PERIOD, banks[k].ratio, scene.device.mass / share)
+        mode = zwidth.Mode(bank.frequency[row] / PERIOD, bank.ratio[row], scene.device.mass / share)
         there = replace(moved, device=replace(moved.device, modes=(mode,)))
         exact = there.max_stiffness(negative_damping=False).stiffness / scene.max_stiffness().stiffness
         assert ratio == pytest.approx(float(exact), rel=0.01)
