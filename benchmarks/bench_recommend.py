@@ -66,6 +66,8 @@ def draw_wishes(random: np.random.Generator) -> dict[str, Any]:
         {"gain_margin": float(random.uniform(1.1, 3))},
         {"phase_margin": 40.0, "gain_margin": 2.5},
         {"passive": True},
+        {"grasps": "all"},
+        {"stiffness_fraction": 0.75, "grasps": "all"},
     ]
     return wishes[random.integers(len(wishes))]
 
@@ -184,6 +186,8 @@ def check_device(seed: int) -> tuple[Counter[str], list[str]]:
     soft = all(stable for name, stable in judge_grasps(scene, K, B).items() if name.startswith("soft"))
     if not wishes:
         count("stable in soft hands", soft)
+    if wishes.get("grasps") == "all":
+        count("stable in all hands", all(judge_grasps(scene, K, B).values()))
     held = any("in the hand" in each for each in found.cautions)
     count("cautions of hands", held == (not all(grasps.values())))
     thin, printed = judge_thin(scene, found.stiffness, found.virtual_damping), len(found.cautions) > held
@@ -205,11 +209,18 @@ def check_device(seed: int) -> tuple[Counter[str], list[str]]:
 
 
 def check_remedy(caution: str, scene: zwidth.Scene, count: Any) -> None:
-    """Count the wall that a caution proposes as stable in all grasps."""
-    wall = re.search(r"K = (\S+) (k?)N/m, B = (\S+) N s/m is stable in all", caution)
-    if wall is not None:
-        K, B = float(wall[1]) * (1e3 if wall[2] else 1.0), float(wall[3])
-        count("walls of cautions", all(judge_grasps(scene, K, B).values()) and find_radius(scene, K, B) < 1, caution)
+    """Count the wall that a caution proposes as stable in all grasps, or as one without thin margins."""
+    wall = re.search(r": K = (\S+) (\S*?)N(?:/m| m/rad).*?, B = (\S+) (\S*?)N (?:s/m|m s/rad) \(", caution)
+    if wall is None:
+        count("cautions with a remedy", False, caution)
+        return
+    count("cautions with a remedy", True)
+    K, B = float(wall[1]) * PREFIXES[wall[2]], float(wall[3]) * PREFIXES[wall[4]]
+    stable = find_radius(scene, K, B) < 1
+    if "in the hand" in caution:
+        count("walls of cautions of hands", stable and all(judge_grasps(scene, K, B).values()), caution)
+    elif (thin := judge_thin(scene, K, B)) is not None:
+        count("walls of cautions of margins", stable and not thin, caution)
 
 
 def read_range(line: str) -> tuple[float, float] | None:

@@ -22,7 +22,6 @@ from methods.clock import time_calls
 from zwidth.arrays import evaluate
 from zwidth.arrays.held_mass import ANY
 from zwidth.loops.rigid import (
-    certified_filter,
     circle,
     crossover,
     exact_points,
@@ -72,7 +71,7 @@ def compiled(kernel: Callable[..., Any], options: dict[str, Any] | None = None, 
 @contextmanager
 def replaced(names: dict[str, Any]) -> Iterator[None]:
     """Other functions in place of those of a module, while something is traced."""
-    modules = {"crossover": crossover, "kkt": exact_points, "newton": ridge_newton, "filter": certified_filter}
+    modules = {"crossover": crossover, "kkt": exact_points, "newton": ridge_newton}
     modules |= {"circle": circle, "radius": radius, "step": pole_step}
     patches = [patch.object(modules[name.split("__")[0]], name.split("__")[1], value) for name, value in names.items()]
     for each in patches:

@@ -236,8 +236,7 @@ def labelled(count: int, seed: int) -> dict[str, np.ndarray]:
 def check(points: dict[str, np.ndarray]) -> int:
     """Hold the certified method to the labels; how many it gets wrong or leaves undecided."""
     import zwidth
-    from zwidth.loops.rigid.certified_filter import OPEN, each_code
-    from zwidth.loops.rigid.folding import Points
+    from zwidth.loops.rigid.certified import OPEN, filter_walls
     from zwidth.loops.rigid.normalization import wall_status
     from zwidth.words.status import Status
 
@@ -253,7 +252,7 @@ def check(points: dict[str, np.ndarray]) -> int:
     wrong = ~undecided & ((result.stable != (~outside & (points["label"] == STABLE))) | (result.status != expected))
     for index in np.flatnonzero(wrong | undecided)[:20]:
         print([points[name][index] for name in points], [values[index] for values in result])
-    by_filter = np.mean(each_code(Points(*walls)) & 3 != OPEN)
+    by_filter = np.mean(filter_walls(*walls) != OPEN)
     print(f"{wrong.size} points in {seconds:.1f} s: {wrong.sum()} wrong, {undecided.sum()} undecided; ", end="")
     print(f"filter {by_filter:.1%}")
     return int(wrong.sum() + undecided.sum())

@@ -46,11 +46,11 @@ class PhiFunctions(NamedTuple):
     gap: Array
 
 
-def phi_functions(x: Array, exp: Callable[[Array], Array] | None = None) -> PhiFunctions:
-    """c, phi1, phi2, psi and gap at x >= 0; within 30 units of 2^-53 for an ``exp`` within 8 of them."""
+def phi_functions(x: Array) -> PhiFunctions:
+    """Return c, phi1, phi2, psi and gap at x >= 0, within 30 units of 2^-53 if ``xp.exp`` is within 8 of them."""
     xp = namespace(x)
     small = x < _SERIES_BELOW
-    factor = (exp or xp.exp)(-0.5 * x)
+    factor = xp.exp(-0.5 * x)
     c = factor * factor
     # Each branch gets an argument that is harmless where the other one holds.
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, _SERIES_BELOW, x)
@@ -160,13 +160,13 @@ class DeviceTerms(NamedTuple):
     tilt: Array  # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1
 
 
-def device(delta: Array, d: Array, kind: DelayClasses = ANY, functions: Functions = phi_functions) -> DeviceTerms:
-    """The `DeviceTerms` of one (delta, d), or of arrays of one shape."""
+def device(delta: Array, d: Array, kind: DelayClasses = ANY) -> DeviceTerms:
+    """Return the `DeviceTerms` of one (delta, d), or of arrays of one shape."""
     delta, d = nan_unless(valid_device(delta, d), delta, d)
     whole, f = split_delay(d)
-    at = functions(delta)
-    late = functions(delta * (1.0 - f)) if kind.fractional else at
-    plant = held_plant(delta, f if kind.fractional else None, functions, at, late)
+    at = phi_functions(delta)
+    late = phi_functions(delta * (1.0 - f)) if kind.fractional else at
+    plant = held_plant(delta, f if kind.fractional else None, at=at, at_t=late)
     # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1; 0 where N(-1) = 0.
     tilt = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
     return DeviceTerms(

@@ -79,19 +79,19 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
     With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given;
     or the virtual damping with which a wall of --stiffness settles fastest. With --tolerance: the share of devices on
     which the wall (--stiffness, --virtual-damping) is stable, the stiffness up to which 99 % of them are stable,
-    and, for uniform tolerances of a rigid device, a wall certified to be stable on all of them. SCENE.yaml
-    (or the folder of a run) supplies parameters not given as options; options override it.
+    and, for uniform tolerances of a rigid device, the stiffest wall that is stable on all of them, found by search.
+    SCENE.yaml (or the folder of a run) supplies parameters not given as options; options override it.
     """
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")
     shares, uniform = tolerances, drawn["distribution"] == "uniform"
-    provable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
-    # The certificate assumes independent intervals of period and delay, but a delay in periods varies with the period.
-    provable = provable and not ("period" in shares and scene.timing.in_periods)
+    searchable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
+    # The search assumes independent intervals of period and delay, but a delay in periods varies with the period.
+    searchable = searchable and not ("period" in shares and scene.timing.in_periods)
     parts = {
         "required": _require(scene, find) if find is not None else None,
         "tolerances": _tolerate(scene, shares, **drawn) if shares else None,
-        "every_device": _prove(scene, shares) if provable else None,
+        "every_device": _search_box(scene, shares) if searchable else None,
     }
     told = {name: part for name, part in parts.items() if part is not None}
     lines = [line for _, said in told.values() for line in said]
@@ -202,8 +202,8 @@ def _tolerate(
     return result, lines
 
 
-def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
-    """What every device of the box bears."""
+def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
+    """Return the stiffest wall that is stable on all devices within the tolerances, as data and as lines."""
     from zwidth.scenes.robust import DIGITS, Interval, robust_max_stiffness, robust_wall
 
     nominal = (scene.mass, scene.damping, scene.timing.period, scene.timing.delay)
@@ -211,7 +211,7 @@ def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[s
     own = (scene.device.mass, scene.device.damping, 0.0, 0.0)
     for (name, value), device in zip(list(box.items()), own, strict=True):
         if name in shares:
-            # A rigid hand adds what has no tolerance.
+            # The mass and damping of a rigid hand have no tolerance.
             reach = shares[name] * (device or value)
             box[name] = Interval(value - reach, value + reach)
     wall, best = robust_wall(**box), robust_max_stiffness(**box)
@@ -220,9 +220,9 @@ def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[s
         "virtual_damping": float(wall.virtual_damping),
         "stiffness_max": float(best.stiffness),
     }
-    # Of a damping that is proved softer walls are proved too.
-    unit, names = scene.unit_system["N/m"], ("stiffness", "stiffness_max")
-    stiffness, most = (with_unit(round_safely(result[name], "below"), unit) for name in names)
-    damping = with_unit(result["virtual_damping"], scene.unit_system["N s/m"], DIGITS)
-    text = f"every device is stable with K = {stiffness} at B = {damping}; {most}, each with its best B"
-    return result, [line("certified", text)]
+    # Round the stiffness down: softer walls of the same damping are stable too.
+    units, names = scene.unit_system, ("stiffness", "stiffness_max")
+    stiffness, most = (with_unit(round_safely(result[name], "below"), units["N/m"]) for name in names)
+    damping = with_unit(result["virtual_damping"], units["N s/m"], DIGITS)
+    text = f"of them (by search) are stable with K = {stiffness} at B = {damping}; {most}, each with its best B"
+    return result, [line("100 %", text)]

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zwidth.cli.options import Command, quantity_type, warn_implausible
+from zwidth.cli.options import Command, get_hardware, quantity_type, warn_implausible
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 
 if TYPE_CHECKING:
@@ -30,14 +31,19 @@ _HARDWARE = (
 
 
 def hardware_options(command: Command) -> Command:
-    """Add the options of encoder, friction and motor; the command receives the given ones as a dict ``hardware``."""
+    """Add the options of encoder, friction and motor; the command receives a dict ``hardware``.
+
+    A scene file supplies what the options leave out.
+    """
 
     @wraps(command)
     def with_hardware(**given: Any) -> Any:
         hardware = {name: value for _, name, *_ in _HARDWARE if (value := given.pop(name)) is not None}
         if "resolution" in hardware:
             warn_implausible({"resolution": hardware["resolution"]}, given["scene"].unit_system)
-        return command(hardware=hardware, **given)
+        # A measured response has no model to simulate with the hardware of the file.
+        known = {} if isinstance(given["scene"].device, MeasuredDevice) else get_hardware()
+        return command(hardware=known | hardware, **given)
 
     decorated: Callable[..., Any] = with_hardware
     for flag, name, unit, allowed, text in reversed(_HARDWARE):
@@ -47,7 +53,7 @@ def hardware_options(command: Command) -> Command:
 
 
 def diagnose_wall(scene: Scene, hardware: dict[str, Any]) -> Any:
-    """Return the `zwidth.diagnose` result of a wall with the given hardware; None if no hardware option is given."""
+    """Return the `zwidth.diagnose` result of a wall with the given hardware; None without hardware."""
     if not hardware:
         return None
     from zwidth.scenes.diagnosis import diagnose

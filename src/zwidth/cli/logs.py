@@ -9,23 +9,22 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
+from zwidth.cli.hardware import diagnose_wall
 from zwidth.cli.help import show_example
 from zwidth.cli.options import (
     SHARE,
     Parsed,
     figure_option,
+    get_hardware,
     get_told,
     json_option,
-    log_options,
-    period_options,
     quantity_type,
-    read_logs,
     save_figure,
-    velocity_options,
     verbose_option,
     warn_implausible,
 )
-from zwidth.pages.words import LABEL, line, print_folded, print_json, row, tell
+from zwidth.cli.records import Loop, log_options, loop_options, read_logs
+from zwidth.pages.words import LABEL, line, print_folded, print_json, row, spell_diagnosis, tell
 from zwidth.parts.checks import find_kind
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
@@ -68,14 +67,12 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 
 
 @cli.command(**show_example("fit --rate '1 kHz'", *_BUZZING))
-@click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
+@loop_options(logs=True)
 @click.option("--buzz", "walls", type=_WALL, multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
-@period_options
 @click.option("--noise", type=SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
 @log_options
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
-@velocity_options
 @figure_option
 @click.option(
     "--code",
@@ -93,9 +90,8 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 def fit(
     logs: tuple[Path, ...],
     walls: tuple[Any, ...],
-    period: float | None,
+    loop: Loop,
     noise: float | None,
-    velocity: Any,
     figure: Path | None,
     code: Any,
     as_yaml: bool,
@@ -108,27 +104,31 @@ def fit(
     With --buzz: from walls at which it began to buzz as K was raised, at two dampings or more, and the frequencies
     heard. With LOG.csv: from its free motion under a force that a computer commanded, friction included; several logs
     are of one device and have the same columns. Units stand in headers, as 'encoder [counts]', or behind a colon.
+    SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, and the period of walls and of
+    logs without a column of times; options override it.
     """
-    from zwidth.fitting.words import detail_fit, list_units, summarize_fit, write_scene
+    from zwidth.fitting.words import list_units, write_scene
 
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if sum(map(bool, (as_json, as_yaml, code))) > 1:
         raise click.UsageError("give one of --json, --yaml and --code: each prints the complete output")
-    points = ()
+    points, motions, period, velocity = (), [], loop.known_period, loop.velocity
     if walls:
         for name, value in of_logs.items():
             if value:
                 raise click.UsageError(f"--{name.replace('_', '-')} belongs to a LOG.csv")
         if period is None:
-            raise click.UsageError("give --period or --rate")
+            raise click.UsageError("give --period or --rate, or a scene file")
         from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 
         kinds = {rotary for _, rotary in walls} - {None}
         if len(kinds) > 1:
             raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
-        points = tuple(BuzzPoint(*point) for point, _ in walls)
-        found = fit_buzz(points, period=period, velocity=velocity, noise=noise, rotary=kinds == {True})
+        usual = loop.scene is not None and loop.scene.unit_system.rotary
+        points, rotary = tuple(BuzzPoint(*point) for point, _ in walls), kinds.pop() if kinds else usual
+        loop.check_kind(rotary)
+        found = fit_buzz(points, period=period, velocity=velocity, noise=noise, rotary=rotary)
         source = f"{len(walls)} buzzing walls"
     else:
         if noise is not None:
@@ -136,8 +136,9 @@ def fit(
         from zwidth.fitting.columns import fit_motions
 
         options = {name: of_logs.pop(name) for name in ("max_delay", "resample")}
-        motions = read_logs(logs, period, **of_logs)
+        motions = read_logs(logs, loop, **of_logs)
         found = fit_motions(motions, period=period, velocity=velocity, **options)
+        loop.check_period(found.period)
         source = " and ".join(log.name for log in logs)
     wrote = []
     if figure is not None:
@@ -150,45 +151,85 @@ def fit(
         click.echo(found.recommended.code(code), nl=False)
         return
     if as_yaml:
-        click.echo("\n".join(write_scene(found, source, period_given=period is not None)))
+        period_given = any(motion.time is None for motion in motions)
+        click.echo("\n".join(write_scene(found, source, period_given=period_given)))
         return
+    diagnosis = _diagnose(found)
     if as_json:
-        print_json({**found.as_dict(), "units": list_units(found)})
+        checks = {"diagnosis": None if diagnosis is None else diagnosis.as_dict()}
+        print_json({**found.as_dict(), "units": list_units(found), **checks})
         return
+    print_folded([*_list_lines(found, source, diagnosis, verbose), *wrote], LABEL)
+
+
+def _diagnose(found: Any) -> Any:
+    """Return the diagnosis of the recommended wall with the fitted friction and encoder; None without one of them."""
+    from zwidth.fitting.words import list_hardware
+
+    recommended = found.recommended
+    return diagnose_wall(recommended.scene, list_hardware(found)) if recommended.status == Status.OK else None
+
+
+def _list_lines(found: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
+    """Return the printed lines of a fit, with the results in a hand and of a simulation as `zwidth recommend`."""
+    from zwidth.fitting.words import detail_fit, summarize_fit
+    from zwidth.pages.verdict import spell_hands
+
+    checks, more = [], "details: --verbose; scene for the other commands: --yaml"
+    if found.recommended.status == Status.OK:
+        checks = [("in a hand", spell_hands(found.recommended))]
+        more += "; program for the loop: --code c"
+    checks += spell_diagnosis(diagnosis)
     details = [("", ""), *detail_fit(found, source)] if verbose else []
-    lines = [line(*each).rstrip() for each in (*summarize_fit(found), *details)]
-    more = "details: --verbose; scene for the other commands: --yaml"
-    more += "; program for the loop: --code c" if found.recommended.status == Status.OK else ""
-    print_folded([*lines, *wrote, line("more", more)], LABEL)
+    rows = [*summarize_fit(found, checks), *details, ("more", more)]
+    return [line(*each).rstrip() for each in rows]
 
 
 _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
 
 
 @cli.command(**show_example("excite --rate '1 kHz' --force '2 N' --resolution '10 um'"))
-@period_options
-@click.option("--force", type=quantity_type("N", POSITIVE), required=True, help="The largest force to command, in N.")
+@loop_options(logs=False)
+@click.option("--force", type=quantity_type("N", POSITIVE), help="The largest force to command, in N.")
 @click.option(
     "--resolution",
     type=quantity_type("m", POSITIVE, counts=True),
-    required=True,
     help="Encoder step in m, or counts per turn as '2000 counts'.",
 )
 @click.option("--duration", type=_TIME, default="60 s", show_default=True, help="How long it plays, in s.")
 @click.option("--response", type=_FILE, help="The response of a first record, to design the second.")
 @click.option("--out", type=_FILE, default=Path("play.csv"), show_default=True, help="The file to play.")
-@velocity_options
 @json_option
-def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> None:
-    """Design the force to play before `zwidth respond`, or the torque if the units are those of a rotary device."""
-    if options["period"] is None:
-        raise click.UsageError("give --period or --rate")
+def excite(
+    loop: Loop,
+    force: float | None,
+    resolution: float | None,
+    duration: float,
+    response: Path | None,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Design the force to play before `zwidth respond`, or the torque if the units are those of a rotary device.
+
+    Required: --rate (or --period), --force and --resolution. SCENE.yaml (or the folder of a run) supplies those not
+    given as options: its period, max_force and resolution; also its velocity estimate, and a measured device as
+    --response.
+    """
+    hardware = get_hardware()
+    options: dict[str, Any] = {"period": loop.known_period, "force": force or hardware.get("max_force")}
+    options["resolution"] = resolution or hardware.get("resolution")
+    if missing := [f"--{name}" for name, value in options.items() if value is None]:
+        raise click.UsageError(f"give {', '.join(missing)}".replace("--period", "--period or --rate"))
     from zwidth.fitting.excite import excite as design
 
     device = None if response is None else MeasuredDevice.read(response)
     # Infer the kind of device from the options as typed, because their parsed values have no units.
     implied = find_kind(get_told())
-    warn_implausible({"resolution": options["resolution"]}, SYSTEMS[bool(implied)])
+    if loop.scene is not None:
+        implied = bool(loop.scene.device.rotary)
+        device = loop.scene.device if device is None and isinstance(loop.scene.device, MeasuredDevice) else device
+    if resolution is not None:
+        warn_implausible({"resolution": resolution}, SYSTEMS[bool(implied)])
     if device is not None and implied not in (None, device.rotary):
         kinds = ("rotary", "linear") if device.rotary else ("linear", "rotary")
         raise click.UsageError(
@@ -196,7 +237,7 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
             "use one kind"
         )
     rotary = device.rotary if device is not None else bool(implied)
-    made = design(response=device, rotary=rotary, **options)
+    made = design(response=device, rotary=rotary, velocity=loop.velocity, duration=duration, **options)
     made.save(out)
     _print_excitation(made, out, as_json)
 
@@ -220,20 +261,17 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
 
 
 @cli.command(**show_example("respond log.csv --save response.csv --figure response.png"))
-@click.argument("logs", metavar="LOG.csv...", nargs=-1, required=True, type=_FILE)
-@period_options
+@loop_options(logs=True)
 @click.option("--cycle", type=_TIME, help="Period of the force, in s; found from a force that repeats exactly.")
 @log_options
 @click.option("--save", type=_FILE, metavar="FILE.csv", help="Keep the response.")
-@velocity_options
 @figure_option
 @json_option
 def respond(
     logs: tuple[Path, ...],
-    period: float | None,
+    loop: Loop,
     cycle: float | None,
     save: Path | None,
-    velocity: Any,
     figure: Path | None,
     as_json: bool,
     **of_logs: str | None,
@@ -242,12 +280,16 @@ def respond(
 
     Without a model, with the band that noise leaves. From logs of a force that `zwidth excite` designed, or of any
     other. What --save keeps, and any table of an analyzer, is a device of the other commands: `zwidth ridge --device
-    FILE.csv` answers of it.
+    FILE.csv` answers of it. SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, and
+    the period of logs without a column of times; options override it.
     """
+    if not logs:
+        raise click.UsageError("give one LOG.csv or several")
     from zwidth.fitting.respond import respond_to_logs
 
-    found = respond_to_logs(read_logs(logs, period, **of_logs), period, cycle)
-    _print_response(found, logs, velocity, save, figure, as_json)
+    found = respond_to_logs(read_logs(logs, loop, **of_logs), loop.known_period, cycle)
+    loop.check_period(found.period)
+    _print_response(found, logs, loop.velocity, save, figure, as_json)
 
 
 def _print_response(

@@ -13,6 +13,7 @@ from zwidth.cli.hardware import hardware_options
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     figure_option,
+    find_silent,
     json_option,
     quantity_type,
     save_figure,
@@ -51,6 +52,7 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
     diagnosis = find_cause(scene, **hardware)
     remedy = diagnosis.advise()
     lines = [row(diagnosis.word, diagnosis.explain()), *([row("to stop it", remedy)] if remedy else [])]
+    lines += [row("CAUTION", text) for text in words.silent_cautions(scene, find_silent())]
     words.tell(diagnosis.as_dict(), lines, as_json)
 
 
@@ -113,6 +115,7 @@ def simulate(
     ]
     if cause.cause not in ("none", "undecided"):
         lines.append(row("remedies", "zwidth diagnose, with the same options"))
+    lines += [row("CAUTION", text) for text in words.silent_cautions(scene, find_silent())]
     if figure is not None:
         from zwidth.figures import plot
 

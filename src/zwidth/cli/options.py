@@ -23,7 +23,7 @@ from zwidth.parts.velocity import ESTIMATES, name_estimate
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError
 from zwidth.words.plausible import list_doubts
-from zwidth.words.quantities import ANY, CHOICES, OF_LOGS, OF_PARTS, PARAMETERS, Range
+from zwidth.words.quantities import ANY, CHOICES, OF_PARTS, PARAMETERS, Range
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 from zwidth.words.units import DIMENSIONS, read_quantity, tell_kind
 
@@ -31,11 +31,10 @@ if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
 
-# In bytes.
-_LONG = 2**23
 # Where the texts of options are kept whose units tell linear and rotary devices apart.
 _TOLD = "zwidth.told"
-_BOTH = "--period and --rate are both given: they are one thing, give one of them"
+_HARDWARE = "zwidth.hardware"  # key of the hardware of the scene file in the context of a command
+BOTH_PERIODS = "--period and --rate are both given: they are one thing, give one of them"
 Command: TypeAlias = Callable[..., Any]
 
 # By path in a scene, as in configuration files, one part after the other.
@@ -67,6 +66,11 @@ class Parsed(click.ParamType):
 def get_told() -> dict[str, Any]:
     """Return the option values of the running command whose units imply a linear or a rotary device."""
     return click.get_current_context().meta.get(_TOLD, {})
+
+
+def get_hardware() -> dict[str, float]:
+    """Return encoder, friction and motor of the scene file of the running command, as in `zwidth.diagnose`."""
+    return click.get_current_context().meta.get(_HARDWARE, {})
 
 
 def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, counts: bool = False) -> Parsed:
@@ -149,14 +153,12 @@ def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Comma
     option is given.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
-    take = _take_options(
-        "scene", (*bare, *_PARTS), lambda given, system: build_scene(given, system, instead, wall=wall)
-    )
+    take = take_options("scene", (*bare, *_PARTS), lambda given, system: build_scene(given, system, instead, wall=wall))
     file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
     return lambda command: file(take(command))
 
 
-def _take_options(
+def take_options(
     name: str, paths: Sequence[str], make: Callable[[dict[str, Any], UnitSystem], Any]
 ) -> Callable[[Command], Command]:
     """Add the options of the parameters ``paths``; the command receives ``make(values, units)`` as argument ``name``.
@@ -179,7 +181,8 @@ def _take_options(
                     from zwidth.parts.devices import read_device
 
                     known["device"] = read_device(known["device"])
-                    # Ignore the kind of the file's device, because the option --device replaces it.
+                    # Ignore kind and hardware of the file's device, because the option --device replaces it.
+                    context.meta.pop(_HARDWARE, None)
                     told = context.meta.get(_TOLD, {}) | {"--device": known["device"]}
                 return function(**{name: make(known, SYSTEMS[bool(find_kind(told))])}, **given)
             except InputError as error:
@@ -197,16 +200,6 @@ def _take_options(
     return decorate
 
 
-def _read_period(given: dict[str, Any], _: UnitSystem) -> float | None:
-    """The period in s, of the one that is given."""
-    if len(given) > 1:
-        raise click.UsageError(_BOTH)
-    return 1.0 / given["rate"] if "rate" in given else given.get("period")
-
-
-period_options = _take_options("period", ("period", "rate"), _read_period)
-
-
 def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
     """Write a warning to the error stream for each value, in SI units by path, that is implausible for a device."""
     for line in list_doubts(
@@ -221,8 +214,10 @@ def read_scene_file(path: Path) -> Scene:
     from zwidth.studies.document import load_config, load_scene
 
     file = find_config(path) if path.is_dir() else path
-    for line in getattr(load_config(file).scene, "doubts", ()):
+    given = load_config(file).scene
+    for line in getattr(given, "doubts", ()):
         click.echo(f"zwidth: {line}", err=True)
+    click.get_current_context().meta[_HARDWARE] = getattr(given, "hardware", {})
     return load_scene(file)
 
 
@@ -234,7 +229,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
     if not given and instead:
         return None
     if {"period", "rate"} <= given.keys():
-        raise click.UsageError(_BOTH)
+        raise click.UsageError(BOTH_PERIODS)
     base = given.pop("scene", None)
     if wall and "stiffness" not in given and (base is None or isinstance(base.wall, NoWall)):
         raise click.UsageError("give --stiffness" + ("" if base is None else ": the scene of the file has no wall"))
@@ -242,12 +237,12 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
         path: value.value if isinstance(value, Span) and value.unit == "s" else value for path, value in given.items()
     }
     warn_implausible(numbers, system)
-    scene = _make_scene(given, system, instead) if base is None else _change_scene(base, given)
+    scene = _make_scene(given, system, instead) if base is None else change_scene(base, given)
     scene.check_parts()
     return scene
 
 
-def _change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
+def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     """Load the scene from a file and override the parameters given as command-line options."""
     from zwidth.parts.devices import KnownDevice
 
@@ -262,7 +257,7 @@ def _change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
         if own.keys() & _ONE_OF_TWO:
             # Drop both, because a low-pass filter takes either a cutoff or a time constant.
             kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
-        changes["velocity"] = _make_velocity({**kept, **own})
+        changes["velocity"] = make_velocity({**kept, **own})
     parts = {} if device else find_parts(scene)
     modes = list(() if device else scene.device.modes)
     for name, kind in {**PARTS, **dict.fromkeys(_MODES, Mode)}.items():
@@ -317,7 +312,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _HELD):
             raise click.UsageError(f"--device is given as a whole and holds {flag_of(path)}: give one of the two")
     wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
-    velocity = _make_velocity(_own(given, "velocity"))
+    velocity = make_velocity(_own(given, "velocity"))
     return Scene(device, timing(**some("period", "rate", "delay")), wall, velocity).replace(**parts)
 
 
@@ -348,7 +343,7 @@ def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
     return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
 
 
-def _make_velocity(given: dict[str, Any]) -> Any:
+def make_velocity(given: dict[str, Any]) -> Any:
     """Return the velocity estimate described by options, given by field name."""
     kind = given.pop("kind", None)
     if kind is None:
@@ -378,13 +373,6 @@ def find_silent() -> frozenset[str]:
     return frozenset(name for name in ("damping", "delay") if given.get(name) is None)
 
 
-def log_options(command: Command) -> Command:
-    """What the columns of a log are, and what counts and amperes stand for."""
-    for name, text in reversed(OF_LOGS.items()):
-        command = click.option(flag_of(name), help=text)(command)
-    return command
-
-
 def read_pairs(context: click.Context, option: click.Parameter, pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Values by their names of an option that may be repeated, each name once."""
     found: dict[str, Any] = {}
@@ -401,26 +389,3 @@ def save_figure(drawn: Any, file: Path) -> str:
 
     save(drawn, file.with_suffix(""), (file.suffix[1:],))
     return row("wrote", str(file))
-
-
-velocity_options = _take_options(
-    "velocity",
-    [path for path in _PARTS if path.startswith("velocity.")],
-    lambda given, _: _make_velocity(_own(given, "velocity")),
-)
-
-
-def read_logs(
-    logs: Iterable[Path], period: float | None, *, resolution: str | None, motor_constant: str | None, **columns: Any
-) -> list[Any]:
-    """The motions of logs by their `log_options`; the error stream says which are read where that takes a while."""
-    if columns["time"] is not None and period is not None:
-        raise click.UsageError("give one of --time, --period and --rate")
-    from zwidth.fitting.columns import read_log
-
-    for log in logs:
-        size = log.stat().st_size if log.is_file() else 0
-        if size > _LONG:
-            click.echo(f"zwidth: reading {log.name}, {size / 2**20:.0f} MiB; then the numbers are computed", err=True)
-    options = {"period": period, "resolution": resolution, "motor_constant": motor_constant}
-    return [read_log(log, columns, **options) for log in logs]

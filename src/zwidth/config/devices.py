@@ -22,7 +22,7 @@ from zwidth.parts.measured import SUFFIXES, MeasuredDevice
 from zwidth.parts.paths import PARTS
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, suggestion
-from zwidth.words.quantities import POSITIVE
+from zwidth.words.quantities import HARDWARE, POSITIVE
 
 FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
 _OF_SYSTEM = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"))
@@ -162,7 +162,7 @@ DeviceForm = Annotated[SystemSection | ResponseSection, WrapValidator(lambda raw
 
 
 PHYSICAL_KEYS = frozenset({"device", "rotary", "mass", "damping", "period", "rate", "delay", *PART_NAMES})
-PHYSICAL_KEYS |= {"stiffness", "virtual_damping", "safe_limit"}
+PHYSICAL_KEYS |= {"stiffness", "virtual_damping", "safe_limit", *HARDWARE}
 NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
 
 

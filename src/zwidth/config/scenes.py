@@ -30,7 +30,7 @@ from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
 from zwidth.words.plausible import list_doubts
-from zwidth.words.quantities import LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
+from zwidth.words.quantities import HARDWARE, LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
 from zwidth.words.xp import within
 
 _Parts: Any = make_parts_base("the difference of two samples", "none")
@@ -180,6 +180,17 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
 
     safe_limit: SafeLimitSection | None = None
     """Stiffest wall that measurements of the device support."""
+
+    resolution: Annotated[float, quantity_of("resolution")] | None = None
+    coulomb: Annotated[float, quantity_of("coulomb")] | None = None
+    static: Annotated[float, quantity_of("static")] | None = None
+    max_force: Annotated[float, quantity_of("max_force")] | None = None
+    max_rate: Annotated[float, quantity_of("max_rate")] | None = None
+
+    @property
+    def hardware(self) -> dict[str, float]:
+        """The given parameters of encoder, friction and motor."""
+        return {name: value for name in HARDWARE if (value := getattr(self, name)) is not None}
 
     @cached_property
     def _scene(self) -> Scene:

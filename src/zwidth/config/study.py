@@ -94,6 +94,7 @@ class Study(Strict):
         supplied: dict[str, Any] = {"delta": scene.delta, "d": scene.d}
         if isinstance(scene, PhysicalScene):
             supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
+            supplied |= scene.hardware
             if "device" in absent:
                 supplied["device"] = scene.bare(SimulatedDevice if cls.simulates else PhysicalDevice)
         if "devices" in absent:

@@ -28,10 +28,10 @@ _LAGS, _RATIO = (0.3, 1.5), 0.7
 # So many resonances are started from, their frequencies so far apart.
 _PARTED, _APART = 2, float(np.exp(0.2))
 
-_Looked = tuple[FittedModel, HiddenPole | None, PoleBank | None, LagTest | None]
+Choice = tuple[FittedModel, HiddenPole | None, PoleBank | None, LagTest | None]
 
 
-def choose_structure(best: FittedModel) -> _Looked:
+def choose_structure(best: FittedModel) -> Choice:
     """Add what explains the residuals best as long as they show a pole; then what they still show, and of lags."""
     # Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
     way = max(float(np.ptp(log.position)) for log in best.model.logs)
@@ -55,7 +55,7 @@ def choose_structure(best: FittedModel) -> _Looked:
     return (best, rival or pole, bank, lags) if known else rigid
 
 
-def _look(best: FittedModel) -> _Looked:
+def _look(best: FittedModel) -> Choice:
     """What the residuals show; of lags where they show no pole and the device has none."""
     pole, bank = detect_missing_pole(best)
     return best, pole, bank, None if pole or best.model.lag else score_lags(best)

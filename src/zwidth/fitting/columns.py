@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit
-from zwidth.fitting.headers import DIMENSIONS, QUANTITIES, Column, find_columns
+from zwidth.fitting.headers import DIMENSIONS, QUANTITIES, Column, find_columns, has_column
 from zwidth.fitting.log import fit_log
 from zwidth.words.errors import InputError, UnusableValueError
 from zwidth.words.formatting import describe, plain, suggestion, with_unit
@@ -84,6 +84,7 @@ def read_log(
     *,
     resolution: Any = None,
     period: float | None = None,
+    usual_period: float | None = None,
     motor_constant: str | None = None,
 ) -> LoggedMotion:
     """Read the time, the position and the force of a log.
@@ -98,6 +99,7 @@ def read_log(
         resolution: of the encoder, a length or an angle with its unit, for one count; a number is in m, or in rad with
             a torque.
         period: of the samples, in s, where the time is not to be read.
+        usual_period: sampling period in s, used if no column of times is recognized.
         motor_constant: what a force in A or mA is multiplied with, as "5 N/A" or "0.03 N m/A".
 
     Raises:
@@ -106,6 +108,8 @@ def read_log(
     """
     table = read_columns(Path(file))
     heads = table.heads
+    if columns.get("time") is None and not has_column(heads, "time"):
+        period = period or usual_period
     wanted = [name for name in QUANTITIES if name != "time" or period is None]
     if table.nameless and not all((columns.get(name) or "").partition(":")[0] in heads for name in wanted):
         raise InputError(

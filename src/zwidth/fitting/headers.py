@@ -100,6 +100,12 @@ def find_columns(
     return columns
 
 
+def has_column(heads: Sequence[str], name: str) -> bool:
+    """Return whether the headers of a table identify at least one column of a quantity."""
+    column, places = _find_by_name(heads, name)
+    return column is not None or bool(places)
+
+
 def _refuse_missing(file: object, heads: Sequence[str], missing: list[str]) -> None:
     """Raise `InputError` for quantities without a column, with the headers of the table and the remedy."""
     names = " and ".join((", ".join(missing[:-1]), missing[-1])) if len(missing) > 1 else missing[0]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.causes import Cause, explain_motion, explain_residuals
-from zwidth.fitting.choosing import ALIKE, EXACT, choose_structure
+from zwidth.fitting.choosing import ALIKE, EXACT, Choice, choose_structure
 from zwidth.fitting.device_estimate import differentiate, reach_of
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, doubt_period
 from zwidth.fitting.encoder import fits_steps
@@ -151,11 +151,7 @@ def _fit(
     )
     doubts = [doubt for log in logs for doubt in find_stretches(log, system)]
     steps, odd = _list_steps(resolution, read, system)
-    step, *finer = steps
-    best, pole, bank, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
-    while finer and best.variance <= (_FINER * step) ** 2 / 12.0:
-        step = finer.pop(0)
-        best, pole, bank, lags = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
+    step, (best, pole, bank, lags) = _choose_step(recordings, longest, steps)
     model, theta = best.model, best.theta
     _refuse_unmoved(best, period, system)
     if best.inverse.open[:3].any():
@@ -177,7 +173,7 @@ def _fit(
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
         doubts.append(
-            f"the delay ends the range looked in, {with_unit(longest * period, 's')}; give a longer max_delay"
+            f"the delay is at the end of the search range, {with_unit(longest * period, 's')}; give a longer max_delay"
         )
     motions = _place(best, logs, places, stretches, skip, period)
     offset, friction = (_in_newton(best, k) for k in (-2, -1))
@@ -251,6 +247,14 @@ def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[li
             f"the positions are no multiples of {text}, so their errors are treated as noise: check resolution"
         ]
     return [step], []
+
+
+def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[float]) -> tuple[float, Choice]:
+    """Return the coarsest encoder step that the residuals do not exclude, and the model fitted with it."""
+    step, *finer = steps
+    choice = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
+    excluded = choice[0].variance <= (_FINER * step) ** 2 / 12.0
+    return _choose_step(recordings, longest, finer) if finer and excluded else (step, choice)
 
 
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:

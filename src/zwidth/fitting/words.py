@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -19,13 +22,8 @@ from zwidth.words.unit_system import UnitSystem
 
 NEAR_ROUNDING = (0.5, 1.1)  # range of residuals as expected, in units of the encoder's quantization noise
 
-SYMBOLS = {
-    "mass": "m",
-    "damping": "b",
-    "delay": "t_d",
-    "friction": "F_c",
-    "stiffness_max": "K_max",
-}
+STIFFER = 1.005  # least ratio of the stiffnesses of two walls that are printed as different
+_SYMBOLS = {"mass": "m", "damping": "b", "delay": "t_d", "stiffness_max": "K_max"}
 # SI units of a linear device by the last part of a path: of parameters, and of what a fit has beside them.
 _UNITS = {path.rpartition(".")[2]: known.unit.removeprefix("1") for path, known in FIELDS.items()}
 _UNITS |= {"stiffness_max": "N/m", "friction": "N", "offset": "N", "force": "N", "position": "m"}
@@ -41,13 +39,23 @@ def list_units(fit: DeviceFit) -> dict[str, str]:
     return {name: unit_of(name, fit.unit_system) for name in ("mass", "damping", "stiffness", "force", "position")}
 
 
+def symbol_of(name: str, system: UnitSystem) -> str:
+    """Return the symbol of a fitted parameter; that of the inertia of a rotary device is J."""
+    return "J" if name == "mass" and system.rotary else _SYMBOLS[name]
+
+
 def spell(name: str, value: float, system: UnitSystem, digits: int = 4) -> str:
     """Return a value of a fit with its unit."""
     return with_unit(value, unit_of(name, system), digits)
 
 
-def summarize_fit(fit: DeviceFit) -> list[tuple[str, str]]:
-    """Return the summary of a fit as pairs of label and text: the recommended wall with its reason, then the device."""
+def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> list[tuple[str, str]]:
+    """Return the summary of a fit as pairs of label and text: the recommended wall with its reason, then the device.
+
+    Args:
+        fit: the fit.
+        checks: further pairs on the recommended wall, as from a simulation.
+    """
     recommended = fit.recommended
     rows = [("NO WALL", recommended.reason)]
     if fit.is_doubted:
@@ -63,38 +71,29 @@ def summarize_fit(fit: DeviceFit) -> list[tuple[str, str]]:
     rows.append(("fit", _describe_residuals(fit)))
     if recommended.status == Status.OK:
         rows.append(("margins", f"{recommended.spell_margins()}; passive: {recommended.spell_passive()}"))
-        rows += [("CAUTION", caution) for caution in recommended.cautions]
-    trouble = [f"{Status(fit.status).name}: {name_trouble(fit)}"] if fit.status != Status.OK else []
+        rows += [*checks, *(("CAUTION", caution) for caution in recommended.cautions)]
+    # The warnings of the fit describe every other status.
+    trouble = [f"NOT_CONVERGED: {name_trouble(fit)}"] if fit.status == Status.NOT_CONVERGED else []
     rows += [("WARNING", text) for text in (*trouble, *fit.doubts)] or [("warnings", "none")]
     rows += [("note", note) for note in fit.notes]
     if fit.next is not None:
         rows.append(("next", _describe_next(fit)))
-    elif recommended.status == Status.OK and recommended.is_held_back and fit.motions:
-        rigid = _assume_rigid(fit)
-        gain = (
-            ""
-            if rigid is None
-            else f" (up to {spell('stiffness', rigid.stiffness, fit.unit_system)} without hidden resonances)"
-        )
-        rows.append(("next", f"for a stiffer wall{gain} {advise_record(fit)}"))
+    elif fit.motions and recommended.is_held_back and (rigid := _assume_rigid(fit)) is not None:
+        stiffest = spell("stiffness", rigid.stiffness, fit.unit_system)
+        rows.append(("next", f"for a stiffer wall (up to {stiffest} without hidden resonances) {advise_record(fit)}"))
     return rows
 
 
 def _assume_rigid(fit: DeviceFit) -> Recommendation | None:
-    """Return the recommended wall for a device without undetected resonances; None if it is no other wall."""
-    limit = limit_walls(fit, rigid=True)
-    if limit == fit.scene.safe_limit:
-        return None
-    recommended = replace(fit.scene, safe_limit=limit).recommend()
-    return recommended if recommended.status == Status.OK else None
+    """Return the recommended wall for a device without undetected resonances; None if it is not stiffer."""
+    recommended = replace(fit.scene, safe_limit=limit_walls(fit, rigid=True)).recommend()
+    return recommended if recommended.stiffness > STIFFER * fit.recommended.stiffness else None
 
 
 def _describe_device(fit: DeviceFit) -> list[tuple[str, str]]:
     """Return pairs of label and text for the fitted parameters, with their 95 % confidence intervals."""
-    symbols = SYMBOLS | ({"mass": "J"} if fit.unit_system.rotary else {}) | {"delay": "delay"}
-    texts = [
-        f"{symbols[name]}{' = ' if name != 'delay' else ' '}{_spell_estimate(fit, name)}" for name in fit.numbers[:3]
-    ]
+    texts = [f"{symbol_of(name, fit.unit_system)} = {_spell_estimate(fit, name)}" for name in fit.numbers[:2]]
+    texts.append(f"delay {_spell_estimate(fit, 'delay')}")
     if "friction" in fit.errors:
         certain = math.isfinite(fit.errors["friction"])
         friction = f"friction {_spell_estimate(fit, 'friction')}" if fit.friction else "no friction"
@@ -207,9 +206,11 @@ def _name_part(name: str, count: int) -> str:
 
 def spell_rival(rival: RivalDevice, system: UnitSystem) -> str:
     """Return the parameters of an equally good device in one line."""
-    parts = {SYMBOLS[name]: spell(name, getattr(rival, name), system) for name in ("mass", "damping", "delay")}
+    parts = {
+        symbol_of(name, system): spell(name, getattr(rival, name), system) for name in ("mass", "damping", "delay")
+    }
     parts |= {_name_part(name, 1).strip(): spell(name, value, system) for name, value in (rival.parts or {}).items()}
-    parts[SYMBOLS["stiffness_max"]] = spell("stiffness", rival.stiffness_max, system)
+    parts[symbol_of("stiffness_max", system)] = spell("stiffness", rival.stiffness_max, system)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 
 
@@ -264,11 +265,12 @@ def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> l
         source: name of the log, or number of walls, for the first comment.
         period_given: whether the user specified the period; otherwise a fit to a log derives it from the times.
     """
+    units = fit.unit_system
     origin = "as given" if period_given or not fit.motions else "from the times of the log"
     lines = [
         f"# Fitted to {source}: {_between(fit, 'stiffness_max')} for K_max.",
         *(f"# Note: {note}" for note in fit.notes),
-        *("version: 1", "name: fitted_device", "scene:"),
+        *("version: 1", f"name: {_name_file(source)}", "scene:"),
         *(f"  {_write_part(fit, key)}" for key in fit.numbers[:3]),
         f"  period: {round_period(fit)!r} s # {origin}",
     ]
@@ -282,16 +284,23 @@ def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> l
     for key, section in spell_estimate(fit.velocity, every=True).items():
         inside = ", ".join(f"{name}: {json.dumps(value).strip(chr(34))}" for name, value in section.items())
         lines.append(f"  {key}: {{{inside}}} # as given")
+    hardware = list_hardware(fit)
+    if "coulomb" in hardware:
+        lines.append(f"  coulomb: {hardware['coulomb']!r} {units['N']} # fitted, {_between(fit, 'friction')}")
+    if "resolution" in hardware:
+        lines.append(f"  resolution: {hardware['resolution']!r} {units['m']} # encoder step of the log")
     lines += _write_limit(fit)
-    lines += ["studies:", "  - kind: recommend # the recommended wall for this device", "    name: recommended"]
-    if fit.friction and math.isfinite(fit.errors["friction"]):
-        friction = (
-            f"{round_number(fit, 'friction')!r} {unit_of('friction', fit.unit_system)}, {_between(fit, 'friction')}"
-        )
-        lines.append(f"# For studies of kind simulate: coulomb: {friction}.")
-    if fit.resolution:
-        resolution = float(f"{fit.resolution:.12g}")
-        lines.append(
-            f"# For studies of kind simulate: resolution: {resolution!r} {unit_of('position', fit.unit_system)}."
-        )
-    return lines
+    return [*lines, "studies:", "  - kind: recommend # the recommended wall for this device", "    name: recommended"]
+
+
+def list_hardware(fit: DeviceFit) -> dict[str, float]:
+    """Return friction and encoder step as far as a fit determines them, as arguments of `zwidth.diagnose`."""
+    friction = math.isfinite(fit.errors.get("friction", math.nan)) and round_number(fit, "friction")
+    known = {"coulomb": friction, "resolution": float(f"{fit.resolution:.12g}")}
+    return {name: value for name, value in known.items() if value}
+
+
+def _name_file(source: str) -> str:
+    """Return a name for a configuration: that of the first log, or the number of walls."""
+    title = Path(source.partition(" and ")[0]).name.partition(".")[0].lower()
+    return f"fitted_{re.sub('[^a-z0-9_-]+', '_', title)}"[:64]

@@ -244,7 +244,7 @@ def recommend_lines(
         line("SET", f"{found.spell_wall()}; {found.spell_limit()}{alarm}"),
         *device,
         *margins,
-        *_list_hands(found),
+        *([line("in a hand", hands)] if (hands := spell_hands(found)) else []),
         *diagnosis_lines(diagnosis),
         line("passive", spell_passivity(scene, verdict) if verbose else found.spell_passive()),
         *unsaid,
@@ -254,13 +254,13 @@ def recommend_lines(
     return lines + gain_lines(heading, found.steps, verbose)
 
 
-def _list_hands(found: Recommendation) -> list[str]:
-    """Return the line with the stability in the reference grasps; an empty list if there are none."""
+def spell_hands(found: Recommendation) -> str:
+    """Return the stability of a wall in the reference grasps in words; "" if there are none."""
     labels = {name: stable for name, stable in found.grasps.items() if name != "released"}
     if not labels:
-        return []
+        return ""
     radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if found.unit_system.rotary else ""
     unstable = [name for name, stable in labels.items() if not stable]
     if not unstable:
-        return [line("in a hand", f"stable in all {COUNTS[len(labels)]} reference grasps{radii}")]
-    return [line("in a hand", f"stable in {len(labels) - len(unstable)} of {len(labels)} reference grasps{radii}")]
+        return f"stable in all {COUNTS[len(labels)]} reference grasps{radii}"
+    return f"stable in {len(labels) - len(unstable)} of {len(labels)} reference grasps{radii}"

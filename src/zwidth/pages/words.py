@@ -166,15 +166,18 @@ def _compare_with_limit(scene: Scene) -> list[str]:
     ]
 
 
-def diagnosis_lines(found: Diagnosis | None) -> list[str]:
-    """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+def spell_diagnosis(found: Diagnosis | None) -> list[tuple[str, str]]:
+    """Return pairs of label and text: the result of a diagnosis and, if the device oscillates, its remedies."""
     if found is None:
         return []
     advice = found.advise()
-    return [
-        line("simulated" if found.cause == "none" else "CAUTION", f"{found.word}: {found.explain()}"),
-        *([line("", f"to stop it: {advice}")] if advice else []),
-    ]
+    label = "simulated" if found.cause == "none" else "CAUTION"
+    return [(label, f"{found.word}: {found.explain()}"), *([("", f"to stop it: {advice}")] if advice else [])]
+
+
+def diagnosis_lines(found: Diagnosis | None) -> list[str]:
+    """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+    return [line(*each) for each in spell_diagnosis(found)]
 
 
 def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
@@ -192,7 +195,7 @@ def note_lines(notes: list[str]) -> list[str]:
 
 
 class Slope(NamedTuple):
-    """The derivative of K_max in one parameter of a scene, and what a small step of it comes to in words."""
+    """The derivative of K_max with respect to one parameter, and the effect of a small change in words."""
 
     name: str
     value: float
@@ -200,7 +203,9 @@ class Slope(NamedTuple):
     words: str
 
     def line(self) -> str:
-        return row(f"dK_max/d({self.name})", f"{with_unit(self.value, self.unit)}: {self.words}")
+        """Return the derivative as a printed line."""
+        name = "inertia" if self.name == "mass" and self.unit.endswith("kg m^2") else self.name
+        return row(f"dK_max/d({name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
         return {"value": self.value, "unit": self.unit}

@@ -26,7 +26,8 @@ TIME_CONSTANTS = 30.0  # length of a simulation, in time constants of the linear
 FEWEST_PERIODS = 2000  # length of the shortest simulation, in sampling periods
 MOST_PERIODS = 200_000  # length of the longest simulation, in sampling periods; limits the run time
 SETTLED = 2.0  # time constants that must be simulated before an UNCLEAR motion may count as sustained
-CONFIRMED = "simulated at these and larger changes; check the value that you choose with diagnose"
+CONFIRMED = "simulated at these and larger changes: check the value that you choose with diagnose"
+FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in proportion to its steps"
 
 
 @shown(
@@ -112,11 +113,13 @@ class Diagnosis:
         """Return the remedies in one sentence; "" if none is needed."""
         if self.cause in ("none", "undecided"):
             return ""
-        if self.remedies:
-            simulated = self.cause != "instability"
-            advice = ", or ".join(remedy.spell(3 if simulated else 4) for remedy in self.remedies)
-            return f"{advice} ({CONFIRMED})" if simulated else advice
-        return "no remedy by a change of one parameter was found"
+        simulated = self.cause != "instability"
+        advice = ", or ".join(remedy.spell(3 if simulated else 4) for remedy in self.remedies)
+        parts = [advice or "no remedy by a change of one parameter was found"]
+        parts += [CONFIRMED] if advice and simulated else []
+        # Without friction the loop scales with the encoder step, and between two force steps no equilibrium exists.
+        parts += [FRICTIONLESS] if self.cause == "quantization" and not self.hardware.static else []
+        return "; ".join(parts)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as JSON values, with None in place of NaN and infinity."""

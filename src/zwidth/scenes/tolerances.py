@@ -1,7 +1,7 @@
-"""How many devices of a series bear a wall, by chance: parameters drawn within their tolerances (any loop).
+"""Estimate the share of devices on which a wall is stable, from parameters drawn within their tolerances (any loop).
 
-Where every device must be safe, `zwidth.robust_wall` proves it for the whole box; here the share is estimated, with its
-confidence interval, which says more where the corners of the box hardly ever occur together.
+If the wall must be stable on every device, use `zwidth.robust_wall`, which searches the whole box of devices. The share
+and its confidence interval are more useful if the vertices of the box hardly ever occur.
 """
 
 from __future__ import annotations

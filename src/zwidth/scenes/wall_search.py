@@ -247,8 +247,9 @@ def choose_wall(
     ):
         active += unstable
         choice = _choose_free(scene, wanted, top, HELD * choice.stiffness, width, active)
-    softer = active and choice.status == Status.OK and choice.stiffness < (1.0 - 2.0 * width) * free.stiffness
-    return choice._replace(limit="grasps" if softer else free.limit)
+    if choice.status != Status.OK:
+        return choice
+    return choice._replace(limit="grasps" if choice.stiffness < (1.0 - 2.0 * width) * free.stiffness else free.limit)
 
 
 def _choose_free(

@@ -38,7 +38,7 @@ from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.wall_search import RANGES, Grasps
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit
-from zwidth.words.quantities import LONGEST_SETTLING, WALL_RANGE, Range
+from zwidth.words.quantities import WALL_RANGE, Range
 
 
 class ResponseStudy(ComputedStudy):
@@ -61,7 +61,7 @@ class ResponseStudy(ComputedStudy):
     def respond(
         self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
     ) -> tuple[dict[str, Any], str]:
-        """The response of a device to 1 N, normalized to a unit force, as columns; and what to say where it is late."""
+        """Return the response of a device to 1 N, normalized to a unit force, as columns, and a note on settling."""
         periods = max(1, round(self.duration.periods(device.period)))
         raw = step_response(alpha, beta, device.delta, device.d, periods=periods, substeps=self.substeps)
         clock, length = (device.period, 1.0 / device.to_scene().units.stiffness) if physical else (1.0, 1.0)
@@ -77,9 +77,7 @@ class ResponseStudy(ComputedStudy):
             f"settling_time{second}": settling_time,
         }
         if np.isnan(settling_time):
-            longest = f"the delay exceeds {LONGEST_SETTLING} periods"
-            unknown = f"the wall is not stable, its poles nearly coincide, or {longest}"
-            return columns, f"no settling time: {unknown}"
+            return columns, "no settling time: the wall is not stable, or needs more than 500,000 periods to settle"
         after = with_unit(settling_time, "s", 3) if physical else f"{plain(settling_time)} periods"
         late = settling_time > time[-1]
         return columns, f"the response settles after {after}, later than the time shown" if late else ""

@@ -25,7 +25,7 @@ from zwidth.simulation.simulate import Contact
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import header, name_wall
-from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, Range
+from zwidth.words.quantities import HARDWARE, NOT_NEGATIVE, POSITIVE, Range
 
 LONGEST = 1_000_000
 """Periods that one motion may take."""
@@ -98,7 +98,7 @@ class Circumstances(Strict):
 class SimulatedStudy(ComputedStudy):
     """What the studies that simulate share."""
 
-    from_scene = ("device",)
+    from_scene = ("device", *HARDWARE)
     takes_parts = True
     simulates = True
 

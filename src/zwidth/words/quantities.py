@@ -52,10 +52,10 @@ WALL_RANGE = (1e-60, 1e60)
 LARGEST_DAMPING = 1e12
 LONGEST_DELAY = 1e5
 SIZES = {"alpha": WALL_RANGE, "beta": WALL_RANGE, "delta": (0.0, LARGEST_DAMPING), "d": (0.0, LONGEST_DELAY)}
-MAX_DELAY_PERIODS = 10_000.0  # longest delay in files, in periods; a longer one has a wrong unit
-MOST_POLES = 4000  # their computation takes minutes and 0.3 GB
-LONGEST_SETTLING = 500  # longest delay with a settling time, in periods; the computation needs all poles
-RECOMMENDED_SHARE = 0.75  # stiffness of a recommended wall relative to K_max
+MAX_DELAY_PERIODS = 10_000.0  # longest delay in files; a longer one is a wrong unit
+MOST_POLES = 4000  # largest degree for all poles, which takes minutes and 0.3 GB
+# Stiffness of a recommended wall over that of the stiffest stable one.
+RECOMMENDED_SHARE = 0.75
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,8 @@ _OF_MOTIONS = (
     Parameter("max_rate", "the fastest that the command changes", "R_m", POSITIVE, "N/s", note="without one no limit"),
 )  # fmt: skip
 OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
-# Every number of a part or a motion. The noise of an estimate is no axis of a sweep.
+# Encoder, friction and motor: arguments of `zwidth.diagnose` and `zwidth.simulate`.
+HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
 FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 

@@ -73,7 +73,7 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(unpain
     assert text.count("# fitted, 95 % between") == 3
     file = tmp_path / "fitted.yaml"
     file.write_text(text, encoding="utf-8")
-    assert load_config(file).name == "fitted_device"
+    assert load_config(file).name == "fitted_2_buzzing_walls"
     fitted = json.loads(run(*WALLS, "--period", "1 ms", "--json", *more))
     assert fitted["mass"] == fit_buzz(POINTS, period=1e-3, velocity=velocity).mass
     for name in ("mass", "damping", "delay"):
@@ -187,7 +187,7 @@ def test_what_is_not_ok_is_told_first():
     first, *others = run(*arguments).splitlines()
     assert not any(line.startswith("SET ") for line in others)
     assert first == "NO WALL    resolve the warnings first, then record again"
-    assert "WARNING    UNREACHABLE: the delay is at the end of the search range" in others
+    assert "WARNING    the delay is at the end of the search range, 1.000 ms; give a longer max_delay" in others
     text = run(*arguments, "--yaml")
     assert 'reason: "the delay is at the end of the search range"' in text
     assert "    stiffness: 0.0 N/m\n" in text

@@ -65,7 +65,8 @@ def test_the_first_line_reports_a_limit_cycle():
 
 def test_a_delay_that_is_left_out_has_a_caution():
     device, text = DEVICE[:6], "no delay given: the results hold only if the force acts at the sample"
-    for command, wall in (("recommend", []), ("ridge", []), ("check", ["--stiffness", "1 kN/m"])):
+    for command in ("recommend", "ridge", "check", "simulate", "diagnose"):
+        wall = [] if command in ("recommend", "ridge") else ["--stiffness", "1 kN/m"]
         said = CliRunner().invoke(cli, [command, *device, *wall]).stdout
         assert " ".join(said.split()).count(f"CAUTION {text}") == 1
         assert text not in CliRunner().invoke(cli, [command, *DEVICE, *wall]).stdout

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zwidth.fitting.encoder import MeasurementNoise, find_resolution, fits_steps
+from zwidth.fitting.encoder import MeasurementNoise, find_resolution, find_steps, fits_steps
 
 STEP = 3e-5
 
@@ -78,3 +78,21 @@ def test_positions_of_a_step_are_told_from_others():
     assert fits_steps(position, STEP / 3)
     assert not fits_steps(position, 1.1 * STEP)
     assert not fits_steps(slow_motion(), STEP)
+
+
+@pytest.mark.parametrize("decimals", [2, 3, 4])
+@pytest.mark.parametrize("wrapped", [False, True])
+@pytest.mark.parametrize("unit", [1.0, np.pi / 180.0])
+def test_an_encoder_is_found_in_a_column_of_rounded_degrees(decimals, wrapped, unit):
+    step = 360.0 / 2048
+    angle = step * np.round(np.cumsum(np.cumsum(np.random.default_rng(decimals).standard_normal(1500))) / 20.0)
+    angle = np.round(np.mod(angle, 360.0) if wrapped else angle, decimals)
+    found = find_steps(unit * angle)
+    # The rounded ends of the record determine the step.
+    assert found[0] / unit == pytest.approx(step, abs=10.0**-decimals / 100.0)
+    assert found[1] / unit == pytest.approx(10.0**-decimals, rel=1e-6)
+
+
+def test_few_rounded_positions_suggest_no_coarse_step():
+    angle = np.array([0.0, 0.6, 1.6, 3.1, 4.6])
+    assert find_steps(angle) == pytest.approx((0.1, 0.1))

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from loop_logs import respond_from_rest
 from scipy.linalg import expm
 from scipy.optimize import least_squares
-from scipy.signal import lfilter, ss2tf
+from scipy.signal import lfilter
 
 import zwidth
 from zwidth.fitting.words import detail_fit, summarize_fit, write_scene
@@ -39,27 +40,13 @@ def move(mass, damping, delay, force, start=(0.0, 0.0), offset=0.0):
     return np.array(places)
 
 
-def answer(mass, damping, delay, force):
-    """The same from rest, by SciPy's transfer functions of the two parts."""
-    whole, fraction = int(delay // PERIOD), delay / PERIOD % 1
-    rate = np.array([[0, 1, 0], [0, -damping / mass, 1 / mass], [0, 0, 0]])
-    one, first, second = (expm(rate * part * PERIOD) for part in (1.0, fraction, 1 - fraction))
-    late = np.concatenate([np.zeros(whole + 1), force])
-    moved = np.zeros(force.size)
-    pushes = (second[:2, :2] @ first[:2, 2], late[: force.size]), (second[:2, 2], late[1 : force.size + 1])
-    for push, held in pushes:
-        top, bottom = ss2tf(one[:2, :2], push[:, None], np.array([[1.0, 0.0]]), np.zeros((1, 1)))
-        moved += lfilter(top[0], bottom, held)
-    return moved
-
-
 def fit_again(force, position, skip, start):
     """By SciPy's least squares with difference quotients, from another start."""
     j = np.arange(position.size - skip)
 
     def rest(x):
         slow = np.exp(-x[1] / x[0] * PERIOD * j)
-        model = answer(x[0], x[1], x[2] * PERIOD, force)[skip:] + x[3] + x[4] * slow
+        model = respond_from_rest(x[0], x[1], x[2] * PERIOD, PERIOD, force)[skip:] + x[3] + x[4] * slow
         return (model - position[skip:]) / np.std(position)
 
     options = {"x_scale": "jac", "xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "jac": "3-point"}

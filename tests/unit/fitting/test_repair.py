@@ -9,6 +9,7 @@ import zwidth
 from zwidth.cli import cli
 from zwidth.fitting.columns import fit_motions, read_log
 from zwidth.fitting.repair import find_glitches, repair_log
+from zwidth.fitting.words import summarize_fit
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 from zwidth.words.unit_system import ROTARY
@@ -144,7 +145,7 @@ def test_repairs_are_right(seed):
     count, turns = knob.reading, rng.random() < 0.7
     if turns:
         count = np.mod(count + int(rng.integers(0, knob.counts)), knob.counts)
-    wild = np.sort(rng.choice(np.arange(10, 790), 2, replace=False)) if rng.random() < 0.5 else np.zeros(0, int)
+    wild = np.sort(rng.choice(np.arange(10, 790), 4, replace=False)) if rng.random() < 0.8 else np.zeros(0, int)
     count = count.copy()
     # A third to two thirds of a turn away from the true count.
     count[wild] = np.mod(count[wild] + rng.integers(knob.counts // 3, 2 * knob.counts // 3, wild.size), knob.counts)
@@ -203,3 +204,22 @@ def test_a_rounded_force_column_is_named():
     assert fit.status == Status.UNDECIDED
     assert any("the force column is rounded to 100 µN m" in doubt for doubt in fit.doubts)
     assert not any("resonance" in doubt for doubt in fit.doubts)
+    # One warning states one fact.
+    assert [label for label, _ in summarize_fit(fit)].count("WARNING") == len(fit.doubts)
+
+
+@pytest.mark.parametrize("unit, decimals", [("deg", 3), ("rad", 5)])
+def test_an_ideal_wrapped_angle_has_the_step_of_its_column(unit, decimals, tmp_path):
+    """A constant torque moves a knob without damping by whole multiples of its first move."""
+    torque = 0.02 * np.repeat(np.random.default_rng(2).choice([-1.0, 1.0], 15), 40)
+    place = 6.2 + respond_from_rest(1.2e-5, 1e-12, 0.0, 1e-3, torque)
+    turn, size = (360.0, 180.0 / np.pi) if unit == "deg" else (2.0 * np.pi, 1.0)
+    angle = [f"{each:.{decimals}f}" for each in np.mod(size * place, turn)]
+    file = tmp_path / "log.csv"
+    rows = [[f"{1e-3 * k:.3f}", x, f"{f:g}"] for k, (x, f) in enumerate(zip(angle, torque, strict=True))]
+    file.write_text(write(f"time [s],angle [{unit}],torque [N m]", rows))
+    fit = fit_motions([read_log(file, {})])
+    assert any("wraps at 6.28319 rad" in note for note in fit.notes)
+    assert fit.resolution == pytest.approx(10.0**-decimals / size, rel=1e-6)
+    assert "as expected for an encoder step of" in dict(summarize_fit(fit))["fit"]
+    assert fit.mass == pytest.approx(1.2e-5, rel=1e-4)

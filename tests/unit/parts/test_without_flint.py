@@ -6,9 +6,9 @@ import sys
 
 import numpy as np
 import pytest
+from mpmath import mp
 
 import zwidth
-from zwidth.loops.linear.certified import prove_zeros
 from zwidth.loops.linear.sampled_zeros import find_sampled_zeros
 from zwidth.parts.exact_polynomials import find_common_factor, find_roots, multiply, trim
 
@@ -21,6 +21,7 @@ import zwidth
 systems = [
     scipy.signal.TransferFunction([1.0], [0.1, 10.0, 0.0]),
     ([1.0, 20.0], [0.1, 10.0, 5e3, 0.0]),
+    ([1.0], [0.1, 0.0, 0.0]),
     "1 0 / 1 2 1",
     scipy.signal.ZerosPolesGain([-300.0], [0.0, -40.0, -100 + 700j, -100 - 700j], 1e6),
     (np.array([[0.0, 1.0], [-900.0, -3.0]]), np.array([[0.0], [4.0]]), np.array([[1.0, 0.0]])),
@@ -48,20 +49,43 @@ def test_a_core_install_finds_the_same_walls():
     assert json.loads(blocked.stdout)[2][0] == pytest.approx(19864.93, rel=1e-6)
 
 
+def response(zeros, poles, gain, period, fraction, z):
+    """The sampled response z^1 G(z) of a strictly proper system with simple poles, by partial fractions."""
+    total = mp.mpc(0)
+    for k, p in enumerate(poles):
+        residue = mp.mpf(gain) * mp.fprod(p - q for q in zeros)
+        residue /= mp.fprod(p - q for i, q in enumerate(poles) if i != k)
+        a, late = mp.exp(p * period), mp.expm1(p * period * (1 - fraction)) / p
+        full = mp.expm1(p * period) / p
+        total += residue * (z * late + full - late if fraction else full) / (z - a)
+    return total
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 1e-3])
-def test_zeros_between_samples_are_those_of_ball_arithmetic(fraction):
-    pytest.importorskip("flint")
+def test_zeros_between_samples_are_those_of_the_response(fraction):
     rng = np.random.default_rng(5)
     for count in (1, 2, 4, 5):
-        poles = -(10 ** rng.uniform(0, 4, count)) + 0j
-        poles = np.concatenate([poles, [-30 + 800j, -30 - 800j]])
-        zeros = -(10 ** rng.uniform(0, 4, count - 1))
+        poles = [*(-(10 ** rng.uniform(0, 4, count))).tolist(), -30 + 800j, -30 - 800j]
+        zeros = (-(10 ** rng.uniform(0, 4, count - 1))).tolist()
         device = zwidth.LinearDevice((zeros, poles, 3.0))
-        gain, offsets = prove_zeros(device, 1e-3, (fraction, 0))
         lead, found = find_sampled_zeros(device, 1e-3, fraction)
-        assert lead * device.mass / 1e-6 == pytest.approx(gain, rel=1e-14)
-        order = [np.lexsort((np.imag(part), np.real(part))) for part in (offsets, found)]
-        np.testing.assert_allclose(found[order[1]], offsets[order[0]], rtol=1e-14)
+        with mp.workdps(80):
+            exact = [mp.mpc(pole) for pole in poles]
+            for angle in (0.01, 0.3, 1.0, 3.0):
+                z = mp.expj(angle)
+                value = mp.mpf(lead) * mp.fprod(z - 1 + mp.mpc(zero) for zero in found.tolist())
+                value /= mp.fprod(z - mp.exp(pole * mp.mpf(1e-3)) for pole in exact)
+                expected = response([mp.mpf(q) for q in zeros], exact, 3.0, mp.mpf(1e-3), mp.mpf(fraction), z)
+                assert abs(value / expected - 1) < 1e-13
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3e-3, 1.5e-3])
+def test_undamped_masses_have_the_walls_of_the_closed_form(delay):
+    """1/(m s^2), a chain of integrators: no coefficient of the denominator sets a time scale."""
+    mass = zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(1e-3, delay)).max_stiffness()
+    system = zwidth.Scene(zwidth.LinearDevice("10 / 1 0 0"), zwidth.Timing(1e-3, delay)).max_stiffness()
+    assert system.stiffness == pytest.approx(mass.stiffness, rel=1e-12)
+    assert system.virtual_damping == pytest.approx(mass.virtual_damping, rel=1e-6)
 
 
 def test_roots_of_exact_polynomials():

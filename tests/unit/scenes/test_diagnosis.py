@@ -56,6 +56,18 @@ def test_remedies_are_simulated() -> None:
         assert (again.cause, again.amplitude) == ("none", 0.0), remedy
 
 
+def test_without_friction_the_limit_cycle_scales_with_the_encoder_step() -> None:
+    ratios = []
+    for step in (2e-5, 2e-6, 2e-7):
+        found = zwidth.diagnose(PHANTOM, 8008, 33.45, resolution=step, remedies=False)
+        assert (found.cause, found.remedies) == ("quantization", ())
+        ratios.append(found.amplitude / step)
+    assert ratios == pytest.approx([ratios[0]] * 3, rel=1e-3)
+    assert found.advise().endswith(
+        "without friction a finer encoder only reduces the amplitude, in proportion to its steps"
+    )
+
+
 def test_without_an_encoder() -> None:
     found = zwidth.diagnose(PHANTOM, 8008, 33, coulomb=0.05)
     assert (found.cause, found.amplitude, found.word, found.advise()) == ("none", 0.0, "AT REST", "")

@@ -1,4 +1,4 @@
-"""Proved bounds of families of devices, against many samples, certified verdicts and a local search."""
+"""Limits of families of devices, against many samples, certified verdicts and another search."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def row_end(wall):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_no_device_that_is_found_beats_the_proved_bounds(seed):
+def test_no_device_that_another_search_finds_is_weaker(seed):
     box = random_box(np.random.default_rng(100 + seed))
     worst, wall = robust_max_stiffness(**box), robust_wall(**box)
     assert worst.status == Status.OK, box
@@ -95,8 +95,8 @@ def test_one_wall_for_all():
         assert not np.all(stable(vertices, stiffer, 1 + 1e-6))
 
 
-def test_devices_within_a_box_that_bind_are_found_by_the_proof():
-    """With the walls of the devices that were searched for, three parts of the box show one that is unstable."""
+def test_limiting_devices_inside_a_box_are_found():
+    """The best wall for the vertices of this box is unstable on devices inside it."""
     box = {
         "mass": (9.54e-3, 14.14e-3),
         "damping": (1.66, 2.48),

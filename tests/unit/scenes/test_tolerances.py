@@ -35,11 +35,11 @@ def test_the_stiffness_is_borne_by_that_share_and_hardly_more_is_not():
     assert found.stiffness_max > found.stiffness
 
 
-def test_a_share_of_all_lies_between_the_proved_and_the_nominal():
+def test_a_share_of_all_lies_between_the_weakest_and_the_nominal():
     found = zwidth.simulate_tolerances(SCENE, SHARES)
     box = {"mass": zwidth.Interval(0.08, 0.12), "damping": zwidth.Interval(7.0, 13.0)}
-    proved = zwidth.robust_max_stiffness(**box, period=1e-3, delay=1e-3)
-    assert proved.stiffness < found.stiffness_max < SCENE.max_stiffness().stiffness
+    weakest = zwidth.robust_max_stiffness(**box, period=1e-3, delay=1e-3)
+    assert weakest.stiffness < found.stiffness_max < SCENE.max_stiffness().stiffness
 
 
 def test_draws_are_repeated_by_their_seed_and_keep_to_their_distribution():

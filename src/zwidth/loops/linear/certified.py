@@ -1,9 +1,13 @@
-"""Stability of any scene that is never guessed: its characteristic polynomial in balls, decided by Schur and Cohn.
+"""Certified verdicts of any linear loop: its characteristic polynomial in balls, decided by the Schur-Cohn recursion.
 
-Every number of the scene and of the wall is taken as exact; only the delay in periods is the float64 quotient that the
-scene uses. The chain's matrix exponential, its characteristic polynomial and the velocity estimate are balls of
-python-flint. With P of degree n and ``P*(z) = z^n P(1/z)``, all zeros of P lie inside the unit circle exactly if
-``|P(0)| < |lead|`` and those of ``(lead P - P(0) P*)/z`` do. Where a comparison is not certain, the precision doubles.
+All parameters of the scene and of the wall are exact; the delay in periods is the float64 quotient that the scene uses.
+The matrix exponential of the device, its characteristic polynomial and the velocity estimate are balls of python-flint.
+Let P have degree n, and let ``P*(z) = z^n P(1/z)``. All zeros of P lie inside the unit circle if and only if
+``|P(0)| < |lead|`` and all zeros of ``(lead P - P(0) P*)/z`` lie inside it. The precision is doubled until all
+comparisons are certain.
+
+References:
+    Schur 1917; Cohn 1922; Johansson 2017.
 """
 
 from __future__ import annotations
@@ -18,7 +22,6 @@ import numpy as np
 from zwidth.arrays.balls import BITS, available
 from zwidth.parts.chain import AnyChain, chain_of
 from zwidth.parts.linear_device import LinearDevice
-from zwidth.parts.system import System
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError, how_to_install
 from zwidth.words.status import Status
@@ -26,13 +29,11 @@ from zwidth.words.status import Status
 if TYPE_CHECKING:
     import flint
 
-# What is right to float64.
-_FLOAT_BITS = 60
-_NOTHING = Estimate(0, 0.0)
+NO_ESTIMATE = Estimate(0, 0.0)
 
 
 def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and statuses of walls of one shape, in SI units."""
+    """Return labels and statuses of walls of one shape, in SI units."""
     if not available():
         raise InputError(f"method: 'certified' needs python-flint for this scene: {how_to_install('certified')}")
     polynomials = cache(lambda bits: _polynomials(scene))
@@ -43,6 +44,7 @@ def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tupl
 
 
 def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float) -> tuple[bool, Status]:
+    """Return label and status of one wall."""
     import flint
 
     if not (np.isfinite(stiffness) and np.isfinite(damping)):
@@ -53,7 +55,7 @@ def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float)
             p = D + N1 * flint.arb(stiffness) + N2 * flint.arb(damping)
             at_one = stiffness == 0 and rest
             if at_one:
-                # z = 1 is a pole; the others decide whether it is the only one not inside.
+                # z = 1 is a pole; decide on the other poles.
                 p = p // flint.arb_poly([-1, 1])
             verdict = all_inside(p)
         if verdict is not None:
@@ -62,7 +64,7 @@ def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float)
 
 
 def all_inside(p: flint.arb_poly) -> bool | None:
-    """Whether all zeros lie inside the unit circle; None where the balls are too wide to tell."""
+    """Return whether all zeros lie inside the unit circle; None if the balls are too wide."""
     import flint
 
     while p.degree() > 0:
@@ -81,12 +83,12 @@ def all_inside(p: flint.arb_poly) -> bool | None:
 
 
 def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly, bool]:
-    """D, N1 and N2 of ``P = D + K N1 + B N2`` in SI units, and whether K = 0 leaves a pole at z = 1 exactly."""
+    """Return D, N1 and N2 of ``P = D + K N1 + B N2`` in SI units, and whether K = 0 puts a pole at exactly z = 1."""
     import flint
 
     exact = _exact(scene)
     period = exact.timing.period
-    chain = chain_of(exact, (scene.d, int(scene.d)), _NOTHING)
+    chain = chain_of(exact, (scene.d, int(scene.d)), NO_ESTIMATE)
     answer, device = _device(chain)
     estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
     top, bottom = _estimate_polynomials(estimate)
@@ -99,54 +101,23 @@ def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_
 
 
 def _exact(part: Any) -> Any:
-    """A scene, or a part of one, with exact balls for numbers, past the checks of these."""
+    """Return a scene, or a part of one, with exact balls as numbers; skip their checks, which need floats."""
     import flint
 
     if isinstance(part, tuple):
         return tuple(map(_exact, part))
     if isinstance(part, LinearDevice) or not is_dataclass(part):
-        # A linear device is exact by itself.
+        # The coefficients of a linear device are exact fractions.
         return flint.arb(part) if isinstance(part, float) else part
-    # Without what the part has computed from its numbers.
+    # Omit cached values, which are floats.
     made = object.__new__(type(part))
     for item in fields(part):
         object.__setattr__(made, item.name, _exact(getattr(part, item.name)))
     return made
 
 
-def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -> tuple[float, np.ndarray]:
-    """Return the gain of the sampled response of a linear device, and ``1 - z`` of its zeros, to float64 accuracy."""
-    # Use balls, because float64 does not resolve slow zeros next to the aliases of fast poles.
-    import flint
-
-    # A zero at s = 0 (no static response to a constant force) becomes a zero at exactly z = 1.
-    still = device.system.numerator[-1] == 0
-    for bits in BITS:
-        with flint.ctx.workprec(bits):
-            ball = flint.arb(period)
-            response, _ = _device(System(device, ball, flint.arb(device.mass), *delay, _NOTHING))
-            coefficients = response.coeffs()
-            while coefficients and coefficients[-1].contains(0):
-                # What no precision tells from 0 is 0 once the others are known far beyond float64.
-                coefficients.pop()
-            if coefficients and coefficients[-1].rel_accuracy_bits() > _FLOAT_BITS:
-                try:
-                    offsets = flint.arb_poly(coefficients)(flint.arb_poly([1, -1]))
-                    if still:
-                        offsets = flint.arb_poly(offsets.coeffs()[1:])
-                    roots = flint.acb_poly(offsets).roots(tol=2.0 ** (-bits // 3)) if offsets.degree() > 0 else []
-                except ValueError:
-                    roots = None
-                if roots is not None and all(root.rel_accuracy_bits() > _FLOAT_BITS for root in roots):
-                    zeros = [complex(root) for root in roots] + [0j] * still
-                    return float(coefficients[-1]), np.array(zeros, complex)
-    raise InputError(
-        "device: zeros of the sampled response cannot be computed to float64 accuracy; remove modes of tiny response"
-    )
-
-
 def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
-    """Numerator and denominator of G without its whole periods of delay."""
+    """Return numerator and denominator of G without its integer delay."""
     import flint
 
     rate, push, _ = (array.tolist() for array in chain.realize())
@@ -167,7 +138,7 @@ def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
     device = step.charpoly()
 
     def numerator(state: flint.arb_mat) -> flint.arb_poly:
-        """``C adj(z - A) push``, by the lemma of the determinant; C is the first number of the state."""
+        """Return ``C adj(z - A) state`` by the matrix determinant lemma; C selects the first state."""
         changed = flint.arb_mat(step)
         for k in range(size):
             changed[k, 0] = changed[k, 0] - state[k, 0]

@@ -17,9 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.balls import available
 from zwidth.arrays.held_mass import Plant, factor_numerator, held_plant
-from zwidth.loops.linear.certified import prove_zeros
 from zwidth.loops.linear.roots import LoopRoots, step_apart
 from zwidth.loops.linear.sampled_zeros import find_sampled_zeros
 from zwidth.parts.chain import AnyChain, Chain, is_zero
@@ -108,7 +106,7 @@ def required_wall(chain: AnyChain, w: Any, parts: Sampled | Plant) -> Any:
 
 
 def find_roots(chain: AnyChain) -> LoopRoots:
-    """The loop of a chain by its roots."""
+    """Return the loop of a chain by its roots."""
     if isinstance(chain, Chain) and chain.rigid:
         return _rigid_loop(chain)
     chain.check()
@@ -117,11 +115,8 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         lag, (zeros, poles) = chain.whole + (chain.d != chain.whole), chain.device.offsets
         gain = chain.device.gain * float(chain.mass) / float(chain.period) ** 2
         if not chain.sampled:
-            if available():
-                gain, zeros = prove_zeros(chain.device, float(chain.period), (float(chain.d), chain.whole))
-            else:
-                lead, zeros = find_sampled_zeros(chain.device, float(chain.period), float(chain.d) - chain.whole)
-                gain = lead * float(chain.mass) / float(chain.period) ** 2
+            lead, zeros = find_sampled_zeros(chain.device, float(chain.period), float(chain.d) - chain.whole)
+            gain = lead * float(chain.mass) / float(chain.period) ** 2
             poles = -np.expm1(chain.device.poles * float(chain.period))
         # Poles at z = 0 are periods of delay, which zeros there take away as far as there are any.
         lag, still = int(lag + np.sum(poles == 1)), int(np.sum(zeros == 1))

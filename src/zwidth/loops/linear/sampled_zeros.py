@@ -1,8 +1,8 @@
-"""Zeros of a linear system ``x' = A x + B u`` after zero-order-hold discretization, if python-flint is not installed.
+"""Zeros of a linear system ``x' = A x + B u`` after zero-order-hold discretization.
 
 A matrix exponential discretizes the system, and the Faddeev-LeVerrier algorithm computes the numerator of its transfer
-function. Both use decimal arithmetic. The precision is doubled until two successive results agree. With python-flint,
-`zwidth.loops.linear.certified.prove_zeros` computes the same zeros with error bounds.
+function. Both use decimal arithmetic. The precision is doubled until two successive results agree,
+because float64 does not resolve slow zeros next to the aliases of fast poles.
 """
 
 from __future__ import annotations
@@ -108,9 +108,8 @@ def _discretize(bottom: list[Decimal], top: list[Decimal], time: Decimal) -> tup
     order = len(bottom) - 1
     monic = [value / bottom[0] for value in bottom]
     # Scale time so that all coefficients of the denominator are at most 1.
-    unit = (
-        max((abs(value).ln() / k).exp() for k, value in enumerate(monic) if k and value) if any(monic[1:]) else 1 / time
-    )
+    sizes = [(abs(value).ln() / k).exp() for k, value in enumerate(monic) if k and value]
+    unit = max(sizes, default=Decimal(1))  # must not depend on ``time``, because responses of two times are combined
     block = np.full((order + 1, order + 1), Decimal(0), object)
     for k in range(order - 1):
         block[k, k + 1] = Decimal(1)

@@ -1,10 +1,17 @@
-"""Stability that is never guessed: the verdict in float64 with a proved error bound, then in ball arithmetic.
+"""Certified verdicts of the rigid loop: the closed form with a static error bound, then ball arithmetic.
 
-The text is that of `loops.rigid.crossover`; for the points that the floating-point filter leaves open its numbers are
-balls of python-flint (optional) around inputs taken as exact, and the precision doubles until a verdict is certain
-(Walton, Marshall 1987; Rump 1999; Johansson 2017). What no precision decides is a pair of poles exactly on the unit
-circle. For delta > 0 and alpha > 0 no such point is known: c is then transcendental, while alpha, beta, delta and d are
-rational. For delta = 0 there are such walls (alpha = 0, beta = 2, d = 0): they stay undecided.
+Both steps evaluate the source code of `loops.rigid.crossover`, with other numbers:
+
+1. `Sized`: float64 values, each with the sum of the magnitudes of its terms. A comparison holds if the difference
+   exceeds `TOLERANCE` times that sum. This static bound covers all rounding errors (docs/theory/certified.md).
+2. Balls of python-flint (optional) around exact inputs, for walls that the first step leaves open. The precision is
+   doubled until the verdict is certain.
+
+A wall stays UNDECIDED if poles other than z = 1 lie exactly on the unit circle. For delta > 0 and alpha > 0 no such
+wall is known: c is then transcendental, but alpha, beta, delta and d are rational.
+
+References:
+    Walton, Marshall 1987; Rump 1999; Johansson 2017; Devillers, Pion 2003 (static filters).
 """
 
 from __future__ import annotations
@@ -15,59 +22,208 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.arrays.balls import BITS, available
-from zwidth.arrays.held_mass import DeviceTerms, PhiFunctions, held_plant
-from zwidth.loops.rigid.certified_filter import OPEN, STABLE, UNSTABLE, filter_walls
-from zwidth.loops.rigid.crossover import Lag, Verdict, first_zero, long_verdict, short_verdict
-from zwidth.loops.rigid.folding import Points, pick_points
+from zwidth.arrays.evaluate import evaluate_columns
+from zwidth.arrays.held_mass import DelayClasses, DeviceTerms, PhiFunctions, classify_delays, held_plant
+from zwidth.arrays.held_mass import device as discretize
+from zwidth.loops.rigid.crossover import Lag, Verdict, compute_lag, first_zero, long_verdict, short_verdict
+from zwidth.loops.rigid.folding import Points
 from zwidth.loops.rigid.normalization import wall_status
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.status import Status
-from zwidth.words.xp import horner
+from zwidth.words.types import Array
+from zwidth.words.xp import horner, namespace, nan_beyond, roots, store_once
 
 if TYPE_CHECKING:
     import flint
 
+# Relative to the size of a number. Steps C1 to C6 of docs/theory/certified.md derive the three bounds.
+TOLERANCE = 2.0**-35  # largest error of a number that depends on the gain crossover u
+CROSSOVER_WIDTH = 2.0**-39  # largest relative error of u
+CUBIC_TOLERANCE = 2.0**-45  # largest error of the cubic H whose zero is u
+TINY = 2.0**-960  # added to each size; TOLERANCE * TINY exceeds what XLA flushes to zero
 
-_EXTRA_BITS = 64
+UNSTABLE, STABLE, OPEN, EDGE = 0, 1, 2, 3  # codes; EDGE: alpha = 0, and all poles but z = 1 lie inside the circle
+
+
+class Sized:
+    """Float64 values with the sum of the magnitudes of their terms, elementwise.
+
+    The exact number differs from ``value`` by at most ``TOLERANCE * size``; without ``size``, ``value`` is exact. The
+    operators are those of ``flint.arb``.
+    """
+
+    __slots__ = ("exact", "size", "value")
+    __array_ufunc__ = None  # makes NumPy defer ``array * sized`` to this class
+
+    def __init__(self, value: Any, size: Any = None):
+        self.value = value
+        self.exact = size is None
+        self.size = abs(value) + TINY if size is None else size
+
+    def __add__(self, other: Any) -> Sized:
+        other = other if isinstance(other, Sized) else Sized(other)
+        value = self.value + other.value
+        # The sum of two exact numbers has only its own rounding error.
+        return Sized(value, abs(value) + TINY if self.exact and other.exact else self.size + other.size)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Sized:
+        return Sized(-self.value, None if self.exact else self.size)
+
+    def __sub__(self, other: Any) -> Sized:
+        return self + -other
+
+    def __rsub__(self, other: Any) -> Sized:
+        return -self + other
+
+    def __mul__(self, other: Any) -> Sized:
+        other = other if isinstance(other, Sized) else Sized(other)
+        return Sized(self.value * other.value, self.size * other.size + TINY)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Sized) -> Sized:
+        xp, quotient = namespace(other.value), self.value / other.value
+        least = abs(other.value) - TOLERANCE * other.size
+        return Sized(quotient, xp.where(least > 0, (self.size + abs(quotient) * other.size) / least, xp.inf))
+
+    def sqrt(self) -> Sized:
+        """Return the square root; NaN if ``value`` is negative."""
+        root = roots(self.value)[0]
+        # |sqrt x - sqrt v| = |x - v|/(sqrt x + sqrt v)
+        return Sized(root, self.size / root)
+
+    def __gt__(self, other: Any) -> Array:
+        difference = self - other
+        return difference.value > TOLERANCE * difference.size
+
+    def __lt__(self, other: Any) -> Array:
+        return -self > -other
+
+
+def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
+    """Return the code of each wall, elementwise."""
+    xp, plant = namespace(alpha, beta, delta), size_device(delta, d, kind)
+    wall, verdicts = (Sized(alpha), Sized(beta)), []
+    if kind.short:
+        verdicts.append(short_verdict(*wall, plant))
+    if kind.long:
+        verdicts.append(long_verdict(*wall, plant.whole, plant, enclose_zero, size_lag))
+    stable, unstable = (xp.where(plant.whole < 1, *pair) for pair in zip(verdicts[0], verdicts[-1], strict=True))
+    # At alpha = 0 the verdict is on the poles other than z = 1, for beta > delta (docs/theory, S15b). For alpha > 0 the
+    # lobe lies above beta = -delta (L16). P(1) = phi1 alpha < 0 implies a real pole above 1.
+    offset, edge = wall[1] + plant.delta, alpha == 0
+    valid = (edge & (beta > delta)) | ((alpha > 0) & (offset > 0))
+    code = xp.where(stable & valid, xp.where(edge, EDGE, STABLE), OPEN)
+    code = xp.where((unstable & valid) | (alpha < 0) | ((alpha > 0) & (offset < 0)), UNSTABLE, code)
+    return code.astype(xp.uint8)
+
+
+def size_device(delta: Array, d: Array, kind: DelayClasses) -> DeviceTerms:
+    """Return the `DeviceTerms` of exact delta and d, NaN if out of range."""
+    plant = discretize(delta, d, kind)
+    if kind.fractional and kind.long:
+        plant = store_once(plant, delta)  # because several loops of the compiled program use it
+    sized = DeviceTerms(*(Sized(value, abs(value) + TINY) for value in plant))
+    sized = sized._replace(delta=Sized(plant.delta), f=Sized(plant.f), whole=plant.whole, a0=None)
+    if kind.fractional:
+        # The rounding error of f changes a0 by up to 2^-52 a1.
+        a0 = Sized(plant.a0, plant.a0 + plant.a1 / 16.0 + TINY)
+        return sized._replace(a0=a0, gap=sized.a2 - sized.a1 + a0)
+    return sized
+
+
+def enclose_zero(cubic: tuple[Sized, ...]) -> tuple[Sized, Array]:
+    """Return the zero of the cubic, and whether sign changes certify it to `CROSSOVER_WIDTH`."""
+    u = first_zero(tuple(h.value for h in cubic))
+    low, high = (horner(Sized(u * (1.0 + side)), cubic) for side in (-CROSSOVER_WIDTH, CROSSOVER_WIDTH))
+    found = (low.value > CUBIC_TOLERANCE * low.size) & (high.value < -CUBIC_TOLERANCE * high.size)
+    return Sized(u, abs(u) + TINY), found & (u > 0) & (u <= 1.0)
+
+
+def size_lag(u: Sized, whole: Array) -> Lag:
+    """Return the delay phase at the crossover."""
+    lag = compute_lag(u.value, whole)
+    # The half angle h is at most pi/2, so that h <= pi/2 sin h.
+    cosine, sine = Sized(lag.cosine, 1.0), Sized(lag.sine, 4.0 * roots(lag.rise)[0] + TINY)
+    return Lag(cosine, sine, Sized(lag.rise, 5.0 * lag.rise + TINY), lag.within, lag.beyond)
+
+
+def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Return certified labels and their statuses; ON_BOUNDARY or UNDECIDED for walls without a label."""
+    columns = points.columns()
+    code = filter_walls(*columns)
+    stable, status = code == STABLE, np.zeros(code.shape, np.int32)
+    rest = np.flatnonzero(code >= OPEN)
+    if rest.size:
+        walls = (column if column.size == 1 else column[rest] for column in columns)
+        stable[rest], status[rest] = _decide_rest(code[rest], *walls)
+    return stable.reshape(points.shape), status.reshape(points.shape)
+
+
+def filter_walls(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return the code of each wall; OPEN if out of range."""
+    # Find invalid numbers by NumPy, because XLA treats those below 2^-1022 as 0.
+    device = (np.where(value < 0, np.nan, value) for value in (delta, d))
+    return evaluate_columns(wall_codes, [*nan_beyond(WALL_RANGE, alpha, beta), *device], classify_delays(d))
+
+
+def _decide_rest(
+    code: np.ndarray, alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return labels and statuses of walls that are at the edge alpha = 0, out of range, or left open by the filter."""
+    code, alpha, beta, delta, d = np.broadcast_arrays(code, alpha, beta, delta, d)
+    status = wall_status(alpha, beta, delta, d)
+    inside, stable = status == Status.OK, np.zeros(code.shape, bool)
+    # For alpha = 0 and |beta| <= delta, |beta N| <= |beta| phi1 <= 1 - c <= |z - c| on the circle: apart from z = 1, no
+    # pole lies outside.
+    edge = (alpha == 0) & ((code == EDGE) | (np.abs(beta) <= delta))
+    status[inside & edge] = Status.ON_BOUNDARY
+    # Walls with beta <= -delta are unstable: P(1) = 0 and P'(1) = phi1 (delta + beta) < 0, or L16.
+    left = np.flatnonzero(inside & ~edge & (beta > -delta))
+    status[left] = Status.UNDECIDED
+    if left.size and available():
+        walls = zip(*(column[left].tolist() for column in (alpha, beta, delta, d)), strict=True)
+        stable[left], status[left] = zip(*(decide(*wall) for wall in walls), strict=True)
+    return stable, status
 
 
 def decide(alpha: float, beta: float, delta: float, d: float) -> tuple[bool, Status]:
-    """Label and status of one exact point: alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
+    """Return label and status of one wall by balls; alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
     edge = alpha == 0
     for bits in BITS:
-        found = verdict(alpha, beta, delta, d, bits)
-        if found.stable or found.unstable:
-            inside = bool(found.stable)
-            return inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK
+        stable, unstable = verdict(alpha, beta, delta, d, bits)
+        if stable or unstable:
+            return bool(stable and not edge), Status.ON_BOUNDARY if stable and edge else Status.OK
     return False, Status.UNDECIDED
 
 
 def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Verdict:
-    """What is certain at one precision."""
+    """Return the verdict at one precision."""
     import flint
 
     with flint.ctx.workprec(bits):
-        here, wall = device(delta, d, bits), (flint.arb(alpha), flint.arb(beta))
-        return short_verdict(*wall, here) if d < 1 else long_verdict(*wall, int(d), here, _enclose_zero, _take_lag)
+        plant, wall = device(delta, d, bits), (flint.arb(alpha), flint.arb(beta))
+        return short_verdict(*wall, plant) if d < 1 else long_verdict(*wall, int(d), plant, _enclose_zero, _take_lag)
 
 
 @lru_cache(maxsize=64)
 def device(delta: float, d: float, bits: int) -> DeviceTerms:
-    """The device of exact delta and d in balls; whole maps share it."""
+    """Return the device of exact delta and d in balls, cached because all walls of a grid share it."""
     import flint
 
-    # What the rounding of delta (1 - f) loses, the phi-functions multiply.
-    with flint.ctx.workprec(bits + _EXTRA_BITS):
+    # Use 64 more bits, because the phi-functions amplify the rounding error of delta (1 - f).
+    with flint.ctx.workprec(bits + 64):
         x, f = flint.arb(delta), flint.arb(d - int(d))
-        late = _phi(x * (1 - f))
-        p = held_plant(x, f if f != 0 else None, _phi)
-        a0 = p.a0 if f != 0 else None
-        at = _phi(x)
+        at, late, plant = _phi(x), _phi(x * (1 - f)), held_plant(x, f if f != 0 else None, _phi)
         phis = at.phi1, at.phi2, at.psi, late.phi1, late.psi
-        return DeviceTerms(x, None, f, p.c, p.em, *phis, p.a2, p.a1, a0, p.gap, None)
+        a0 = plant.a0 if f != 0 else None
+        return DeviceTerms(x, None, f, plant.c, plant.em, *phis, plant.a2, plant.a1, a0, plant.gap, None)
 
 
 def _phi(x: flint.arb) -> PhiFunctions:
-    """The phi-functions of x >= 0, with as many bits more as the quotients cancel."""
+    """Return the phi-functions of x >= 0; the working precision compensates the cancellation of the quotients."""
     import flint
 
     if x == 0:
@@ -81,67 +237,28 @@ def _phi(x: flint.arb) -> PhiFunctions:
         return PhiFunctions(c, p1, p2, psi, p2 - psi)
 
 
-def _enclose_zero(cubic: tuple[Any, ...]) -> tuple[flint.arb, bool]:
-    """Newton's method on the midpoints, then the signs beside it."""
+def _enclose_zero(cubic: tuple[flint.arb, ...]) -> tuple[flint.arb, bool]:
+    """Return a ball around the zero of the cubic, and whether sign changes certify it."""
     import flint
 
     mids = [h.mid() for h in cubic]
-    with np.errstate(all="ignore"):
-        guess = first_zero(tuple(map(np.float64, mids)))
-    u = flint.arb(float(guess) if 0 < guess < 2 else 1.0)
-    smallest = flint.arb(2) ** (8 - flint.ctx.prec)
     slopes = [k * h for k, h in enumerate(mids)][1:]
-    for _ in range(64):
-        step = (horner(u, mids) / horner(u, slopes)).mid()
-        u = (u - step).mid()
-        if not (u > 0 and u < 2):
-            return u, False
-        if abs(step) < u * smallest * 16:
-            break
-    error, slope = abs(horner(u, cubic)), abs(horner(u, slopes))
-    reach = (error * 3 / slope + u * smallest).upper()
+    with np.errstate(all="ignore"):
+        start = float(first_zero(tuple(map(np.float64, mids))))
+    u = flint.arb(start if 0 < start < 2 else 1.0)
+    for _ in range(16):  # Newton steps; 10 suffice from 8 correct bits
+        u = (u - horner(u, mids) / horner(u, slopes)).mid()
+    reach = u * flint.arb(2) ** (-flint.ctx.prec // 2)
     low, high = u - reach, u + reach
-    found = low > 0 and high < 2 and horner(low, cubic) > 0 and horner(high, cubic) < 0
-    return flint.arb(u, reach), bool(found)
+    return flint.arb(u, reach), bool(low > 0 and high < 2 and horner(low, cubic) > 0 and horner(high, cubic) < 0)
 
 
 def _take_lag(u: flint.arb, whole: int) -> Lag:
+    """Return the delay phase at the crossover, in balls."""
     import flint
 
     w = (u / 2).sqrt().asin() * 2
-    lag, turn = w * (whole + 0.5), flint.arb.pi()
-    sine, cosine = lag.sin_cos()
-    half = (lag / 2).sin()
-    return Lag(cosine, sine, half * half, lag < turn, w * (whole + 1) > turn)
-
-
-def prove_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
-    """Labels that are right, and statuses: ON_BOUNDARY or UNDECIDED where there is none (docs/theory/certified.md)."""
-    code = filter_walls(points)
-    stable, status = np.asarray(code == STABLE), np.zeros(points.shape, np.int32)
-    rest = code >= OPEN
-    if rest.any():
-        stable[rest], status[rest] = _settle_points(pick_points(points, rest).columns(), code[rest] & 3)
-    return stable, status
-
-
-def _settle_points(columns: list[np.ndarray], verdict: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Decide what the filter left open or marked as special, by signs, then by balls."""
-    alpha, beta, delta, d = np.broadcast_arrays(*columns)
-    status = np.broadcast_to(wall_status(alpha, beta, delta, d), verdict.shape).copy()
-    inside = status == Status.OK
-    # P(1) = phi1 alpha < 0, or for alpha = 0 P'(1) = phi1 (delta + beta) < 0: a real pole beyond z = 1. For alpha > 0
-    # the lobe lies above beta = -delta.
-    signs = (alpha < 0) | (beta < -delta) | ((alpha > 0) & (beta == -delta))
-    # For alpha = 0 and |beta| <= delta, |beta N| <= |beta| phi1 <= 1 - c <= |z - c| on the circle: with the pole at
-    # z = 1 aside, none is outside.
-    calm = (alpha == 0) & (np.abs(beta) <= delta)
-    verdict = np.where(signs, UNSTABLE, np.where(calm, STABLE, verdict))
-    stable = inside & (verdict == STABLE) & (alpha != 0)
-    status[inside & (verdict == STABLE) & (alpha == 0)] = Status.ON_BOUNDARY
-    rest = np.flatnonzero(inside & (verdict == OPEN))
-    status[rest] = Status.UNDECIDED
-    if rest.size and available():
-        walls = zip(*(column[rest].tolist() for column in (alpha, beta, delta, d)), strict=True)
-        stable[rest], status[rest] = zip(*(decide(*wall) for wall in walls), strict=True)
-    return stable, status
+    phase, pi = w * (whole + 0.5), flint.arb.pi()
+    sine, cosine = phase.sin_cos()
+    half = (phase / 2).sin()
+    return Lag(cosine, sine, half * half, phase < pi, w * (whole + 1) > pi)

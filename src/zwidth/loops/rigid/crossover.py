@@ -11,8 +11,8 @@ of the boundary curve at this w, and the wall is stable exactly if its argument 
 ``beta alpha_w > alpha beta_w``, or ``beta > beta_w``, where (alpha_w, beta_w) is the curve in the form of
 `loops.rigid.row_limit`. Below one period the crossover is eliminated: the end of each row is in closed form.
 
-One text serves arrays of NumPy and JAX, float64 balls (`arrays.balls`), affine forms and python-flint's
-balls. Where a number stands for all in a set, a comparison is true if it is so for all.
+The same source code serves arrays of NumPy and JAX, float64 numbers with an error bound, and balls of python-flint
+(`loops.rigid.certified`). With bounds or balls, a comparison is true only if it is certain.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ def long_curve(here: Any) -> tuple[tuple, tuple, tuple, tuple]:
 
 
 class Verdict(NamedTuple):
-    """What is certain; neither for what is left open."""
+    """Two masks; a wall that is not certain is in neither."""
 
     stable: Any
     unstable: Any
 
 
 class Lag(NamedTuple):
-    """``(n + 1/2) w``, and what is certain of w."""
+    """The delay phase ``(n + 1/2) w`` at the crossover, and certain bounds of w."""
 
     cosine: Any
     sine: Any
@@ -171,13 +171,14 @@ def _solve(cubic: tuple[Array, ...]) -> tuple[Array, Array]:
     return u, (sum(cubic[1:], cubic[0]) <= 0) & (u > 0) & (u <= 1.0)
 
 
-def _take_lag(u: Array, whole: Array) -> Lag:
+def compute_lag(u: Array, whole: Array) -> Lag:
+    """Return the delay phase at the crossover ``u = 1 - cos w``."""
     xp = namespace(u, whole)
-    # Half of the angle, so that its sine keeps its digits for slow loops.
+    # Compute the sine of half the angle, because it keeps its digits for slow loops.
     half = xp.minimum((whole + 0.5) * xp.sqrt(0.5 * u) * horner(2.0 * u - 1.0, ARCSINE), 0.5 * np.pi)
     square = half * half
     sine, cosine = half * horner(square, SINE), horner(square, COSINE)
-    # w < pi/(n + 1), with room: where that binds the wall is unstable by far, and only a full turn must be excluded.
+    # The test implies (n + 1/2) w <= pi; its failure implies (n + 1) w >= pi (docs/theory/certified.md, C5).
     near = u * (whole + 1.0) * (whole + 1.0) < 0.5 * np.pi * np.pi
     return Lag((cosine - sine) * (cosine + sine), 2.0 * sine * cosine, sine * sine, near, near ^ True)
 
@@ -223,6 +224,6 @@ def stable_at(alpha: Array, beta: Array, here: DeviceTerms, kind: DelayClasses) 
     if early is not None and kind.fractional:
         # At its corner the lobe of d = 0 is better known by its own formula.
         early = namespace(here.f).where(here.f == 0, short_verdict(alpha, beta, plain).stable, early)
-    late = long_verdict(alpha, beta, here.whole, here, _solve, _take_lag).stable if kind.long else early
+    late = long_verdict(alpha, beta, here.whole, here, _solve, compute_lag).stable if kind.long else early
     stable = late if early is None else namespace(here.whole).where(here.whole < 1, early, late)
     return stable & (alpha > 0) & (beta + here.delta > 0) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)

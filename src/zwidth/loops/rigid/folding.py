@@ -179,12 +179,6 @@ def _repeats(array: np.ndarray, axis: int, compare: bool) -> bool:
     return bool(np.array_equal(along[0], along[-1]) and (along == along[0]).all())
 
 
-def pick_points(points: Points, mask: np.ndarray) -> Points:
-    """The points of a mask of the broadcast shape, listed; what is the same for all of them stays a single value."""
-    shape = points.shape
-    return Points(*(a.reshape(1) if a.size == 1 and shape else np.broadcast_to(a, shape)[mask] for a in points))
-
-
 def group_by(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> Iterator[tuple[Any, tuple[np.ndarray, ...], Any]]:
     """The values of a key that broadcasts with arguments, the arguments of each, and the place of what they give."""
     # Where the key varies along one axis the parts keep their layout; along several, the points are listed one by one.

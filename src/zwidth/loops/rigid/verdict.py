@@ -131,9 +131,9 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
         return radius < 1.0, Method.COMPANION, np.where(rough, Status.UNDECIDED, Status.OK)
     if method == "certified":
         # Loaded here: it needs an extra for its last resort.
-        from zwidth.loops.rigid.certified import prove_labels
+        from zwidth.loops.rigid.certified import certify_labels
 
-        stable, status = prove_labels(points)
+        stable, status = certify_labels(points)
         return stable, Method.CERTIFIED, status
     if points.is_dense:
         return boundary_map(points), Method.CROSSOVER, None

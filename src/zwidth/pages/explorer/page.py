@@ -242,7 +242,6 @@ class Page:
     def update(self, changes: dict[str, Any], *, rest: bool, link: str | None = None) -> None:
         """Show what follows a drag at once, and have the rest computed where the slider rests."""
         # A link is the scene to begin with, as the page's address has it; an empty one is that of the first visit.
-        self.generation += 1
         try:
             with IMPORTING:
                 before = self.controls if link is None else read_link(link) if link else self.start
@@ -251,6 +250,8 @@ class Page:
         except Exception as error:
             self.tell({"error": _explain(error), "state": self.controls.shown(), "busy": False})
             return
+        # A refused value does not cancel the computation for the state that stays shown.
+        self.generation += 1
         if rest:
             assert self.frame is not None, "it has just been shown"
             wanted = {"normalized": controls.normalized, "of_device": not self.drawn, "contact": self.contact}

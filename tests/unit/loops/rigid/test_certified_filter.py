@@ -1,54 +1,53 @@
-"""The verdict in float64 balls: every intermediate encloses what the same text gives in python-flint's balls.
+"""The static error bound of the certified filter, against the same source code in balls of python-flint.
 
-Those are held to poles in mpmath by test_certified_balls.py; the device's numbers here to mpmath's formulas.
+`test_certified_balls` compares those balls with poles computed by mpmath.
 """
 
+import jax
 import numpy as np
 import pytest
-from mpmath import mp, mpf
+from mpmath import mp
 from proved import certified_stable
 
 import oracles
-from zwidth.arrays import balls
-from zwidth.arrays.balls import Ball
-from zwidth.arrays.held_mass import classify_delays
-from zwidth.loops.rigid import certified, certified_filter
-from zwidth.loops.rigid.certified_filter import enclose_zero, enclosed_device, exp, functions, take_lag
+from zwidth.arrays.held_mass import classify_delays, phi_functions
+from zwidth.loops.rigid import certified
+from zwidth.loops.rigid.certified import CROSSOVER_WIDTH, CUBIC_TOLERANCE, TOLERANCE, Sized, enclose_zero, size_device
 from zwidth.loops.rigid.crossover import gain_cubic, long_curve, long_verdict, short_curve, short_verdict
-from zwidth.loops.rigid.folding import Points
 
 flint = pytest.importorskip("flint")
 BITS = 400
 UNIT = 2.0**-53
 DELTAS = np.array([0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-3, 0.3, 1.0, 1.4999, 1.5, 1.51, 7.0, 50.0, 699.0, 750.0, 1e12])
+DELAYS = [1.0, 2.0, 7.0, 500.0, 1.5, 3.25, 60.7, np.nextafter(2.0, 1.0), 1.0 + 1e-12, 99999.5]
 
 
-def numbers(here, exact):
-    """The balls of a device beside their true values, and those of its curve."""
-    names = [name for name, value in here._asdict().items() if isinstance(value, Ball)]
-    curve = short_curve if isinstance(here.p1_t, Ball) else None
-    pairs = [(getattr(here, name), getattr(exact, name)) for name in names]
-    for of in (long_curve, curve):
-        if of is not None:
-            pairs += [pair for parts in zip(of(here), of(exact), strict=True) for pair in zip(*parts, strict=True)]
-    return zip(*pairs, strict=True)
+def pick(value, index):
+    """One entry of an array, or of a number that stands for all entries."""
+    return float(np.broadcast_to(value, index + 1 if np.ndim(value) == 0 else value.shape)[index])
 
 
-def escaped(found, exact, index):
-    """How many balls of one point miss the numbers in the balls of arb."""
-    count = 0
-    with flint.ctx.workprec(BITS):
-        for ball, truth in zip(found, exact, strict=True):
-            mid, rad = (
-                float(np.broadcast_to(x, index + 1 if np.ndim(x) == 0 else x.shape)[index])
-                for x in (ball.mid, ball.radius)
-            )
-            count += not abs(truth - mid) <= rad
-    return count
+def errors(computed, exact, index, precision=BITS):
+    """Errors relative to the sizes of numbers, of one entry."""
+    with flint.ctx.workprec(precision):
+        return [
+            float(abs(truth - pick(number.value, index)).upper() / flint.arb(pick(number.size, index)))
+            for number, truth in zip(computed, exact, strict=True)
+        ]
+
+
+def numbers(plant, exact):
+    """The numbers of a device and of its curve, with their exact values."""
+    names = [name for name, value in plant._asdict().items() if isinstance(value, Sized) and name not in ("p2", "tilt")]
+    pairs = [(getattr(plant, name), getattr(exact, name)) for name in names]
+    for curve in (long_curve, short_curve) if exact.a0 is not None else (long_curve,):
+        parts = zip(curve(plant), curve(exact), strict=True)
+        pairs += [pair for part in parts for pair in zip(*part, strict=True)]
+    return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
 
 
 def walls(count, seed, d):
-    """Walls on and around the stable set of many devices."""
+    """Walls in and around the stable set of many devices."""
     rng = np.random.default_rng(seed)
     delta = np.where(rng.random(count) < 0.5, rng.exponential(1.0, count), 10.0 ** rng.uniform(-9, 9, count))
     d = np.full(count, float(d)) if np.ndim(d) == 0 else rng.choice(d, count)
@@ -56,140 +55,170 @@ def walls(count, seed, d):
     return rng.uniform(0, 2, count) * scale, rng.uniform(-1, 2, count) * (delta + 1 / (1 + d)), delta, d
 
 
-@pytest.mark.parametrize("d", [1.0, 2.0, 7.0, 500.0, 1.5, 3.25, 60.7, np.nextafter(2.0, 1.0), 1.0 + 1e-12, 99999.5])
-def test_every_intermediate_of_the_crossover_is_enclosed(d):
+class Exact:
+    """A ball that records every difference whose sign is tested."""
+
+    def __init__(self, ball, differences):
+        self.ball, self.differences = ball, differences
+
+    def new(self, ball):
+        return Exact(ball, self.differences)
+
+    def __add__(self, other):
+        return self.new(self.ball + getattr(other, "ball", other))
+
+    def __mul__(self, other):
+        return self.new(self.ball * getattr(other, "ball", other))
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __neg__(self):
+        return self.new(-self.ball)
+
+    def __sub__(self, other):
+        return self + -other
+
+    def __rsub__(self, other):
+        return -self + other
+
+    def __truediv__(self, other):
+        return self.new(self.ball / other.ball)
+
+    def sqrt(self):
+        return self.new(self.ball.sqrt())
+
+    def __gt__(self, other):
+        self.differences.append((self - other).ball)
+        return bool(self.differences[-1] > 0)
+
+    def __lt__(self, other):
+        return -self > -other
+
+
+def exact_differences(verdict, wall, plant, *more):
+    """The differences whose signs a verdict tests, in balls."""
+    differences = []
+    terms = plant._replace(**{k: Exact(v, differences) for k, v in plant._asdict().items() if isinstance(v, flint.arb)})
+    verdict(*(Exact(value, differences) for value in wall), *more, terms)
+    return differences
+
+
+def computed_differences(monkeypatch, operation):
+    """The differences whose signs ``operation`` tests, with their sizes."""
+    differences = []
+
+    def record(self, other):
+        differences.append(self - other)
+        return differences[-1].value > TOLERANCE * differences[-1].size
+
+    with monkeypatch.context() as patch, np.errstate(all="ignore"):
+        patch.setattr(Sized, "__gt__", record)
+        operation()
+    return differences
+
+
+@pytest.mark.parametrize("d", DELAYS)
+def test_bounds_of_the_crossover_hold(d, monkeypatch):
     alpha, beta, delta, d = walls(60, 11, d)
-    a, b = Ball(alpha), Ball(beta)
+    wall = Sized(alpha), Sized(beta)
     with np.errstate(all="ignore"):
-        here = enclosed_device(delta, d, classify_delays(d))
-        cubic = gain_cubic(a, b, here)
+        plant = size_device(delta, d, classify_delays(d))
+        cubic = gain_cubic(*wall, plant)
         u, found = enclose_zero(cubic)
-        lag = take_lag(u, np.floor(d))
+        computed = certified.size_lag(u, np.floor(d))
+    differences = computed_differences(
+        monkeypatch, lambda: long_verdict(*wall, plant.whole, plant, enclose_zero, certified.size_lag)
+    )
     seen = 0
     for index in range(alpha.size):
+        exact = certified.device(delta[index], d[index], BITS)
         with flint.ctx.workprec(BITS):
             x, y = flint.arb(alpha[index]), flint.arb(beta[index])
-            device = certified.device(delta[index], d[index], BITS)
-            truth = gain_cubic(x, y, device)
-            assert escaped(*numbers(here, device), index=index) == 0
-            assert escaped(cubic, truth, index) == 0
+            true_cubic = gain_cubic(x, y, exact)
+            assert max(errors(cubic, true_cubic, index)) < CUBIC_TOLERANCE / 2
+            assert max(errors(*numbers(plant, exact), index)) < CUBIC_TOLERANCE / 2
             if not found[index]:
                 continue
-            root, sure = certified._enclose_zero(truth)
+            root, sure = certified._enclose_zero(true_cubic)
             assert sure
-            exact = certified._take_lag(root, int(d[index]))
-            assert escaped((u,), (root,), index) == 0
-            if exact.within:
-                seen += 1
-                assert escaped(lag[:3], exact[:3], index) == 0
-            assert not lag.within[index] or exact.within
-            assert not lag.beyond[index] or exact.beyond
+            assert float(abs(root / u.value[index] - 1).upper()) < CROSSOVER_WIDTH
+            lag = certified._take_lag(root, int(d[index]))
+            assert not computed.within[index] or lag.within
+            assert not computed.beyond[index] or lag.beyond
+            if not lag.within:
+                continue
+            seen += 1
+            assert max(errors(computed[:3], lag[:3], index)) < 4 * CROSSOVER_WIDTH
+
+            def judge(a, b, terms, root=root, whole=int(d[index]), lag=lag):
+                phase = lag._replace(**{k: a.new(v) for k, v in lag._asdict().items() if isinstance(v, flint.arb)})
+                return long_verdict(a, b, whole, terms, lambda _: (a.new(root), True), lambda *_: phase)
+
+            true = exact_differences(judge, (x, y), exact)
+            assert len(true) == len(differences)
+            assert max(errors(differences, true, index)) < TOLERANCE / 2
     assert seen > 15
 
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1e-9, 5e-324, 0.125, 0.93, 1.0 - 2.0**-53])
-def test_every_number_of_a_short_device_is_enclosed(d):
+def test_bounds_of_a_short_device_hold(d):
     with np.errstate(all="ignore"):
-        here = enclosed_device(DELTAS, np.full(DELTAS.size, d), classify_delays(d))
+        plant = size_device(DELTAS, np.full(DELTAS.size, d), classify_delays(d))
     for index, delta in enumerate(DELTAS):
-        assert escaped(*numbers(here, certified.device(float(delta), d, 1600)), index=index) == 0
+        assert max(errors(*numbers(plant, certified.device(float(delta), d, 1600)), index)) < CUBIC_TOLERANCE / 2
 
 
-def test_bounds_too_small_are_noticed(monkeypatch):
+@pytest.mark.parametrize("d", [0.0, 0.3, 0.93])
+def test_bounds_of_a_short_verdict_hold(d, monkeypatch):
+    alpha, beta, delta, _ = walls(80, 13, d)
+    plant = size_device(delta, np.full(80, d), classify_delays(d))
+    differences = computed_differences(monkeypatch, lambda: short_verdict(Sized(alpha), Sized(beta), plant))
+    compared = 0
+    for index in range(80):
+        with flint.ctx.workprec(BITS):
+            wall, exact = (flint.arb(alpha[index]), flint.arb(beta[index])), certified.device(delta[index], d, BITS)
+            true = exact_differences(short_verdict, wall, exact)
+            assert len(true) == len(differences)
+            # Behind the end of the lobe there is no root, and no bound.
+            kept = [k for k, value in enumerate(true) if value.is_finite()]
+            compared += len(kept) == len(true)
+            assert max(errors([differences[k] for k in kept], [true[k] for k in kept], index)) < TOLERANCE / 2
+    assert compared > 40
+
+
+def test_a_bound_too_small_is_noticed():
     _, _, delta, d = walls(60, 11, [1.5, 4.2, 2.5])
-    monkeypatch.setattr(balls, "UNIT", 2.0**-58)
-    monkeypatch.setattr(certified_filter, "UNIT", 2.0**-58)
-    here = enclosed_device(delta, d, classify_delays(d))
-    assert sum(escaped(*numbers(here, certified.device(delta[i], d[i], BITS)), index=i) for i in range(60)) > 10
+    plant = size_device(delta, d, classify_delays(d))
+    worst = [max(errors(*numbers(plant, certified.device(delta[i], d[i], BITS)), i)) for i in range(60)]
+    assert max(worst) > UNIT / 2
 
 
-def test_phi_errors_are_as_stated():
+def test_exponentials_and_phi_functions_are_as_accurate_as_assumed():
     x = np.concatenate([np.random.default_rng(5).uniform(0, 4, 1500), DELTAS])
-    found, power = functions(x), exp(-x)
+    with jax.enable_x64(True):
+        compiled = [np.asarray(part) for part in jax.jit(phi_functions)(x)]
+        powers = np.exp(-x), np.asarray(jax.jit(lambda value: jax.numpy.exp(-value))(x))
     for index, value in enumerate(x):
         with mp.workdps(oracles.digits_for(value)):
             exact = oracles.phi(value)
-            assert oracles.relative_error(power[index], exact.c, floor=1e-280) <= 8 * UNIT
-            assert oracles.relative_error(found.c[index], exact.c, floor=1e-280) <= 17 * UNIT
-            pairs = (found.phi1, exact.phi1), (found.phi2, exact.phi2), (found.psi, exact.psi)
-            for value_of, truth in (*pairs, (found.gap, exact.phi2 - exact.psi)):
-                assert oracles.relative_error(value_of[index], truth, floor=1e-300) <= 30 * UNIT
-
-
-def test_device_is_that_of_the_printed_formulas():
-    for delta in (1e-6, 0.4, 3.0, 40.0):
-        for f in (0.0, 1e-7, 0.4, 0.999):
-            with mp.workdps(oracles.digits_for(delta)):
-                exact = oracles.numerator(delta, f)[: 3 if f else 2]
-                here = enclosed_device(np.float64(delta), np.float64(f), classify_delays(f))
-                for ball, value in zip((here.a2, here.a1, here.a0), exact, strict=False):
-                    assert abs(mpf(float(ball.mid)) - value) <= mpf(float(ball.radius))
-                assert abs(mpf(float(here.c.mid)) - mp.exp(-mpf(delta))) <= mpf(float(here.c.radius))
-
-
-def test_arcsine_series_is_as_close_as_stated():
-    # Over boxes that cover [0, 0.5002], by Taylor polynomials of the difference with a bounded remainder.
-    pieces, order, worst = 200, 8, 0.0
-    with flint.ctx.workprec(200):
-        fit = flint.arb_poly([flint.arb(c) for c in certified_filter.ARCSINE])(flint.arb_poly([-1, 4]))
-        half = flint.arb(0.5002) / (2 * pieces)
-        offset = flint.arb(0, (half * 1.0001).upper())
-        for piece in range(pieces):
-            centre = (2 * piece + 1) * half
-            total, power = flint.arb(0), flint.arb(1)
-            for k in range(order + 1):
-                at = centre if k < order else centre + offset
-                total += (_arcsine_derivative(at, k) - fit(flint.arb_poly([at, 1]))[k]) * power
-                power *= offset
-            worst = max(worst, float(abs(total).upper()))
-    # The rest up to 2^-46 is room for the rounding of the evaluation.
-    assert 2.0**-48 < worst < 2.0**-46.5
-
-
-def _arcsine_derivative(y, k):
-    """The k-th derivative over k! of ``asin(sqrt y)/sqrt y = sum_j binom(2 j, j)/(4^j (2 j + 1)) y^j``."""
-    total, term, power = flint.arb(0), flint.arb(1), flint.arb(1)
-    for j in range(120):
-        if j >= k:
-            total += term / (2 * j + 1) * flint.arb.bin_uiui(j, k) * power
-            power *= y
-        term = term * (2 * j + 1) / (2 * j + 2)
-    # Later terms fall by more than y 120/(120 - k) < 0.54 each.
-    return total + flint.arb(0, (term / 241 * flint.arb.bin_uiui(120, k) * power * 3).upper())
+            for power in powers:
+                assert oracles.relative_error(power[index], exact.c, floor=1e-280) <= 8 * UNIT
+            for c, phi1, phi2, psi, gap in (phi_functions(x), compiled):
+                assert oracles.relative_error(c[index], exact.c, floor=1e-280) <= 17 * UNIT
+                pairs = (phi1, exact.phi1), (phi2, exact.phi2), (psi, exact.psi), (gap, exact.phi2 - exact.psi)
+                for found, truth in pairs:
+                    assert oracles.relative_error(found[index], truth, floor=1e-300) <= 30 * UNIT
 
 
 @pytest.mark.parametrize("d", [0.0, 0.4, 1.0, 3.0, 1.7, 40.0])
-def test_a_verdict_on_a_box_holds_for_every_wall_in_it(d):
-    rng = np.random.default_rng(17)
-    alpha, beta, delta, _ = walls(400, 19, d)
-    width = 10.0 ** rng.uniform(-5, -1, 400)
-    boxes = Ball(alpha, 1.001 * width * np.abs(alpha)), Ball(beta, 1.001 * width * np.abs(beta))
-    with np.errstate(all="ignore"):
-        here = enclosed_device(delta, np.full(400, d), classify_delays(d))
-        if d < 1:
-            verdict = short_verdict(*boxes, here)
-        else:
-            verdict = long_verdict(*boxes, here.whole, here, enclose_zero, take_lag)
-        meant = (boxes[0] > 0) & (boxes[1] + delta > 0)
-    stable, unstable = verdict.stable & meant, verdict.unstable & meant
-    assert stable.sum() > 20
-    assert unstable.sum() > 20
-    for _ in range(8):
-        inside = [x * (1 + width * rng.uniform(-1, 1, 400)) for x in (alpha, beta)]
-        truth = certified_stable(*inside, delta=delta, d=d)
-        assert (truth.status == 0).all()
-        assert truth.stable[stable].all()
-        assert not truth.stable[unstable].any()
-
-
-@pytest.mark.parametrize("error", [0.3, 0.9, 1.1, 3.0, np.nan])
-def test_where_the_computed_end_of_a_row_is_wrong_nothing_wrong_is_proved(error, monkeypatch):
-    """The end only chooses the walls that are tried: whatever it is, the codes are those of the walls one by one."""
-    arrays = np.linspace(0.0, 0.9, 1701)[None, :], np.linspace(-0.3, 1.1, 41)[:, None], np.full((1, 1), 0.2)
-    points = Points(*arrays, np.full((1, 1), 1.5))
-    assert certified_filter.has_rows(points)
-    expected = certified_filter.each_code(points)
-    assert {certified_filter.STABLE, certified_filter.UNSTABLE} <= set(expected.ravel().tolist())
-    computed = certified_filter.row_limits
-    monkeypatch.setattr(certified_filter, "row_limits", lambda *row: computed(*row) * error)
-    np.testing.assert_array_equal(certified_filter.filter_walls(points), expected)
+def test_labels_of_the_filter_are_those_of_balls(d):
+    alpha, beta, delta, _ = walls(4000, 19, d)
+    truth = certified_stable(alpha, beta, delta, d)
+    code = certified.filter_walls(alpha, beta, delta, np.full(1, d))
+    assert (code != certified.OPEN).mean() > 0.999
+    for label in (certified.STABLE, certified.UNSTABLE):
+        assert (code == label).sum() > 100
+        chosen = np.flatnonzero((code == label) & (beta > -delta))[:150]
+        for k in chosen:
+            assert certified.decide(alpha[k], beta[k], delta[k], d)[0] == (label == certified.STABLE)
+    assert (truth.status == 0).all()

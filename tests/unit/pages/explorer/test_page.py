@@ -125,6 +125,15 @@ def test_a_refused_number_leaves_the_last_good_view(page):
     assert page.controls.scene.mass == 0.2
 
 
+def test_a_refused_number_leaves_the_computation_of_the_shown_state(page):
+    say(page, set={"mass": 200}, rest=True)
+    say(page, set={"mass": -1}, rest=True)
+    page.queue.work()
+    assert "200.0 g" in page.texts["verdict"]
+    assert len(page.sources["contours"].data["xs"]) > 3
+    assert page.texts["busy"] is False
+
+
 def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
     def fail(scene):
         raise ZeroDivisionError("far away")

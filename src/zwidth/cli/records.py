@@ -1,0 +1,142 @@
+"""Options of the commands on records: the loop of a record, which a scene file completes, and its logs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from zwidth.cli.options import (
+    BOTH_PERIODS,
+    Command,
+    change_scene,
+    flag_of,
+    get_hardware,
+    make_velocity,
+    take_options,
+)
+from zwidth.words.formatting import with_unit
+from zwidth.words.quantities import CHOICES, OF_LOGS, OF_PARTS
+from zwidth.words.unit_system import UnitSystem
+
+if TYPE_CHECKING:
+    from zwidth.parts.velocity import Velocity
+    from zwidth.scenes.scene import Scene
+
+_LONG = 2**23  # bytes; the user is informed that reading a longer log takes a while
+_SAME_PERIOD = 1e-3  # largest relative difference of the periods of a record and a scene file
+
+
+class Loop(NamedTuple):
+    """The control loop of a record: options, completed by a scene file."""
+
+    period: float | None  # in s, from the options
+    velocity: Velocity | None  # velocity estimate from the options or the file
+    scene: Scene | None  # the scene of the file
+
+    @property
+    def known_period(self) -> float | None:
+        """The sampling period in s, from the options or the file."""
+        return self.scene.timing.period if self.period is None and self.scene is not None else self.period
+
+    def check_kind(self, rotary: bool) -> None:
+        """Raise an error if a record and the scene of the file belong to different kinds of devices."""
+        if self.scene is not None and self.scene.device.rotary != rotary:
+            kinds = ("rotary", "linear") if rotary else ("linear", "rotary")
+            raise click.UsageError(
+                f"the record is that of a {kinds[0]} device, but the scene file has a {kinds[1]} one"
+            )
+
+    def check_period(self, period: float) -> None:
+        """Raise an error if the sampling period of a record differs from that of the scene file."""
+        known = self.known_period
+        if known is not None and abs(period - known) > _SAME_PERIOD * known:
+            got, own = with_unit(known, "s"), with_unit(period, "s")
+            raise click.UsageError(f"period: the scene file has {got}, but the samples of the record are {own} apart")
+
+
+def _make_loop(given: dict[str, Any], _: UnitSystem) -> Loop:
+    """Return the loop described by options, given by path, and by the scene of a file."""
+    scene = given.pop("scene", None)
+    if {"period", "rate"} <= given.keys():
+        raise click.UsageError(BOTH_PERIODS)
+    period = 1.0 / given["rate"] if "rate" in given else given.get("period")
+    changes = {path: value for path, value in given.items() if path.startswith("velocity.")}
+    if scene is not None:
+        return Loop(period, change_scene(scene, changes).velocity, scene)
+    return Loop(
+        period,
+        make_velocity({path.removeprefix("velocity."): value for path, value in changes.items()}) if changes else None,
+        None,
+    )
+
+
+def _is_scene(path: Path) -> bool:
+    """Return whether a path names a scene file or the folder of a run, and not a log."""
+    return path.suffix in (".yaml", ".yml") or path.is_dir()
+
+
+def loop_options(*, logs: bool) -> Callable[[Command], Command]:
+    """Add the options of period and velocity estimate, and the argument for a scene file.
+
+    The command receives a `Loop` as ``loop``. With ``logs``, the arguments are logs, one of which may be a scene file,
+    and the command receives the paths of the others as ``logs``.
+    """
+    paths = ("period", "rate", *(path for path in (*CHOICES, *OF_PARTS) if path.startswith("velocity.")))
+    take = take_options("loop", paths, _make_loop)
+    kind = click.Path(path_type=Path)
+
+    def decorate(command: Command) -> Command:
+        made = take(command)
+        if not logs:
+            return click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=kind)(made)
+
+        @wraps(made)
+        def with_files(files: tuple[Path, ...], **given: Any) -> Any:
+            scenes = [file for file in files if _is_scene(file)]
+            if len(scenes) > 1:
+                raise click.UsageError(f"got {len(scenes)} scene files; give at most one")
+            given["logs"] = tuple(file for file in files if file not in scenes)
+            return made(scene_file=scenes[0] if scenes else None, **given)
+
+        return click.argument("files", metavar="[LOG.csv]... [SCENE.yaml|DIR]", nargs=-1, type=kind)(with_files)
+
+    return decorate
+
+
+def log_options(command: Command) -> Command:
+    """Add the options on the columns of a log, and on the values of a count and of an ampere."""
+    for name, text in reversed(OF_LOGS.items()):
+        command = click.option(flag_of(name), help=text)(command)
+    return command
+
+
+def read_logs(
+    logs: Iterable[Path], loop: Loop, *, resolution: str | None, motor_constant: str | None, **columns: Any
+) -> list[Any]:
+    """Return the motions of logs; report on the error stream which logs are read if that takes long.
+
+    Args:
+        logs: paths of the logs.
+        loop: loop of the logs; the period of its scene replaces a missing column of times.
+        resolution: option of that name; by default that of the scene file.
+        motor_constant: option of that name.
+        columns: the other `log_options`.
+    """
+    if columns["time"] is not None and loop.period is not None:
+        raise click.UsageError("give one of --time, --period and --rate")
+    from zwidth.fitting.columns import read_log
+
+    for log in logs:
+        size = log.stat().st_size if log.is_file() else 0
+        if size > _LONG:
+            click.echo(f"zwidth: reading {log.name}, {size / 2**20:.0f} MiB; then the numbers are computed", err=True)
+    options = {"period": loop.period, "usual_period": loop.known_period, "motor_constant": motor_constant}
+    options["resolution"] = resolution or get_hardware().get("resolution")
+    motions = [read_log(log, columns, **options) for log in logs]
+    for motion in motions:
+        loop.check_kind(motion.rotary)
+    return motions

@@ -1,0 +1,151 @@
+"""`zwidth fit`, `excite` and `respond` take a scene from a file, and scenes carry encoder, friction and motor."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from loop_logs import make_knob
+
+import zwidth
+from zwidth.cli import cli
+from zwidth.fitting.device_fit import RivalDevice
+from zwidth.fitting.words import spell_rival
+from zwidth.studies.document import load_config
+from zwidth.words.unit_system import LINEAR, ROTARY
+
+pytestmark = pytest.mark.usefixtures("fitted_once", "unpainted")
+KNOB = make_knob(4, samples=1000)
+SCENE = """\
+version: 1
+name: knob
+scene:
+  mass: 60 g cm^2
+  rate: {rate}
+  velocity: {{kind: low_pass, cutoff: 80 Hz}}
+  resolution: 16384 counts
+  max_force: 20 mN m
+studies: [{{kind: recommend, name: wall}}]
+"""
+BUZZING = "--buzz", "K=0.218 N m/rad B=0 f=26.5", "--buzz", "K=2.53 N m/rad B=0.008 N m s/rad f=107", "--noise", "2%"
+
+
+def run(*words, code=0):
+    done = CliRunner().invoke(cli, [str(word) for word in words])
+    assert done.exit_code == code, done.output
+    return done.stderr if code else done.stdout
+
+
+def refused(*words):
+    done = CliRunner().invoke(cli, [str(word) for word in words])
+    assert isinstance(done.exception, SystemExit | zwidth.ZwidthError)
+    return done.stderr if isinstance(done.exception, SystemExit) else str(done.exception)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Return a log with times, the same log without times, and a scene file."""
+    rows = [f"{count:.0f},{torque:.8f}" for count, torque in zip(KNOB.reading, KNOB.torque, strict=True)]
+    timed, bare, scene = tmp_path / "My knob.csv", tmp_path / "bare.csv", tmp_path / "knob.yaml"
+    timed.write_text("\n".join(["t_ms,enc_counts,tau_Nm", *(f"{k},{row}" for k, row in enumerate(rows))]))
+    bare.write_text("\n".join(["enc_counts,tau_Nm", *rows]))
+    scene.write_text(SCENE.format(rate="1 kHz"))
+    return timed, bare, scene
+
+
+def test_fit_takes_period_encoder_and_velocity_estimate_from_a_file(files):
+    timed, bare, scene = files
+    given = "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz"
+    expected = json.loads(run("fit", timed, *given, "--json"))
+    assert json.loads(run("fit", timed, scene, "--json")) == expected
+    assert json.loads(run("fit", bare, scene, "--json"))["mass"] == pytest.approx(expected["mass"], rel=1e-12)
+    # Options override the file.
+    slower = json.loads(run("fit", scene, bare, "--rate", "500 Hz", "--json"))
+    assert slower["period"] == 2e-3
+
+
+def test_fit_of_walls_takes_the_period_and_the_kind_of_the_device_from_a_file(files):
+    given = "--rate", "1 kHz", "--velocity-cutoff", "80 Hz"
+    assert run("fit", files[2], *BUZZING, "--json") == run("fit", *given, *BUZZING, "--json")
+
+
+def test_excite_and_respond_take_a_scene_from_a_file(files, tmp_path):
+    timed, bare, scene = files
+    given = "--rate", "1 kHz", "--force", "20 mN m", "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz"
+    for out, words in (("a.csv", [scene]), ("b.csv", given), ("c.csv", [scene, "--force", "10 mN m"])):
+        run("excite", *words, "--duration", "10 s", "--out", tmp_path / out)
+    played = {out: np.loadtxt(tmp_path / out, delimiter=",", skiprows=1)[:, 1] for out in ("a.csv", "b.csv", "c.csv")}
+    assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
+    assert np.abs(played["a.csv"]).max() == pytest.approx(2.0 * np.abs(played["c.csv"]).max()) == 0.02
+    given = "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz"
+    assert json.loads(run("respond", bare, scene, "--json"))["doubts"]
+    assert run("respond", timed, scene, "--json") == run("respond", timed, *given, "--json")
+
+
+def test_contradictions_of_record_and_file_are_refused(files, tmp_path):
+    timed, _, scene = files
+    slow = tmp_path / "slow.yaml"
+    slow.write_text(SCENE.format(rate="500 Hz"))
+    assert "the scene file has 2.000 ms, but the samples of the record are 1.000 ms apart" in refused(
+        "fit", timed, slow
+    )
+    linear = tmp_path / "linear.yaml"
+    linear.write_text("version: 1\nname: a\nscene: {mass: 1, rate: 1 kHz}\nstudies: [{kind: recommend, name: b}]\n")
+    words = "the record is that of a rotary device, but the scene file has a linear one"
+    assert words in refused("fit", timed, linear, "--resolution", "16384 counts")
+    assert words in refused("fit", linear, *BUZZING)
+    assert "got 2 scene files" in refused("fit", timed, scene, slow)
+    assert "give one LOG.csv or several" in refused("respond", scene)
+    assert "give --force, --resolution" in refused("excite", linear)
+
+
+def test_a_fit_hands_friction_and_encoder_to_the_other_commands(files, tmp_path):
+    fitted = tmp_path / "fitted.yaml"
+    text = run("fit", files[0], "--resolution", "16384 counts", "--yaml")
+    # Friction that the log does not show is no data.
+    assert "coulomb" not in text
+    fitted.write_text(text.replace("  resolution:", "  coulomb: 0.1 mN m\n  resolution:"))
+    config = load_config(fitted)
+    assert config.name == "fitted_my_knob"
+    assert config.scene.hardware == {"resolution": pytest.approx(KNOB.step), "coulomb": 1e-4}
+    wall = "--stiffness", "0.2 N m/rad", "--virtual-damping", "1 mN m s/rad"
+    checked = json.loads(run("check", fitted, *wall, "--json"))["diagnosis"]
+    for found in (checked, json.loads(run("diagnose", fitted, *wall, "--json"))):
+        assert found["hardware"]["resolution"] == pytest.approx(KNOB.step)
+        assert found["hardware"]["coulomb"] == 1e-4
+    found = json.loads(run("diagnose", fitted, *wall, "--friction", "0.2 mN m", "--json"))["hardware"]
+    assert (found["resolution"], found["coulomb"]) == (pytest.approx(KNOB.step), 2e-4)
+    simulated = [line for line in run("recommend", fitted).splitlines() if line.startswith("simulated")]
+    printed = run("fit", files[0], "--resolution", "16384 counts").splitlines()
+    assert simulated
+    assert any(line.startswith("in a hand  stable in all six") for line in printed)
+    assert any(line.startswith("simulated") for line in printed)
+
+
+def test_a_scene_supplies_its_hardware_to_studies_that_simulate(files):
+    text = (
+        files[2]
+        .read_text()
+        .replace(
+            "{kind: recommend, name: wall}", "{kind: simulate, name: s, stiffness_fraction: 0.5, max_force: 5 mN m}"
+        )
+    )
+    files[2].write_text(text)
+    (study,) = load_config(files[2]).studies
+    found = study.options(1e-3)
+    assert (found["resolution"], found["max_force"]) == (pytest.approx(2.0 * np.pi / 16384), 5e-3)
+
+
+def test_a_normalized_scene_has_no_hardware(tmp_path):
+    file = tmp_path / "scene.yaml"
+    file.write_text(
+        "version: 1\nname: a\nscene: {delta: 0.1, d: 1, resolution: 1 um}\nstudies: [{kind: ridge, name: b}]\n"
+    )
+    with pytest.raises(zwidth.ConfigError, match="described in SI units or normalized, never both"):
+        load_config(file)
+
+
+def test_the_inertia_of_a_rotary_device_has_the_symbol_j():
+    rival = RivalDevice(1e-5, 1e-4, 1e-3, 1.0)
+    assert spell_rival(rival, ROTARY).startswith("J = 100.0 g cm^2")
+    assert spell_rival(rival, LINEAR).startswith("m = ")
