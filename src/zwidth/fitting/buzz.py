@@ -1,4 +1,4 @@
-"""A device from walls at the onset of buzzing: which stiffness, which damping, and the frequency that was heard."""
+"""Fit of a rigid device to walls at the onset of instability: their stiffness, damping and frequency."""
 
 from __future__ import annotations
 
@@ -8,32 +8,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.buzz_search import (
-    AS_GOOD,
-    EXACT,
-    Candidate,
-    FittedKind,
-    choose_device,
-    find_edges,
-    is_blind,
-    weigh,
-)
+from zwidth.fitting.buzz_search import AS_GOOD, EXACT, Candidate, RigidFit, find_device, find_edges, is_blind, weigh
 from zwidth.fitting.buzzing import Onsets
-from zwidth.fitting.device_estimate import differentiate, find_stiffest, name_numbers
+from zwidth.fitting.device_estimate import differentiate, find_stiffest
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FurtherExperiment, RivalDevice, doubt_period
 from zwidth.fitting.words import spell_rival
 from zwidth.parts.checks import check_number, find_kind, read_texts
 from zwidth.parts.velocity import BackwardDifference, Velocity
+from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
-# Worse by chance of 1e-4, or than this share where the noise is unknown, the points contradict each other.
-_CHANCE, _ROUGH = 1e-4, 0.1
-_ANGLES = 240
-# Dampings closer than this are one experiment.
-_SAME = 1e-6
+CHANCE = 0.003  # probability of refusing the walls of a rigid device; with 1e-4 some walls of resonances would pass
+ROUGH = 0.1  # largest standard deviation of K and f if the noise is not given
+ANGLES = 240  # frequencies of the boundary at which the next experiment is searched
+SAME = 1e-6  # dampings with a smaller relative difference count as one
 
 
 class BuzzPoint(NamedTuple):
@@ -58,46 +49,40 @@ def fit_buzz(
     noise: float | tuple[float, float] | None = None,
     rotary: bool | None = None,
 ) -> DeviceFit:
-    """Find mass, damping and delay from walls at the onset of buzzing, and a lag or a resonance where they ask for it.
+    """Fit mass, damping and delay of a rigid device to walls at the onset of instability.
 
-    On ``z = e^(j 2 pi f T)`` each wall gives two real equations, ``K + B F(z)/T = (m/T^2) q(z)`` with ``q = -1/G``, the
-    closed form of `zwidth.boundary`. Two walls of different damping determine m, b and t_d of a rigid mass; more are
-    least squares of the relative deviations of K and f, with B exact. Where a rigid mass leaves more than noise, an
-    amplifier's lag (first or second order), a resonance, or a first-order lag and a resonance are tried, as far as the
-    walls are more than the unknowns: each number more has to explain what Schwarz's criterion asks for, and what chance
-    explains in one of 300 cases.
+    At ``z = e^(j 2 pi f T)`` each wall gives two real equations, ``K + B F(z)/T = (m/T^2) q(z)`` with ``q = -1/G``, the
+    closed form of `zwidth.boundary`. Two walls of different damping determine m, b and t_d. More walls are fitted by
+    least squares of the relative errors of K and f, with B exact. Residuals larger than the noise mean that the device
+    is not rigid: the walls are then refused, and `zwidth.fit_log` fits an actuator lag and resonances. A lag or a
+    resonance within the noise hardly changes walls between the measured ones, but it may change K_max at a larger B.
+    Therefore no safe wall has a larger B than the measured ones.
 
     Args:
         points: walls, each (K in N/m, B in N s/m, f in Hz) or a `zwidth.BuzzPoint`; K > 0, 0 < f < 1/(2 T). At least
-            two dampings. Texts with units, as "0.4 N m/rad", are allowed.
+            two dampings. Texts with units, such as "0.4 N m/rad", are allowed.
         period: T in s.
-        velocity: how the velocity was estimated; the backward difference by default.
-        noise: relative standard deviation of K and f, one number or one for each. Left out, it is taken to be equal
-            for both and is estimated from the residuals, which two or three walls hardly determine; a wall given twice
-            to the last digit then counts once.
+        velocity: the velocity estimate; the backward difference by default.
+        noise: relative standard deviation of K and f, one number or one for each. By default it is equal for both and
+            estimated from the residuals, which is inaccurate for two or three walls; identical walls then count once.
         rotary: True if K is in N m/rad and B in N m s/rad. By default, the units of the points decide; numbers without
             units are those of a linear device.
 
     Returns:
-        DeviceFit: the interval of K_max reaches down to what buzzed at the largest B where K_max has more; ``status``:
-        UNDECIDED where another device fits as well (those are ``rivals``), NO_BOUNDARY where the walls do not lie on
-        the edge of its stable set or contradict each other; K_max is NaN then, see `zwidth.DeviceFit`.
+        DeviceFit: if B at K_max exceeds the largest measured B, the interval of K_max includes the K measured there.
+        ``status``: UNDECIDED if other devices fit equally well (``rivals``); NO_BOUNDARY if no rigid device has the
+        walls on its boundary, K_max is then NaN.
 
     Raises:
-        InputError: a number is impossible, or an experiment is missing, which the message names.
+        InputError: an invalid number, or a missing experiment, which the message names.
 
     Numerics:
-        Levenberg and Marquardt (SciPy's: three unknowns, nothing to compile) from the dips over damping and delay;
-        exact walls give the device back to about 1e-12. Errors are linear in the noise, those of K_max in its
-        logarithm. With 2 % of K and f and four walls of 800 random rigid devices, 10 % of the fits were UNDECIDED, 4 %
-        refused, and 5 of them found a part; of the others, the intervals of m, b, t_d and K_max held the true value on
-        94.8, 94.5, 94.6 and 95.5 %. Of 200 others with a lag, a resonance or both, most of five walls, 11 % were
-        doubted; of the rest the interval of K_max held it on 96.6 %, and every safe wall was stable. Looking for parts
-        takes a few seconds.
+        SciPy's Levenberg-Marquardt method from several initial values; exact walls reproduce the device to about 1e-12.
+        Errors are linear in the noise, those of K_max in its logarithm.
+        @FIGURES@
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V (the boundary). Boggs, Rogers 1990 (errors in both coordinates).
-        Schwarz 1978, Annals of Statistics 6, 461-464 (further numbers).
 
     Example:
         >>> import zwidth
@@ -126,21 +111,20 @@ def fit_buzz(
     kappa, rub, w = (table * [period**2, period, 2 * np.pi * period]).T
     onsets = Onsets(kappa, rub, w, velocity, period, system=system)
     weights = 1.0 / np.array(share or (1.0, 1.0))
-    chosen, others = choose_device(onsets, weights, share is not None)
-    onsets, best, equals, _ = chosen
+    chosen = find_device(onsets, weights, share is not None)
+    best, equals = chosen.best, chosen.equals
     scale = chosen.scale
     against = None
-    if share and best.squares > chdtri(chosen.freedom, _CHANCE):
+    if share and best.squares > chdtri(chosen.freedom, CHANCE):
         far = plain(np.sqrt(best.squares / chosen.freedom), 2)
         against = (
-            f"the walls contradict each other: they are {far} times as far from this device as their noise explains; "
-            "look for friction, a compliance or a hand that holds it"
+            f"no rigid device has these walls: their residuals are {far} times the noise; check K, B and f, or fit a "
+            "log, which determines a lag or a resonance"
         )
-    elif not share and scale > _ROUGH**2:
+    elif not share and scale > ROUGH**2:
         against = (
-            f"the walls contradict each other: no device comes closer to them than {plain(100 * np.sqrt(scale), 2)} %; "
-            "check K, B, f and the period, look for friction, a compliance or a hand that holds it, or give the noise "
-            "if they were measured so roughly"
+            f"no rigid device has these walls: their residuals are {plain(100 * np.sqrt(scale), 2)} %; check K, B, f "
+            "and the period, fit a log, or give a larger noise"
         )
     elif not equals:
         against = "the walls do not lie on the edge of this device's stable set: they began to buzz before or later"
@@ -152,23 +136,16 @@ def fit_buzz(
     by_theta = differentiate(lambda theta: onsets.normalize(theta).to_numbers(period), best.theta)
     stiffest, slope = find_stiffest(scene)
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
-    rivals: list[tuple[FittedKind, np.ndarray]] = []
     apart = [best.theta]
     for other in equals[1:] if status == Status.OK else ():
         # Not along the flat floor of the same valley.
         if all((away := other.theta - one) @ information @ away > AS_GOOD for one in apart):
             apart.append(other.theta)
-            rivals.append((chosen, other.theta))
-    error = float(np.sqrt(slope @ covariance @ slope))
-    for kind in others if status == Status.OK else ():
-        # Devices of other kinds whose K_max is the same say nothing else of walls.
-        if abs(float(kind.scene(kind.best.theta).max_stiffness().stiffness) - stiffest) > error:
-            rivals.append((kind, kind.best.theta))
-    told = tuple(_describe_rival(*rival) for rival in rivals)
+    rivals = tuple(_describe_rival(chosen.scene(theta)) for theta in apart[1:])
     if rivals:
         status = Status.UNDECIDED
         doubts.append(
-            f"another device fits equally well: {spell_rival(told[0], system)}; add the experiment named next"
+            f"another device fits equally well: {spell_rival(rivals[0], system)}; add the experiment named next"
         )
     if against:
         doubts.append(against)
@@ -181,7 +158,7 @@ def fit_buzz(
                 for name in best.held
                 if name != "delay" or _delay_beyond(slopes, best) < -BEYOND * np.sqrt(scale)
             ]
-    further = _further(chosen, stiffest, information, slope @ by_theta, weights**2 / scale, rivals)
+    further = _further(chosen, stiffest, information, slope @ by_theta, weights**2 / scale)
     stiffness, damping, _ = table[np.argmax(table[:, 1])].tolist()
     fit = DeviceFit(
         nominal=scene,
@@ -191,7 +168,7 @@ def fit_buzz(
         doubts=(*doubts, *doubt_period(period)),
         status=int(status),
         freedom=None if share else chosen.freedom,
-        rivals=told,
+        rivals=rivals,
         damping_tried=damping,
         stiffness_tried=stiffness,
     )
@@ -237,7 +214,7 @@ def _read_points(
     table = np.array(rows)
     # A force over a velocity: the dampings that matter are of this size.
     unit = table[0, 0] / (2 * np.pi * table[0, 2])
-    if np.ptp(table[:, 1]) <= _SAME * max(unit, np.abs(table[:, 1]).max()):
+    if np.ptp(table[:, 1]) <= SAME * max(unit, np.abs(table[:, 1]).max()):
         count = (
             "one wall gives two equations for" if len(table) == 1 else f"{len(table)} walls of one damping cannot tell"
         )
@@ -260,11 +237,8 @@ def _read_noise(noise: Any) -> tuple[float, float] | None:
     return float(pair[0]), float(pair[1])
 
 
-def _describe_rival(kind: FittedKind, theta: np.ndarray) -> RivalDevice:
-    scene = kind.scene(theta)
-    parts = {name: scene.parameters()[name] for name in name_numbers(scene)[3:]}
-    stiffness = float(scene.max_stiffness().stiffness)
-    return RivalDevice(scene.mass, scene.damping, scene.timing.delay, stiffness, parts or None)
+def _describe_rival(scene: Scene) -> RivalDevice:
+    return RivalDevice(scene.mass, scene.damping, scene.timing.delay, float(scene.max_stiffness().stiffness))
 
 
 def _delay_beyond(slopes: np.ndarray, best: Candidate) -> float:
@@ -289,22 +263,16 @@ def _refuse_blind(slopes: np.ndarray, theta: np.ndarray, table: np.ndarray, on_e
 
 
 def _further(
-    chosen: FittedKind,
-    stiffest: float,
-    information: np.ndarray,
-    wanted: np.ndarray,
-    precision: np.ndarray,
-    rivals: list[tuple[FittedKind, np.ndarray]],
+    chosen: RigidFit, stiffest: float, information: np.ndarray, wanted: np.ndarray, precision: np.ndarray
 ) -> FurtherExperiment | None:
-    """The wall of the device's own boundary, B >= 0, after which K_max is known best."""
-    # Where a device of another kind may be there, the wall at which the two differ most.
+    """Return the wall on the boundary of the device, B >= 0, that reduces the error of K_max most."""
     onsets, theta = chosen.onsets, chosen.best.theta
     scene, period = chosen.scene(theta), onsets.period
-    w = np.linspace(0.0, np.pi, _ANGLES + 2)[1:-1]
-    # Slow loops have all of their boundary at low frequencies.
+    w = np.linspace(0.0, np.pi, ANGLES + 2)[1:-1]
+    # The boundary of slow loops is at low frequencies.
     w = np.concatenate([np.geomspace(1e-4, w[0], 60)[:-1], w])
     stiffness, damping = scene.boundary(w / period)
-    # Softer walls than a tenth of the stiffest are outside of what anybody measures well.
+    # Walls softer than a tenth of K_max are hard to measure.
     real = (damping >= 0) & (stiffness > 0.1 * stiffest)
     real[real] = find_edges(scene, stiffness[real], damping[real])
     if not real.any():
@@ -315,13 +283,6 @@ def _further(
     more = np.einsum("nki,k,nkj->nij", rows, precision, rows)
     after = np.linalg.solve(information + more, wanted[:, None])[..., 0] @ wanted
     best = int(np.argmin(after))
-    for kind, other in rivals[:1]:
-        if kind is not chosen:
-            there = replace(kind.onsets, kappa=walls.kappa, rub=walls.rub, w=walls.w).follow(other)
-            # Where the other one has no stiffness there is nothing to compare with.
-            seen = there.found & (there.kappa > 0)
-            away = np.log(np.where(seen, [there.kappa / walls.kappa, there.w / walls.w], 1.0)) ** 2
-            best = int(np.argmax(precision @ away))
     return FurtherExperiment(
         float(damping[best]),
         float(stiffness[best]),

@@ -66,16 +66,12 @@ class FittedMotion(NamedTuple):
 
 
 class RivalDevice(NamedTuple):
-    """Another device that fits as well: kg, N s/m, s, its K_max in N/m.
-
-    ``parts`` are the numbers of its amplifier and its resonance by their paths, None of a rigid one.
-    """
+    """Another device that fits equally well: parameters in kg, N s/m and s, and its K_max in N/m."""
 
     mass: float
     damping: float
     delay: float
     stiffness_max: float
-    parts: dict[str, float] | None = None
 
 
 @shown(
@@ -110,8 +106,7 @@ class DeviceFit(DeviceEstimate):
         status: of `zwidth.Status`: UNDECIDED where another device fits as well, or where a log shows more than the
             model has.
         rivals: those devices, a `zwidth.RivalDevice` each.
-        next: the further experiment that narrows K_max most, or tells the device from a rival of another kind; None of
-            a log.
+        next: the further experiment that reduces the error of K_max most; None for a log.
         offset, friction: constant force beside the commanded one and Coulomb friction, in N, of a log; their errors in
             ``errors_of_log`` and ``errors``, NaN where the log leaves open how much is of which.
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
@@ -277,14 +272,13 @@ class DeviceFit(DeviceEstimate):
             InputError: a share that there cannot be.
 
         Numerics:
-            8,000 devices, 1,000 with a velocity filter, or 400 with an amplifier or resonances: ln m, b, t_d normal
+            8,000 devices, 1,000 with a velocity filter, or 400 with an actuator lag or resonances: ln m, b, t_d normal
             with the fit's covariance, or Student's t where the noise was estimated; draws of negative ones are drawn
             again, and equal fits give equal walls. A rigid device: rows and columns in closed form, K to 0.1 %, in
             about 0.1 s; of 20,000 other devices of 69 fits each, 98.5 to 99.2 % bore it, and of 2 % more stiffness at
-            most 91.4 % at any B. With a filter, and of walls with an amplifier or a resonance: boundaries on a grid of
-            frequencies, judged by eigenvalues, in some seconds. Hidden resonances, one at a time with damping ratios
-            from 0.005 on, by ``response`` and its radius: what the residuals show of each and four standard errors, as
-            `zwidth.MeasuredDevice` decides.
+            most 91.4 % at any B. With a velocity filter: boundaries on a grid of frequencies, checked by eigenvalues,
+            in a few seconds. Hidden resonances, one at a time with damping ratios from 0.005 on, by ``response`` and
+            its radius: what the residuals show of each and four standard errors, as `zwidth.MeasuredDevice` decides.
 
         References:
             Hulin, Preusche, Hirzinger 2006, section V (the stable set). Kotz, Nadarajah 2004 (the t distribution).

@@ -85,8 +85,8 @@ def fit_log(
     Returns:
         DeviceFit: the errors of ``friction`` and ``offset`` are NaN where the log leaves open how much is of which, as
         of a mass that slides one way only; ``doubts`` as of a unit or of residuals that are no noise: then there is no
-        safe wall; ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED, UNDECIDED where the
-        residuals are no noise: then K_max is NaN; ``response`` bounds the safe wall.
+        safe wall; ``status``: UNREACHABLE if the delay is at the end of the search range, NOT_CONVERGED, UNDECIDED if
+        the residuals are no noise: then K_max is NaN; ``response`` bounds the safe wall.
 
     Raises:
         InputError: times are uneven, the force or the position never changes, the device runs away from its force, most

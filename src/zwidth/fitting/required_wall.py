@@ -1,7 +1,7 @@
-"""The wall that a device needs to have a pole on the unit circle: ``K + B F(z)/T = q(z)`` with ``q = -1/G``.
+"""The critical controller of a device, which puts a pole on the unit circle: ``K + B F(z)/T = q(z)``, ``q = -1/G``.
 
-The lag and the modes add to the response of the mass a sum over their poles p of ``r h(p; z)``, what a force held and
-late by d = n + f moves of ``E' = p E + F``, with zeta = z - 1:
+The lag and the modes add to the response of the mass a sum over their poles p of ``r h(p; z)``: the response of
+``E' = p E + F`` to a held force with the delay d = n + f. With zeta = z - 1:
 
     h = (zeta (e^((1 - f) p) - 1) + e^p - 1)/(p (zeta + 1 - e^p) z^(n + 1))
 
@@ -30,14 +30,15 @@ _DAMPINGS, _REFINED, _TIMES = 33, 9, 3
 
 
 class RequiredWall:
-    """``q = -1/G`` of devices, arrays that broadcast with the points asked for.
+    """``q = -1/G`` of devices, arrays that broadcast with the frequencies.
 
-    Of a rigid one ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``; ``lag`` is an amplifier's time constant in periods
-    and, of second order, its damping ratio; ``modes`` are frequencies in radians a period, damping ratios, ``m/m_i``.
+    A rigid device has ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``. ``lag`` contains the time constant of the
+    actuator in periods and, for second order, its damping ratio; ``modes`` frequencies in rad per sample, damping
+    ratios and mass ratios ``m/m_i``.
     """
 
     def __init__(self, delta: Any, d: Any, lag: Sequence[Any] = (), modes: Sequence[Sequence[Any]] = ()) -> None:
-        """Of devices, described once for all frequencies."""
+        """Compute the quantities that do not depend on the frequency."""
         self.whole, fraction = split_delay(np.asarray(d, float))
         self.delta, self.fraction = delta, fraction
         poles, residues = list_poles(delta, lag, modes)
@@ -50,35 +51,29 @@ class RequiredWall:
 
     @cached_property
     def plant(self) -> Plant:
-        """The mass alone."""
+        """The rigid mass."""
         return held_plant(self.delta, self.fraction)
 
-    def jet(self, at: CirclePoints) -> Jet:
-        """q and its derivative in w."""
-        rigid = self.rigid_jet(at)
-        if not self.beside:
-            return rigid
-        more = self.add(at)
-        share = 1.0 / (1.0 - rigid.value * more.value)
-        return Jet(rigid.value * share, share**2 * (rigid.slope + rigid.value**2 * more.slope))
+    def value(self, at: CirclePoints) -> Array:
+        """Return q."""
+        rigid = self.jet(at).value
+        return rigid / (1.0 - rigid * self.add(at)) if self.beside else rigid
 
-    def rigid_jet(self, at: CirclePoints) -> Jet:
-        """The same of the mass alone."""
+    def jet(self, at: CirclePoints) -> Jet:
+        """Return q of the rigid mass and its derivative in w."""
         plant, turn = self.plant, 1j * at.z
         total, below = _answer(plant, at), at.before + plant.em
         q = -np.exp(1j * self.whole * at.w) * at.before * below / total
         slopes = turn / at.before + turn / below - 1j * (plant.a2 * at.z - plant.a0 / at.z) / total
         return Jet(q, q * (1j * self.whole + slopes))
 
-    def add(self, at: CirclePoints) -> Jet:
-        """What lag and modes add to the response, and its derivative in w."""
+    def add(self, at: CirclePoints) -> Array:
+        """Return the part of the response that lag and modes add."""
         above, below = at.before * self.late + self.full, at.before - self.turns
-        each = self.residues * (np.exp(-1j * (self.whole + 1.0) * at.w) * above / below)
-        slopes = 1j * (at.z * (self.late / above - 1.0 / below) - self.whole - 1.0)
-        return Jet(each.sum(0), (each * slopes).sum(0))
+        return (self.residues * (np.exp(-1j * (self.whole + 1.0) * at.w) * above / below)).sum(0)
 
     def moves(self, at: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The derivatives in delta and d of q, that of the rigid device alone."""
+        """Return the derivatives of q of the rigid mass in delta and d."""
         by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
         total = _answer(self.plant, at)
         return (

@@ -4,8 +4,8 @@ Raised from below: a device bears (K, B) where every softer wall of that B is st
 and columns of the stable set are intervals (docs/theory/one-lobe.md), so that at each K the dampings that most devices
 bear are counted from the ends of their columns, and K is halved between what they bear and what they do not.
 
-With a velocity filter, an amplifier or resonances rows are looked for on a grid of frequencies
-(`zwidth.fitting.required_wall`); eigenvalues then judge the wall on every device.
+With a velocity filter rows are computed on a grid of frequencies (`zwidth.fitting.required_wall`). Eigenvalues then
+decide the stability of the wall on every device.
 
 A log bounds resonances as well: how large one may be and not show. The fitted response with that radius decides walls
 as a measured one does (docs/theory/measured.md), and a wall counts that it decides too.
@@ -40,8 +40,6 @@ _CLOSE, _NOTHING = 1e-3, 1e-4
 _BELOW = 1e-9
 # Frequencies: of slow loops, evenly, and more for each period of delay.
 _SLOWEST, _SLOW, _EVEN, _EVEN_PER_PERIOD = 1e-4, 60, 400, 40
-# Beside a resonance, in half-widths.
-_BESIDE = np.sinh(np.linspace(-4.0, 4.0, 241))
 # The longest delay looked at, in periods, and for each period of the estimated one.
 _FARTHEST = (20.0, 1.5)
 # Judged at K and at this share of it; how many devices eigenvalues may judge otherwise than the grid.
@@ -66,22 +64,22 @@ _UNDECIDED = SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
 
 
 def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> SafeWall:
-    """See `zwidth.DeviceFit.safe_wall`."""
+    """Return the wall that `zwidth.DeviceFit.safe_wall` describes."""
     scene, usual = fit.nominal, _CONFIRMED if fit.is_structured else _FOUND
     count = min(_SAMPLES, usual * scene.loop.draws)
     drawn = fit.draw(count)
     if drawn is None:
         return _UNDECIDED
-    if fit.is_structured and fit.damping_tried is None:
+    if fit.is_structured:
         return _bear_response(fit, reliability, rigid, drawn)
-    searched = fit.is_structured or scene.velocity != BackwardDifference()
+    filtered = scene.velocity != BackwardDifference()
     devices = (
-        _SearchedDevices(drawn, fit) if searched else _RigidDevices(scene, dict(zip(fit.numbers, drawn.T, strict=True)))
+        _SearchedDevices(drawn, fit) if filtered else _RigidDevices(scene, dict(zip(fit.numbers, drawn.T, strict=True)))
     )
     most = np.inf if rigid or fit.damping_tried is None else fit.damping_tried
     (stiffness, virtual_damping), resonance = devices.find(reliability, most), np.nan
     if virtual_damping == most:
-        # A resonance may bend the edge there already, and leave the walls as a rigid device does.
+        # A resonance may lower the boundary near the last wall without changing the measured walls.
         stiffness = min(stiffness, fit.bear_tried(reliability))
     if not rigid and fit.responding is not None and not bears_resonances(fit, stiffness, virtual_damping):
         # Nothing is sure of walls with B < 0 that is not of those with B = 0.
@@ -165,7 +163,7 @@ class _RigidDevices(RigidVariants):
 
 
 class _SearchedDevices:
-    """Devices with a filter or parts, by their boundaries on a grid of frequencies; only B >= 0 counts."""
+    """Rigid devices with a velocity filter, by their boundaries on a grid of frequencies; only B >= 0 counts."""
 
     def __init__(self, drawn: np.ndarray, fit: DeviceEstimate) -> None:
         period, scene = fit.period, fit.nominal
@@ -173,20 +171,15 @@ class _SearchedDevices:
             rate, d = drawn[:, 0] / period, drawn[:, 2] / period
             known = device_status(drawn[:, 1] / rate, d) == Status.OK
         known &= (drawn[:, 0] > SI_RANGE[0]) & (drawn[:, 0] < SI_RANGE[1]) & (d < _FARTHEST[0] + _FARTHEST[1] * scene.d)
-        # Beyond what is looked at nothing is believed to be borne.
+        # Devices out of range count as unstable.
         self.others = np.zeros(np.count_nonzero(~known))
         drawn, d, rate = drawn[known], d[known], rate[known]
         self.fit, self.drawn = fit, drawn
         even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max(initial=0.0)))[1:]
-        w = np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even])
-        devices = fit.normalize(drawn[..., None])
-        if devices.modes:
-            beside = [np.clip(turns * (1.0 + ratio * _BESIDE), _SLOWEST, np.pi) for turns, ratio, _ in devices.modes]
-            w = np.sort(np.concatenate([np.broadcast_to(w, (len(drawn), w.size)), *beside], -1), -1)
-        at = circle(w)
+        at = circle(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
         with np.errstate(all="ignore"):
-            velocity = scene.velocity.estimate(period).jet(at).value.reshape(-1, w.shape[-1]) / period
-            needed = RequiredWall(*devices[1:]).jet(at).value * (rate / period)[:, None]
+            velocity = scene.velocity.estimate(period).jet(at).value[None] / period
+            needed = RequiredWall(*fit.normalize(drawn[..., None])[1:3]).jet(at).value * (rate / period)[:, None]
             # At z = -1 both are real.
             needed[:, -1], velocity[:, -1] = np.real(needed[:, -1]), np.real(velocity[:, -1])
             self.rows = DeviceRows(needed, velocity)

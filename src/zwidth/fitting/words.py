@@ -194,22 +194,10 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     return rows
 
 
-def _name_part(name: str, count: int) -> str:
-    """The label of a number of the amplifier or of one of so many resonances."""
-    _, *place, number = name.split(".")
-    if number == "time_constant":
-        return "amplifier's lag"
-    if number == "frequency":
-        return f"resonance {int(place[0]) + 1}" if count > 1 else "resonance"
-    return f"  its {number.replace('_', ' ')}"
-
-
 def spell_rival(rival: RivalDevice, system: UnitSystem) -> str:
-    """Return the parameters of an equally good device in one line."""
-    parts = {
-        symbol_of(name, system): spell(name, getattr(rival, name), system) for name in ("mass", "damping", "delay")
-    }
-    parts |= {_name_part(name, 1).strip(): spell(name, value, system) for name, value in (rival.parts or {}).items()}
+    """Return the parameters of a rival device in one line."""
+    names = ("mass", "damping", "delay")
+    parts = {symbol_of(name, system): spell(name, getattr(rival, name), system) for name in names}
     parts[symbol_of("stiffness_max", system)] = spell("stiffness", rival.stiffness_max, system)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 

@@ -182,7 +182,8 @@ def diagnosis_lines(found: Diagnosis | None) -> list[str]:
 
 def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
     """Return the caution about a delay that is 0 only because it was not given; ``silent`` names such options."""
-    if "delay" not in silent or scene.timing.delay:
+    # A measured response usually contains the delay.
+    if "delay" not in silent or scene.timing.delay or isinstance(scene.device, MeasuredDevice):
         return []
     return [
         "no delay given: the results hold only if the force acts at the sample; if it acts one period later, add "

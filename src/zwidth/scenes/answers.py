@@ -219,10 +219,11 @@ class SceneAnswers(SceneParts):
     def decide_stability(
         self, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
     ) -> Stability:
-        """Labels of walls with a status and what decided each, as `zwidth.decide_stability` has them.
+        """Return the label, status and method of each wall, as `zwidth.decide_stability` does.
 
-        "auto" and "crossover" count by the signed crossings of each row, "companion" computes all poles, "certified"
-        decides in balls of python-flint, exactly for the numbers given, or says UNDECIDED or ON_BOUNDARY.
+        "auto" and "crossover" sum the signed crossings of each line of constant B; "companion" computes all poles;
+        "certified" decides in ball arithmetic of python-flint for exactly the given parameters, or returns UNDECIDED
+        or ON_BOUNDARY.
         """
         check_choice("method", method, STABILITY_METHODS)
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))

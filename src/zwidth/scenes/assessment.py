@@ -18,7 +18,7 @@ from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
 from zwidth.words.results import Margins
-from zwidth.words.showing import find_unit, shown, with_units
+from zwidth.words.showing import ResultList, find_unit, shown, with_units
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
@@ -285,7 +285,7 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
         stiffness = measure(improved)
         found.append(Limit(name, words, stiffness, stiffness / now, note))
     found.sort(key=lambda limit: (not limit.gain >= 0, -limit.gain))
-    return with_units(found, scene.unit_system)
+    return with_units(ResultList(found), scene.unit_system)
 
 
 def describe_islands(scene: SceneOptima) -> list[str]:

@@ -25,7 +25,7 @@ Cause: TypeAlias = Literal["none", "instability", "quantization", "saturation", 
 TIME_CONSTANTS = 30.0  # length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS = 2000  # length of the shortest simulation, in sampling periods
 MOST_PERIODS = 200_000  # length of the longest simulation, in sampling periods; limits the run time
-SETTLED = 2.0  # time constants that must be simulated before an UNCLEAR motion may count as sustained
+SETTLED = 2.0  # time constants that must be simulated before a motion may count as sustained
 CONFIRMED = "simulated at these and larger changes: check the value that you choose with diagnose"
 FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in proportion to its steps"
 
@@ -54,7 +54,7 @@ class Diagnosis:
             rest, infinite if one grows without bound.
         frequency: frequency of the largest sustained motion in Hz; NaN at rest. For an unstable linear loop whose
             simulation shows no frequency: frequency of the dominant pole.
-        outcome: code of `zwidth.MotionKind` of the largest sustained motion; UNCLEAR: sustained, without a certificate.
+        outcome: code of `zwidth.MotionKind` observed for the largest sustained motion.
         remedies: changes of one parameter, each of which stops the oscillation. For limit cycles the list is empty if
             the delay exceeds 50 periods, because the search would take too long.
         unit_system: units of the device.
@@ -218,14 +218,17 @@ def _find_cause(experiment: Experiment, worst: SustainedMotion, dominant: Any) -
     scene, hardware = experiment.scene, experiment.hardware
     if not dominant.marginal and not scene.is_stable():
         return "instability"
-    if not worst.certified[0] and experiment.decay < SETTLED:
+    limited = min(hardware.max_force, hardware.max_rate) < math.inf
+    if not limited and hardware.resolution == 0:
+        # The verdict of the linear loop decides, because friction only dissipates energy.
+        return "none"
+    if not worst.at_rest[0] and experiment.decay < SETTLED:
         return "undecided"
     if worst.amplitude[0] == 0:
         return "none"
-    limited = min(hardware.max_force, hardware.max_rate) < math.inf
     if limited and hardware.resolution > 0:
         unlimited = experiment.measure(max_force=np.inf, max_rate=np.inf)
         # A motion sustained by saturation is larger than the quantization limit cycle that remains once the force
         # limits are removed.
         limited = bool(worst.amplitude[0] > 2.0 * unlimited.amplitude[0])
-    return "saturation" if limited else "quantization" if hardware.resolution > 0 else "undecided"
+    return "saturation" if limited else "quantization"

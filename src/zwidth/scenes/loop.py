@@ -119,7 +119,7 @@ class LinearLoop:
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod, exact: tuple[np.ndarray, np.ndarray]
     ) -> Stability:
-        """Labels with status and method, broadcast; ``exact`` are the walls in SI units, as "certified" takes them."""
+        """Return label, status and method of each wall; ``exact`` are the walls in SI units, for "certified"."""
         # Device and delay were checked as the parts of the scene.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)

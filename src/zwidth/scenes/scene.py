@@ -11,6 +11,7 @@ from zwidth.loops.linear.border import Outline
 from zwidth.scenes.base import WallSI, wrap_methods
 from zwidth.scenes.recommendation import SceneAdvice
 from zwidth.simulation.simulate import simulate
+from zwidth.words.showing import ResultList
 from zwidth.words.types import ArrayLike
 from zwidth.words.xp import is_traced, namespace
 
@@ -67,10 +68,10 @@ class Scene(SceneAdvice):
             `islands` means it.
         """
         units = self.units
-        return [
+        return ResultList(
             Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
             for piece in self.loop.outlines()
-        ]
+        )
 
     simulate = simulate
     """A method: `zwidth.simulate` of this scene, with all its arguments."""

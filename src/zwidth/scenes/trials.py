@@ -23,7 +23,7 @@ LARGEST_PUSH = 0.9  # largest constant external force on a `LinearDevice`, in un
 SPEEDS = (0.05, 0.5)  # initial velocities if K = 0, in initial displacements per sampling period
 FIRST_DISPLACEMENT = 1e-3  # m or rad; used if neither the encoder nor the motor sets a scale
 
-SUSTAINED = 0.8  # least trend (see `Motion`) of a sustained oscillation, if its outcome is UNCLEAR
+SUSTAINED = 0.5  # least trend (see `Motion`) of a sustained oscillation
 RUNAWAY = 1.1  # trend above which a response without a frequency counts as growing without bound
 
 TRIALS = 16  # trials per call of `simulate`; constant, because JAX compiles once per batch size
@@ -56,7 +56,7 @@ class SustainedMotion(NamedTuple):
     amplitude: np.ndarray  # 0 if every response of the trial comes to rest
     frequency: np.ndarray  # in Hz; NaN if the motion has no frequency
     outcome: np.ndarray  # code of `MotionKind`
-    certified: np.ndarray  # bool; no response of the trial has the outcome UNCLEAR
+    at_rest: np.ndarray  # bool; every response of the trial is observed at rest
 
 
 class Experiment(NamedTuple):
@@ -104,7 +104,11 @@ class Experiment(NamedTuple):
             raise InputError("coulomb: friction stops and restarts the device too often within one period; lower it")
         # The trend of a response that decays like the linear loop is exp(-decay/8), because each half of the tail is
         # an eighth of the simulation. The square root of this factor is the least trend of a sustained oscillation.
-        return _pick_largest(motion, max(SUSTAINED, math.exp(-max(self.decay, 0.0) / 16.0)))
+        least_trend = max(SUSTAINED, math.exp(-self.decay / 16.0) if self.decay > 0 else 0.0)
+        # Only an unstable linear loop without motor limits grows without bound; other growing responses approach a
+        # limit cycle.
+        limited = np.minimum(columns["max_force"], columns["max_rate"]) < np.inf
+        return _pick_largest(motion, least_trend, ~limited & (self.decay < 0))
 
 
 def list_starts(scene: Any, hardware: Hardware) -> Starts:
@@ -131,18 +135,17 @@ def list_starts(scene: Any, hardware: Hardware) -> Starts:
     return Starts(*starts)
 
 
-def _pick_largest(motion: Any, least_trend: float) -> SustainedMotion:
+def _pick_largest(motion: Any, least_trend: float, unlimited: np.ndarray) -> SustainedMotion:
     """Return the sustained motion of largest amplitude along the last axis."""
-    kind, unclear = motion.outcome, motion.outcome == MotionKind.UNCLEAR
-    unbounded = (kind == MotionKind.DIVERGED) | (kind == MotionKind.GROWING)
-    sustained = (kind == MotionKind.STEADY) | (kind == MotionKind.RESTLESS) | (unclear & (motion.trend > least_trend))
+    kind, moving = motion.outcome, motion.outcome != MotionKind.REST
     # A response without a frequency either drifts or departs from an unstable equilibrium.
     oscillating = np.isfinite(motion.frequency)
-    unbounded |= ~oscillating & (unclear | (kind == MotionKind.RESTLESS)) & (motion.trend > RUNAWAY)
-    sustained = unbounded | (sustained & oscillating)
+    unbounded = (kind == MotionKind.DIVERGED) | (~oscillating & moving & (motion.trend > RUNAWAY))
+    unbounded |= unlimited & (kind == MotionKind.GROWING)
+    sustained = unbounded | (oscillating & ((kind == MotionKind.STEADY) | (moving & (motion.trend > least_trend))))
     amplitude = np.where(unbounded, np.inf, np.where(sustained, motion.amplitude, 0.0))
     index = np.argmax(amplitude, axis=-1)[:, None]
     size, frequency, outcome = (
         np.take_along_axis(part, index, -1)[:, 0] for part in (amplitude, motion.frequency, kind)
     )
-    return SustainedMotion(size, frequency, outcome, ~unclear.any(-1))
+    return SustainedMotion(size, frequency, outcome, ~moving.any(-1))

@@ -1,8 +1,8 @@
-"""Simulations of one structure, from numbers to arrays: laid out in lanes, run in pieces, collected."""
+"""Simulations of scenes of one structure: normalize the parameters, run groups of a fixed size, collect the results."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,191 +12,203 @@ from zwidth.parts.chain import chain_of
 from zwidth.parts.device import Device
 from zwidth.parts.paths import Parts, replace_parameters
 from zwidth.parts.velocity import FOAW, BackwardDifference
-from zwidth.simulation.flow import Mechanics, mechanics
-from zwidth.simulation.lanes import (
-    Course,
-    Given,
-    Lanes,
+from zwidth.simulation.flow import build_mechanics
+from zwidth.simulation.parameters import (
+    ExternalInputs,
     Motor,
     Options,
+    Parameters,
+    Settings,
+    build_estimators,
+    build_flows,
     cut_period,
-    lay_estimators,
-    lay_machines,
-    lay_scenes,
     round_up,
+    spread_scenes,
 )
-from zwidth.simulation.result import OF_ENERGY, to_si
+from zwidth.simulation.result import OF_ENERGY, convert_to_si
 
-# Lanes that run together: enough for the vector units, few enough that a state stays next to the processor.
-TOGETHER = 1 << 10
+GROUP = 1 << 10  # simulations per call: enough for vector units, few enough that a state stays in the cache
 
 
-def structure(scene: Parts) -> tuple[Any, ...]:
-    """What the scenes of one program share: bodies, modes and actuator, what is sensed, and FOAW's longest window."""
+def find_structure(scene: Parts) -> tuple[Any, ...]:
+    """Return the properties that scenes of one compiled program share."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
-    behind = len(scene.device.modes), 0 if scene.device.actuator is None else scene.device.actuator.order
-    # Of a linear system no part is known that others may share.
-    whole = None if isinstance(scene.device, Device) else (scene.device, scene.timing.period)
+    orders = len(scene.device.modes), 0 if scene.device.actuator is None else scene.device.actuator.order
+    # Linear systems have no common structure, so each device and period has a program of its own.
+    system = None if isinstance(scene.device, Device) else (scene.device, scene.timing.period)
     longest = scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
-    return *name_bodies(scene), sensor, *behind, longest, whole
+    return *name_bodies(scene), sensor, *orders, longest, system
 
 
 def name_bodies(scene: Parts) -> tuple[str, ...]:
-    """The position of every body by its name in `Motion`."""
+    """Return the names in `Motion` of the positions of all bodies."""
     tip = ("tip_position",) if scene.device.coupling is not None else ()
     hand = ("hand_position",) if scene.operator is not None and not scene.operator.rigid else ()
     return "position", *tip, *hand
 
 
-class Batch:
-    """Simulations of scenes of one structure.
+class Model(NamedTuple):
+    """Loop of one scene."""
 
-    ``which`` is the scene of each; ``numbers`` has a row each of the arguments of `simulate`, by name and in SI units.
-    """
-
-    def __init__(self, scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], course: Course) -> None:
-        self.names, self.which, self.numbers, self.course = name_bodies(scenes[0]), which, numbers, course
-        # An adaptive window is no filter: its own numbers stand beside the chain's.
-        adapts = isinstance(scenes[0].velocity, FOAW)
-        plain = [replace_parameters(each, {"velocity": BackwardDifference()}) for each in scenes] if adapts else scenes
-        chains: Any = [chain_of(each) for each in plain]
-        self.machine = mechanics(chains)
-        self.estimates: list[Any] = (
-            [each.velocity for each in scenes] if adapts else [chain.estimate for chain in chains]
-        )
-        self.late = np.array([chain.whole for chain in chains])
-        self.fractions = np.array([float(chain.d - chain.whole) for chain in chains])
-        self.periods = np.array([float(scene.timing.period) for scene in scenes])
-        self.masses = np.array([float(scene.mass) for scene in scenes])
-        jitter, friction = bool(np.any(numbers["jitter"] > 0)), bool(np.any(numbers["static"] > 0))
-        self.options = Options(
-            substeps=course.substeps,
-            pieces=4 if jitter else 2 if friction or np.any(self.fractions > 0) else 1,
-            friction=friction,
-            jitter=jitter,
-            foaw=scenes[0].velocity.samples if adapts else 0,
-            bodies=isinstance(scenes[0].device, Device),
-            record=course.record,
-            law=course.law,
-        )
-        windows = [each.samples if isinstance(each, FOAW) else each.window for each in self.estimates]
-        # Reading a ring takes no longer where it is: as long as most are, it needs no program of its own.
-        self.rings = round_up(max(*windows, 3) + 1), round_up(max(int(self.late.max()), 5) + 3)
-
-    def lay(self, places: np.ndarray) -> tuple[Lanes, Given]:
-        """Some of the simulations side by side."""
-        own, lane_of = np.unique(self.which[places], return_inverse=True)
-        course, options = self.course, self.options
-        numbers = {name: part[places] for name, part in self.numbers.items()}
-        shared = ("place", "motion")
-        machine = Mechanics(*(part if name in shared else part[own] for name, part in self.machine._asdict().items()))
-        period, mass = self.periods[self.which[places]], self.masses[self.which[places]]
-        force = period * period / mass
-        late, fractions = (lay_scenes(part[own], lane_of) for part in (self.late, self.fractions))
-        lanes = Lanes(
-            alpha=numbers["stiffness"] * force,
-            beta=numbers["virtual_damping"] * period / mass,
-            period=period,
-            force=1.0 / force,
-            resolution=numbers["resolution"],
-            push=numbers["push"] * force,
-            bilateral=np.array([course.contact == "bilateral"]),
-            pulling=np.array([course.contact != "push_only"]),
-            late=late,
-            motor=Motor(
-                numbers["max_force"] * force,
-                numbers["max_rate"] * period * force,
-                numbers["coulomb"] * force,
-                numbers["static"] * force,
-            ),
-            estimator=lay_estimators([self.estimates[k] for k in own], lane_of),
-            **lay_machines(
-                machine, cut_period(self.fractions[own], options.substeps, options.pieces), lane_of, options
-            ),
-        )
-        instants = durations = None
-        if options.jitter:
-            instants, durations = draw_instants(
-                numbers["seed"],
-                numbers["jitter"] / period,
-                late,
-                fractions,
-                course.periods,
-                course.substeps,
-            )
-        return lanes, Given(
-            positions=np.stack([numbers[f"start_position.{name}"] for name in self.names]),
-            velocities=np.stack([numbers[f"start_velocity.{name}"] for name in self.names]) * period,
-            noise=draw_noise(numbers["seed"], numbers["noise"], course.periods),
-            history=(numbers["push_history"] * force[:, None]).T if "push_history" in numbers else None,
-            durations=durations,
-            instants=instants,
-            period=period,
-            mass=mass,
-        )
-
-    def run(self, places: np.ndarray) -> dict[str, np.ndarray]:
-        """Columns of one row a simulation."""
-        # What JAX is needed for begins here.
-        from zwidth.simulation.engine import run_lanes
-        from zwidth.simulation.outlook import foresee
-
-        lanes, given = self.lay(places)
-        with compute_concretely():
-            state, sensed, reading, frame = run_lanes(lanes, self.options, self.course, given, self.rings)
-            last = lanes.push + np.zeros(places.size)
-            steady = (self.numbers["noise"][places] == 0) & (self.numbers["jitter"][places] == 0)
-            if given.history is not None:
-                # A hand that still moves in the tail moves on.
-                tail = given.history[-self.course.tail :]
-                last, steady = last + tail[-1], steady & np.all(tail == tail[-1], axis=0)
-            outlook = foresee(lanes, self.options, state, last, steady, sensed, self.course.periods)
-        found = to_si((state, reading, frame), given, lanes.motor.static > 0, outlook, self.names, self.course)
-        # Where a force acts and what stores its work is known of bodies.
-        unknown = () if self.options.bodies else OF_ENERGY & found.keys()
-        return found | {name: np.full_like(found[name], np.nan) for name in unknown}
+    chain: Any
+    estimate: Any
+    late: int  # integer delay
+    fraction: float  # remaining delay, in periods
+    window: int  # in samples
+    period: float  # in s
+    mass: float  # in kg
 
 
-def run_batch(
-    scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], course: Course
+def build_model(scene: Any) -> Model:
+    """Return the loop of a scene."""
+    estimate, period, mass = scene.velocity, float(scene.timing.period), float(scene.mass)
+    # FOAW is not a filter, so its parameters bypass the chain.
+    adapts = isinstance(estimate, FOAW)
+    chain: Any = chain_of(replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene)
+    fraction = float(chain.d - chain.whole)
+    if adapts:
+        return Model(chain, estimate, chain.whole, fraction, estimate.samples, period, mass)
+    return Model(chain, chain.estimate, chain.whole, fraction, chain.estimate.window, period, mass)
+
+
+def run_scenes(
+    scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], settings: Settings
 ) -> dict[str, np.ndarray]:
-    """Run the simulations of a `Batch`: columns of one row each."""
-    batch, count = Batch(scenes, which, numbers, course), which.size
-    size = min(TOGETHER, 1 << (count - 1).bit_length())
-    # The last piece is filled up with its last simulation: one size is one compilation.
-    pieces = [np.minimum(np.arange(first, first + size), count - 1) for first in range(0, count, size)]
-    # The first piece compiles the program; JAX lets go of the interpreter while it computes.
-    found = [batch.run(pieces[0]), *run_in_threads(batch.run, pieces[1:])]
+    """Simulate scenes of one structure.
+
+    Args:
+        scenes: the scenes.
+        which: index of the scene of each simulation.
+        numbers: arguments of `simulate` in SI units by name, with one row per simulation.
+        settings: settings that all simulations share.
+
+    Returns:
+        The fields of `Motion` by name, with one row per simulation.
+    """
+    models = [build_model(scene) for scene in scenes]
+    jitter, friction = bool(np.any(numbers["jitter"] > 0)), bool(np.any(numbers["static"] > 0))
+    options = Options(
+        substeps=settings.substeps,
+        pieces=4 if jitter else 2 if friction or any(model.fraction > 0 for model in models) else 1,
+        friction=friction,
+        jitter=jitter,
+        foaw=scenes[0].velocity.samples if isinstance(scenes[0].velocity, FOAW) else 0,
+        record=settings.record,
+        law=settings.law,
+    )
+    # The minima avoid further compilations; a longer ring takes no more time.
+    rings = (
+        round_up(max(3, *(model.window for model in models)) + 1),
+        round_up(max(5, *(model.late for model in models)) + 3),
+    )
+    names, count = name_bodies(scenes[0]), which.size
+    # The energies of a linear system are unknown, because its bodies are.
+    unknown = set() if isinstance(scenes[0].device, Device) else OF_ENERGY
+
+    def run(rows: np.ndarray) -> dict[str, np.ndarray]:
+        # Import JAX only here, because importing zwidth must not load it.
+        from zwidth.simulation.engine import run_batch
+
+        own, scene_of = np.unique(which[rows], return_inverse=True)
+        members, group = [models[k] for k in own], {name: part[rows] for name, part in numbers.items()}
+        params, inputs = build_batch(members, scene_of, group, settings, options, names)
+        with compute_concretely():
+            found = run_batch(params, options, settings, inputs, rings)
+        memory = np.array([model.late + model.window for model in members])[scene_of]
+        columns = convert_to_si(found, inputs, params.motor.static > 0, memory, names, settings)
+        return columns | {name: np.full_like(columns[name], np.nan) for name in unknown & columns.keys()}
+
+    size = min(GROUP, 1 << (count - 1).bit_length())
+    # Repeat the last simulation to fill the last group, because each size needs a compilation.
+    groups = [np.minimum(np.arange(first, first + size), count - 1) for first in range(0, count, size)]
+    # Compile with the first group; threads run the others in parallel, because JAX releases the interpreter lock.
+    found = [run(groups[0]), *run_in_threads(run, groups[1:])]
     return {name: np.concatenate([each[name] for each in found])[:count] for name in found[0]}
 
 
+def build_batch(
+    models: list[Model],
+    which: np.ndarray,
+    numbers: dict[str, np.ndarray],
+    settings: Settings,
+    options: Options,
+    names: tuple[str, ...],
+) -> tuple[Parameters, ExternalInputs]:
+    """Return the normalized parameters and inputs of one group; ``which``: index of the model of each simulation."""
+    chains, estimates, late, fractions, _, periods, masses = zip(*models, strict=True)
+    period, mass = np.array(periods)[which], np.array(masses)[which]
+    force = period * period / mass
+    durations = cut_period(np.ones(len(models)), [np.array(fractions)][: options.pieces - 1], settings.substeps)
+    late, fractions = (spread_scenes(np.array(part), which) for part in (late, fractions))
+    params = Parameters(
+        alpha=numbers["stiffness"] * force,
+        beta=numbers["virtual_damping"] * period / mass,
+        period=period,
+        force=1.0 / force,
+        resolution=numbers["resolution"],
+        push=numbers["push"] * force,
+        bilateral=np.array([settings.contact == "bilateral"]),
+        pulling=np.array([settings.contact != "push_only"]),
+        late=late,
+        motor=Motor(
+            numbers["max_force"] * force,
+            numbers["max_rate"] * period * force,
+            numbers["coulomb"] * force,
+            numbers["static"] * force,
+        ),
+        estimator=build_estimators(estimates, which),
+        **build_flows(build_mechanics(chains), np.moveaxis(durations, -1, 0), which, options),
+    )
+    instants = durations = None
+    if options.jitter:
+        instants, durations = draw_instants(numbers["seed"], numbers["jitter"] / period, late, fractions, settings)
+    return params, ExternalInputs(
+        positions=np.stack([numbers[f"start_position.{name}"] for name in names]),
+        velocities=np.stack([numbers[f"start_velocity.{name}"] for name in names]) * period,
+        noise=draw_noise(numbers["seed"], numbers["noise"], settings.periods),
+        history=(numbers["push_history"] * force[:, None]).T if "push_history" in numbers else None,
+        durations=durations,
+        instants=instants,
+        period=period,
+        mass=mass,
+    )
+
+
 def draw_noise(seeds: np.ndarray, sizes: np.ndarray, periods: int) -> np.ndarray | None:
-    """Errors of the measured positions, (periods, lanes); equal seeds draw the same."""
+    """Return the errors of the measured positions, (periods, batch); equal seeds give equal errors."""
     if not np.any(sizes > 0):
         return None
-    each, of = np.unique(seeds, return_inverse=True)
+    each, index = np.unique(seeds, return_inverse=True)
     drawn = np.stack([np.random.default_rng([0, seed]).standard_normal(periods) for seed in each], 1)
-    return drawn[:, of] * sizes
+    return drawn[:, index] * sizes
 
 
 def draw_instants(
-    seeds: np.ndarray, most: np.ndarray, whole: np.ndarray, fractions: np.ndarray, periods: int, substeps: int
+    seeds: np.ndarray, most: np.ndarray, whole: np.ndarray, fractions: np.ndarray, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Instants of the samples, (periods + 1, lanes), and how every period is cut, as by `cut_period` (T3)."""
-    each, of = np.unique(seeds, return_inverse=True)
+    """Return the instants of the samples, (periods + 1, batch), and the durations of constant force (T3).
+
+    Args:
+        seeds: equal seeds give equal jitter.
+        most: largest jitter, in periods.
+        whole: integer delay.
+        fractions: remaining delay, in periods.
+        settings: length of the simulation, and substeps.
+
+    Returns:
+        Instants in periods, and durations of shape (periods, substeps, pieces, batch).
+    """
+    each, index = np.unique(seeds, return_inverse=True)
+    periods = settings.periods
     drawn = np.stack([np.random.default_rng([1, seed]).random(periods + 1) for seed in each], 1)
-    late = drawn[:, of] * most
+    late = drawn[:, index] * most
     late[0] = 0.0
     whole, fractions = np.broadcast_to(whole, most.shape), np.broadcast_to(fractions, most.shape)
     k = np.arange(periods)[:, None]
-    length = 1.0 + np.diff(late, axis=0)
-    begin = np.arange(substeps)[:, None] / substeps * length[:, None]  # (periods, substeps, lanes)
-    part = np.broadcast_to(length[:, None] / substeps, begin.shape)
-    cuts = [np.zeros(begin.shape)]
+    effective = []
     for age in (1, 0, -1):
-        # When the command of that age sets in; before the first sample there are none.
+        # Time at which the command of this age takes effect; there is no command before the first sample.
         sample = np.clip(k - whole - age, 0, periods)
-        sets_in = fractions - age + np.take_along_axis(late, sample, 0) - late[:-1]
-        cuts.append(np.clip(sets_in[:, None] - begin, 0.0, part))
-    cuts.append(part)
-    return np.arange(periods + 1)[:, None] + late, np.moveaxis(np.diff(np.stack(cuts), axis=0), 0, 2)
+        effective.append(fractions - age + np.take_along_axis(late, sample, 0) - late[:-1])
+    durations = cut_period(1.0 + np.diff(late, axis=0), effective, settings.substeps)
+    return np.arange(periods + 1)[:, None] + late, durations

@@ -1,8 +1,9 @@
-"""The exact motion of a chain over given times, and the energy that its dampers take (docs/theory/simulation.md).
+"""Exact motion of a mechanism over given times, and the energy that its dampers dissipate (docs/theory/simulation.md).
 
-With the state x and a constant force u, ``z = (x, u)``: over a time t the state changes by ``change @ z`` and the
-dampers take ``z @ loss @ z`` (T1, T6). Both by series for a small part of t and doubling, all times of all chains at
-once. Where a command does not act on the first body alone and at once, it stands before u, the force that does.
+With the state x, constant forces u and ``z = (x, u)``: over a time t the state changes by ``change @ z``, and the
+dampers dissipate ``z @ loss @ z`` (T1, T6). Both follow from a series for a fraction of t and repeated doubling, for
+all times and mechanisms at once. With an actuator or modes the command is the first force, and the last force acts on
+the first body directly. Units: the sampling period and the mass of the first body.
 """
 
 from __future__ import annotations
@@ -17,79 +18,82 @@ from zwidth.parts.chain import Resonance, body_position
 from zwidth.parts.system import System
 from zwidth.words.errors import InputError
 
-# Of series in a matrix of norm up to 1/2: the first term left out is below 1e-19 of the whole.
-_TERMS = 15
-# Binary digits of a time below 2 periods: 1, 1/2, ... 2^-52.
-DIGITS = 53
+TERMS = 15  # of the series; for a norm of 1/2 the truncation error is below 1e-19
+DIGITS = 53  # binary digits of a time below 2 periods: 1, 1/2, ... 2^-52
 
 
 class Flow(NamedTuple):
-    """What a time does to ``z = (x, u)``, of one force or two, along leading axes."""
+    """Change of the state and dissipated energy over a time, along leading axes."""
 
     change: np.ndarray  # (..., n, n + forces)
     loss: np.ndarray  # (..., n + forces, n + forces)
 
 
 class Mechanics(NamedTuple):
-    """Chains of one structure as matrices, one a scene along the first axis, in units of T and of the first mass."""
+    """Matrices of mechanisms of one structure."""
 
     rate: np.ndarray  # (scenes, n, n + forces): x' = rate @ (x, u)
-    held: np.ndarray  # the same while friction holds the first body
-    place: np.ndarray  # (bodies, n): the position of every body, the same for all
-    motion: np.ndarray  # (bodies, n): its velocity
+    held: np.ndarray  # (scenes, n, n + forces): the same while friction holds the first body
+    place: np.ndarray  # (bodies, n): positions of the bodies, equal for all scenes
+    motion: np.ndarray  # (bodies, n): their velocities
     energy: np.ndarray  # (scenes, n, n): kinetic and elastic energy x @ energy @ x
-    drain: np.ndarray  # (scenes, n + forces, n + forces): the power that dampers take
+    drain: np.ndarray  # (scenes, n + forces, n + forces): power that the dampers dissipate
 
 
-def mechanics(chains: Sequence[Any]) -> Mechanics:
-    """The matrices of chains with equally many bodies and modes, the sensor on the same body; or of one system."""
+def build_mechanics(chains: Sequence[Any]) -> Mechanics:
+    """Return the matrices of chains that differ in their parameters only, or of one linear system."""
     first: Any = chains[0]
     if isinstance(first, System):
-        return _follow(chains)
-    together = {
+        return _build_system(chains)
+    parts = {
         name: tuple(_stack(parts) for parts in zip(*(getattr(chain, name) for chain in chains), strict=True))
         for name in ("bodies", "links", "modes")
     }
     lags = [chain.actuator for chain in chains]
     lag = _stack(lags) if isinstance(lags[0], Resonance) else None if lags[0] is None else np.array(lags, float)
-    A, B, push = replace(first, **together, actuator=lag).realize()
+    A, B, push = replace(first, **parts, actuator=lag).realize()
     forces = [push] if first.plain else [B, push]
     rate = np.moveaxis(np.concatenate([A, np.stack(forces, 1)], 1), -1, 0)
-    bodies, links, modes = together.values()
-    here, count, size = len(bodies), len(bodies) + len(modes), len(A)
-    place = np.zeros((here, size))
-    for body in range(here):
-        for entry, sign in body_position(body, first.sensor, here, len(modes)):
+    bodies, links, modes = parts.values()
+    first_mode, count, size = len(bodies), len(bodies) + len(modes), len(A)
+    place = np.zeros((len(bodies), size))
+    for body in range(len(bodies)):
+        for entry, sign in body_position(body, first.sensor, len(bodies), len(modes)):
             place[body, entry] = sign
     motion = np.roll(place, count, axis=1)
     axes = np.eye(size)
-    stretch, stretching = axes[1:here], axes[count + 1 : count + here]
-    swing, swinging = axes[here:count], axes[count + here : 2 * count]
-    # Driven and sensed at equally large places, a mode has the energy of its modal mass.
+    stretch, swing = axes[1:first_mode], axes[first_mode:count]
+    # A mode that is driven and measured at points of equal displacement has the energy of its modal mass.
     inertia = [np.abs(mode.mass) for mode in modes]
-    springs = [size * mode.rate**2 for size, mode in zip(inertia, modes, strict=True)]
-    dampers = [2.0 * size * mode.damping_ratio * mode.rate for size, mode in zip(inertia, modes, strict=True)]
+    springs = [mass * mode.rate**2 for mass, mode in zip(inertia, modes, strict=True)]
+    dampers = [2.0 * mass * mode.damping_ratio * mode.rate for mass, mode in zip(inertia, modes, strict=True)]
 
     def weigh(rows: np.ndarray, weights: list[np.ndarray]) -> np.ndarray:
         return np.einsum("ki,kd,kj->dij", rows, np.reshape(weights, (len(rows), len(chains))), rows)
 
+    def differentiate(rows: np.ndarray) -> np.ndarray:
+        return np.roll(rows, count, axis=1)
+
     energy = weigh(motion, [body.mass for body in bodies]) + weigh(place, [body.stiffness for body in bodies])
     energy = energy + weigh(stretch, [link.stiffness for link in links]) + weigh(swing, springs)
-    drain = weigh(motion, [body.damping for body in bodies]) + weigh(stretching, [link.damping for link in links])
-    energy, drain = energy + weigh(swinging, inertia), drain + weigh(swinging, dampers)
-    # The force that holds the first body acts where the wall's does (T4), and its mass is the unit.
+    energy = energy + weigh(differentiate(swing), inertia)
+    drain = weigh(motion, [body.damping for body in bodies]) + weigh(differentiate(swing), dampers)
+    drain = drain + weigh(differentiate(stretch), [link.damping for link in links])
+    # The holding force acts on the first body as the last force does (T4), and the mass of that body is the unit.
     held = rate - rate[..., -1:] * (motion[0] @ rate)[:, None, :]
     wide = (0, len(forces))
     return Mechanics(rate, held, place, motion, 0.5 * energy, np.pad(drain, ((0, 0), wide, wide)))
 
 
-def _follow(systems: Sequence[Any]) -> Mechanics:
-    """The same of one linear system at any delays: one place is known, that the sensor sees, and no energy."""
+def _build_system(systems: Sequence[Any]) -> Mechanics:
+    """Return the matrices of one linear system with several delays; its only position is the output, without energy."""
     A, _, push = systems[0].realize()
     if systems[0].sampled:
-        raise InputError("device: got a system from sample to sample, whose motion between them is not known")
+        raise InputError(
+            "device: got a discrete-time system, whose motion between samples is unknown; use a continuous one"
+        )
     if push[0] != 0:
-        raise InputError("device: a force moves its velocity at once; add the mass or the lag that is missing")
+        raise InputError("device: got a system whose velocity jumps with the force; add the missing mass or lag")
     size = len(A)
     rate = np.repeat(np.concatenate([A, push[:, None]], 1)[None], len(systems), 0)
     unknown = np.zeros((len(systems), size, size)), np.zeros((len(systems), size + 1, size + 1))
@@ -101,7 +105,7 @@ def _stack(parts: Sequence[Any]) -> Any:
 
 
 def flow(rate: np.ndarray, drain: np.ndarray, times: np.ndarray) -> Flow:
-    """The flow of ``x' = rate @ (x, u)`` over some times, ``(scenes, ...)``."""
+    """Return the flow of ``x' = rate @ (x, u)`` over given times, (scenes, ...)."""
     count, size = rate.shape[-2:]
     inner = (rate.shape[0], *(1,) * (times.ndim - 1), size, size)
     whole = np.concatenate([rate, np.zeros((rate.shape[0], size - count, size))], 1).reshape(inner)
@@ -111,7 +115,7 @@ def flow(rate: np.ndarray, drain: np.ndarray, times: np.ndarray) -> Flow:
     power = np.broadcast_to(np.eye(size), (*times.shape, size, size))
     drained = small * drain.reshape(inner)
     step, lost = np.zeros(power.shape), np.zeros(power.shape)
-    for k in range(1, _TERMS + 1):
+    for k in range(1, TERMS + 1):
         power = power @ whole * (small / k)
         step = step + power
         lost = lost + drained
@@ -119,6 +123,6 @@ def flow(rate: np.ndarray, drain: np.ndarray, times: np.ndarray) -> Flow:
     for _ in range(doublings):
         moved = step.mT @ lost
         lost = 2.0 * lost + moved + moved.mT + moved @ step
-        # e^A - 1 by itself keeps the digits of slow motions.
+        # Double e^A - 1 instead of e^A, to keep the digits of slow motions.
         step = 2.0 * step + step @ step
     return Flow(step[..., :count, :], lost)

@@ -1,4 +1,4 @@
-"""What a simulation returns: the motion in SI units, and what is said of it."""
+"""Result of a simulation in SI units: the motion, its statistics and its observed behavior."""
 
 from __future__ import annotations
 
@@ -17,56 +17,76 @@ if TYPE_CHECKING:
 
 
 class MotionKind(IntEnum):
-    """What becomes of a motion: each proved, or `UNCLEAR` (docs/theory/simulation.md, T7)."""
+    """Observed behavior of a motion in the tail of its simulation; no statement on later times.
+
+    The tail is divided into six equal segments. The width of a segment is the peak-to-peak position of the device
+    (docs/theory/simulation.md, T7).
+    """
 
     REST = 0
+    """No body moves in the second half of the tail by more than 1e-9 of the largest distance."""
     DECAYING = 1
+    """The width decreases from each segment to the next, or is below 1 % of the earlier motion and halves."""
     STEADY = 2
+    """The position oscillates, and the width has no trend."""
     GROWING = 3
+    """The width increases from each segment to the next, or is twice that of the earlier motion and doubles."""
     DIVERGED = 4
+    """The position exceeds 1e100."""
     UNCLEAR = 5
+    """None of these: the trend of the width is not clear, or the tail has too few oscillations."""
     INVALID = 6
-    RESTLESS = 7
+    """The ``status`` of the simulation is not 0."""
 
 
-# A tail this small beside the widest motion is at rest; halves this much alike are steady, and hold so many swings.
-_AT_REST, _STILL, _ALIKE, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 2, 1e100
-# Who halves in so many times the periods has changed by 2 % after 20 times as many.
-_FOR_GOOD = 4000.0
+AT_REST = 1e-9  # largest width at rest, relative to the largest distance of a body from 0
+LEAST_REST = 3  # samples without motion that do not yet count as rest
+EQUAL = 1e-3  # largest relative difference of equal widths
+NO_TREND = 1.25  # ratio of the widths of both halves up to which fluctuations count as no trend
+DECAYED = 0.01  # width relative to the earlier motion that counts as decayed, even if it oscillates slowly
+BEYOND = 1e100  # m; distance beyond which a motion has diverged
+
+FRAME = (
+    *("velocity", "wall_force", "sticking"),
+    *("energy", "wall_work", "push_work", "damping_loss", "friction_loss"),
+)
+"""Fields of `Motion` at an instant, in the order of the recorded rows, after the positions."""
+READING = ("measured", "estimated_velocity", "command", "contact")
+"""Fields of `Motion` at a sample, in the order of the recorded rows."""
 
 OF_MOTION = {
     "position": ("position of the device, into the wall", "m"),
     "velocity": ("velocity of the device", "m/s"),
-    "wall_force": ("force of the wall that acts", "N"),
-    "sticking": ("whether friction holds the device", "1"),
-    "tip_position": ("position of the mass beyond the coupling", "m"),
-    "hand_position": ("position of the hand behind its grasp", "m"),
-    "measured": ("position that the program reads", "m"),
-    "estimated_velocity": ("velocity that the program estimates", "m/s"),
-    "command": ("force that the program commands at the sample", "N"),
-    "contact": ("whether the program sees contact at the sample", "1"),
-    "wall_work": ("energy that the wall has given since the start", "J"),
-    "push_work": ("energy that the pushing hand has given", "J"),
-    "damping_loss": ("energy that dampers have taken", "J"),
-    "friction_loss": ("energy that friction has taken", "J"),
+    "wall_force": ("force of the wall", "N"),
+    "sticking": ("friction holds the device", "1"),
+    "tip_position": ("position of the mass at the far end of the coupling", "m"),
+    "hand_position": ("position of the operator's hand", "m"),
+    "measured": ("measured position", "m"),
+    "estimated_velocity": ("estimated velocity", "m/s"),
+    "command": ("force commanded at the sample", "N"),
+    "contact": ("contact at the sample", "1"),
+    "wall_work": ("energy supplied by the wall since the start", "J"),
+    "push_work": ("energy supplied by the external force", "J"),
+    "damping_loss": ("energy dissipated by dampers", "J"),
+    "friction_loss": ("energy dissipated by friction", "J"),
     "energy": ("kinetic and elastic energy of all bodies", "J"),
 }
 OF_WHOLE = {
     "amplitude": ("half of the peak-to-peak position in the tail", "m"),
-    "trend": ("width of the second half of the tail over that of the first", "1"),
+    "trend": ("ratio of the peak-to-peak positions in the second and first half of the tail", "1"),
     "frequency": ("frequency of the motion in the tail", "Hz"),
     "penetration": ("largest position at a sample", "m"),
     "bounces": ("number of times contact ends", "1"),
     "impact_velocity": ("velocity at the first sample in contact", "m/s"),
-    "energy_given": ("most energy that the wall has given beyond what it took", "J"),
-    "outcome": ("how the motion ends", "1"),
-    "status": ("why a simulation has its values", "1"),
+    "energy_given": ("largest net energy supplied by the wall", "J"),
+    "outcome": ("code of the observed behavior", "1"),
+    "status": ("status code", "1"),
 }
 OF_ENERGY = {"wall_work", "push_work", "damping_loss", "friction_loss", "energy", "energy_given"}
 
 
 def _draw(motion: Motion) -> str:
-    """A small picture of a single motion that was recorded."""
+    """Return a text plot of a single recorded motion; "" for others."""
     if motion.position is None or np.ndim(motion.position) != 1:
         return ""
     return draw_line(motion.time, motion.position, "position over time")
@@ -76,9 +96,9 @@ def _draw(motion: Motion) -> str:
     ("outcome", "time", *OF_WHOLE),
     _draw,
     {
-        "frequency": "the velocity does not turn twice in the tail",
+        "frequency": "fewer than two oscillations in the tail",
         "impact_velocity": "the device does not enter the wall after the first sample",
-        "trend": "nothing moves, or the tail is one period",
+        "trend": "no motion in the tail, or a tail of one period",
     },
     outcome=MotionKind,
     time="s",
@@ -86,35 +106,30 @@ def _draw(motion: Motion) -> str:
 )
 @dataclass(frozen=True)
 class Motion:
-    """One motion or many: arrays of the batch's shape, those over time with one more axis at the end.
+    """Result of one simulation or a batch: arrays of the batch shape, those over time with one more axis at the end.
 
     Attributes:
-        time: instants in s, ``substeps`` a period, the first 0; of one axis where all share a period.
+        time: instants in s, ``substeps`` per period, the first 0; one axis if all simulations share the period.
         position, velocity: of the device, the body that the forces act on, in m and m/s; positive into the wall.
-        tip_position, hand_position: of the bodies behind a coupling and behind a grasp; None without.
-        wall_force: that acts from the instant on, in N; with an actuator, what it is commanded then.
-        sticking: whether friction holds the device.
-        measured, estimated_velocity, command, contact: what the program made of the last sample.
-        wall_work, push_work: energy given by the wall and by the hand's push since the start, in J.
-        damping_loss, friction_loss: energy taken by dampers and by friction.
-        energy: kinetic and elastic energy of all bodies; grows by the work done and falls by what is lost.
-        amplitude: half of the peak-to-peak position in the tail, in m, at the samples; infinite for a diverged motion.
-        trend: the peak-to-peak position in the second half of the tail over that in the first.
-        frequency: of the motion in the tail, in Hz; NaN at rest and where the velocity does not turn twice there.
-        penetration: the largest position at a sample, in m, at least 0.
+        tip_position, hand_position: of the bodies at the far ends of a coupling and of a grasp; None without.
+        wall_force: force of the wall from the instant on, in N; with an actuator, its commanded force.
+        sticking: True if friction holds the device.
+        measured, estimated_velocity, command, contact: result of the control program at each sample.
+        wall_work, push_work: energy supplied by the wall and by the external force since the start, in J.
+        damping_loss, friction_loss: energy dissipated by dampers and by friction, in J.
+        energy: kinetic and elastic energy of all bodies; increases by the work and decreases by the losses.
+        amplitude: half of the peak-to-peak position at the samples of the tail, in m; infinite if the motion diverged.
+        trend: peak-to-peak position in the second half of the tail, relative to the first half.
+        frequency: frequency in the tail in Hz; NaN at rest, and with fewer than two oscillations.
+        penetration: largest position at a sample, in m, at least 0.
         bounces: number of samples at which contact ends. A bilateral wall is always in contact; a force law is in
             contact while its force is nonzero.
         impact_velocity: velocity at the first sample at which contact begins, in m/s; NaN if no contact begins after
             the first sample.
-        energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
-        outcome: a code of `zwidth.MotionKind`, what becomes of the motion, the hand pushing on as in the tail
-            (docs/theory/simulation.md, T7). Proved: REST, no body moves more than 1e-9 of the widest motion in the
-            tail's second half, nor will; DECAYING, it comes to rest; GROWING, it gets ever wider; STEADY, it goes on as
-            it is; RESTLESS, it never comes to rest, and ``trend`` says how its width changes: there is no place where
-            it could, or it repeats by now and was wider in the tail before; DIVERGED, beyond 1e100. UNCLEAR, none of
-            these is shown. INVALID, ``status`` is not 0.
-        status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
-            within a period than are followed, or a force law gave no finite force.
+        energy_given: largest net energy supplied by the wall, at any sample, in J, at least 0.
+        outcome: code of `zwidth.MotionKind`, the behavior observed in the tail.
+        status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED if friction has more events
+            within a period than the simulation follows, or if a force law returns no finite force.
     """
 
     time: Any
@@ -144,13 +159,13 @@ class Motion:
     status: Any
 
     def to_dataset(self, *dims: str) -> xarray.Dataset:
-        """The same as an xarray Dataset (extra ``store``), each variable with its long name and unit.
+        """Return an xarray Dataset (extra ``store``); each variable has a long name and a unit.
 
         Args:
-            *dims: names of the batch's axes, none for a single motion; ``batch_0``, ``batch_1``, ... where left out.
+            *dims: names of the batch axes, none for a single motion; default ``batch_0``, ``batch_1``, ...
 
         Raises:
-            InputError: more or fewer names than axes, one twice, or that of a variable.
+            InputError: the number of names differs from the number of axes, or a name is not unique.
         """
         import xarray
 
@@ -159,8 +174,8 @@ class Motion:
         taken = {"time", "instant", *OF_MOTION, *OF_WHOLE}
         if len(names) != len(shape) or len(set(names)) < len(names) or taken & set(names):
             raise InputError(
-                f"dims: got {', '.join(map(repr, names))} for a batch of shape {shape}; give a name for each axis, all "
-                "different and none of a variable or time"
+                f"dims: got {', '.join(map(repr, names))} for a batch of shape {shape}; use one unique name per axis, "
+                "different from all variables"
             )
         variables: dict[str, Any] = {}
         for name, (long_name, units) in (OF_MOTION | OF_WHOLE).items():
@@ -176,79 +191,96 @@ class Motion:
         return data
 
 
-def classify(known: Any, outlook: Any, course: Any) -> np.ndarray:
-    """How motions end."""
-    wide = known.high[1:] - known.low[1:]
-    first, second = wide.max(1)
-    # A tail of a period or two has not moved for want of time.
-    still = (second <= _AT_REST * known.widest) & (first <= np.sqrt(_AT_REST) * known.widest) & (course.tail >= _STILL)
-    # Commands that are still on their way may move again what has not moved for a while.
-    still &= ~(outlook.settles | outlook.grows) | (outlook.off <= _AT_REST * known.widest)
-    alike = np.ptp(wide[:, 0], axis=0) <= _ALIKE * wide[:, 0].max(0)
-    slow = (outlook.pace > _FOR_GOOD * course.periods) & (outlook.settles | outlook.grows)
-    # What repeats by now may have been wider before: the tail's width is not that of what lasts.
-    lasting = ~still & (known.turns[1:].min(0) >= _SWINGS) & alike & (outlook.repeats | slow)
-    growing = outlook.grows & ~still & ((wide[1, 0] >= wide[0, 0]) | (outlook.pace <= 2 * course.periods))
-    kind = np.where(outlook.restless & (second > _AT_REST * known.widest), MotionKind.RESTLESS, MotionKind.UNCLEAR)
-    kind = np.where(growing, MotionKind.GROWING, kind)
-    kind = np.where(outlook.settles, np.where(still, MotionKind.REST, MotionKind.DECAYING), kind)
-    kind = np.where(lasting, MotionKind.STEADY, kind)
-    # All bodies without any motion of a loop that grows.
-    kind = np.where(outlook.grows & (first == 0) & (second == 0) & still, MotionKind.REST, kind)
-    return np.where(known.widest < _BEYOND, kind, MotionKind.DIVERGED)
+def _measure_width(summary: Any, start: int, stop: int) -> np.ndarray:
+    """Return the peak-to-peak positions in consecutive segments, (bodies, batch); NaN without samples."""
+    width = summary.far[start:stop].max(0).sum(0)
+    return np.where(width >= 0, width, np.nan)
+
+
+def _measure_halves(summary: Any) -> list[np.ndarray]:
+    """Return the peak-to-peak positions in both halves of the tail, (bodies, batch)."""
+    count = len(summary.far)
+    return [_measure_width(summary, *half) for half in ((1, (1 + count) // 2), ((1 + count) // 2, count))]
+
+
+def find_largest(summary: Any) -> np.ndarray:
+    """Return the largest distance of a body from 0."""
+    return np.maximum(summary.far.max((0, 1, 2)), 0.0)
+
+
+def classify(summary: Any, memory: np.ndarray, tail: int) -> np.ndarray:
+    """Return the code of `MotionKind` of each motion; ``memory``: samples that decide the next command."""
+    widest = find_largest(summary)
+    width = np.stack([_measure_width(summary, k, k + 1)[0] for k in range(1, len(summary.turns))])
+    before, (first, second) = _measure_width(summary, 0, 1), _measure_halves(summary)
+    still = (second.max(0) <= AT_REST * widest) & (first.max(0) <= np.sqrt(AT_REST) * widest)
+    # A shorter rest is not a rest, because commands are still delayed.
+    still &= tail // 2 > np.maximum(memory, LEAST_REST)
+    before, trend, second = before[0], second[0] / first[0], second[0]
+    oscillating = summary.turns[1:].min(0) >= 1
+    falling = np.all((np.diff(width, axis=0) < 0) | (width[1:] <= AT_REST * widest), axis=0)
+    falling = (falling & (width[0] > AT_REST * widest)) | ((trend < 0.5) & (second < DECAYED * before))
+    rising = np.all(np.diff(width, axis=0) > 0, axis=0) | ((trend > 2.0) & (second > 2.0 * before))
+    conditions = {
+        MotionKind.DIVERGED: ~(widest < BEYOND),
+        MotionKind.REST: still,
+        MotionKind.STEADY: oscillating & (np.ptp(width, axis=0) <= EQUAL * width.max(0)),
+        MotionKind.DECAYING: falling,
+        MotionKind.GROWING: rising,
+    }
+    level = oscillating & (np.abs(np.log(trend)) < np.log(NO_TREND))
+    return np.select([*conditions.values(), level], [*conditions, MotionKind.STEADY], MotionKind.UNCLEAR)
 
 
 @np.errstate(all="ignore")
-def to_si(
-    found: Any, given: Any, dry: np.ndarray, outlook: Any, bodies: tuple[str, ...], course: Any
+def convert_to_si(
+    found: Any, inputs: Any, dry: np.ndarray, memory: np.ndarray, bodies: tuple[str, ...], settings: Any
 ) -> dict[str, np.ndarray]:
-    """Columns of one row a simulation, by the names of `Motion`; ``bodies`` names the positions of all bodies."""
-    state, reading, frame = found
-    period, mass, instants = given.period, given.mass, given.instants
-    known, force = state.summary, mass / period**2
-    low, high = (part[1:, 0] for part in (known.low, known.high))
-    # Of a tail of one period the second half has no sample.
-    width = np.where(high >= low, high - low, np.nan)
-    finite = np.isfinite(state.body.x).all(0)
-    turns = known.turns[1:].sum(0)
-    frequency = (turns - 1) / (np.diff(known.turned, axis=0)[0] * period)
-    # A motion that is lost before it is large was not followed.
-    lost = ~finite & (known.widest < _BEYOND)
-    outcome = np.where(lost, MotionKind.INVALID, classify(known, outlook, course))
+    """Return the fields of `Motion` by name, with one row per simulation.
+
+    Args:
+        found: result of `run_batch`.
+        inputs: external inputs, with the units.
+        dry: mask of the simulations with friction.
+        memory: number of samples that decide the next command.
+        bodies: names of the positions of all bodies.
+        settings: settings of the batch.
+    """
+    state, readings, frames = found
+    period, mass, instants = inputs.period, inputs.mass, inputs.instants
+    summary, force = state.summary, mass / period**2
+    first, second = _measure_halves(summary)
+    turns = summary.turns[1:].sum(0)
+    frequency = (turns - 1) / (np.diff(summary.turned, axis=0)[0] * period)
+    # A motion that is not finite although it was small has too many friction events.
+    lost = ~np.isfinite(state.body.x).all(0) & (find_largest(summary) < BEYOND)
+    outcome = np.where(lost, MotionKind.INVALID, classify(summary, memory, settings.tail))
     columns = {
-        "amplitude": np.where(outcome == MotionKind.DIVERGED, np.inf, 0.5 * (high.max(0) - low.min(0))),
-        "trend": width[1] / width[0],
+        "amplitude": np.where(
+            outcome == MotionKind.DIVERGED, np.inf, 0.5 * _measure_width(summary, 1, len(summary.far))[0]
+        ),
+        "trend": second[0] / first[0],
         "frequency": np.where((turns > 1) & (outcome != MotionKind.REST), frequency, np.nan),
-        "penetration": known.deepest,
-        "bounces": known.exits.astype(int),
-        "impact_velocity": known.impact / period,
-        "energy_given": known.given * force,
+        "penetration": np.maximum(summary.far[:, 1, 0].max(0), 0.0),
+        "bounces": summary.exits.astype(int),
+        "impact_velocity": summary.impact / period,
+        "energy_given": summary.given * force,
         "outcome": outcome,
         "status": np.where(lost, Status.NOT_CONVERGED, Status.OK),
     }
-    if frame is None:
+    if frames is None:
         return columns
-
-    def unroll(part: np.ndarray) -> np.ndarray:
-        """(periods, substeps, lanes) as (lanes, samples)."""
-        return part.reshape(-1, part.shape[-1]).T
-
-    columns |= {name: unroll(part) for name, part in zip(bodies, frame.positions, strict=True)}
-    columns |= {
-        "velocity": unroll(frame.velocity) / period[:, None],
-        "wall_force": unroll(frame.force) * force[:, None],
-        "sticking": (unroll(frame.slip) == 0) & dry[:, None],
-        "measured": reading.measured.T,
-        "estimated_velocity": reading.velocity.T / period[:, None],
-        "command": reading.command.T * force[:, None],
-        "contact": reading.touching.T > 0,
-        "energy": unroll(frame.energy) * force[:, None],
-    }
-    for name, part in zip(("wall_work", "push_work", "damping_loss", "friction_loss"), frame.work, strict=True):
-        columns[name] = unroll(part) * force[:, None]
+    units = {"velocity": 1.0 / period, "estimated_velocity": 1.0 / period}
+    units |= dict.fromkeys(("wall_force", "command", *FRAME[3:]), force)
+    for rows, names in ((frames, (*bodies, *FRAME)), (readings[:, None], READING)):
+        # (periods, substeps, rows, batch) to one (batch, samples) per row
+        flat = np.moveaxis(rows, (2, 3), (0, 1)).reshape(len(names), len(period), -1)
+        columns |= {name: row * units.get(name, np.ones(1))[:, None] for name, row in zip(names, flat, strict=True)}
+    columns["sticking"] = (columns["sticking"] == 0) & dry[:, None]
+    columns["contact"] = columns["contact"] > 0
     if instants is not None:
-        substeps = frame.force.shape[1]
+        substeps = frames.shape[1]
         shares = np.arange(substeps)[:, None] / substeps
         time = instants[:-1, None] + shares * np.diff(instants, axis=0)[:, None]
-        columns["time"] = unroll(time) * period[:, None]
+        columns["time"] = time.reshape(-1, len(period)).T * period[:, None]
     return columns

@@ -30,15 +30,14 @@ from zwidth.words.status import Status
 
 _COLUMNS = {known.name: column for column, known in AXES.items()}
 _OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
-# So many values of a list are curves, and more are a plane.
-_MOST_CURVES = 6
+_MOST_CURVES = 6  # values of a list that are drawn as curves; a longer list is drawn as a plane
 # Default of the largest amplitude that counts as a limit cycle, by "is rotary": in m for a linear, in rad for a rotary
 # device.
 WIDEST = {False: 1e-3, True: math.radians(20.0)}
 WIDEST_STEPS = 10.0  # lower bound of that default, in encoder steps
 
 
-# All that the study sets for every condition may be set for one; what is not is None.
+# A condition may override every parameter of the study; None means not overridden.
 _OWN: Any = {
     name: (hint | None, None)
     for name, hint in get_type_hints(Circumstances, include_extras=True).items()
@@ -48,13 +47,13 @@ _Own: Any = create_model("_Own", __base__=Strict, **_OWN)
 
 
 class CycleCondition(_Own):
-    """What one panel of a limit_cycle study has of its own."""
+    """Parameters of one panel of a limit_cycle study."""
 
     what = "a condition"
     described_by = (Circumstances,)
 
     label: str
-    """Name of the condition, each one its own."""
+    """Unique name of the condition."""
 
 
 class CycleAxes(Strict, what="the axes of a limit_cycle study"):
@@ -67,8 +66,8 @@ class CycleAxes(Strict, what="the axes of a limit_cycle study"):
 
     def limits(self) -> Iterable[LocatedProblem]:
         if not 1 <= len(self.varied) <= 2:
-            what = f"got {len(self.varied)} axes of several values"
-            yield (), problem(what, "one or two of them are drawn", "write the others as numbers")
+            what = f"got {len(self.varied)} axes with several values"
+            yield (), problem(what, "one or two are allowed", "write the others as numbers")
 
     @property
     def given(self) -> dict[str, Axis]:
@@ -79,7 +78,7 @@ class CycleAxes(Strict, what="the axes of a limit_cycle study"):
         return {name: axis for name, axis in self.given.items() if axis.size > 1}
 
     def lay_out(self) -> dict[str, np.ndarray]:
-        """The values of every axis, so that they broadcast to the grid."""
+        """Return the values of every axis, shaped to broadcast to the grid."""
         grid = np.meshgrid(*(axis.values() for axis in self.varied.values()), indexing="ij", sparse=True)
         return {name: axis.values()[0] for name, axis in self.given.items()} | dict(zip(self.varied, grid, strict=True))
 
@@ -88,16 +87,16 @@ class CycleAxes(Strict, what="the axes of a limit_cycle study"):
 class LimitCycleStudy(SimulatedStudy, Circumstances):
     """Amplitude of limit cycles over one or two parameters, under one or several conditions."""
 
-    method = "Simulations, exact between samples, each judged by the end of what was simulated."
+    method = "Simulations, exact between samples; amplitude and frequency as observed in the last quarter."
     point_bytes = 8 * (1 + len(_OUTPUTS))
 
     kind: Literal["limit_cycle"]
 
     axes: CycleAxes
-    """The walls, and encoder and friction where they vary."""
+    """Walls, and encoder and friction if they vary."""
 
     conditions: Annotated[tuple[CycleCondition, ...], WrapValidator(members("conditions"))]
-    """What each panel has of its own, beside what the study sets for all; one panel where left out."""
+    """Parameters of each panel that differ from those of the study; default: one panel."""
 
     silence: Annotated[float, Quantity("m", POSITIVE)] = 1e-6
     """Amplitude below which a motion counts as at rest, in m or rad or with a unit."""
@@ -130,7 +129,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         for index, (condition, faults) in enumerate(zip(self.conditions, found, strict=True)):
             for path, what in faults:
                 own = getattr(condition, str(path[0])) is not None
-                # What the study sets for all is told once.
+                # Report a fault of the whole study only once.
                 if own or index == 0:
                     yield (("conditions", index, *path) if own else path), what
 
@@ -176,7 +175,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
         arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
         table = stack(edges)
-        # A curve for each value of a short list, or a single one; else a plane.
+        # Draw one curve for each value of a short list, or one curve; otherwise a plane.
         short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MOST_CURVES]
         draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
         if short or len(varied) == 1:
@@ -194,7 +193,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
 
 
 def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """The linear boundary in the plane of two axes, as columns: outlines, or lines where one of the walls' is fixed."""
+    """Return the linear boundary in the plane of two axes, as columns: outlines, or lines if K or B is fixed."""
     walls = [name for name in ("stiffness", "virtual_damping") if name in varied]
     if not walls:
         return []

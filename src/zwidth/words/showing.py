@@ -87,6 +87,13 @@ def shown(
     return decorate
 
 
+class ResultList(list[Any]):
+    """List of `shown` results, displayed as tables in notebooks."""
+
+    def _repr_html_(self) -> str:
+        return "\n".join(each._repr_html_() for each in self)
+
+
 def find_unit(result: Any, unit: Any) -> Any:
     """Return a unit in the unit system of a result; "" for units that depend on the system if it is not known."""
     if isinstance(unit, type) or ROTARY[unit] == unit:

@@ -48,9 +48,8 @@ def test_the_end_is_that_of_the_poles(stiffness):
     stable = zwidth.Scene(SYSTEM, TIMING).is_stable(stiffness, 10.0)
     ends = zwidth.MotionKind.REST, zwidth.MotionKind.DECAYING
     assert (zwidth.MotionKind(int(motion.outcome)) in ends) == stable
-    # Of a wall with one side nothing is proved without bodies.
     touched = zwidth.Scene(SYSTEM, TIMING).simulate(4e3, 10.0, push=0.3, contact="unilateral", substeps=SUBSTEPS)
-    assert touched.outcome == zwidth.MotionKind.UNCLEAR
+    assert touched.outcome == zwidth.MotionKind.REST
 
 
 def test_a_batch_may_hold_several_systems_and_bodies():
@@ -98,8 +97,8 @@ def test_what_needs_a_body_is_refused(options, field):
 
 
 def test_what_moves_at_once_or_between_unknown_samples_is_refused():
-    with pytest.raises(zwidth.InputError, match="moves its velocity at once"):
+    with pytest.raises(zwidth.InputError, match="velocity jumps with the force"):
         zwidth.Scene(zwidth.LinearDevice(([1.0], [3.0, 0.0])), TIMING).simulate(100.0, 0.0, push=1.0)
     device = zwidth.LinearDevice(scipy.signal.dlti([4e-6, 4e-6], [1.0, -1.9, 0.9], dt=1e-3))
-    with pytest.raises(zwidth.InputError, match="from sample to sample"):
+    with pytest.raises(zwidth.InputError, match="discrete-time system"):
         zwidth.Scene(device, zwidth.Timing(1e-3)).simulate(100.0, 0.0, push=1.0)

@@ -1,4 +1,4 @@
-"""What is said of a motion: how it ends, how wide and how fast it swings, and what a batch makes of odd inputs."""
+"""Statistics and observed behavior of motions, and batches with unusual input."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from tolerances import SIMULATED_AGAIN
 
 import zwidth
 from zwidth import MotionKind, Status
-from zwidth.simulation import outlook
 from zwidth.words.errors import InputError
 
 TIMING = zwidth.Timing(period=1e-3, delay=1e-3)
@@ -27,21 +26,12 @@ def test_a_linear_motion_ends_as_its_poles_say(share, periods, kind):
 def test_an_undamped_swing_is_steady():
     free = zwidth.Scene(zwidth.Device(mass=0.1, damping=0.5), zwidth.Timing(period=1e-3))
     found = free.simulate(1e3, 0.0, start_position=1e-3, periods=4000)
-    # It halves in 333,000 periods: that is a decay, and over few periods none.
+    # The width halves in 333,000 periods: a change of 0.2 % within the tail of 1,000 periods is observed.
     assert MotionKind(found.outcome) is MotionKind.DECAYING
     assert MotionKind(free.simulate(1e3, 0.0, start_position=1e-3, periods=500, tail=400).outcome) is MotionKind.STEADY
     assert found.trend == pytest.approx(float(free.spectral_radius(1e3, 0.0)) ** 500, rel=1e-3)
     assert found.amplitude == pytest.approx(1e-3, rel=0.02)
     assert found.frequency == pytest.approx(np.sqrt(1e3 / 0.1) / (2 * np.pi), rel=1e-2)
-
-
-def test_who_has_no_place_to_rest_is_restless_however_short_the_motion():
-    hit = {"start_position": -1e-4, "start_velocity": 0.1, "push": 1.0, "contact": "unilateral"}
-    walls = np.array([1.2, 0.9]) * TOP.stiffness, TOP.virtual_damping
-    found, later = (SCENE.simulate(*walls, periods=periods, **hit) for periods in (30, 6000))
-    assert [MotionKind(code).name for code in found.outcome] == ["RESTLESS", "DECAYING"]
-    assert later.amplitude[0] > 1e-4
-    assert later.amplitude[1] < 1e-12
 
 
 def test_a_decay_below_a_step_of_the_encoder_is_not_steady():
@@ -65,28 +55,11 @@ def test_a_wall_that_is_no_number_is_not_quiet():
     assert found.outcome.tolist() == [MotionKind.REST, MotionKind.INVALID]
 
 
-def test_friction_that_breaks_loose_later_is_no_rest():
-    found = SCENE.simulate(1e3, 5.0, start_position=5e-3, coulomb=2.0, max_rate=1.5, periods=1000)
-    assert found.sticking[-250:].all()
-    assert MotionKind(found.outcome) is MotionKind.UNCLEAR
-
-
 def test_an_encoder_at_rest_does_not_kick():
     start = np.linspace(-0.49, 0.49, 99) * 1e-4
     found = SCENE.simulate(0.0, 42.5, resolution=1e-4, start_position=start, coulomb=0.5, periods=100)
     assert not found.wall_force.any()
     assert set(found.outcome.tolist()) == {MotionKind.REST}
-
-
-def test_who_flies_off_does_not_return():
-    damped = SCENE.replace(damping=0.4)
-    hit = {"start_position": -1e-3, "start_velocity": 0.1, "contact": "unilateral", "periods": 120, "record": False}
-    # Next to the wall still, and as slow as it will be: only its direction tells.
-    found = damped.simulate(2 * TOP.stiffness, 5.0, push=[0.0, -0.01, 0.01], **hit)
-    assert found.bounces.tolist() == [1, 1, 1]
-    assert MotionKind(found.outcome[0]) is MotionKind.DECAYING
-    # One is pushed away for good, the other comes back to a wall that does not hold it.
-    assert [MotionKind(code).name for code in found.outcome[1:]] == ["UNCLEAR", "RESTLESS"]
 
 
 @pytest.mark.parametrize("names", [("a", "b"), (), ("position",)])
@@ -117,19 +90,6 @@ def test_a_tail_of_one_period_has_no_trend(coulomb):
 def test_steps_too_fine_to_be_counted_are_none(resolution):
     fine, exact = (SCENE.simulate(1e3, 5.0, start_velocity=0.1, periods=50, resolution=r) for r in (resolution, 0.0))
     np.testing.assert_array_equal(fine.position, exact.position)
-
-
-def test_behind_a_long_delay_motions_are_foreseen_a_few_at_a_time(monkeypatch):
-    late = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=1e-3, delay=40.3e-3))
-    ask = {"stiffness": np.linspace(5.0, 50.0, 30), "virtual_damping": 0.1, "start_velocity": 0.1, "periods": 200}
-    together = late.simulate(**ask).outcome
-    lay, sizes = outlook.gather, []
-    monkeypatch.setattr(outlook, "gather", lambda *given: sizes.append(given[-1].size) or lay(*given))
-    monkeypatch.setattr(outlook, "_AT_ONCE", 10_000)
-    np.testing.assert_array_equal(late.simulate(**ask).outcome, together)
-    # Each has 44 numbers: five or six at a time.
-    assert max(sizes) <= 6
-    assert sum(sizes) >= 30
 
 
 def test_a_motion_beyond_all_numbers_diverges_without_a_warning():
@@ -177,13 +137,6 @@ def test_a_dataset_has_one_time_where_all_share_it_and_else_instants():
     np.testing.assert_allclose(own.instant, np.outer([1e-3, 5e-4], np.arange(8)))
 
 
-def test_what_becomes_of_a_motion_is_said_of_a_hand_that_holds_still_in_the_tail():
-    pushes = np.ones((4, 200))
-    pushes[1:, :120], pushes[2, 160], pushes[3, -1] = 2.0, 1.1, 1.1
-    found = SCENE.simulate(1e3, 5.0, push_history=pushes, periods=200, tail=60)
-    assert [MotionKind(code).name for code in found.outcome] == ["DECAYING", "DECAYING", "UNCLEAR", "UNCLEAR"]
-
-
 @pytest.mark.parametrize(
     "scenes, options, words",
     [
@@ -191,10 +144,10 @@ def test_what_becomes_of_a_motion_is_said_of_a_hand_that_holds_still_in_the_tail
         (3, {}, "scenes: got 3"),
         ([SCENE, "x"], {}, "scenes: got 'x'"),
         (SCENE, {"seed": [[1], [2, 3]]}, "seed: got"),
-        (SCENE, {"stiffness": np.ones(0)}, "one simulation at least"),
-        ([], {}, "one simulation at least"),
+        (SCENE, {"stiffness": np.ones(0)}, "use at least one simulation"),
+        ([], {}, "use at least one simulation"),
         (SCENE, {"push_history": np.zeros((3, 10)), "stiffness": [1.0, 2.0]}, "push_history"),
-        (SCENE, {"push_history": [0.0] * 9 + [np.nan]}, "push_history: got a force that is not finite"),
+        (SCENE, {"push_history": [0.0] * 9 + [np.nan]}, "push_history: got a value that is not finite"),
     ],
 )
 def test_what_cannot_be_simulated_is_named(scenes, options, words):

@@ -209,7 +209,7 @@ def test_an_adaptive_window_has_no_linear_boundary():
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ({"axes": {"stiffness": 1e3, "virtual_damping": 5}}, "got 0 axes of several values"),
+        ({"axes": {"stiffness": 1e3, "virtual_damping": 5}}, "got 0 axes with several values"),
         ({"axes": {"stiffness": [1, 2], "virtual_damping": [1, 2], "coulomb": [1, 2]}}, "got 3 axes"),
         ({"axes": {"stiffness": [1, 2]}}, "virtual_damping"),
         ({"conditions": [{"label": "a"}, {"label": "a"}]}, "got 'a' twice"),

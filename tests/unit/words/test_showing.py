@@ -49,6 +49,13 @@ def find(name: str) -> Any:
     return RESULTS[name]()
 
 
+def test_a_list_of_results_has_tables():
+    lists: list[Any] = [zwidth.limits_of(SCENE), SCENE.stable_region()]
+    for results in lists:
+        assert results._repr_html_().count("<table>") == len(results) > 0
+        assert results == list(results)
+
+
 @pytest.mark.parametrize("name", RESULTS)
 def test_a_result_is_short_and_has_a_table(name):
     result = find(name)

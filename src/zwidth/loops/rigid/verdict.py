@@ -70,7 +70,8 @@ def is_stable(
     """
     values = (alpha, beta, delta, d)
     arguments, numbers = dict(zip(NAMES, values, strict=True)), are_numbers(*values)
-    check_choice("method", method, STABILITY_METHODS)
+    if method != "auto":
+        check_choice("method", method, STABILITY_METHODS)
     if method in ("auto", "crossover") and (numbers or is_traced(*values)):
         return evaluate(stable_kernel, arguments, classify_delays(d))
     check_scalars(arguments)
@@ -124,13 +125,13 @@ def decide_stability(
 
 
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
-    """Labels, what decided them, and statuses where they are not all OK."""
+    """Return labels, the method that decided them, and statuses unless all are OK."""
     if method == "companion":
         radius = np.asarray(radius_by_companion(*points))
         rough = (np.abs(radius - 1.0) < _ROUGH) & (np.asarray(points[0]) != 0)
         return radius < 1.0, Method.COMPANION, np.where(rough, Status.UNDECIDED, Status.OK)
     if method == "certified":
-        # Loaded here: it needs an extra for its last resort.
+        # Import only on demand, because most programs never certify.
         from zwidth.loops.rigid.certified import certify_labels
 
         stable, status = certify_labels(points)

@@ -140,7 +140,7 @@ def test_a_contact_is_the_simulation():
     np.testing.assert_array_equal(position, hit.position)
     np.testing.assert_array_equal(force, hit.wall_force)
     assert int(hit.bounces) == 1
-    assert words == "(leaves the wall after 1 contact)"
+    assert words == "(leaves the wall after 1 contact within 50.0 ms)"
     assert position[0] < 0 < position.max()
 
 

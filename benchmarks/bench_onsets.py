@@ -1,0 +1,185 @@
+#!/usr/bin/env python3
+"""Measure fits of onsets of instability: how often intervals of K_max and walls hold on the true device.
+
+    python benchmarks/bench_onsets.py [--rigid 200] [--others 200] [--processes 2] [--write docs/onsets.md]
+
+Devices with an actuator lag, one or two resonances, or both are those of `tests/oracles/measured_devices.py`. Onsets
+and stability on the true device are computed by eigenvalues, without zwidth. Most devices have five walls, with 2 %
+noise in K and f.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import zwidth
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
+
+from measured_devices import TrueDevice
+
+from methods.page import hand_out, page_parser
+
+NOISE = 0.02  # relative standard deviation of K and f
+MOST_PER_RIGID = 30.0  # softest onset over the maximum stiffness; devices below are not measurable in practice
+SOFTER = np.array([0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0])  # a user raises K from below
+INTRODUCTION = """\
+# How good fits of onsets are
+
+Written by `benchmarks/bench_onsets.py --write docs/onsets.md`.
+
+`zwidth.fit_buzz` fits a rigid device to walls at the onset of instability. The devices here are random: rigid ones with
+four walls, and others with an actuator lag of 0.1 to 1 ms, one or two resonances of 30 to 400 Hz, or both, with four to
+six walls. K and f have 2 % noise. B increases from 0 to 0.7 to 1.2 times the damping of the stiffest wall. Onsets and
+stability are computed by eigenvalues of the true device. A safe wall counts as stable only if softer walls of the same
+damping are stable, too. No K_max means that the fit refused the walls or warned, and recommends no wall. The width of
+the interval and the stiffness of the safe wall are medians, relative to the true K_max.
+"""
+
+
+def draw_device(random: np.random.Generator, rigid: bool) -> TrueDevice:
+    """Return a random device without resonances and lag, or with at least one of them."""
+    while True:
+        true = TrueDevice.draw(random)
+        if rigid:
+            return TrueDevice("rigid", true.mass, true.damping, 0.0, (), true.delay, true.period, 1e-5, 3.0)
+        if true.lag or true.modes:
+            return true
+
+
+def name_kind(true: TrueDevice) -> str:
+    """Return the kind of a device for the table."""
+    modes = ("", "one resonance", "two resonances")[len(true.modes)]
+    return " and ".join(filter(None, [modes, "lag" if true.lag else ""])) or "rigid"
+
+
+def raise_stiffness(true: TrueDevice, damping: float) -> tuple[float, float]:
+    """Return the smallest unstable K at a damping and the frequency in Hz there; NaN if the softest is unstable."""
+    A, B, C = true.sampled()
+    size, rate = B.size, damping / true.period
+
+    def find_dominant(stiffness: float) -> complex:
+        closed = np.zeros((size + 1, size + 1))
+        closed[:size, :size] = A - np.outer(B, (stiffness + rate) * C)
+        closed[:size, size], closed[size, :size] = rate * B, C
+        poles = np.linalg.eigvals(closed)
+        return poles[np.argmax(np.abs(poles))]
+
+    low = high = 1e-3 * true.mass / true.period**2 / MOST_PER_RIGID
+    if abs(find_dominant(low)) >= 1:
+        return np.nan, np.nan
+    while abs(find_dominant(high)) < 1:
+        low, high = high, 1.02 * high
+    while high - low > 1e-13 * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if abs(find_dominant(middle)) < 1 else (low, middle)
+    return low, abs(np.angle(find_dominant(high))) / (2 * np.pi * true.period)
+
+
+def measure(seed: int, rigid: bool) -> tuple[TrueDevice, np.ndarray, float] | None:
+    """Return a device, its walls with noise and its K_max; None if a wall cannot be measured."""
+    random = np.random.default_rng([11, seed, rigid])
+    true = draw_device(random, rigid)
+    device = zwidth.LinearDevice(true.matrices())
+    top = zwidth.Scene(device, zwidth.Timing(true.period, true.delay)).max_stiffness()
+    count = int(random.choice([4, 5, 5, 5, 6])) if not rigid else 4
+    # From no damping to somewhat more or less than that of the stiffest wall.
+    shares = np.linspace(0.0, random.uniform(0.7, 1.2), count)
+    walls = [(*raise_stiffness(true, share * float(top.virtual_damping)),) for share in shares]
+    table = np.array([(K, share * float(top.virtual_damping), f) for (K, f), share in zip(walls, shares, strict=True)])
+    good = top.status == 0 and top.virtual_damping > 0 and np.isfinite(table).all() and (table[:, 2] < 450).all()
+    table = table * (1 + NOISE * np.array([1, 0, 1]) * random.standard_normal(table.shape))
+    return (true, table, float(top.stiffness)) if good else None
+
+
+def judge(seed: int, rigid: bool) -> dict[str, Any] | None:
+    """Fit the walls of one device, and compare with the truth."""
+    measured = measure(seed, rigid)
+    if measured is None:
+        return None
+    true, walls, limit = measured
+    row: dict[str, Any] = {"seed": seed, "kind": name_kind(true), "doubted": True, "refused": False}
+    try:
+        fit = zwidth.fit_buzz(walls, period=true.period, noise=NOISE)
+    except zwidth.InputError as error:
+        return {**row, "refused": True, "why": str(error)}
+    row |= {"doubted": fit.is_doubted, "why": "; ".join(fit.doubts), "structured": fit.is_structured}
+    if fit.is_doubted:
+        return row
+    bar, safe, advice = fit.intervals["stiffness_max"], fit.safe_wall(), fit.recommended
+
+    def is_stable(wall: tuple[float, float]) -> bool:
+        return all(true.is_stable(softer * wall[0], wall[1]) for softer in SOFTER)
+
+    return {
+        **row,
+        "held": bar.low <= limit <= bar.high,
+        "width": (bar.high - bar.low) / limit,
+        "safe": is_stable(safe[:2]) if safe.stiffness > 0 else None,
+        "share": safe.stiffness / limit,
+        "advised": is_stable((advice.stiffness, advice.virtual_damping)) if advice.stiffness > 0 else None,
+    }
+
+
+def judge_all(count: int, rigid: bool, processes: int) -> list[dict[str, Any]]:
+    """Return the rows of as many devices whose walls can be measured."""
+    rows: list[dict[str, Any]] = []
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        for row in pool.map(partial(judge, rigid=rigid), range(3 * count), chunksize=5):
+            rows += [row] if row else []
+            if len(rows) == count:
+                pool.shutdown(cancel_futures=True)
+                break
+    return rows
+
+
+def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield the lines of the table, in Markdown."""
+    yield "| device | fits | no K_max | interval contains K_max | its width | stable safe walls | their stiffness |"
+    yield "|---|--:|--:|--:|--:|--:|--:|"
+    kinds = sorted({row["kind"] for row in rows} - {"rigid"})
+    for kind in ("rigid", *kinds, "all but rigid"):
+        those = [row for row in rows if kind == row["kind"] or (kind == "all but rigid" and row["kind"] in kinds)]
+        known = [row for row in those if not row["doubted"]]
+        walls = [row for row in known if row["safe"] is not None]
+        held = sum(row["held"] for row in known)
+        cells = [
+            kind, len(those), len(those) - len(known), f"{100 * held / max(1, len(known)):.1f} %",
+            f"{100 * np.median([row['width'] for row in known]):.0f} %" if known else "",
+            f"{sum(row['safe'] for row in walls)} of {len(walls)}",
+            f"{np.median([row['share'] for row in walls]):.2f}" if walls else "",
+        ]  # fmt: skip
+        yield f"| {' | '.join(map(str, cells))} |"
+
+
+def report(rigid: int, others: int, processes: int) -> str:
+    """Return the page."""
+    rows = judge_all(rigid, True, processes) + judge_all(others, False, processes)
+    for row in rows:
+        if row.get("safe") is False or row.get("advised") is False or row.get("held") is False:
+            print(row)
+    advised = [row["advised"] for row in rows if row.get("advised") is not None]
+    stable = f"Recommended walls that are stable on the true device: {sum(advised)} of {len(advised)}."
+    return "\n".join([INTRODUCTION, *tabulate(rows), "", stable, ""])
+
+
+def main() -> None:
+    """Measure, and print or write."""
+    parser = page_parser(__doc__)
+    parser.add_argument("--rigid", type=int, default=200, help="rigid devices")
+    parser.add_argument("--others", type=int, default=200, help="devices with a lag, resonances or both")
+    parser.add_argument("--processes", type=int, default=2)
+    given = parser.parse_args()
+    hand_out(report(given.rigid, given.others, given.processes), given.write)
+
+
+if __name__ == "__main__":
+    main()
