@@ -263,8 +263,7 @@ CHOICES = {
     "coupling.sensor": Choice(("motor", "tip"), "Where the position is measured; at the motor by default"),
 }
 
-# Options of log files.
-OF_LOGS = {
+OF_LOGS = {  # options of log files
     "time": "Time column: its header, or HEADER:ms; HEADER:s+HEADER:ns for two columns. Default: by the headers.",
     "position": "Column of the position: its header, or HEADER:mm, :counts, :deg.",
     "force": "Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.",
