@@ -145,8 +145,9 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
         }
-        place = f"B = {with_unit(named['virtual_damping'], 'N s/m')}, {with_unit(named['frequency'], 'Hz')}"
-        top = f"{spell_stiffness(named['stiffness_max'])} at {place} ({kind.replace('_', ' ')} optimum)"
+        B, f = with_unit(found[1], scene.unit_system["N s/m"]), with_unit(named["frequency"], "Hz")
+        K = spell_stiffness(named["stiffness_max"], scene.unit_system)
+        top = f"{K} at B = {B}, {f} ({kind.replace('_', ' ')} optimum)"
         lines = [
             words.line("K_max", top),
             *lines,
@@ -169,9 +170,8 @@ def _say_stiffer(scene: Any) -> list[str]:
 
     top = find_nominal_limit(scene)
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
-    return [
-        f"K_max = {spell_stiffness(float(top.stiffness))} by the curve without its deviation; {text}" for text in said
-    ]
+    K_max = spell_stiffness(float(top.stiffness), scene.unit_system)
+    return [f"K_max = {K_max} by the curve without its deviation; {text}" for text in said]
 
 
 @cli.command()

@@ -33,7 +33,6 @@ from zwidth.words.formatting import (
     with_unit,
 )
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
 
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
@@ -107,7 +106,8 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     path = _FINDS[find]
     if path == "virtual_damping":
         return _choose_damping(scene)
-    unit = PARAMETERS[path].unit
+    units = scene.unit_system
+    unit = units[PARAMETERS[path].unit]
     values = {**scene.parameters(), "rate": 1.0 / scene.timing.period}
     if path not in values:
         raise click.UsageError(f"--find {find}: this scene has none; give {flag_of(path)} to start from")
@@ -120,18 +120,18 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     if path == "delay" and needed.status == Status.UNREACHABLE and within is None:
         # Extend the default range downwards, because a large stiffness may require a very short delay.
         needed = scene.required(path, wanted, within=(1e-4 * present, needed.range[1]))
-    result = {"parameter": path, "value": needed.value, "unit": own_unit(unit), "enough": needed.enough}
+    result = {"parameter": path, "value": needed.value, "unit": unit, "enough": needed.enough}
     result["status"] = Status(needed.status).name
     result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
     if path in ("period", "rate"):
         result["rate"] = needed.value if path == "rate" else 1.0 / needed.value
     low, high = (with_unit(end, unit) for end in needed.range)
-    goal = f"for K_max = {spell_stiffness(wanted)}"
+    goal = f"for K_max = {spell_stiffness(wanted, units)}"
     kept = f" (the delay stays {scene.timing.kept_delay})" if path in ("period", "rate") and scene.timing.delay else ""
     if needed.status == Status.UNREACHABLE:
         best = _find_best(scene, path, needed.range)
         result["best"] = best
-        reached = f"the largest is {spell_stiffness(best['stiffness'])} at {with_unit(best['value'], unit)}"
+        reached = f"the largest is {spell_stiffness(best['stiffness'], units)} at {with_unit(best['value'], unit)}"
         text = f"none {goal} from {low} to {high}{kept}; {reached}" if best["stiffness"] else f"none {goal}"
     elif needed.status != Status.OK:
         text = f"not found from {low} to {high}{kept}: {Status(needed.status).message}"
@@ -160,15 +160,15 @@ def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, fl
 
 def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
     """The virtual damping with which a wall of a wanted stiffness settles fastest."""
-    wanted, best = float(scene.wall.stiffness), scene.best_damping()
-    result = {"parameter": "virtual_damping", "value": best.virtual_damping, "unit": own_unit("N s/m")}
+    wanted, best, units = float(scene.wall.stiffness), scene.best_damping(), scene.unit_system
+    result = {"parameter": "virtual_damping", "value": best.virtual_damping, "unit": units["N s/m"]}
     result |= {"spectral_radius": best.spectral_radius, "modulus_margin": best.modulus_margin}
     result["status"] = Status(best.status).name
-    text = f"none: no B is stable at K = {with_unit(wanted, 'N/m')}"
+    text = f"none: no B is stable at K = {with_unit(wanted, units['N/m'])}"
     if best.status == Status.OK:
         B, radius = best.virtual_damping, plain(best.spectral_radius)
         digits = count_digits(lambda digits: scene.is_stable(wanted, float(f"{B:.{digits}g}")))
-        text = f"{with_unit(B, 'N s/m', digits)} settles fastest: spectral radius {radius}"
+        text = f"{with_unit(B, units['N s/m'], digits)} settles fastest: spectral radius {radius}"
         text += f", modulus margin {plain(best.modulus_margin)}"
     return result, [line("B", text), line("device", spell_device(scene, find_silent())), *part_lines(scene)]
 
@@ -185,14 +185,15 @@ def _tolerate(
     result = {name: value for name, value in asdict(found).items() if name not in ("drawn", "labels")}
     result |= {"seed": seed, "distribution": distribution, "shares": shares}
     percent = f"{100 * found.reliability:g} %"
-    borne, most = (with_unit(round_safely(end, "below"), "N/m") for end in (found.stiffness, found.stiffness_max))
+    unit = scene.unit_system["N/m"]
+    borne, most = (with_unit(round_safely(end, "below"), unit) for end in (found.stiffness, found.stiffness_max))
     # Not 100 % where one of many does not bear it.
     ends = (found.stable, "below"), (found.stable_low, "below"), (found.stable_high, "above")
     stable, low, high = (plain(round_safely(100 * each, side)) for each, side in ends)
     share = f"{stable} % of {found.samples} devices drawn"
     known = f"{low} to {high} % of all, with 95 % confidence"
     lines = [
-        line("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping)),
+        line("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping, scene.unit_system)),
         line("stable", f"{share} ({known})"),
         line(percent, f"of them are stable for K up to {borne} at this B"),
     ]
@@ -220,7 +221,8 @@ def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], l
         "stiffness_max": float(best.stiffness),
     }
     # Round the stiffness down: softer walls of the same damping are stable too.
-    stiffness, most = (with_unit(round_safely(result[name], "below"), "N/m") for name in ("stiffness", "stiffness_max"))
-    damping = with_unit(result["virtual_damping"], "N s/m", DIGITS)
+    units, names = scene.unit_system, ("stiffness", "stiffness_max")
+    stiffness, most = (with_unit(round_safely(result[name], "below"), units["N/m"]) for name in names)
+    damping = with_unit(result["virtual_damping"], units["N s/m"], DIGITS)
     text = f"of them (by search) are stable with K = {stiffness} at B = {damping}; {most}, each with its best B"
     return result, [line("100 %", text)]

@@ -40,7 +40,7 @@ def hardware_options(command: Command) -> Command:
     def with_hardware(**given: Any) -> Any:
         hardware = {name: value for _, name, *_ in _HARDWARE if (value := given.pop(name)) is not None}
         if "resolution" in hardware:
-            warn_implausible({"resolution": hardware["resolution"]})
+            warn_implausible({"resolution": hardware["resolution"]}, given["scene"].unit_system)
         # A measured response has no model to simulate with the hardware of the file.
         known = {} if isinstance(given["scene"].device, MeasuredDevice) else get_hardware()
         return command(hardware=known | hardware, **given)

@@ -32,8 +32,8 @@ from zwidth.parts.velocity import BackwardDifference
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import name_wall, round_safely, with_unit
 from zwidth.words.quantities import POSITIVE
-from zwidth.words.rotation import is_rotary, own_unit, use_kind
 from zwidth.words.status import Status
+from zwidth.words.unit_system import SYSTEMS, UnitSystem
 from zwidth.words.units import tell_kind
 
 # A letter, "=", and all up to the next letter with "=".
@@ -125,10 +125,10 @@ def fit(
         kinds = {rotary for _, rotary in walls} - {None}
         if len(kinds) > 1:
             raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
-        points, rotary = tuple(BuzzPoint(*point) for point, _ in walls), True in kinds or (not kinds and is_rotary())
+        usual = loop.scene is not None and loop.scene.unit_system.rotary
+        points, rotary = tuple(BuzzPoint(*point) for point, _ in walls), kinds.pop() if kinds else usual
         loop.check_kind(rotary)
-        with use_kind(rotary):
-            found = fit_buzz(points, period=period, velocity=velocity, noise=noise)
+        found = fit_buzz(points, period=period, velocity=velocity, noise=noise, rotary=rotary)
         source = f"{len(walls)} buzzing walls"
     else:
         if noise is not None:
@@ -221,14 +221,14 @@ def excite(
         raise click.UsageError(f"give {', '.join(missing)}".replace("--period", "--period or --rate"))
     from zwidth.fitting.excite import excite as design
 
-    if resolution is not None:
-        warn_implausible({"resolution": resolution})
     device = None if response is None else MeasuredDevice.read(response)
     # Infer the kind of device from the options as typed, because their parsed values have no units.
     implied = find_kind(get_told())
     if loop.scene is not None:
         implied = bool(loop.scene.device.rotary)
         device = loop.scene.device if device is None and isinstance(loop.scene.device, MeasuredDevice) else device
+    if resolution is not None:
+        warn_implausible({"resolution": resolution}, SYSTEMS[bool(implied)])
     if device is not None and implied not in (None, device.rotary):
         kinds = ("rotary", "linear") if device.rotary else ("linear", "rotary")
         raise click.UsageError(
@@ -236,25 +236,26 @@ def excite(
             "use one kind"
         )
     rotary = device.rotary if device is not None else bool(implied)
-    with use_kind(rotary):
-        made = design(response=device, rotary=rotary, velocity=loop.velocity, duration=duration, **options)
-        made.save(out)
-        _print_excitation(made, out, as_json)
+    made = design(response=device, rotary=rotary, velocity=loop.velocity, duration=duration, **options)
+    made.save(out)
+    _print_excitation(made, out, as_json)
 
 
 def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
     """Print the properties of a designed record and the safe wall that it is expected to determine."""
     low, high = (with_unit(end, "Hz") for end in made.frequency[[0, -1]])
+    units = SYSTEMS[made.rotary]
     lines = [
-        row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), 'N')}"),
+        row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), units['N'])}"),
         row("lines", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"),
-        row("deviation", f"{_compliance(made.deviation)} to expect, in the median"),
+        row("deviation", f"{_compliance(made.deviation, units)} to expect, in the median"),
     ]
     result: dict[str, Any] = {"file": str(out), "samples": made.force.size, "cycle": made.cycle}
     if made.expected is not None and made.limit is not None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
-        lines += [row("will tell", f"{name_wall(*made.expected[:2])} as safe, {100 * share:.0f} % of K_max by now")]
+        expected = name_wall(made.expected.stiffness, made.expected.virtual_damping, units)
+        lines += [row("will tell", f"{expected} as safe, {100 * share:.0f} % of K_max by now")]
     tell(result, [*lines, row("wrote", str(out))], as_json)
 
 
@@ -286,8 +287,7 @@ def respond(
     from zwidth.fitting.respond import respond_to_logs
 
     found = respond_to_logs(read_logs(logs, loop, **of_logs), loop.known_period, cycle)
-    with use_kind(found.device.rotary):
-        _print_response(found, logs, loop.velocity, save, figure, as_json)
+    _print_response(found, logs, loop.velocity, save, figure, as_json)
 
 
 def _print_response(
@@ -305,9 +305,13 @@ def _print_response(
     low, high = (with_unit(float(end), "Hz") for end in device.frequency[[0, -1]])
     lines = [row("response of", source), row("lines", f"{device.frequency.size} from {low} to {high}")]
     if device.deviation is not None:
-        lines.append(row("deviation", f"{_compliance(device.deviation)} in the median"))
+        lines.append(row("deviation", f"{_compliance(device.deviation, device.unit_system)} in the median"))
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
-    words = f"{name_wall(*top[:2])}, by the curve that was measured" if top.status == Status.OK else "undecided"
+    words = (
+        f"{name_wall(*top[:2], device.unit_system)}, by the curve that was measured"
+        if top.status == Status.OK
+        else "undecided"
+    )
     lines.append(row("K_max", words))
     given = safe.status == Status.OK and device.deviation is not None and not doubts
     words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none is told"
@@ -332,16 +336,16 @@ def spell_safe_wall(scene: Any, wall: Any) -> str:
     for _ in range(_SOFTER):
         stiffness = round_safely(stiffness, "below")
         if scene.is_stable(stiffness, damping):
-            return name_wall(stiffness, damping)
+            return name_wall(stiffness, damping, scene.unit_system)
         stiffness *= 1.0 - 1e-4
-    units = own_unit("N/m"), own_unit("N s/m")
-    return f"K = {float(wall.stiffness)!r} {units[0]}, B = {float(wall.virtual_damping)!r} {units[1]}"
+    units = scene.unit_system
+    return f"K = {float(wall.stiffness)!r} {units['N/m']}, B = {float(wall.virtual_damping)!r} {units['N s/m']}"
 
 
-def _compliance(deviation: Any) -> str:
+def _compliance(deviation: Any, system: UnitSystem) -> str:
     import numpy as np
 
-    return with_unit(float(np.median(deviation)), "m/N", 3)
+    return with_unit(float(np.median(deviation)), system["m/N"], 3)
 
 
 def _plain(wall: Any) -> dict[str, float]:
@@ -351,6 +355,7 @@ def _plain(wall: Any) -> dict[str, float]:
 def _draw(scene: Any, wall: Any) -> Any:
     """The response with its band, and the open loop of a wall."""
     from zwidth import figures
+    from zwidth.figures.style import style_sheet
 
     device = scene.device
     table = {"frequency_Hz": device.frequency, "real_m_per_N": device.response.real}
@@ -360,4 +365,5 @@ def _draw(scene: Any, wall: Any) -> Any:
     if wall is not None:
         loop = scene.frequency_response(wall.stiffness, wall.virtual_damping, device.frequency)
         table |= {"open_loop_real": loop.real, "open_loop_imag": loop.imag}
-    return figures.draw_response(table)
+    with style_sheet(system=device.unit_system):
+        return figures.draw_response(table)

@@ -25,7 +25,6 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import ANY, POSITIVE
-from zwidth.words.rotation import is_rotary
 
 TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS = 300  # shortest default length of a simulation, in sampling periods
@@ -97,16 +96,18 @@ def simulate(
     periods = _choose_length(scene) if duration is None else max(1, round(duration.periods(scene.timing.period)))
     motion = scene.simulate(**options, **hardware, periods=periods)
     cause, ending = find_cause(scene, **hardware, remedies=False), describe_ending(motion)
+    units = scene.unit_system
     start = [
-        f"hit at {with_unit(hit, 'm/s', 3)}" if hit is not None else "",
-        f"pushed with {with_unit(options['push'], 'N', 3)}" if options.get("push") else "",
-        f"released at a depth of {with_unit(options['start_position'], 'm', 3)}"
+        f"hit at {with_unit(hit, units['m/s'], 3)}" if hit is not None else "",
+        f"pushed with {with_unit(options['push'], units['N'], 3)}" if options.get("push") else "",
+        f"released at a depth of {with_unit(options['start_position'], units['m'], 3)}"
         if hit is None and options.get("start_position")
         else "",
     ]
     force = max(abs(float(motion.command.min())), abs(float(motion.command.max())))
-    load = "torque" if is_rotary() else "force"
-    depth = f"penetrates {with_unit(float(motion.penetration), 'm', 3)}, {load} up to {with_unit(force, 'N', 3)}"
+    load = "torque" if units.rotary else "force"
+    depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}"
+    depth += f", {load} up to {with_unit(force, units['N'], 3)}"
     lines = [
         row("start", ", ".join(filter(None, start)) or "at rest"),
         row("motion", f"{depth}; {ending}"),

@@ -24,8 +24,8 @@ from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError
 from zwidth.words.plausible import list_doubts
 from zwidth.words.quantities import ANY, CHOICES, OF_PARTS, PARAMETERS, Range
-from zwidth.words.rotation import is_rotary, use_kind
-from zwidth.words.units import find_dimension, read_quantity, tell_kind
+from zwidth.words.unit_system import SYSTEMS, UnitSystem
+from zwidth.words.units import DIMENSIONS, read_quantity, tell_kind
 
 if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
@@ -87,11 +87,11 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
             number = value if math.isfinite(value := float(text)) else text
         except ValueError:
             number = text
-        # Whether all are of one kind of device is asked when all are known.
-        with use_kind(bool(tell_kind(number))):
-            if periods:
-                return read_span(number, allowed)
-            return read_quantity(number, find_dimension(unit), allowed, counts=counts)[0]
+        if periods:
+            return read_span(number, allowed)
+        # Each option has its own system here; all options together are checked when the scene is made.
+        dimension = DIMENSIONS[SYSTEMS[bool(tell_kind(number))][unit]]
+        return read_quantity(number, dimension, allowed, counts=counts)[0]
 
     return Parsed("quantity", read)
 
@@ -153,15 +153,18 @@ def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Comma
     option is given.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
-    take = take_options("scene", (*bare, *_PARTS), lambda given: build_scene(given, instead, wall=wall))
+    take = take_options("scene", (*bare, *_PARTS), lambda given, system: build_scene(given, system, instead, wall=wall))
     file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
     return lambda command: file(take(command))
 
 
 def take_options(
-    name: str, paths: Sequence[str], make: Callable[[dict[str, Any]], Any]
+    name: str, paths: Sequence[str], make: Callable[[dict[str, Any], UnitSystem], Any]
 ) -> Callable[[Command], Command]:
-    """Add the options of the parameters ``paths``; the command receives ``make(values)`` as its argument ``name``."""
+    """Add the options of the parameters ``paths``; the command receives ``make(values, units)`` as argument ``name``.
+
+    The units are those of the options of the command, linear or rotary.
+    """
 
     def decorate(function: Command) -> Command:
         @wraps(function)
@@ -181,8 +184,7 @@ def take_options(
                     # Ignore kind and hardware of the file's device, because the option --device replaces it.
                     context.meta.pop(_HARDWARE, None)
                     told = context.meta.get(_TOLD, {}) | {"--device": known["device"]}
-                with use_kind(bool(find_kind(told))):
-                    return function(**{name: make(known)}, **given)
+                return function(**{name: make(known, SYSTEMS[bool(find_kind(told))])}, **given)
             except InputError as error:
                 field, _, text = str(error).partition(": ")
                 flags = {option.name: option.opts[0] for option in context.command.params}
@@ -198,9 +200,11 @@ def take_options(
     return decorate
 
 
-def warn_implausible(given: dict[str, Any]) -> None:
+def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
     """Write a warning to the error stream for each implausible value of ``given``, a dict of SI values by path."""
-    for line in list_doubts(given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path)):
+    for line in list_doubts(
+        given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path), system
+    ):
         click.echo(f"zwidth: {line}", err=True)
 
 
@@ -217,7 +221,7 @@ def read_scene_file(path: Path) -> Scene:
     return load_scene(file)
 
 
-def build_scene(given: dict[str, Any], instead: str = "", *, wall: bool = False) -> Scene | None:
+def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *, wall: bool = False) -> Scene | None:
     """Return the scene described by options, given by path; ``given["scene"]`` supplies all other parameters.
 
     Return None if no option is given and ``instead`` names alternative options.
@@ -232,8 +236,8 @@ def build_scene(given: dict[str, Any], instead: str = "", *, wall: bool = False)
     numbers = {
         path: value.value if isinstance(value, Span) and value.unit == "s" else value for path, value in given.items()
     }
-    warn_implausible(numbers)
-    scene = _make_scene(given, instead) if base is None else change_scene(base, given)
+    warn_implausible(numbers, system)
+    scene = _make_scene(given, system, instead) if base is None else change_scene(base, given)
     scene.check_parts()
     return scene
 
@@ -276,7 +280,7 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
         raise click.UsageError(f"{flags}: the file gives the device as a whole; change it in the file") from None
 
 
-def _make_scene(given: dict[str, Any], instead: str) -> Scene:
+def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scene:
     """Return the scene described by options only, without a scene file."""
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
@@ -301,7 +305,7 @@ def _make_scene(given: dict[str, Any], instead: str) -> Scene:
     parts |= {"modes": modes} if modes else {}
     timing = Timing
     if device is None:
-        device = Device(**some("mass", "damping"), rotary=is_rotary())
+        device = Device(**some("mass", "damping"), rotary=system.rotary)
     elif isinstance(device, KnownDevice):
         timing, device = device.to_timing, device.to_device(**some("mass", "damping"))
     else:

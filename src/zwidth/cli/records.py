@@ -19,6 +19,7 @@ from zwidth.cli.options import (
     take_options,
 )
 from zwidth.words.quantities import CHOICES, OF_LOGS, OF_PARTS
+from zwidth.words.unit_system import UnitSystem
 
 if TYPE_CHECKING:
     from zwidth.parts.velocity import Velocity
@@ -48,7 +49,7 @@ class Loop(NamedTuple):
             )
 
 
-def _make_loop(given: dict[str, Any]) -> Loop:
+def _make_loop(given: dict[str, Any], _: UnitSystem) -> Loop:
     """Return the loop described by options, given by path, and by the scene of a file."""
     scene = given.pop("scene", None)
     if {"period", "rate"} <= given.keys():

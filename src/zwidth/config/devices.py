@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, Validat
 from zwidth.config.device_table import find_file
 from zwidth.config.fields import LocatedProblem, Strict, listing, problem, validation_error
 from zwidth.config.parts import PART_NAMES, PartSection, split_refusal
-from zwidth.config.values import Delay, Quantity, quantity_of
+from zwidth.config.values import Delay, Quantity, find_system, quantity_of
 from zwidth.parts.checks import Span
 from zwidth.parts.devices import DEVICES
 from zwidth.parts.linear_device import LinearDevice, split_fraction
@@ -23,7 +23,6 @@ from zwidth.parts.paths import PARTS
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, suggestion
 from zwidth.words.quantities import HARDWARE, POSITIVE
-from zwidth.words.rotation import is_rotary
 
 FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
 _OF_SYSTEM = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"))
@@ -223,12 +222,12 @@ def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
 
 
 def tell_rotary(value: Any = None) -> bool | None:
-    """What a section keeps: true of a file of rotary devices; nothing of linear ones."""
+    """Return True for a file of rotary devices, None for a file of linear devices."""
     if value is not None and not isinstance(value, bool):
         raise problem(f"got {describe(value)}", "it must be true or false", "remove it: units tell the kind")
-    if value is False and is_rotary():
+    if value is False and find_system().rotary:
         raise problem("got false", "other devices of the file are rotary, or have units of rotation", "write two files")
-    return value or is_rotary() or None
+    return value or find_system().rotary or None
 
 
 Rotary = Annotated[bool | None, PlainValidator(tell_rotary, json_schema_input_type=bool)]
@@ -253,7 +252,7 @@ class SampledMass(OneKind):
         known = {device.name: device for device in DEVICES}.get(name) if isinstance(name, str) else None
         if known is None:
             return super().prepare(raw)
-        if known.rotary != is_rotary():
+        if known.rotary != find_system().rotary:
             allowed = "this device is linear, and others of the file are rotary"
             what = problem(f"got {describe(name)}", allowed, "write two files")
             raise validation_error(cls.__name__, [(("device",), what)])

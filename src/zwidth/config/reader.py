@@ -33,13 +33,14 @@ from zwidth.config.fields import (
     problem,
     problems_of,
 )
+from zwidth.config.values import read_in_units
 from zwidth.parts.devices import DEVICES
 from zwidth.parts.measured import SUFFIXES, MeasuredDevice
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.rotation import use_kind
 from zwidth.words.tables import read_columns
+from zwidth.words.unit_system import SYSTEMS
 from zwidth.words.units import split_head, tell_kind
 
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -72,7 +73,7 @@ def _check(
     """The model of plain values; else all faults, those known already and those that are given their places."""
     found = None
     try:
-        with use_kind(tells_rotary(data)):
+        with read_in_units(SYSTEMS[tells_rotary(data)]):
             found = model.model_validate(data)
     except ValidationError as error:
         faults = faults + place(problems_of(error))

@@ -31,7 +31,6 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
 from zwidth.words.plausible import list_doubts
 from zwidth.words.quantities import HARDWARE, LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
-from zwidth.words.rotation import use_kind
 from zwidth.words.xp import within
 
 _Parts: Any = make_parts_base("the difference of two samples", "none")
@@ -207,11 +206,11 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
 
     @property
     def doubts(self) -> list[str]:
-        """A line for every value that lies far from what any device has."""
+        """Warnings on implausible values, one line each."""
         own = {path: value for path, value in self.to_scene().parameters().items() if path not in ("period", "rate")}
         own |= {"period": self.period} if self.rate is None else {"rate": self.rate}
-        with use_kind(bool(self.rotary)):
-            return list_doubts(own, lambda path, value: f"'{path}: {value}'" if value else f"scene.{path}")
+        system = self.to_scene().unit_system
+        return list_doubts(own, lambda path, value: f"'{path}: {value}'" if value else f"scene.{path}", system)
 
     @property
     def wall(self) -> PhysicalWall | None:

@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar, get_args
 
-from pydantic import GetJsonSchemaHandler
+from pydantic import GetJsonSchemaHandler, PrivateAttr
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from zwidth.config.fields import LocatedProblem, Name, Strict, listing, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
-from zwidth.config.values import Axis
+from zwidth.config.values import Axis, find_system
+from zwidth.words.unit_system import UnitSystem
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30
@@ -57,6 +58,13 @@ class Study(Strict):
 
     name: Name
     """Name of the study, unique in the file; its results are stored under it."""
+
+    _system: UnitSystem = PrivateAttr(default_factory=find_system)
+
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The units of its devices."""
+        return self._system
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:

@@ -44,6 +44,7 @@ from zwidth.words.quantities import (
     Family,
     Range,
 )
+from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
 MAX_SWEEP_POINTS = 10**12
 
@@ -184,6 +185,11 @@ class SweepStudy(_Parts, Study):
 
     rotary: Rotary = Field(default_factory=tell_rotary)
     """Whether its devices turn, as all of a file do where one quantity has a unit of rotation."""
+
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The units of its devices."""
+        return SYSTEMS[bool(self.rotary)]
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed."""

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Annotated, Any, TypeAlias, cast
@@ -21,11 +23,11 @@ from zwidth.parts.checks import Span, read_span
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, FIELDS, FRACTION, NOT_NEGATIVE, POSITIVE, Range
-from zwidth.words.rotation import is_rotary, use_kind
+from zwidth.words.unit_system import LINEAR, UnitSystem
 from zwidth.words.units import (
+    DIMENSIONS,
     PERIOD_WORDS,
     check_range,
-    find_dimension,
     find_other,
     looks_like_number,
     read_quantity,
@@ -40,6 +42,25 @@ Entry: TypeAlias = Callable[[Any], float]
 """Reads one value of an axis, or raises a problem."""
 
 _FORMS = "a number, a list of numbers, {linear: {start, stop, num}} or {log: {start, stop, num}}"
+
+
+# A value of a file does not contain the kind of device; other values of the file determine it.
+_system: ContextVar[UnitSystem] = ContextVar("system", default=LINEAR)
+
+
+@contextmanager
+def read_in_units(system: UnitSystem) -> Iterator[None]:
+    """Read values of a configuration in a unit system."""
+    token = _system.set(system)
+    try:
+        yield
+    finally:
+        _system.reset(token)
+
+
+def find_system() -> UnitSystem:
+    """Return the unit system of the configuration that is being read."""
+    return _system.get()
 
 
 @dataclass(frozen=True)
@@ -61,8 +82,8 @@ class Quantity:
                 return read_span(value, self.allowed)
             if self.unit == "1":
                 return self._read_number(value)
-            with use_kind(self.turns and is_rotary()):
-                return read_quantity(value, find_dimension(self.unit), self.allowed, counts=self.counts)[0]
+            unit = find_system()[self.unit] if self.turns else self.unit
+            return read_quantity(value, DIMENSIONS[unit], self.allowed, counts=self.counts)[0]
         except UnusableValueError as error:
             raise problem(*error.parts) from None
 
@@ -101,7 +122,7 @@ class Quantity:
     @property
     def schema(self) -> dict[str, Any]:
         if self.unit != "1":
-            other = find_other(find_dimension(self.unit)) if self.turns else None
+            other = find_other(DIMENSIONS[self.unit]) if self.turns else None
             return describe_entry(self.unit, *(PERIOD_WORDS if self.periods else ()), *(other.units if other else ()))
         low, high, low_open, high_open = self.allowed
         ends = {"exclusiveMinimum" if low_open else "minimum": low}
@@ -138,7 +159,7 @@ def share(name: str, schema: dict[str, Any]) -> dict[str, Any]:
 
 def describe_entry(unit: str, *more: str) -> dict[str, Any]:
     """The JSON Schema of a number in an SI unit, or with one of the units beside it."""
-    dimension = find_dimension(unit)
+    dimension = DIMENSIONS[unit]
     pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
     words = f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}."
     forms = [{"type": "number"}, {"type": "string", "pattern": pattern}]

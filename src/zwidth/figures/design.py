@@ -100,7 +100,7 @@ def _scale(table: Table) -> tuple[dict[float, Any], float, str]:
 
 
 def _name_damping(damping: float) -> str:
-    return f"$b$ = {with_unit(damping, 'N s/m', 3)}"
+    return f"$b$ = {with_unit(damping, style.units()['N s/m'], 3)}"
 
 
 def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) -> str:
@@ -111,7 +111,7 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) 
         which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
         ax.plot(noise * factors[0], stiffness * factors[1], linestyle="", label="best", **look)
-        spelled = f":  ${which}$,  {with_unit(round_safely(stiffness, 'below', 3), 'N/m', 3)}"
+        spelled = f":  ${which}$,  {with_unit(round_safely(stiffness, 'below', 3), style.units()['N/m'], 3)}"
     return spelled
 
 
@@ -154,14 +154,14 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         _mark_required(ax, curve_drawn, target * factor, value * scale if known else np.nan, colors[target])
         # As a design study writes them.
         crossings = [float(each.split()[0]) for each in str(others).split("; ") if each]
-        name = spell_enough(float(value), enough, crossings, parameter.unit, 3) if known else ""
+        name = spell_enough(float(value), enough, crossings, style.units()[parameter.unit], 3) if known else ""
         names.append(name.replace("g cm^2", style.write_unit("g cm^2")))
     heights = np.append(stiffness, targets)
     for name, scaled in (("x", values * scale), ("y", heights * factor)):
         style.use_logarithmic(ax, name, scaled, style.DECADES)
     ax.set(
         xlim=(values[0] * scale, values[-1] * scale),
-        xlabel=f"{parameter.axis_label}  in {spelled}",
+        xlabel=f"{parameter.label_in(style.units())}  in {spelled}",
         ylabel=f"maximum stable stiffness  $K_{{\\max}}$  in {unit}",
     )
     # Beside the panel: below its dot a value would stand on the line of the next one.

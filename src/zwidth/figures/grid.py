@@ -133,7 +133,7 @@ def spell(value: xarray.DataArray) -> str:
     unit = unit.removesuffix("s") if unit == "periods" and number == "1" else unit
     # Within mathematics as it is.
     unit = rf"\,\mathrm{{{unit.replace(' ', '~').replace('$', '')}}}" if unit else ""
-    return rf"${VARIABLES[str(value.name)].own_symbol} = {number}{unit}$"
+    return rf"${VARIABLES[str(value.name)].symbol_in(style.units())} = {number}{unit}$"
 
 
 def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
@@ -148,7 +148,7 @@ def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
 
 def axis_label(data: xarray.Dataset, name: str) -> str:
     """A parameter in words, with symbol and unit."""
-    return VARIABLES[name].axis_label + _in_unit(data, name)
+    return VARIABLES[name].label_in(style.units()) + _in_unit(data, name)
 
 
 def output_label(data: xarray.Dataset, name: str) -> str:

@@ -71,14 +71,16 @@ def draw_limit_cycles(
             ax.set_title(style.literal(label))
         grid.scale_axis(ax, "x", x)
         grid.scale_axis(ax, "y", y)
-    style.label_axes(panels, *(f"{AXES[name].axis_label}  in {scales[name][1]}" for name in names), once=axes is None)
+    style.label_axes(
+        panels, *(f"{AXES[name].label_in(style.units())}  in {scales[name][1]}" for name in names), once=axes is None
+    )
     figure = style.figure_of(panels)
     label = f"amplitude of the limit cycle  in {meter}"
     figure.colorbar(image, ax=list(panels), label=label, shrink=0.9, format=_PLAIN)
     edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.6}
     handles: list[Any] = [
         Patch(facecolor="white", label="at rest", **edge),
-        Patch(**_BEYOND, label=f"larger than {spell_short(bounds[1], 'm')}"),
+        Patch(**_BEYOND, label=f"larger than {spell_short(bounds[1], style.units()['m'])}"),
     ]
     handles += [style.line("boundary of the linear theory", width=1.2, color=style.VERMILION)] if edges else []
     style.legend(panels, handles, outside=axes is None, ncols=3)
@@ -127,6 +129,7 @@ def draw_limit_cycle_curves(
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
     # A wall that buzzes between two that do not is a dot without a line.
     dots = {"marker": "o", "markersize": 3.5 if arrays[over].size <= _FEW else 1.25, "clip_on": False}
+    largest = spell_short(bounds[1], style.units()["m"])
     for row, (name, times, words) in enumerate(quantities):
         for column, ax in enumerate(panels[row * len(labels) : (row + 1) * len(labels)]):
             for curve, buzz, look in zip(cycles[name][column], buzzes[column], looks, strict=True):
@@ -136,17 +139,17 @@ def draw_limit_cycle_curves(
             for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
-                _name_absent(ax, looks, buzzes[column], cycles[name][column] < bounds[0], spell_short(bounds[1], "m"))
+                _name_absent(ax, looks, buzzes[column], cycles[name][column] < bounds[0], largest)
                 if amplitudes.size:
                     style.use_logarithmic(ax, "y", amplitudes)
                 ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
             else:
-                ax.set_xlabel(f"{AXES[over].axis_label}  in {unit}")
+                ax.set_xlabel(f"{AXES[over].label_in(style.units())}  in {unit}")
             if column == 0:
                 ax.set_ylabel(words)
     handles = [style.line(look["label"], look["linestyle"], color=look["color"]) for look in looks]
     boundary = [style.line("boundary of the linear theory", width=1.0, color=style.VERMILION)] if edges else []
-    gap = style.line(f"gap: at rest, or larger than {spell_short(bounds[1], 'm')}", "")
+    gap = style.line(f"gap: at rest, or larger than {largest}", "")
     style.legend(panels, [*(handles if family else boundary), gap], outside=axes is None, ncols=4)
     return panels
 

@@ -12,7 +12,6 @@ from zwidth.figures import style
 from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
 from zwidth.words.formatting import round_safely
-from zwidth.words.rotation import is_rotary, own_unit
 
 # Samples that one panel shows; of longer logs every n-th.
 _MOST = 4000
@@ -88,7 +87,7 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
         factor, length = style.si_unit(np.ptp(place), "m")
         ax.plot(time[thin], place[thin] * factor, color=style.GRAY, linewidth=2.4, alpha=0.55, label="measured")
         ax.plot(time[thin], model[thin] * factor, color=style.VERMILION, linewidth=0.9, label="modelled")
-        ax.set(ylabel=f"{'angle' if is_rotary() else 'position'}  in {length}", xlim=(0.0, time[-1]))
+        ax.set(ylabel=f"{'angle' if style.units().rotary else 'position'}  in {length}", xlim=(0.0, time[-1]))
         ax.tick_params(labelbottom="residuals" not in panels)
         _put_above(ax)
         count = np.unique(logs).size
@@ -233,7 +232,9 @@ def draw_response(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
     panels[0].fill_between(f, np.maximum(size - radius, 0.1 * least), size + radius, label="band", **band)
     panels[0].plot(f, size, color=style.BLUE, label="measured")
     panels[0].set(
-        yscale="log", ylabel=f"response  $|G|$  in {own_unit('m/N')}", ylim=(least, 3.0 * float((size + radius).max()))
+        yscale="log",
+        ylabel=f"response  $|G|$  in {style.units()['m/N']}",
+        ylim=(least, 3.0 * float((size + radius).max())),
     )
     panels[0].legend(loc="lower left", fontsize=7)
     if len(panels) > 1:

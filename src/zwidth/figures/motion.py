@@ -10,7 +10,6 @@ from matplotlib.lines import Line2D
 
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves, draws_tables
-from zwidth.words.rotation import is_rotary, own_unit
 
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
@@ -34,15 +33,15 @@ _ENERGIES = {
 
 
 def _name_force() -> str:
-    return "wall torque" if is_rotary() else "wall force"
+    return "wall torque" if style.units().rotary else "wall force"
 
 
 def _name_position() -> str:
-    return r"angle  $\theta$" if is_rotary() else "position  $x$"
+    return r"angle  $\theta$" if style.units().rotary else "position  $x$"
 
 
 def _name_velocity() -> str:
-    return r"angular velocity  $\dot\theta$" if is_rotary() else "velocity  $v$"
+    return r"angular velocity  $\dot\theta$" if style.units().rotary else "velocity  $v$"
 
 
 @draws_tables
@@ -63,7 +62,7 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
             look = {**each.look, **_HELD, "label": f"wall_force, {each.label}"}
             ax.plot(each.time * clock, each.wall_force, zorder=3, **look)
         ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
-        ax.set_ylabel(f"{_name_force()} in {own_unit('N')}" if unit else "wall force  in $F$")
+        ax.set_ylabel(f"{_name_force()} in {style.units()['N']}" if unit else "wall force  in $F$")
     for ax in panels:
         # The last sample ends before the time that was asked for.
         ax.set_xlim(0.0, max(float(each.time[-1] + each.time[1]) for each in responses) * clock)
@@ -97,7 +96,7 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
             ax.plot(each.settling_time * clock, at * factor, color=each.look["color"], zorder=4, **_DOT)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
     ax.set_ylabel(
-        f"{_name_position()}  in {length} for 1 {own_unit('N')}" if physical else r"position  $x$  in $F\,T^2\!/m$"
+        f"{_name_position()}  in {length} for 1 {style.units()['N']}" if physical else r"position  $x$  in $F\,T^2\!/m$"
     )
     return clock, unit
 

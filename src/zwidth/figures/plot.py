@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from typing import Any, Concatenate
 
 import numpy as np
@@ -44,7 +45,6 @@ from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import name_wall
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.rotation import in_own_units, own_unit
 from zwidth.words.types import ArrayLike
 
 _ANGLES = 181
@@ -61,15 +61,22 @@ def __dir__() -> list[str]:
 
 
 def _draws(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Let a function draw in the house's look, in the units of its first argument."""
-    return in_own_units(style.house_style()(function))
+    """Wrap a function to draw in the house style, in the units of its first argument."""
+
+    @wraps(function)
+    def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        owner = args[0] if args else next(iter(kwargs.values()), None)
+        with style.house_style(getattr(owner, "unit_system", None)):
+            return function(*args, **kwargs)
+
+    return within
 
 
 def _draws_scene(
     function: Callable[Concatenate[Scene, Parameters], Result],
 ) -> Callable[Concatenate[Scene, Parameters], Result]:
-    """The same of a function whose first argument is a scene; anything else is refused."""
-    return of_scene(style.house_style()(function))
+    """Wrap a function of a scene as `_draws` does, and check the scene."""
+    return of_scene(_draws(function))
 
 
 def _axes(ax: Axes | None) -> Axes:
@@ -197,12 +204,12 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
         ax: an Axes of yours; pyplot's current one where left out.
     """
     known = PARAMETERS.get(parameter)
-    grid = as_float64("values", read_texts("values", values, known.unit) if known else values)
+    grid = as_float64("values", read_texts("values", values, scene.unit_system[known.unit]) if known else values)
     if grid.ndim != 1 or not grid.size:
         raise InputError(f"values: got shape {grid.shape}; a list of values of {parameter} is needed")
     walls = [scene.replace(**{parameter: value}).max_stiffness() for value in grid.tolist()]
     top, spelled = np.array([float(wall.stiffness) for wall in walls]), known.unit if known else "1"
-    if own_unit(spelled) != spelled:
+    if scene.unit_system[spelled] != spelled:
         scale, spelled = style.si_unit(grid, spelled)
         grid = scale * grid
     ax = _axes(ax)
@@ -211,7 +218,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     ax.plot(grid, top * factor, color=style.BLUE, label="stiffest stable wall", **(style.POINTS if whole else {}))
     if not whole:
         ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
-    words = known.axis_label if known else style.literal(parameter)
+    words = known.label_in(scene.unit_system) if known else style.literal(parameter)
     words += f"  in {spelled}" if spelled not in ("", "1") else ""
     ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
     scale_axis(ax, "x", grid)
@@ -238,7 +245,7 @@ def step(
         ax: an Axes of yours; pyplot's current one where left out.
         periods: how many sampling periods.
     """
-    K, B = map(float, resolve_wall(scene.wall, stiffness, virtual_damping))
+    K, B = map(float, resolve_wall(scene.wall, stiffness, virtual_damping, scene.unit_system))
     drawn = draw_step(stack([_tabulate_step(scene, K, B, periods)]), _axes(ax))[0]
     drawn.lines[0].set(marker=".", markersize=3)
     return drawn
@@ -246,7 +253,8 @@ def step(
 
 def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, periods: int) -> dict[str, Any]:
     """The response to 1 N at the samples, as columns of a step study."""
-    columns = {**tabulate_walls(scene, stiffness, virtual_damping), "label": name_wall(stiffness, virtual_damping)}
+    label = name_wall(stiffness, virtual_damping, scene.unit_system)
+    columns = {**tabulate_walls(scene, stiffness, virtual_damping), "label": label}
     columns["time_s"] = np.arange(periods) * scene.timing.period
     columns["position_m"] = scene.state_space(stiffness, virtual_damping).step(periods)
     return columns | {"final_position_m": 1.0 / stiffness if stiffness else math.nan}

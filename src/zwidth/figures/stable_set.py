@@ -211,7 +211,7 @@ def draw_stable_set(
         which = kind.split()[0]
         symbols = zip((r"\alpha", r"\beta") if normalized else "KB", read, ("N/m", "N s/m"), strict=True)
         numbers = [
-            f"${symbol}$ = {f'{value:.{digits}g}' if normalized else with_unit(value, unit, digits)}"
+            f"${symbol}$ = {f'{value:.{digits}g}' if normalized else with_unit(value, style.units()[unit], digits)}"
             for symbol, value, unit in symbols
         ]
         text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""

@@ -26,7 +26,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.files import write_whole
 from zwidth.words.formatting import PREFIXES
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.rotation import is_rotary, own_unit
+from zwidth.words.unit_system import LINEAR, UnitSystem
 
 # Okabe and Ito's palette, told apart with any color vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -65,29 +65,42 @@ _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"
 
 _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
 Size: TypeAlias = tuple[float, float | None]
-# The user's settings: changes of the house style by a style sheet, size of new figures, and dots per inch.
-_wanted: ContextVar[tuple[Any, Size | None, float | None]] = ContextVar("wanted", default=((), None, None))
+# Settings of figures in the current context, like matplotlib's rcParams: changes of the house style by a style sheet,
+# size of new figures in inches, dots per inch, and units.
+_wanted: ContextVar[tuple[Any, Size | None, float | None, UnitSystem]] = ContextVar(
+    "wanted", default=((), None, None, LINEAR)
+)
 # Narrower, in inches, panels stand below each other: beside each other their labels would have no room.
 _ONE_COLUMN = 5.0
 
 
 @contextmanager
-def house_style() -> Iterator[None]:
-    """Draw and save within this look; the settings of before return at the end. Serves as a decorator, too."""
-    with matplotlib.rc_context({**_RC, **dict(_wanted.get()[0])}):
+def house_style(system: UnitSystem | None = None) -> Iterator[None]:
+    """Draw and save in the house style, in a unit system if given; restore the previous settings at the end."""
+    with style_sheet(system=system), matplotlib.rc_context({**_RC, **dict(_wanted.get()[0])}):
         yield
 
 
+def units() -> UnitSystem:
+    """Return the unit system of the figures drawn in the current context."""
+    return _wanted.get()[3]
+
+
 @contextmanager
-def style_sheet(file: Path | None = None, size: Size | None = None, dpi: float | None = None) -> Iterator[None]:
-    """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given."""
+def style_sheet(
+    file: Path | None = None,
+    size: Size | None = None,
+    dpi: float | None = None,
+    system: UnitSystem | None = None,
+) -> Iterator[None]:
+    """Draw with the settings of a matplotlib style sheet, a size in inches, a resolution and a unit system if given."""
     # A size without a height does not change the font size. A size or resolution set by an outer call has priority.
-    changes, known, dots = _wanted.get()
+    changes, known, dots, outer = _wanted.get()
     try:
         changes = changes if file is None else dict(rc_params_from_file(file, use_default_template=False))
     except OSError as error:
         raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error
-    token = _wanted.set((changes, known or size, dots or dpi))
+    token = _wanted.set((changes, known or size, dots or dpi, system or outer))
     try:
         yield
     finally:
@@ -123,8 +136,8 @@ def panels(given: AnyAxes | None, count: int, width: float, height: float, colum
 def label_quantity(name: str) -> str:
     """Return the axis label of a normalized quantity, for a linear or a rotary device."""
     if name != "alpha_max":
-        return PARAMETERS[name].axis_label
-    return rf"maximum stable stiffness  $\alpha_{{\max}} = K_{{\max}}T^2\!/{'J' if is_rotary() else 'm'}$"
+        return PARAMETERS[name].label_in(units())
+    return rf"maximum stable stiffness  $\alpha_{{\max}} = K_{{\max}}T^2\!/{'J' if units().rotary else 'm'}$"
 
 
 def write_unit(unit: str) -> str:
@@ -336,17 +349,20 @@ def spread(positions: Sequence[float], gap: float) -> np.ndarray:
 def add_si_axes(ax: Axes, scale: tuple[float, float]) -> None:
     """Read the normalized axes of an (alpha, beta) plane in SI units as well, at the top and the right."""
     ax.spines[["top", "right"]].set_visible(True)
-    ends, units = (ax.get_xlim()[1], max(map(abs, ax.get_ylim()))), ("N/m", "N s/m")
+    ends, names = (ax.get_xlim()[1], max(map(abs, ax.get_ylim()))), ("N/m", "N s/m")
     places: Any = ((ax.secondary_xaxis, "top", "stiffness  $K$"), (ax.secondary_yaxis, "right", "virtual damping  $B$"))
-    for (add, side, words), one, end, unit in zip(places, scale, ends, units, strict=True):
+    for (add, side, words), one, end, unit in zip(places, scale, ends, names, strict=True):
         factor, spelled = si_unit(one * end, unit)
         both = (lambda value, by=one * factor: value * by), (lambda value, by=one * factor: value / by)
         add(side, functions=both).set(**{"xlabel" if side == "top" else "ylabel": f"{words}  in {spelled}"})
 
 
 def si_unit(values: Any, unit: str) -> tuple[float, str]:
-    """The factor and the unit in which the largest of some values has one to three digits before the point."""
-    unit, largest = own_unit(unit), float(np.nanmax(np.abs(values), initial=0.0))
+    """Return a factor and a unit with prefix for which the largest value has one to three digits before the point.
+
+    ``unit`` is that of a linear device.
+    """
+    unit, largest = units()[unit], float(np.nanmax(np.abs(values), initial=0.0))
     if not np.isfinite(largest) or largest <= 0 or unit == "sampling periods" or unit.startswith("1"):
         # Of an inverse the prefix would be read as its unit's.
         return 1.0, unit

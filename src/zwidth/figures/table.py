@@ -10,9 +10,10 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from zwidth.figures.style import house_style
-from zwidth.words.formatting import turn_header
-from zwidth.words.rotation import ROTARY, is_rotary, use_kind
+from zwidth.words.formatting import convert_header
+from zwidth.words.unit_system import LINEAR, SYSTEMS, UNIT_PAIRS
 
+_ROTARY_UNITS = [rotary for _, rotary in UNIT_PAIRS]
 # Walls in SI units, beside alpha and beta.
 SI_COLUMNS = ("stiffness_N_per_m", "virtual_damping_N_s_per_m")
 
@@ -32,14 +33,14 @@ Result = TypeVar("Result")
 
 
 def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Let a function draw in the house's look, and what has columns of rotary devices in their units."""
+    """Wrap a function to draw in the house style, and in rotary units if a table or dataset has some."""
 
     @wraps(function)
     def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         given: Any = [*args, *kwargs.values()]
         read: Any = [name_as_linear(each) for each in given]
         turned = any(new is not old for new, old in zip(read, given, strict=True)) or any(map(is_of_rotary, given))
-        with house_style(), use_kind(turned or is_rotary()):
+        with house_style(SYSTEMS[True] if turned else None):
             return function(*read[: len(args)], **dict(zip(kwargs, read[len(args) :], strict=True)))  # pyright: ignore
 
     return within
@@ -48,12 +49,12 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
 def is_of_rotary(data: Any) -> bool:
     """Return whether a sweep's dataset contains units of rotary devices."""
     variables = getattr(data, "variables", {})
-    return any(str(each.attrs.get("units", "")) in ROTARY.values() for each in variables.values())
+    return any(str(each.attrs.get("units", "")) in _ROTARY_UNITS for each in variables.values())
 
 
 def name_as_linear(table: Any) -> Any:
     """A table with the names that figures know; itself where it has them, and what is no table."""
-    names = {str(name): turn_header(str(name), False) for name in table} if hasattr(table, "keys") else {}
+    names = {str(name): convert_header(str(name), LINEAR) for name in table} if hasattr(table, "keys") else {}
     return {linear: table[name] for name, linear in names.items()} if any(k != v for k, v in names.items()) else table
 
 

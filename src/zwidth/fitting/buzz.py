@@ -18,8 +18,8 @@ from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
-from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.status import Status
+from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
 CHANCE = 0.003  # probability of refusing the walls of a rigid device
 ROUGH = 0.1  # largest standard deviation of K and f if the noise is not given
@@ -47,6 +47,7 @@ def fit_buzz(
     period: Any,
     velocity: Velocity | None = None,
     noise: float | tuple[float, float] | None = None,
+    rotary: bool | None = None,
 ) -> DeviceFit:
     """Fit mass, damping and delay of a rigid device to walls at the onset of instability.
 
@@ -64,6 +65,8 @@ def fit_buzz(
         velocity: the velocity estimate; the backward difference by default.
         noise: relative standard deviation of K and f, one number or one for each. By default it is equal for both and
             estimated from the residuals, which is inaccurate for two or three walls; identical walls then count once.
+        rotary: True if K is in N m/rad and B in N m s/rad. By default, the units of the points decide; numbers without
+            units are those of a linear device.
 
     Returns:
         DeviceFit: if B at K_max exceeds the largest measured B, the interval of K_max includes the K measured there.
@@ -95,19 +98,20 @@ def fit_buzz(
     period = check_number("period", period)
     if isinstance(points, Iterable) and not isinstance(points, str | dict):
         points = list(points)
-        rotary = find_kind(
+        implied = find_kind(
             {f"points[{k}]": list(each) for k, each in enumerate(points) if isinstance(each, list | tuple)}
         )
-        if rotary is not None and rotary != is_rotary():
-            with use_kind(rotary):
-                return fit_buzz(points, period=period, velocity=velocity, noise=noise)
+        if None not in (implied, rotary) and implied != rotary:
+            raise InputError(f"rotary: got {rotary}, but points have the units of another kind; omit rotary")
+        rotary = implied or rotary
+    system = SYSTEMS[bool(rotary)]
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
         raise InputError(f"velocity: got {velocity!r}; give an estimate, as zwidth.LowPass(cutoff=100)")
     share = _read_noise(noise)
-    table, doubts = _read_points(points, period, share is None)
+    table, doubts = _read_points(points, period, share is None, system)
     kappa, rub, w = (table * [period**2, period, 2 * np.pi * period]).T
-    onsets = Onsets(kappa, rub, w, velocity, period)
+    onsets = Onsets(kappa, rub, w, velocity, period, system=system)
     weights = 1.0 / np.array(share or (1.0, 1.0))
     chosen = find_device(onsets, weights, share is not None)
     best, equals = chosen.best, chosen.equals
@@ -142,7 +146,9 @@ def fit_buzz(
     rivals = tuple(_describe_rival(chosen.scene(theta)) for theta in apart[1:])
     if rivals:
         status = Status.UNDECIDED
-        doubts.append(f"another device fits equally well: {spell_rival(rivals[0])}; add the experiment named next")
+        doubts.append(
+            f"another device fits equally well: {spell_rival(rivals[0], system)}; add the experiment named next"
+        )
     if against:
         doubts.append(against)
     else:
@@ -174,20 +180,24 @@ def fit_buzz(
     return replace(fit, next=further._replace(error_afterwards=after))
 
 
-def _read_points(points: Iterable[Any], period: float, copies_count_once: bool) -> tuple[np.ndarray, list[str]]:
+def _read_points(
+    points: Iterable[Any], period: float, copies_count_once: bool, system: UnitSystem
+) -> tuple[np.ndarray, list[str]]:
     """The walls as an array, and doubts; an impossible one is refused, and so are walls that cannot tell a device."""
     if not isinstance(points, Iterable) or isinstance(points, str | dict):
         raise InputError(f"points: got {points!r}; give walls, each (K in N/m, B in N s/m, f in Hz)")
-    rows = []
+    rows, units = [], (system["N/m"], system["N s/m"], "Hz")
     for k, point in enumerate(points):
         try:
-            row = [float(read_texts(f"points[{k}]", *each)) for each in zip(point, ("N/m", "N s/m", "Hz"), strict=True)]
+            row = [float(read_texts(f"points[{k}]", *each)) for each in zip(point, units, strict=True)]
         except (TypeError, ValueError):
             row = []
         if len(row) != 3 or not np.all(np.isfinite(row)):
-            raise InputError(f"points[{k}]: got {point!r}; give K in N/m, B in N s/m and f in Hz, as (6e3, 0, 37.6)")
+            raise InputError(
+                f"points[{k}]: got {point!r}; give K in {units[0]}, B in {units[1]} and f in Hz, as (6e3, 0, 37.6)"
+            )
         if not row[0] > 0:
-            raise InputError(f"points[{k}].stiffness: got {row[0]:g} N/m; it must be greater than 0 to buzz")
+            raise InputError(f"points[{k}].stiffness: got {row[0]:g} {units[0]}; it must be greater than 0 to buzz")
         if not 0 < row[2] < 0.5 / period:
             raise InputError(
                 f"points[{k}].frequency: got {row[2]:g} Hz; it must be greater than 0 and less than half the sampling "
@@ -212,7 +222,7 @@ def _read_points(points: Iterable[Any], period: float, copies_count_once: bool) 
         )
         raise InputError(
             f"points: {count} the three unknowns m, b and t_d; what is missing is a wall of another damping: raise K "
-            f"at B = {with_unit(table[0, 1] + 0.4 * unit, 'N s/m', 2)}, say, until it buzzes"
+            f"at B = {with_unit(table[0, 1] + 0.4 * unit, units[1], 2)}, say, until it buzzes"
         )
     return table, doubts
 

@@ -123,7 +123,7 @@ class RigidFit(NamedTuple):
 
     def scene(self, theta: np.ndarray) -> Scene:
         """Return the loop of one of the devices."""
-        return self.onsets.normalize(theta).to_scene(self.onsets.period, self.onsets.velocity)
+        return self.onsets.normalize(theta).to_scene(self.onsets.period, self.onsets.velocity, self.onsets.system)
 
 
 def find_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> RigidFit:

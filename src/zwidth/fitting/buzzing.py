@@ -21,6 +21,7 @@ from zwidth.fitting.device_estimate import DimensionlessDevice
 from zwidth.fitting.required_wall import RequiredWall
 from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate, Velocity
+from zwidth.words.unit_system import LINEAR, UnitSystem
 
 # Newton's method for w, relative to w
 STEPS = 25  # most iterations
@@ -47,6 +48,7 @@ class Onsets:
     w: np.ndarray
     velocity: Velocity
     period: float
+    system: UnitSystem = LINEAR
 
     @cached_property
     def _estimate(self) -> Estimate:

@@ -18,7 +18,7 @@ from zwidth.fitting.encoder import find_steps
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import FittedModel
 from zwidth.words.formatting import plain, with_unit
-from zwidth.words.rotation import is_rotary
+from zwidth.words.unit_system import UnitSystem
 
 # Regression on the weak form.
 _WINDOWS = (32, 128)  # lengths of the test functions, in samples; position errors count in proportion to 1/length^2
@@ -42,7 +42,7 @@ class Cause(NamedTuple):
     reversed: bool = False  # the force, or the position, has the wrong sign
 
 
-def explain_motion(logs: tuple[Recording, ...], period: float) -> Cause:
+def explain_motion(logs: tuple[Recording, ...], period: float, system: UnitSystem) -> Cause:
     """Return the cause of a motion that the force does not explain; ``words`` is empty if no cause is identified.
 
     The equation of motion ``x'' = g F - delta x' + o + e(x)``, in sampling periods, is multiplied by smooth test
@@ -61,16 +61,16 @@ def explain_motion(logs: tuple[Recording, ...], period: float) -> Cause:
         free, rest = _solve(acceleration, [force, speed, constant])
         spring, with_spring = _solve(acceleration, [force, speed, constant, position])
         gravity, with_gravity = (
-            _solve(acceleration, [force, speed, constant, sine, cosine]) if is_rotary() else (None, np.inf)
+            _solve(acceleration, [force, speed, constant, sine, cosine]) if system.rotary else (None, np.inf)
         )
         if min(with_spring, with_gravity) < min(lowest, _EXPLAINED * rest):
             lowest = min(with_spring, with_gravity)
             if gravity is not None and gravity[0] > 0 and with_gravity < 0.5 * with_spring:
                 size = float(np.hypot(*gravity[3:])) / gravity[0]
-                best = Cause(f"gravity also moves the device, with a torque of up to {with_unit(size, 'N', 3)}")
+                best = Cause(f"gravity also moves the device, with a torque of up to {with_unit(size, system['N'], 3)}")
             elif spring[0] > 0:
                 stiffness = -spring[3] / spring[0]
-                size = f"{'-' if stiffness < 0 else ''}{with_unit(abs(stiffness), 'N/m', 3)}"
+                size = f"{'-' if stiffness < 0 else ''}{with_unit(abs(stiffness), system['N/m'], 3)}"
                 best = Cause(f"a spring or gravity of about {size} also moves the device")
         if not best.words and free[0] < 0 and rest < _SIGN * total:
             best = Cause("", reversed=True)
@@ -108,14 +108,14 @@ def _solve(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndarray, f
     return values / sizes, float(rest @ rest)
 
 
-def explain_residuals(best: FittedModel) -> str:
+def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
     """Return the cause of residuals that are not white noise as a clause; "" if no cause is identified."""
     slopes = best.motion.slopes
     basis = np.linalg.qr(slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300))[0]
     left = best.residuals - basis @ (basis.T @ best.residuals)
     squares = float(left @ left)
     # Test for rounding first, because the response to rounding errors drifts and resembles that of a weak spring.
-    if rounded := _explain_rounding(best, basis, squares):
+    if rounded := _explain_rounding(best, basis, squares, system):
         return rounded
 
     def explain(*pushes: list[np.ndarray]) -> float:
@@ -126,7 +126,7 @@ def explain_residuals(best: FittedModel) -> str:
 
     places = [log.position - log.position.mean() for log in best.model.logs]
     spring = explain([-each for each in places])
-    if is_rotary() and max(map(np.ptp, places)) > 0.5:
+    if system.rotary and max(map(np.ptp, places)) > 0.5:
         gravity = explain(*([turn(log.position) for log in best.model.logs] for turn in (np.sin, np.cos)))
         if gravity > _SHARE and gravity > spring + 0.1:
             return "they depend on the angle, as gravity would cause"
@@ -151,7 +151,7 @@ def _respond(best: FittedModel, pushes: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(moved)
 
 
-def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float) -> str:
+def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float, system: UnitSystem) -> str:
     """Return a clause on the rounding of the force column if it explains residuals of this size, "" otherwise.
 
     Args:
@@ -176,8 +176,8 @@ def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float) -> s
         expected.append(float(moved @ moved))
     if np.mean(expected) < _ROUNDING_SHARE * squares:
         return ""
-    percent = plain(100.0 * step / largest, 1)
+    percent, rounded = plain(100.0 * step / largest, 1), with_unit(step, system["N"], 3)
     return (
-        f"the force column is rounded to {with_unit(step, 'N', 3)}, {percent} % of its largest value, which alone "
+        f"the force column is rounded to {rounded}, {percent} % of its largest value, which alone "
         "accounts for residuals of this size"
     )

@@ -17,7 +17,7 @@ from zwidth.parts.mode import Mode
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
-from zwidth.words.rotation import is_rotary
+from zwidth.words.unit_system import LINEAR, UnitSystem
 
 # Of the upper ends of intervals of 95 %.
 UPPER = 0.975
@@ -59,13 +59,13 @@ class DimensionlessDevice(NamedTuple):
         delays = [part / unit for part, unit in zip(values[3 : 3 + lag], [period, 1.0], strict=False)]
         return cls(mass, values[1] / (mass / period), values[2] / period, delays, ringing)
 
-    def to_scene(self, period: float, velocity: Velocity) -> Scene:
-        """Its loop without a wall; the device is of the kind in question, linear or rotary."""
+    def to_scene(self, period: float, velocity: Velocity, system: UnitSystem = LINEAR) -> Scene:
+        """Return the scene of the device, without a wall."""
         lag, (mass, damping, delay, *beside) = len(self.lag), map(float, self.to_numbers(period))
         constant, *ratio = beside[:lag] or [None]
         actuator = Actuator(None, constant, lag, *ratio) if lag else None
         modes = [Mode(*beside[k : k + 3]) for k in range(lag, len(beside), 3)]
-        device = Device(mass, damping, actuator=actuator, modes=modes, rotary=is_rotary())
+        device = Device(mass, damping, actuator=actuator, modes=modes, rotary=system.rotary)
         return Scene(device, Timing(period=period, delay=delay), velocity=velocity)
 
 
@@ -116,6 +116,7 @@ class DeviceEstimate:
     velocity = property(attrgetter("nominal.velocity"))
     actuator = property(attrgetter("nominal.device.actuator"))
     modes = property(attrgetter("nominal.device.modes"))
+    unit_system = property(attrgetter("nominal.unit_system"))
 
     @property
     def is_structured(self) -> bool:

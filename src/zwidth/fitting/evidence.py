@@ -13,7 +13,6 @@ from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.words import unit_of
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import header
-from zwidth.words.rotation import in_own_units
 from zwidth.words.status import Status
 
 # Devices drawn around the estimate, dampings of the boundary, and how far beyond its end.
@@ -22,7 +21,6 @@ _DRAWS, _ROWS, _BEYOND = 1000, 121, 1.1
 _LAGS, _SHARE = 60, 0.25
 
 
-@in_own_units
 def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = ()) -> dict[str, dict[str, Any]]:
     """Every table of a fit, as `zwidth.figures.draw_device_fit` takes them."""
     found: dict[str, dict[str, Any]] = {}
@@ -34,11 +32,11 @@ def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = (
     return found
 
 
-@in_own_units
 def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
     """Every sample of the logs: measured, modelled, and what is left."""
     logs = [np.full(motion.time.size, k, int) for k, motion in enumerate(fit.motions, start=1)]
-    units = {"time": "s"} | {name: unit_of(name) for name in ("force", "position")} | {"modelled": unit_of("position")}
+    names = {"force": "force", "position": "position", "modelled": "position"}
+    units = {"time": "s"} | {name: unit_of(quantity, fit.unit_system) for name, quantity in names.items()}
     columns = {name: np.concatenate([getattr(motion, name) for motion in fit.motions]) for name in units}
     table = {header(name, unit): columns[name] for name, unit in units.items()}
     rest = columns["position"] - columns["modelled"]
@@ -60,7 +58,6 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
     }
 
 
-@in_own_units
 def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
     """The stiffest stable wall at each damping B >= 0, and between which stiffnesses it lies with 95 %."""
     # The band is pointwise: the quantiles of devices drawn around the estimate, by a fixed seed; NaN where the records
@@ -75,11 +72,12 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
     drawn = fit.draw(min(_DRAWS, fit.nominal.loop.draws))
     if drawn is not None:
         low, high = np.quantile(_limit_rows(fit, drawn, damping), [0.025, 0.975], axis=0)
+    unit = unit_of("stiffness", fit.unit_system)
     return {
-        header("virtual_damping", unit_of("damping")): damping,
-        header("stiffness", unit_of("stiffness")): _limit_rows(fit, own, damping)[0],
-        header("stiffness_low", unit_of("stiffness")): low,
-        header("stiffness_high", unit_of("stiffness")): high,
+        header("virtual_damping", unit_of("damping", fit.unit_system)): damping,
+        header("stiffness", unit): _limit_rows(fit, own, damping)[0],
+        header("stiffness_low", unit): low,
+        header("stiffness_high", unit): high,
     }
 
 
@@ -88,7 +86,6 @@ def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.
     return fit.nominal.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).row_ends(damping)
 
 
-@in_own_units
 def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str, np.ndarray]:
     """The stiffest wall, the one to set, and walls that buzzed: errors, frequencies, and distances from the fit."""
     # Distances are in units of the noise, stiffness and frequency apart.
@@ -99,7 +96,7 @@ def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str
     for each, rest in zip(points, fit.residuals if points else (), strict=True):
         rows.append(("buzzing", each.stiffness, each.virtual_damping, share * each.stiffness, each.frequency, *rest))
     kinds, *numbers = zip(*rows, strict=True)
-    stiffness, damping = unit_of("stiffness"), unit_of("damping")
+    stiffness, damping = (unit_of(name, fit.unit_system) for name in ("stiffness", "damping"))
     heads = {"stiffness": stiffness, "virtual_damping": damping, "stiffness_error": stiffness, "frequency": "Hz"}
     names = [*(header(*head) for head in heads.items()), "stiffness_residual", "frequency_residual"]
     columns = {name: np.array(part, float) for name, part in zip(names, numbers, strict=True)}

@@ -23,8 +23,8 @@ from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.files import write_whole
 from zwidth.words.quantities import POSITIVE
-from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.status import Status
+from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
 # Stretches of other phases, and periods of each.
 _STRETCHES, _PERIODS = 5, 3
@@ -70,9 +70,9 @@ class Excitation:
     rotary: bool = False
 
     @property
-    def in_rotary_units(self) -> bool:
-        """True for a rotary device."""
-        return self.rotary
+    def unit_system(self) -> UnitSystem:
+        """The units of the force and of the device."""
+        return SYSTEMS[self.rotary]
 
     def save(self, file: str | Path) -> None:
         """Write a CSV file with a row per sample: the time in s, and the force in N or the torque in N m."""
@@ -134,8 +134,8 @@ def excite(
         raise InputError(
             f"rotary: got {rotary}, but force, resolution or response belong to a {kind} device; omit rotary"
         )
-    with use_kind(is_rotary() if rotary is None and implied is None else bool(implied or rotary)):
-        return _design(period, force, resolution, duration, response, velocity, seed)
+    system = SYSTEMS[bool(implied or rotary)]
+    return _design(period, force, resolution, duration, response, velocity, seed, system)
 
 
 def _design(
@@ -146,10 +146,14 @@ def _design(
     response: MeasuredDevice | None,
     velocity: Velocity | None,
     seed: int,
+    system: UnitSystem,
 ) -> Excitation:
-    """Design the force as in `excite`, with the units of the current kind of device, linear or rotary."""
-    period, most = check_number("period", period), check_number("force", force, "N", POSITIVE)
-    step, length = check_number("resolution", resolution, "m"), check_number("duration", duration, "s", POSITIVE)
+    """Design the force as in `excite`, in a unit system."""
+    period, most = check_number("period", period), check_number("force", force, system["N"], POSITIVE)
+    step, length = (
+        check_number("resolution", resolution, system["m"]),
+        check_number("duration", duration, "s", POSITIVE),
+    )
     count = int(length / period / (_STRETCHES * _PERIODS)) // 2 * 2
     if count < _FEWEST_SAMPLES:
         needed = _FEWEST_SAMPLES * _STRETCHES * _PERIODS * period
@@ -172,9 +176,9 @@ def _design(
     hertz, expected = lines / (count * period), None
     if scene is not None and response is not None:
         answer = _answer_at(scene, 2.0 * np.pi * lines / count)[0]
-        predicted = MeasuredDevice(hertz, answer, deviation, is_rotary())
+        predicted = MeasuredDevice(hertz, answer, deviation, system.rotary)
         expected = Scene(predicted, scene.timing, velocity=velocity).max_stiffness()
-    return Excitation(played, period, count * period, hertz, amplitude, deviation, expected, limit, is_rotary())
+    return Excitation(played, period, count * period, hertz, amplitude, deviation, expected, limit, system.rotary)
 
 
 def _lay_lines(count: int, period: float, spacing: np.ndarray) -> np.ndarray:

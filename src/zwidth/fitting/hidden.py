@@ -178,7 +178,7 @@ def bound_response(fit: FittedModel, scene: Scene, bank: PoleBank) -> MeasuredDe
         bias = poles.absorbed[:, : fit.model.parts.stop] @ derivatives.T
         change = _evaluate_unit_modes(fit, grid, poles.frequency[:, None], poles.ratio[:, None]) - bias
         deviation = np.maximum(deviation, np.max(np.abs(change) * poles.bound_mass_ratios()[:, None], 0))
-    return MeasuredDevice(grid / scene.timing.period, response, deviation, bool(scene.device.rotary))
+    return MeasuredDevice(grid / scene.timing.period, response, deviation, scene.unit_system.rotary)
 
 
 def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenResonances | None:

@@ -85,6 +85,8 @@ def bound_lag(fit: FittedModel, test: LagTest | None, scene: Scene, reach: float
     lag = float(test.lag[count - 1] * scene.timing.period)
     # The linearized shift of the parameters of resonances is small, but may exceed their bounds.
     theta = np.clip(test.theta[:, count - 1], *fit.model.bounds())
-    lagged = fit.model.normalize(theta, scene.timing.period).to_scene(scene.timing.period, scene.velocity)
+    lagged = fit.model.normalize(theta, scene.timing.period).to_scene(
+        scene.timing.period, scene.velocity, scene.unit_system
+    )
     lagged = replace(lagged, device=replace(lagged.device, actuator=Actuator(time_constant=lag)))
     return HiddenLag(lag, float(lagged.timing.delay), float(lagged.max_stiffness().stiffness))

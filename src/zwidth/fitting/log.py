@@ -23,9 +23,9 @@ from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE
-from zwidth.words.rotation import is_rotary, own_unit, use_kind
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
+from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
 # By default the longest delay, in periods.
 _LONGEST = 20
@@ -119,13 +119,9 @@ def fit_log(
         >>> print(f"{fit.mass * 1e3:.1f} g, {fit.damping:.2f} N s/m")
         100.0 g, 2.00 N s/m
     """
-    with use_kind(rotary):
-        return _fit(
-            read_logs(time, position, force, resample, resolution),
-            BackwardDifference() if velocity is None else velocity,
-            max_delay,
-            resolution,
-        )
+    system = SYSTEMS[rotary]
+    read = read_logs(time, position, force, system, resample, resolution)
+    return _fit(read, BackwardDifference() if velocity is None else velocity, max_delay, resolution, system)
 
 
 def _fit(
@@ -133,6 +129,7 @@ def _fit(
     velocity: Velocity,
     max_delay: Any,
     resolution: Any,
+    system: UnitSystem,
 ) -> DeviceFit:
     """Return the fit of logs that were read and repaired."""
     logs, places, period, wavers, notes, _ = read
@@ -152,23 +149,23 @@ def _fit(
         for log, own in zip(logs, stretches, strict=True)
         for each in own
     )
-    doubts = [doubt for log in logs for doubt in find_stretches(log)]
-    steps, odd = _list_steps(resolution, read)
+    doubts = [doubt for log in logs for doubt in find_stretches(log, system)]
+    steps, odd = _list_steps(resolution, read, system)
     step, (best, pole, bank, lags) = _choose_step(recordings, longest, steps)
     model, theta = best.model, best.theta
-    _refuse_unmoved(best, period)
+    _refuse_unmoved(best, period, system)
     if best.inverse.open[:3].any():
         raise InputError(
             "force: mass, damping and delay cannot be told apart by this log; record longer, with a force that changes "
             "its sign at different times, as steps to and fro"
         )
-    scene, known = model.normalize(theta, period).to_scene(period, velocity), slice(0, model.parts.stop)
+    scene, known = model.normalize(theta, period).to_scene(period, velocity, system), slice(0, model.parts.stop)
     by_theta = differentiate(lambda theta: model.normalize(theta, period).to_numbers(period), theta)[:, known]
     (by_period,) = differentiate(lambda time: model.normalize(theta, time[0]).to_numbers(time[0]), np.array([period])).T
     late = wavers * period * by_period
     covariance = by_theta @ best.covariance[known, known] @ by_theta.T + np.outer(late, late)
     freedom = max(1, best.count - theta.size)
-    unexplained = _find_unexplained(best, pole, period) if bank else []
+    unexplained = _find_unexplained(best, pole, period, system) if bank else []
     doubts = odd + doubts + _doubt(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     # The device that bears K_max is another one then.
@@ -202,9 +199,9 @@ def _fit(
     )
 
 
-def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float) -> list[str]:
+def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float, system: UnitSystem) -> list[str]:
     """What the residuals show beyond noise, with the record to make next."""
-    cause = explain_residuals(best) if pole is not None or best.excess > ALIKE else ""
+    cause = explain_residuals(best, system) if pole is not None or best.excess > ALIKE else ""
     if cause:
         remedy = "log the force with more digits" if "rounded" in cause else _RECORD_NEXT
         return [f"the residuals are not white noise: {cause}; {remedy}"]
@@ -233,7 +230,7 @@ def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
     return 0.0 if none else float(value), error
 
 
-def _list_steps(resolution: Any, read: ReadLogs) -> tuple[list[float], list[str]]:
+def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[list[float], list[str]]:
     """Return the candidates for the encoder step, coarsest first, and warnings about a given step.
 
     An ideal sensor is rounded to the step of the column only. A constant force moves it by nearly whole multiples of a
@@ -242,10 +239,10 @@ def _list_steps(resolution: Any, read: ReadLogs) -> tuple[list[float], list[str]
     if resolution is None:
         columns = zip(*read.steps, strict=True)
         return sorted({min(each) if max(each) < 1.5 * min(each) else 0.0 for each in columns}, reverse=True), []
-    step = check_number("resolution", resolution, "m", NOT_NEGATIVE)
+    step = check_number("resolution", resolution, system["m"], NOT_NEGATIVE)
     pairs = zip(read.logs, read.steps, strict=True)
     if step and not all(fits_steps(log.position, step, slack=column) for log, (_, column) in pairs):
-        text = with_unit(step, "m")
+        text = with_unit(step, system["m"])
         return [0.0], [
             f"the positions are no multiples of {text}, so their errors are treated as noise: check resolution"
         ]
@@ -260,7 +257,7 @@ def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[
     return _choose_step(recordings, longest, finer) if finer and excluded else (step, choice)
 
 
-def _refuse_unmoved(best: FittedModel, period: float) -> None:
+def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:
     """Raise `InputError` where the force explains nothing of the motion, the contrary of it, or too little."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
     # What there would be without any force, not even friction.
@@ -274,7 +271,7 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
         )
     left = squares / float(rest @ rest)
     unexplained = left > _UNEXPLAINED and best.excess > _SMOOTH
-    cause = explain_motion(model.logs, period) if theta[0] <= 0 or unexplained else Cause("")
+    cause = explain_motion(model.logs, period, system) if theta[0] <= 0 or unexplained else Cause("")
     if cause.words:
         raise InputError(
             f"force: {cause.words}; support the device, or measure its frequency response, which needs no model "
@@ -282,8 +279,9 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
         )
     if theta[0] <= 0 and (cause.reversed or left < _UNEXPLAINED):
         raise InputError(
-            f"force: the device runs away from it, as if its mass were {with_unit(period**2 / theta[0], 'kg')}; "
-            "turn the sign of the force, or of the position; a velocity given as a position looks so too"
+            "force: the device runs away from it, as if its mass were "
+            f"{with_unit(period**2 / theta[0], system['kg'])}; turn the sign of the "
+            "force, or of the position; a velocity given as a position looks so too"
         )
     if theta[0] <= 0:
         raise InputError(
@@ -302,21 +300,21 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
 
 def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Recording, ...]) -> list[str]:
     mass, damping, delay = scene.device.mass, scene.device.damping, scene.timing.delay
-    doubts, residuals = [], best.residuals
-    lightest, heaviest, farthest, strongest = _USUAL[is_rotary()]
-    place, newton, fine = own_unit("m"), own_unit("N"), "degrees or counts" if is_rotary() else "mm"
+    doubts, residuals, units = [], best.residuals, scene.unit_system
+    lightest, heaviest, farthest, strongest = _USUAL[units.rotary]
+    place, newton, fine = units["m"], units["N"], "degrees or counts" if units.rotary else "mm"
     if not lightest <= mass <= heaviest:
         light = f"the position may be in {fine}, or the force in k{newton}"
         heavy = f"the force may be in m{newton}, the time in ms, or the position in a larger unit than is said"
         slip = light if mass < lightest else heavy
-        what = f"a mass of {with_unit(mass, 'kg')} is far from any device"
+        what = f"a mass of {with_unit(mass, units['kg'])} is far from any device"
         doubts.append(f"{what}; {slip}: {place}, {newton} and s are meant")
     way, push = max(float(np.ptp(log.position)) for log in logs), best.model.largest
     if way > farthest:
-        what = f"a way of {with_unit(way, 'm')} is far from any device"
+        what = f"a way of {with_unit(way, place)} is far from any device"
         doubts.append(f"{what}; the position may be in {fine}: {place} is meant")
     if push > strongest:
-        what = f"a force of {with_unit(push, 'N')} is far from any device"
+        what = f"a force of {with_unit(push, newton)} is far from any device"
         doubts.append(f"{what}; it may be in m{newton}: {newton} is meant")
     if errors[0] > VAGUE * mass:
         doubts.append(MASS_OPEN)
@@ -334,8 +332,8 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
     elif errors[1] > VAGUE * damping:
         span = max(log.force.size for log in logs)
         doubts.append(
-            f"the damping is hardly seen, its standard error is {with_unit(errors[1], 'N s/m', 2)}; record longer than "
-            f"these {span} samples, or let the device run faster"
+            f"the damping is hardly seen, its standard error is {with_unit(errors[1], units['N s/m'], 2)}; record "
+            f"longer than these {span} samples, or let the device run faster"
         )
     if delay == 0 and (away := best.step_beyond(2)) < -BEYOND:
         doubts.append(

@@ -13,6 +13,7 @@ from zwidth.parts.checks import check_number
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SI_RANGE
+from zwidth.words.unit_system import UnitSystem
 
 # How far a sample's time may lie from an even one, as a share of the period, unasked and where a wavering clock is
 # asked for, less than what a missing sample looks like; how far periods of logs may differ beyond their errors.
@@ -35,13 +36,16 @@ class ReadLogs(NamedTuple):
     steps: tuple[tuple[float, float], ...]  # encoder step and column step of each log, from `find_steps`
 
 
-def read_logs(time: Any, position: Any, force: Any, resample: bool = False, resolution: Any = None) -> ReadLogs:
+def read_logs(
+    time: Any, position: Any, force: Any, system: UnitSystem, resample: bool = False, resolution: Any = None
+) -> ReadLogs:
     """Read and repair logs; raise `InputError` if no device can be fitted to them.
 
     Args:
         time: times in s, or the sampling period; a list for several logs.
         position: positions in SI units, NaN where missing; a list for several logs.
         force: forces in SI units, NaN where missing; a list for several logs.
+        system: units of position and force.
         resample: allow timestamp jitter up to a quarter of the period.
         resolution: encoder step in SI units; None if unknown.
     """
@@ -52,8 +56,8 @@ def read_logs(time: Any, position: Any, force: Any, resample: bool = False, reso
         raise InputError(
             f"time, position, force: got {len(times)}, {len(positions)} and {len(forces)} logs; give each log all three"
         )
-    step = 0.0 if resolution is None else check_number("resolution", resolution, "m", NOT_NEGATIVE)
-    read = [_read(*parts, resample, step) for parts in zip(times, positions, forces, strict=True)]
+    step = 0.0 if resolution is None else check_number("resolution", resolution, system["m"], NOT_NEGATIVE)
+    read = [_read(*parts, resample, step, system) for parts in zip(times, positions, forces, strict=True)]
     logs, places, periods, errors, notes, steps = zip(*read, strict=True)
     if len(read) > 1:
         notes = [[f"log {k}: {note}" for note in each] for k, each in enumerate(notes, start=1)]
@@ -67,7 +71,7 @@ def read_logs(time: Any, position: Any, force: Any, resample: bool = False, reso
 
 
 def _read(
-    time: Any, position: Any, force: Any, resample: bool, step: float
+    time: Any, position: Any, force: Any, resample: bool, step: float, system: UnitSystem
 ) -> tuple[Recording, np.ndarray, float, float, list[str], tuple[float, float]]:
     x, f = as_float64("position", position), as_float64("force", force)
     clock = None if isinstance(time, str) or np.ndim(time) == 0 else as_float64("time", time)
@@ -89,14 +93,14 @@ def _read(
                 f"{name}: got values from {plain(low)} to {plain(high)}; they must be at most {most:g} in magnitude "
                 f"and at least {least:g} apart; check the unit"
             )
-    clock, row, x, f, notes, steps = repair_log(clock, x, f, step)
+    clock, row, x, f, notes, steps = repair_log(clock, x, f, step, system)
     if clock is None:
         place, period, error = row - row[0], check_number("time", time, "s", POSITIVE), 0.0
     else:
         place, period, error = _place(clock, resample, notes)
     if np.ptp(f) == 0:
         raise InputError(
-            f"force: it is {plain(f[0])} N all the time; command a force that changes, as steps to and fro"
+            f"force: it is {plain(f[0])} {system['N']} all the time; command a force that changes, as steps to and fro"
         )
     if np.ptp(x) == 0:
         raise InputError("position: it never changes; check the column, and that nothing holds the device")
@@ -154,15 +158,15 @@ def find_even(place: np.ndarray, least: int) -> list[slice]:
     return [slice(first, last + 1) for first, last in runs if last + 1 - first >= least]
 
 
-def find_stretches(log: Recording) -> list[str]:
+def find_stretches(log: Recording, system: UnitSystem) -> list[str]:
     """What hints at an end stop, a saturated sensor, or a saturated motor, a sentence each."""
     doubts = []
     for end, way in ((log.position.max(), 1.0), (log.position.min(), -1.0)):
         first, last = _longest_run((log.position == end) & (log.force * way > 0))
         if last - first >= _STUCK:
             doubts.append(
-                f"the position stays at {with_unit(end, 'm', 4)} from sample {first} to {last - 1} though the force "
-                "pushes on: an end stop, a saturated sensor, or friction that holds; leave such stretches out"
+                f"the position stays at {with_unit(end, system['m'], 4)} from sample {first} to {last - 1} though the "
+                "force pushes on: an end stop, a saturated sensor, or friction that holds; leave such stretches out"
             )
     for end in (log.force.max(), log.force.min()):
         at_end = log.force == end
@@ -170,8 +174,8 @@ def find_stretches(log: Recording) -> list[str]:
         inside = np.unique(log.force[~at_end]).size
         if inside > _MANY * at_end.size and last - first >= _STUCK:
             doubts.append(
-                f"the force stays at {with_unit(end, 'N', 4)} from sample {first} to {last - 1} and varies elsewhere: "
-                "is that what the motor gave, or where it saturates? Log the force that is given"
+                f"the force stays at {with_unit(end, system['N'], 4)} from sample {first} to {last - 1} and varies "
+                "elsewhere: is that what the motor gave, or where it saturates? Log the force that is given"
             )
     return doubts
 

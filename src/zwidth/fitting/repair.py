@@ -14,7 +14,7 @@ import numpy as np
 from zwidth.fitting.encoder import find_resolution, find_steps
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
-from zwidth.words.rotation import is_rotary
+from zwidth.words.unit_system import UnitSystem
 
 # Times in s after which common clocks and counters roll over.
 _ROLLOVERS = {
@@ -63,7 +63,9 @@ class RepairedLog(NamedTuple):
     steps: tuple[float, float]  # encoder step and column step of the logged positions, from `find_steps`
 
 
-def repair_log(clock: np.ndarray | None, position: np.ndarray, force: np.ndarray, step: float) -> RepairedLog:
+def repair_log(
+    clock: np.ndarray | None, position: np.ndarray, force: np.ndarray, step: float, system: UnitSystem
+) -> RepairedLog:
     """Return the valid rows of a log, with continuous times and unwrapped positions.
 
     Args:
@@ -71,6 +73,7 @@ def repair_log(clock: np.ndarray | None, position: np.ndarray, force: np.ndarray
         position: positions in SI units, NaN where missing.
         force: forces in SI units, NaN where missing.
         step: encoder step in SI units, 0 if unknown.
+        system: units of position and force.
 
     Raises:
         InputError: the times decrease without a rollover, too few rows have all three numbers, or the positions contain
@@ -92,7 +95,7 @@ def repair_log(clock: np.ndarray | None, position: np.ndarray, force: np.ndarray
     if clock is not None:
         kept = _drop_repeated(clock, position, force, notes)
         clock, row, position, force = clock[kept], row[kept], position[kept], force[kept]
-    modulus = find_modulus(position, step or find_resolution(position))
+    modulus = find_modulus(position, step or find_resolution(position), system)
     kept = ~find_glitches(unwrap(position, modulus) if modulus else position, modulus)
     if not kept.all():
         bad = np.flatnonzero(~kept)
@@ -109,8 +112,8 @@ def repair_log(clock: np.ndarray | None, position: np.ndarray, force: np.ndarray
     if modulus:
         # Count wraps after the removal of glitches, because a glitch may hide a wrap.
         count = int(np.count_nonzero(np.round(np.diff(position) / modulus)))
-        turn = "360 deg, " if is_rotary() and np.isclose(modulus, 2 * np.pi) else ""
-        size = with_unit(modulus, "m", 6)
+        turn = "360 deg, " if system.rotary and np.isclose(modulus, 2 * np.pi) else ""
+        size = with_unit(modulus, system["m"], 6)
         notes.append(f"the position wraps at {size} ({turn}{_count(count, 'time')}) and was unwrapped")
         position = unwrap(position, modulus)
     return RepairedLog(clock, row, position, force, notes, steps)
@@ -206,12 +209,12 @@ def _drop_repeated(clock: np.ndarray, position: np.ndarray, force: np.ndarray, n
     return np.ones(clock.size, bool)
 
 
-def find_modulus(position: np.ndarray, step: float) -> float:
+def find_modulus(position: np.ndarray, step: float, system: UnitSystem) -> float:
     """Return the modulus at which the positions wrap, 0 if they do not.
 
     A modulus is accepted if the unwrapped positions are smooth at more than half of the wraps.
     """
-    for modulus in _list_moduli(position, step):
+    for modulus in _list_moduli(position, step, system):
         # Exclude glitches, because their jumps are not wraps.
         places = position[~find_glitches(unwrap(position, modulus), modulus)]
         events = np.flatnonzero(np.round(np.diff(places) / modulus))
@@ -232,7 +235,7 @@ def unwrap(position: np.ndarray, modulus: float) -> np.ndarray:
     return position - modulus * np.append(0.0, np.cumsum(np.round(np.diff(position) / modulus)))
 
 
-def _list_moduli(position: np.ndarray, step: float) -> Iterator[float]:
+def _list_moduli(position: np.ndarray, step: float, system: UnitSystem) -> Iterator[float]:
     """Yield candidates for the modulus at which the positions wrap, most plausible first.
 
     The candidates are one turn of a rotary axis, the smallest power of two of encoder steps that covers the span (at
@@ -241,22 +244,23 @@ def _list_moduli(position: np.ndarray, step: float) -> Iterator[float]:
     # The median removes isolated glitches from the span.
     places = _filter_median(position, _REACH)
     span, largest = float(np.ptp(places)), float(np.abs(np.diff(position)).max(initial=0.0))
-    moduli = [2.0 * np.pi] if is_rotary() and span <= 2.0 * np.pi * (1.0 + 1e-9) + step else []
+    moduli = [2.0 * np.pi] if system.rotary and span <= 2.0 * np.pi * (1.0 + 1e-9) + step else []
     if step > 0 and span > 0:
         counts = round(span / step) + 1
         moduli.append(step * 2.0 ** max(8, int(np.ceil(np.log2(counts)))))
     yield from (modulus for modulus in moduli if largest > 0.5 * modulus)
-    if modulus := _measure_modulus(np.diff(position[~find_glitches(position)]), span, step):
+    if modulus := _measure_modulus(np.diff(position[~find_glitches(position)]), span, step, system):
         yield modulus
 
 
-def _measure_modulus(moves: np.ndarray, span: float, step: float) -> float:
+def _measure_modulus(moves: np.ndarray, span: float, step: float, system: UnitSystem) -> float:
     """Return the modulus of a counter with an arbitrary range, measured from its jumps; 0 if they differ in size.
 
     Args:
         moves: differences of successive positions.
         span: range of the positions.
         step: encoder step, 0 if unknown.
+        system: units of the positions.
 
     Raises:
         InputError: the jumps have the same size, but do not determine the modulus to a whole number of encoder steps.
@@ -274,8 +278,8 @@ def _measure_modulus(moves: np.ndarray, span: float, step: float) -> float:
     if step > 0 and error < 0.2 * step:
         return step * round(float(np.mean(sizes)) / step)
     raise InputError(
-        f"position: {inner.size} jumps by {with_unit(middle, 'm', 3)} indicate an encoder that wraps at an unknown "
-        "count; unwrap it, or log counts and specify a resolution such as '4000 counts/rev'"
+        f"position: {inner.size} jumps by {with_unit(middle, system['m'], 3)} indicate an encoder that wraps at an "
+        "unknown count; unwrap it, or log counts and specify a resolution such as '4000 counts/rev'"
     )
 
 

@@ -24,8 +24,8 @@ from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import POSITIVE
-from zwidth.words.rotation import use_kind
 from zwidth.words.types import ArrayLike
+from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
 # The radius that holds for some thousand lines at once: 4.5 standard errors of real and imaginary part, each of which
 # has half of the variance.
@@ -117,24 +117,25 @@ def respond(
         >>> f"{found.device.frequency.size} lines from {found.records} stretches"
         '409 lines from 5 stretches'
     """
-    with use_kind(rotary):
-        estimate = _respond(time, position, force, cycle, resolution)
-        return replace(estimate, device=replace(estimate.device, rotary=rotary))
+    estimate = _respond(time, position, force, cycle, resolution, SYSTEMS[rotary])
+    return replace(estimate, device=replace(estimate.device, rotary=rotary))
 
 
-def _respond(time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any, resolution: Any) -> ResponseEstimate:
-    """Estimate the response as in `respond`, with the units of the current kind of device, linear or rotary."""
-    read = read_logs(time, position, force, resolution=resolution)
+def _respond(
+    time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any, resolution: Any, system: UnitSystem
+) -> ResponseEstimate:
+    """Estimate the response as in `respond`, in a unit system."""
+    read = read_logs(time, position, force, system, resolution=resolution)
     period, notes = read.period, list(read.notes)
     logs = tuple(_fill(log, place, k, notes) for k, (log, place) in enumerate(zip(*read[:2], strict=True), start=1))
     step = min(encoder for encoder, _ in read.steps)
-    step = step if resolution is None else check_number("resolution", resolution, "m")
+    step = step if resolution is None else check_number("resolution", resolution, system["m"])
     given = None if cycle is None else int(np.round(check_number("cycle", cycle, "s", POSITIVE) / period))
     doubts = []
     if step and all(np.ptp(log.position) < _STEPS * step for log in logs):
         doubts.append(
-            f"the position moves by less than {_STEPS} steps of {with_unit(step, 'm')}; push harder, for an encoder "
-            "hides smaller motions"
+            f"the position moves by less than {_STEPS} steps of {with_unit(step, system['m'])}; push harder, for an "
+            "encoder hides smaller motions"
         )
     count = given or _find_period(logs[0].force)
     if count is None:

@@ -11,7 +11,6 @@ import numpy as np
 from zwidth.parts.safe_limit import SafeLimit
 from zwidth.scenes.scene import Scene
 from zwidth.words.formatting import round_safely, with_unit
-from zwidth.words.rotation import use_kind
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -68,17 +67,16 @@ def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
         fit: the fit.
         rigid: assume that the device has no resonances other than the fitted ones, as in `DeviceFit.safe_wall`.
     """
-    with use_kind(bool(fit.nominal.device.rotary)):
-        if fit.is_doubted:
-            trouble = name_trouble(fit)
-            return SafeLimit(0.0, reason=trouble or "resolve the warnings first", warnings=fit.doubts)
-        wall = fit.safe_wall(rigid=rigid)
-        if wall.status != Status.OK or not wall.stiffness > 0:
-            return SafeLimit(0.0, reason="the fitted parameters are too uncertain for any wall; record longer")
-        stiffness = round_safely(wall.stiffness, "below", LIMIT_DIGITS)
-        # Round B toward 0, because at larger |B| the stiffness limit often decreases steeply.
-        damping = math.copysign(round_safely(abs(wall.virtual_damping), "below", LIMIT_DIGITS), wall.virtual_damping)
-        return SafeLimit(float(f"{stiffness:.12g}"), float(f"{damping:.12g}"), _explain(fit, wall))
+    if fit.is_doubted:
+        trouble = name_trouble(fit)
+        return SafeLimit(0.0, reason=trouble or "resolve the warnings first", warnings=fit.doubts)
+    wall = fit.safe_wall(rigid=rigid)
+    if wall.status != Status.OK or not wall.stiffness > 0:
+        return SafeLimit(0.0, reason="the fitted parameters are too uncertain for any wall; record longer")
+    stiffness = round_safely(wall.stiffness, "below", LIMIT_DIGITS)
+    # Round B toward 0, because at larger |B| the stiffness limit often decreases steeply.
+    damping = math.copysign(round_safely(abs(wall.virtual_damping), "below", LIMIT_DIGITS), wall.virtual_damping)
+    return SafeLimit(float(f"{stiffness:.12g}"), float(f"{damping:.12g}"), _explain(fit, wall))
 
 
 def _explain(fit: DeviceFit, wall: SafeWall) -> str:
@@ -88,8 +86,9 @@ def _explain(fit: DeviceFit, wall: SafeWall) -> str:
         hidden = f"a resonance near {near}, undetectable in the log, may make stiffer walls unstable"
         return f"{hidden}; {advise_record(fit)}"
     if fit.damping_tried is not None and wall.virtual_damping >= fit.damping_tried:
-        tried = with_unit(fit.damping_tried, "N s/m")
-        remedy = "" if fit.next is None else f", such as B = {with_unit(fit.next.virtual_damping, 'N s/m', 3)}"
+        unit = fit.unit_system["N s/m"]
+        tried = with_unit(fit.damping_tried, unit)
+        remedy = "" if fit.next is None else f", such as B = {with_unit(fit.next.virtual_damping, unit, 3)}"
         return (
             f"no wall with B > {tried} was measured, and an undetected resonance may make such walls unstable; measure "
             f"one{remedy}"
@@ -102,7 +101,7 @@ def advise_record(fit: DeviceFit) -> str:
     force = max(float(np.abs(motion.force).max()) for motion in fit.motions)
     options = {
         "rate": with_unit(1.0 / round_period(fit), "Hz"),
-        "force": with_unit(force, "N", 2),
-        "resolution": with_unit(fit.resolution or float(np.max(fit.noise)), "m", 3),
+        "force": with_unit(force, fit.unit_system["N"], 2),
+        "resolution": with_unit(fit.resolution or float(np.max(fit.noise)), fit.unit_system["m"], 3),
     }
     return "record again with " + " ".join(["zwidth excite", *(f"--{name} '{text}'" for name, text in options.items())])

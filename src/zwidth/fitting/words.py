@@ -17,8 +17,8 @@ from zwidth.parts.paths import spell_estimate
 from zwidth.scenes.recommendation import Recommendation
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import FIELDS
-from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 from zwidth.words.status import Status
+from zwidth.words.unit_system import UnitSystem
 
 NEAR_ROUNDING = (0.5, 1.1)  # range of residuals as expected, in units of the encoder's quantization noise
 
@@ -29,28 +29,26 @@ _UNITS = {path.rpartition(".")[2]: known.unit.removeprefix("1") for path, known 
 _UNITS |= {"stiffness_max": "N/m", "friction": "N", "offset": "N", "force": "N", "position": "m"}
 
 
-def unit_of(name: str) -> str:
-    """The SI unit of a value of a fit, "" where it has none."""
-    return own_unit(_UNITS.get(name.rpartition(".")[2], ""))
+def unit_of(name: str, system: UnitSystem) -> str:
+    """Return the SI unit of a value of a fit, "" if it has none."""
+    return system[_UNITS.get(name.rpartition(".")[2], "")]
 
 
-@in_own_units
 def list_units(fit: DeviceFit) -> dict[str, str]:
-    """Those of a fit, by the name of what has them."""
-    return {name: unit_of(name) for name in ("mass", "damping", "stiffness", "force", "position")}
+    """Return the units of the main quantities of a fit, by name."""
+    return {name: unit_of(name, fit.unit_system) for name in ("mass", "damping", "stiffness", "force", "position")}
 
 
-def symbol_of(name: str) -> str:
+def symbol_of(name: str, system: UnitSystem) -> str:
     """Return the symbol of a fitted parameter; that of the inertia of a rotary device is J."""
-    return "J" if name == "mass" and is_rotary() else _SYMBOLS[name]
+    return "J" if name == "mass" and system.rotary else _SYMBOLS[name]
 
 
-def spell(name: str, value: float, digits: int = 4) -> str:
-    """A value of a fit for people."""
-    return with_unit(value, _UNITS.get(name.rpartition(".")[2], ""), digits)
+def spell(name: str, value: float, system: UnitSystem, digits: int = 4) -> str:
+    """Return a value of a fit with its unit."""
+    return with_unit(value, unit_of(name, system), digits)
 
 
-@in_own_units
 def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> list[tuple[str, str]]:
     """Return the summary of a fit as pairs of label and text: the recommended wall with its reason, then the device.
 
@@ -81,7 +79,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
     if fit.next is not None:
         rows.append(("next", _describe_next(fit)))
     elif fit.motions and recommended.is_held_back and (rigid := _assume_rigid(fit)) is not None:
-        stiffest = spell("stiffness", rigid.stiffness)
+        stiffest = spell("stiffness", rigid.stiffness, fit.unit_system)
         rows.append(("next", f"for a stiffer wall (up to {stiffest} without hidden resonances) {advise_record(fit)}"))
     return rows
 
@@ -94,7 +92,7 @@ def _assume_rigid(fit: DeviceFit) -> Recommendation | None:
 
 def _describe_device(fit: DeviceFit) -> list[tuple[str, str]]:
     """Return pairs of label and text for the fitted parameters, with their 95 % confidence intervals."""
-    texts = [f"{symbol_of(name)} = {_spell_estimate(fit, name)}" for name in fit.numbers[:2]]
+    texts = [f"{symbol_of(name, fit.unit_system)} = {_spell_estimate(fit, name)}" for name in fit.numbers[:2]]
     texts.append(f"delay {_spell_estimate(fit, 'delay')}")
     if "friction" in fit.errors:
         certain = math.isfinite(fit.errors["friction"])
@@ -119,7 +117,7 @@ def _spell_estimate(fit: DeviceFit, name: str) -> str:
     if not math.isfinite(sum(interval)):
         return f"{_spell(fit, name)} (uncertain)"
     value = _spell(fit, name)
-    low, high = (spell(name, end, _count_digits(fit, name)) for end in interval)
+    low, high = (spell(name, end, fit.unit_system, _count_digits(fit, name)) for end in interval)
     unit = f" {high.partition(' ')[2]}"
     if low.endswith(unit):
         low, high = low.removesuffix(unit), high.removesuffix(unit) if value.endswith(unit) else high
@@ -130,27 +128,26 @@ def _describe_residuals(fit: DeviceFit) -> str:
     """Return the size of the residuals, compared with the quantization noise of the encoder."""
     if isinstance(fit.noise, tuple):
         return f"noise of K and f {' and '.join(f'{plain(100 * share, 2)} %' for share in fit.noise)}"
-    size = f"residuals of {spell('position', fit.noise, 3)}"
+    size = f"residuals of {spell('position', fit.noise, fit.unit_system, 3)}"
     if not fit.resolution:
         return size
     expected = NEAR_ROUNDING[0] < fit.noise / fit.resolution * math.sqrt(12.0) < NEAR_ROUNDING[1]
-    step = spell("position", fit.resolution, 3)
+    step = spell("position", fit.resolution, fit.unit_system, 3)
     return f"{size}, {'as expected for an encoder step of' if expected else 'with an encoder step of'} {step}"
 
 
 def _describe_next(fit: DeviceFit) -> str:
     """Return the most informative next experiment with walls, and the expected standard error of K_max after it."""
-    step = fit.next
+    step, units = fit.next, fit.unit_system
     assert step is not None, "only fits to walls at the onset of instability propose a next experiment"
-    B, K = spell("damping", step.virtual_damping, 3), spell("stiffness", step.stiffness, 3)
+    B, K = spell("damping", step.virtual_damping, units, 3), spell("stiffness", step.stiffness, units, 3)
     text = f"raise K at B = {B}, to about {K} and {with_unit(step.frequency, 'Hz', 3)}"
     if math.isfinite(fit.stiffness_error + step.error_afterwards):
-        errors = [spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards)]
+        errors = [spell("stiffness", error, units, 2) for error in (fit.stiffness_error, step.error_afterwards)]
         text += f": decreases the standard error of K_max from {' to '.join(errors)}"
     return text
 
 
-@in_own_units
 def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     """Return the details that `summarize_fit` omits, as pairs of label and text.
 
@@ -158,7 +155,7 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
         fit: the fit.
         source: name of the log, or number of walls, for the first line.
     """
-    rows = [("fitted to", source)]
+    rows, units = [("fitted to", source)], fit.unit_system
     count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
     gaps = sum(int(np.count_nonzero(np.diff(motion.time) > 1.5 * fit.period)) for motion in fit.motions)
     if gaps:
@@ -172,7 +169,7 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     elif any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
         rows.append(("used", f"{count:,} of {total:,} samples, from the start; more would only reduce the errors"))
     if math.isfinite(fit.virtual_damping):
-        B, error = (spell("damping", value) for value in (fit.virtual_damping, fit.virtual_damping_error))
+        B, error = (spell("damping", value, units) for value in (fit.virtual_damping, fit.virtual_damping_error))
         rows.append(("at K_max", f"B = {B} (standard error {error})"))
     for name in ("friction", "offset"):
         if name in fit.errors and not math.isfinite(fit.errors[name]):
@@ -181,38 +178,39 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
             )
         elif name == "offset" and name in fit.errors:
             rows.append((name, f"{_spell_estimate(fit, name)}, a constant force"))
-    rows += [("or as well", spell_rival(rival)) for rival in fit.rivals]
+    rows += [("or as well", spell_rival(rival, units)) for rival in fit.rivals]
     if fit.lag is not None:
         names = ("time_constant", "delay", "stiffness_max")
-        lag, delay, K = (spell(name, value, 3) for name, value in zip(names, fit.lag, strict=True))
+        lag, delay, K = (spell(name, value, units, 3) for name, value in zip(names, fit.lag, strict=True))
         rows.append(
             ("or as well", f"an actuator lag of up to {lag}; at this lag the fitted delay is {delay} and K_max is {K}")
         )
     if fit.is_doubted or fit.scene.safe_limit is None:
         return rows
-    rows.append(("safe limit", fit.scene.safe_limit.describe()))
+    rows.append(("safe limit", fit.scene.safe_limit.describe(units)))
     if (wall := _assume_rigid(fit)) is not None:
         kind = "no further resonances" if fit.is_structured else "a rigid device"
         rows.append(("assuming", f"{kind}: {wall.spell_wall()}; {wall.spell_requirement()}"))
     return rows
 
 
-def spell_rival(rival: RivalDevice) -> str:
+def spell_rival(rival: RivalDevice, system: UnitSystem) -> str:
     """Return the parameters of a rival device in one line."""
-    parts = {symbol_of(name): spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
-    parts[symbol_of("stiffness_max")] = spell("stiffness", rival.stiffness_max)
+    names = ("mass", "damping", "delay")
+    parts = {symbol_of(name, system): spell(name, getattr(rival, name), system) for name in names}
+    parts[symbol_of("stiffness_max", system)] = spell("stiffness", rival.stiffness_max, system)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 
 
 def _spell(fit: DeviceFit, name: str) -> str:
     """A value with so many digits that its interval shows."""
-    return spell(name, fit.value_of(name), _count_digits(fit, name))
+    return spell(name, fit.value_of(name), fit.unit_system, _count_digits(fit, name))
 
 
 def _between(fit: DeviceFit, name: str) -> str:
     if not math.isfinite(sum(fit.intervals[name])):
         return "open"
-    low, high = (spell(name, end, _count_digits(fit, name)) for end in fit.intervals[name])
+    low, high = (spell(name, end, fit.unit_system, _count_digits(fit, name)) for end in fit.intervals[name])
     return f"95 % between {low} and {high}"
 
 
@@ -224,7 +222,7 @@ def _count_digits(fit: DeviceFit, name: str) -> int:
 
 def _write_number(fit: DeviceFit, name: str) -> str:
     """Return a parameter of the scene as a line of YAML."""
-    return f"{name.rpartition('.')[2]}: {round_number(fit, name)!r} {unit_of(name)}".rstrip()
+    return f"{name.rpartition('.')[2]}: {round_number(fit, name)!r} {unit_of(name, fit.unit_system)}".rstrip()
 
 
 def _write_part(fit: DeviceFit, name: str) -> str:
@@ -239,15 +237,14 @@ def _write_limit(fit: DeviceFit) -> list[str]:
     lines = [
         "  # Valid for this loop only: measure again after changes to the device, the timing or the velocity estimate.",
         "  safe_limit:",
-        f"    stiffness: {float(limit.stiffness)!r} {unit_of('stiffness')}",
-        f"    virtual_damping: {float(limit.virtual_damping)!r} {unit_of('damping')}",
+        f"    stiffness: {float(limit.stiffness)!r} {unit_of('stiffness', fit.unit_system)}",
+        f"    virtual_damping: {float(limit.virtual_damping)!r} {unit_of('damping', fit.unit_system)}",
         f"    reason: {json.dumps(limit.reason, ensure_ascii=False)}",
     ]
     warnings = [f"      - {json.dumps(text, ensure_ascii=False)}" for text in limit.warnings]
     return lines + (["    warnings:", *warnings] if warnings else [])
 
 
-@in_own_units
 def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> list[str]:
     """Return a configuration for `zwidth run`, as lines of YAML: the fitted scene with its safe limit.
 
@@ -256,6 +253,7 @@ def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> l
         source: name of the log, or number of walls, for the first comment.
         period_given: whether the user specified the period; otherwise a fit to a log derives it from the times.
     """
+    units = fit.unit_system
     origin = "as given" if period_given or not fit.motions else "from the times of the log"
     lines = [
         f"# Fitted to {source}: {_between(fit, 'stiffness_max')} for K_max.",
@@ -276,9 +274,9 @@ def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> l
         lines.append(f"  {key}: {{{inside}}} # as given")
     hardware = list_hardware(fit)
     if "coulomb" in hardware:
-        lines.append(f"  coulomb: {hardware['coulomb']!r} {unit_of('friction')} # fitted, {_between(fit, 'friction')}")
+        lines.append(f"  coulomb: {hardware['coulomb']!r} {units['N']} # fitted, {_between(fit, 'friction')}")
     if "resolution" in hardware:
-        lines.append(f"  resolution: {hardware['resolution']!r} {unit_of('position')} # encoder step of the log")
+        lines.append(f"  resolution: {hardware['resolution']!r} {units['m']} # encoder step of the log")
     lines += _write_limit(fit)
     return [*lines, "studies:", "  - kind: recommend # the recommended wall for this device", "    name: recommended"]
 

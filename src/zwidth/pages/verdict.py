@@ -26,7 +26,7 @@ from zwidth.scenes.assessment import round_margin
 from zwidth.scenes.cautions import find_thin
 from zwidth.scenes.stabilization import stabilize
 from zwidth.words.formatting import plain, round_safely, spell_periods, spell_stiffness, tell_apart, with_unit
-from zwidth.words.rotation import in_own_units, is_rotary
+from zwidth.words.showing import find_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.assessment import Assessment, Intervals, Limit
@@ -52,7 +52,6 @@ HELD = {
 }
 
 
-@in_own_units
 def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
     """Return device and timing in words; ``silent`` names the options that were not given."""
     device, timing = scene.device, scene.timing
@@ -61,8 +60,9 @@ def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
         return f"{name} 0 (not given)" if name in silent else f"{name} 0"
 
     if isinstance(device, Device):
-        damping = with_unit(device.damping, "N s/m") if device.damping else name_default("damping")
-        body = f"{with_unit(device.mass, 'kg')}, {damping}"
+        units = scene.unit_system
+        damping = with_unit(device.damping, units["N s/m"]) if device.damping else name_default("damping")
+        body = f"{with_unit(device.mass, units['kg'])}, {damping}"
     else:
         body = device.spell()
     delay = spell_periods(float(scene.d)) if scene.d else ""
@@ -72,7 +72,6 @@ def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
     return f"{body}, at {with_unit(1.0 / timing.period, 'Hz')}, {delay}"
 
 
-@in_own_units
 def check_lines(
     scene: Scene,
     verdict: Assessment,
@@ -83,8 +82,8 @@ def check_lines(
     verbose: bool = False,
 ) -> list[str]:
     """Return the lines of `zwidth check` without notes; ``limits=None`` omits gains and remedies, which take longer."""
-    wall, word = scene.wall, word_of(verdict).upper()
-    K, B = spell_stiffness(wall.stiffness), with_unit(wall.virtual_damping, "N s/m")
+    wall, word, units = scene.wall, word_of(verdict).upper(), scene.unit_system
+    K, B = spell_stiffness(wall.stiffness, units), with_unit(wall.virtual_damping, units["N s/m"])
     wall_words, device_words = f"K = {K}, B = {B}", spell_device(scene, silent)
     if isinstance(scene.device, Device):
         wall_words += f" (alpha {plain(verdict.alpha)}, beta {plain(verdict.beta)})"
@@ -100,7 +99,7 @@ def check_lines(
         lines.append(line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
     lines.append("")
     if word == "UNSTABLE" and damper and dampings:
-        lines.append(line("remedy", f"a pure damper: {_spell_intervals('B', dampings, 'N s/m', 'K')}"))
+        lines.append(line("remedy", f"a pure damper: {_spell_intervals('B', dampings, units['N s/m'], 'K')}"))
     elif word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no stabilizing change of one parameter was found"]
         lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
@@ -122,7 +121,8 @@ def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | Non
 
 def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
     """Return the stable intervals of K at the wall's B and of B at its K."""
-    rooms = (("K", verdict.stable_stiffness, "N/m", "B"), ("B", dampings, "N s/m", "K"))
+    units = verdict.unit_system
+    rooms = (("K", verdict.stable_stiffness, units["N/m"], "B"), ("B", dampings, units["N s/m"], "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
 
 
@@ -144,7 +144,8 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
     if not isfinite(verdict.stiffness_max):
         none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
         return [line("K_max", none)]
-    top = f"{spell_stiffness(verdict.stiffness_max)} at B = {with_unit(verdict.virtual_damping_at_max, 'N s/m')}"
+    damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
+    top = f"{spell_stiffness(verdict.stiffness_max, scene.unit_system)} at B = {damping}"
     used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
     lines = [line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
     if verbose:
@@ -194,10 +195,10 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     dampings = scene.device.damping + abs(scene.wall.virtual_damping) + stiffness * scene.timing.period
     if abs(margin) <= ROUNDED * dampings:
         return "on the limit: no physical damping to spare"
+    size = with_unit(abs(round_safely(margin, "below")), scene.unit_system["N s/m"])
     if verdict.passive:
-        return f"yes: {with_unit(round_safely(margin, 'below'), 'N s/m')} of physical damping to spare"
-    word = "no" if scene.device.coupling is None else "not certified"
-    return f"{word}: {with_unit(round_safely(-margin, 'above'), 'N s/m')} more physical damping needed"
+        return f"yes: {size} of physical damping to spare"
+    return f"{'no' if scene.device.coupling is None else 'not certified'}: {size} more physical damping needed"
 
 
 def gain_lines(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
@@ -207,7 +208,7 @@ def gain_lines(heading: str, limits: Iterable[Limit], verbose: bool = False) -> 
         return []
     width, rows = max(len(limit.words) for limit in shown), []
     for limit in shown:
-        stiffness = with_unit(round_safely(limit.stiffness, "below"), "N/m")
+        stiffness = with_unit(round_safely(limit.stiffness, "below"), find_unit(limit, "N/m"))
         kept = f"; {limit.note}" if limit.note else ""
         rows.append(f"{limit.words:<{width}}  {stiffness}  (x {plain(limit.gain, 3)}{kept})")
     if len(heading) > LONG:
@@ -215,7 +216,6 @@ def gain_lines(heading: str, limits: Iterable[Limit], verbose: bool = False) -> 
     return ["", *(f"{heading if not k else '':<{len(heading)}}  {row}" for k, row in enumerate(rows))]
 
 
-@in_own_units
 def recommend_lines(
     found: Recommendation,
     *,
@@ -254,13 +254,12 @@ def recommend_lines(
     return lines + gain_lines(heading, found.steps, verbose)
 
 
-@in_own_units
 def spell_hands(found: Recommendation) -> str:
     """Return the stability of a wall in the reference grasps in words; "" if there are none."""
     labels = {name: stable for name, stable in found.grasps.items() if name != "released"}
     if not labels:
         return ""
-    radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if is_rotary() else ""
+    radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if found.unit_system.rotary else ""
     unstable = [name for name, stable in labels.items() if not stable]
     if not unstable:
         return f"stable in all {COUNTS[len(labels)]} reference grasps{radii}"

@@ -18,7 +18,6 @@ from zwidth.parts.paths import find_parts
 from zwidth.parts.wall import NoWall
 from zwidth.words.formatting import plain, short, to_json, with_unit
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.assessment import Assessment
@@ -80,7 +79,6 @@ def tell(result: Any, lines: Iterable[str], as_json: bool, indent: int = 24) -> 
         print_folded(lines, indent)
 
 
-@in_own_units
 def part_lines(scene: Scene) -> list[str]:
     """Return a line for each part of a scene apart from the rigid device, in order from the motor outwards."""
     lines = []
@@ -93,7 +91,7 @@ def part_lines(scene: Scene) -> list[str]:
         named = {path.removeprefix(f"{name}.").replace("_", " "): path for path in own if own[path]}
         words = []
         for key, path in named.items():
-            value, unit = own[path], unit_of(path)
+            value, unit = own[path], scene.unit_system[unit_of(path)]
             spelled = with_unit(value, unit) if unit else short(value) if isinstance(value, int) else plain(value)
             words.append(f"{key} {spelled}")
         if name == "coupling":
@@ -162,10 +160,12 @@ def _compare_with_limit(scene: Scene) -> list[str]:
         return []
     if limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
         return list(limit.warnings)
-    return [f"this wall exceeds the safe limit: the real device may be unstable. {limit.describe()}", *limit.warnings]
+    return [
+        f"this wall exceeds the safe limit: the real device may be unstable. {limit.describe(scene.unit_system)}",
+        *limit.warnings,
+    ]
 
 
-@in_own_units
 def spell_diagnosis(found: Diagnosis | None) -> list[tuple[str, str]]:
     """Return pairs of label and text: the result of a diagnosis and, if the device oscillates, its remedies."""
     if found is None:
@@ -205,11 +205,11 @@ class Slope(NamedTuple):
 
     def line(self) -> str:
         """Return the derivative as a printed line."""
-        name = "inertia" if self.name == "mass" and is_rotary() else self.name
+        name = "inertia" if self.name == "mass" and self.unit.endswith("kg m^2") else self.name
         return row(f"dK_max/d({name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
-        return {"value": self.value, "unit": own_unit(self.unit)}
+        return {"value": self.value, "unit": self.unit}
 
 
 def list_slopes(scene: Scene) -> list[Slope]:
@@ -217,18 +217,18 @@ def list_slopes(scene: Scene) -> list[Slope]:
     if isinstance(scene.device, MeasuredDevice):
         return []
     per, values = scene.sensitivities().per, scene.parameters()
-    found = []
+    found, system = [], scene.unit_system
     for path, slope in per.items():
-        unit, value = unit_of(path), float(slope)
+        unit, value = system[unit_of(path)], float(slope)
         # A delay is counted in periods, a damping one by one.
         size = scene.timing.period if path == "delay" else values[path]
-        by_one = not size or (unit == "N s/m" and not is_rotary())
+        by_one = not size or unit == "N s/m"
         # A power of ten near one percent, as people can picture it.
-        step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if is_rotary() else 1.0
+        step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
         effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
         if isfinite(value) and (change := value * step):
-            effect = f"{'buys' if change > 0 else 'costs'} {with_unit(abs(change), 'N/m', 3)}"
+            effect = f"{'buys' if change > 0 else 'costs'} {with_unit(abs(change), system['N/m'], 3)}"
         note = f" (the delay stays {scene.timing.kept_delay})" if path == "period" and scene.timing.delay else ""
         words = f"{with_unit(step, unit, 1)} more {effect}{note}"
-        found.append(Slope(path, value, f"N/m per {unit}" if unit else "N/m", words))
+        found.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
     return found

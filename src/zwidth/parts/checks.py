@@ -15,9 +15,10 @@ import numpy as np
 from zwidth.words.errors import InputError, UnusableValueError, check_choice
 from zwidth.words.formatting import describe, short
 from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
-from zwidth.words.rotation import is_rotary, use_kind
+from zwidth.words.showing import with_units
 from zwidth.words.types import Array
-from zwidth.words.units import TIME, find_dimension, read_quantity, tell_kind, to_float
+from zwidth.words.unit_system import LINEAR, SYSTEMS, UnitSystem
+from zwidth.words.units import DIMENSIONS, TIME, read_quantity, tell_kind, to_float
 from zwidth.words.xp import frozen, is_jax, is_traced, namespace
 
 
@@ -68,18 +69,21 @@ Result = TypeVar("Result")
 
 
 def accept_units(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Let the SI quantities that a function takes be texts with a unit: "70 g", and a delay "1.5 periods" as well."""
-    # Where one is in a unit of rotary devices, the answer is in theirs.
+    """Wrap a function to accept SI quantities as text with a unit, "70 g", and a delay as "1.5 periods".
+
+    The result is shown in rotary units if one of the units is rotary.
+    """
     names = tuple(inspect.signature(function).parameters)
 
     @wraps(function)
     def accepting(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         given = dict(zip(names, args, strict=False)) | kwargs
         if len(args) <= len(names) and any(map(_has_text, given.values())):
-            with use_kind(bool(find_kind(given))):
-                period = _in_si("period", given.get("period"), None)
-                return function(**{name: _in_si(name, value, period) for name, value in given.items()})  # pyright: ignore[reportCallIssue]
-        return function(*args, **kwargs)
+            system = SYSTEMS[bool(find_kind(given))]
+            period = _in_si("period", given.get("period"), None, system)
+            numbers = {name: _in_si(name, value, period, system) for name, value in given.items()}
+            return with_units(function(**numbers), system)  # pyright: ignore[reportCallIssue]
+        return with_units(function(*args, **kwargs), LINEAR)
 
     return accepting
 
@@ -105,12 +109,12 @@ def read_texts(field: str, value: Any, unit: str) -> Any:
     return value if unit in ("", "1") else _map_texts(lambda text: check_number(field, text, unit, ANY), value)
 
 
-def _in_si(name: str, value: Any, period: Any) -> Any:
-    """Texts as numbers in the SI base unit of an argument; anything else as it is."""
+def _in_si(name: str, value: Any, period: Any, system: UnitSystem) -> Any:
+    """Return an argument with all texts converted to numbers in its SI unit."""
     if name not in PARAMETERS or PARAMETERS[name].unit == "1":
         return value
     if name != "delay":
-        return read_texts(name, value, PARAMETERS[name].unit)
+        return read_texts(name, value, system[PARAMETERS[name].unit])
 
     def read(text: str) -> float:
         try:
@@ -131,24 +135,28 @@ class Part:
 
     def __post_init__(self) -> None:
         """Put every number in its SI unit, where `words.quantities` allows it; else raise `InputError`."""
-        # One that is None by default may be left out. A part that was told in units of one kind of device, linear or
-        # rotary, has that as ``rotary``.
+        # Values that are None by default may be omitted. A part with linear or rotary units stores the kind in
+        # ``rotary``.
         own = {f"{self._owner}.{item.name}".lstrip("."): item for item in fields(self)}  # pyright: ignore[reportArgumentType]
         told = find_kind({path: getattr(self, item.name) for path, item in own.items()})
         if told is not None:
             object.__setattr__(self, "rotary", told)
-        with use_kind(is_rotary() if told is None else told):
-            for path, item in own.items():
-                value = getattr(self, item.name)
-                if path in CHOICES:
-                    check_choice(path, value, CHOICES[path].names)
-                elif path in FIELDS and not (value is None and item.default is None):
-                    known, allowed = FIELDS[path], find_range(item, path)
-                    if known.whole:
-                        value = check_whole(path, value, int(allowed.low), int(allowed.high))
-                    else:
-                        value = check_number(path, value, known.unit, allowed)
-                    object.__setattr__(self, item.name, value)
+        for path, item in own.items():
+            value = getattr(self, item.name)
+            if path in CHOICES:
+                check_choice(path, value, CHOICES[path].names)
+            elif path in FIELDS and not (value is None and item.default is None):
+                known, allowed = FIELDS[path], find_range(item, path)
+                if known.whole:
+                    value = check_whole(path, value, int(allowed.low), int(allowed.high))
+                else:
+                    value = check_number(path, value, self.unit_system[known.unit], allowed)
+                object.__setattr__(self, item.name, value)
+
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The units of its device; linear unless a unit or an argument ``rotary`` defines a rotary device."""
+        return SYSTEMS[bool(getattr(self, "rotary", False))]
 
     def __repr__(self) -> str:
         """A call, without what is as it is where left out."""
@@ -163,7 +171,7 @@ class Part:
 
 
 def _list_told(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """What may tell a kind of device: every value by its name, each text of a list."""
+    """Yield each value with its name, and each text of a list separately."""
     for name, value in given.items():
         if isinstance(value, list | tuple) and _has_text(value):
             for each in value:
@@ -172,15 +180,20 @@ def _list_told(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
+def _kind_of(value: Any) -> bool | None:
+    """Return True for a quantity or part of a rotary device, False for that of a linear device, None otherwise."""
+    return tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
+
+
 def find_kind(given: dict[str, Any]) -> bool | None:
-    """Whether quantities and parts, by name, are those of a rotary device; None where none says.
+    """Return True if quantities and parts, by name, belong to a rotary device, False for a linear one, None otherwise.
 
     Raises:
         InputError: some are of a rotary device, others of a linear one.
     """
     told: dict[bool, str] = {}
     for name, value in _list_told(given):
-        kind = tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
+        kind = _kind_of(value)
         if kind is None:
             continue
         if told and kind not in told:
@@ -193,9 +206,9 @@ def find_kind(given: dict[str, Any]) -> bool | None:
 
 
 def check_kind(rotary: bool, given: dict[str, Any]) -> None:
-    """Refuse quantities and parts of a device, by name, that are told in units of the other kind of device."""
+    """Raise `InputError` if a quantity or part, by name, has units of the other kind of device."""
     for name, value in given.items():
-        kind = tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
+        kind = _kind_of(value)
         if kind is not None and bool(kind) != rotary:
             raise InputError(
                 f"{name}: got {value!r}, in units of a {_KINDS[kind]} device, for a {_KINDS[rotary]} one; write it in "
@@ -219,7 +232,7 @@ def check_number(field: str, value: Any, unit: str = "", allowed: Range | None =
     if allowed is None:
         allowed = PARAMETERS[field].sign if field in PARAMETERS else NOT_NEGATIVE
     counts = field == "resolution"
-    return _read(field, value, lambda known: read_quantity(known, find_dimension(unit), allowed, counts=counts)[0])
+    return _read(field, value, lambda known: read_quantity(known, DIMENSIONS[unit], allowed, counts=counts)[0])
 
 
 def check_limit(name: str, value: Any, unit: str) -> float:

@@ -10,7 +10,6 @@ from zwidth.parts.checks import Part, check_kind, find_kind
 from zwidth.parts.mode import Mode
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import with_unit
-from zwidth.words.rotation import use_kind
 
 
 @dataclass(frozen=True, repr=False)
@@ -91,12 +90,10 @@ class Device(Part):
             if part is not None and not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a zwidth.{kind.__name__} is needed, or None")
         check_kind(rotary, own)
-        with use_kind(rotary):
-            super().__post_init__()
         object.__setattr__(self, "rotary", rotary)
+        super().__post_init__()
 
     def spell(self) -> str:
-        """Mass and damping in words."""
-        with use_kind(bool(self.rotary)):
-            mass, damping = with_unit(self.mass, "kg"), with_unit(self.damping, "N s/m")
+        """Return mass and damping with symbols and units."""
+        mass, damping = with_unit(self.mass, self.unit_system["kg"]), with_unit(self.damping, self.unit_system["N s/m"])
         return f"{'J' if self.rotary else 'm'} = {mass}, b = {damping}"

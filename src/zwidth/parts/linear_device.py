@@ -21,6 +21,7 @@ from zwidth.parts.exact_polynomials import (
 )
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import short
+from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
 _FORMS = (
     "(A, B, C), (numerator, denominator), (zeros, poles, gain), or a model of scipy.signal or python-control with one "
@@ -43,8 +44,13 @@ class WholeDevice:
     actuator: ClassVar[None] = None
     modes: ClassVar[tuple[()]] = ()
     rotary: bool = False
-    # What damping there is stands in the response.
+    # The response contains the damping.
     damping: ClassVar[float] = 0.0
+
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The units of the device."""
+        return SYSTEMS[self.rotary]
 
 
 @dataclass(frozen=True, repr=False)

@@ -37,15 +37,9 @@ _NAMES = {
     "deviation": ("deviation", "radius", "uncertainty"),
 }
 _TURN = 2.0 * math.pi
-_FREQUENCY = Dimension(RATE.powers, RATE.example, {"rad/s": 1.0 / _TURN, "1/s": 1.0 / _TURN, "krad/s": 1e3 / _TURN})
-_COMPLIANCE = Dimension(
-    {f"{length}/{force}": p - q for length, p in LENGTH.powers.items() for force, q in FORCE.powers.items()}, "1 mm/N"
-)
-_ANGULAR_COMPLIANCE = Dimension(
-    {"rad/(N m)": 0, "rad/(mN m)": 3, "mrad/(N m)": -3, "mrad/(mN m)": 0},
-    "1 rad/(N m)",
-    {"deg/(N m)": math.pi / 180, "deg/(mN m)": 1e3 * math.pi / 180},
-)
+_FREQUENCY = Dimension(RATE.names, RATE.example, {"rad/s": 1.0 / _TURN, "1/s": 1.0 / _TURN, "krad/s": 1e3 / _TURN})
+_COMPLIANCE = Dimension(", ".join(f"{length}/{force}" for length in LENGTH.units for force in FORCE.units), "1 mm/N")
+_ANGULAR_COMPLIANCE = Dimension("rad/(N m), rad/(mN m), mrad/(N m), mrad/(mN m), deg/(N m), deg/(mN m)", "1 rad/(N m)")
 _DECIBELS = re.compile(r"dB(?:\s*(?:\(?re\.?\s*)?(?:1\s*)?(m\s*/\s*N|mm\s*/\s*N|um\s*/\s*N|µm\s*/\s*N)\)?)?")
 
 

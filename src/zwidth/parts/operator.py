@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 from zwidth.parts.checks import Part, check_number
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import POSITIVE
-from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.xp import is_jax
 
 # That of the reference below.
@@ -55,9 +54,8 @@ class Operator(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.rigid:
-            # Check the mass after its conversion to SI, with rotary units if any parameter has a rotary unit.
-            with use_kind(getattr(self, "rotary", is_rotary())):
-                check_number("operator.mass", self.mass, allowed=POSITIVE)
+            # Check the mass after its conversion to SI.
+            check_number("operator.mass", self.mass, self.unit_system["kg"], POSITIVE)
         # Which number JAX holds, nobody can ask.
         if self.rigid and (is_jax(self.coupling_damping) or self.coupling_damping):
             raise InputError(

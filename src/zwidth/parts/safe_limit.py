@@ -9,6 +9,7 @@ from typing import Any
 from zwidth.parts.checks import Part
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import name_wall
+from zwidth.words.unit_system import UnitSystem
 
 ROUNDING = 5e-4  # relative tolerance, so that the limit allows a wall that is rounded to four digits
 
@@ -71,7 +72,7 @@ class SafeLimit(Part):
         """Return the limit with an additional warning."""
         return self if text in self.warnings else replace(self, warnings=(*self.warnings, text))
 
-    def describe(self) -> str:
+    def describe(self, system: UnitSystem) -> str:
         """Return a one-line description of the limit and its reason."""
-        wall = "no wall is supported" if self.forbids_all else name_wall(self.stiffness, self.virtual_damping)
+        wall = "no wall is supported" if self.forbids_all else name_wall(self.stiffness, self.virtual_damping, system)
         return f"{wall}: {self.reason}" if self.reason else wall

@@ -7,7 +7,7 @@ from typing import Any
 
 from zwidth.parts.checks import Part, read_texts
 from zwidth.words.errors import InputError
-from zwidth.words.rotation import is_rotary, own_unit, use_kind
+from zwidth.words.unit_system import UnitSystem
 from zwidth.words.units import to_float
 
 
@@ -32,21 +32,18 @@ class NoWall(VirtualWall):
     virtual_damping: Any = field(default=0.0, init=False, repr=False)
 
 
-def resolve_wall(
-    wall: VirtualWall, stiffness: Any, virtual_damping: Any, rotary: bool | None = None
-) -> tuple[Any, Any]:
-    """Which K and B a question means of a scene with this wall, the one rule for all of them."""
-    # Neither given means the scene's own wall. Both given are what they say. K alone is a spring, B = 0, of a scene
-    # without a wall; where there is one it could as well mean that wall's B, and is refused. Texts have a unit, of a
-    # rotary device or not, or of the kind of device in question.
-    # Whole numbers beyond float64 are infinite.
+def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any, system: UnitSystem) -> tuple[Any, Any]:
+    """Return K and B in SI units: those given as arguments, or those of the scene's wall if both are None.
+
+    K without B means B = 0 if the scene has no wall. If it has one, K without B is ambiguous and an error.
+    """
+    # Integers that overflow float64 become infinite.
     both = stiffness, virtual_damping
     stiffness, virtual_damping = (to_float(v) if isinstance(v, int) and v.bit_length() > 1023 else v for v in both)
     # Most questions are of numbers, in which there is no text to look for.
     if not (isinstance(stiffness, int | float) and isinstance(virtual_damping, int | float | None)):
-        with use_kind(is_rotary() if rotary is None else rotary):
-            stiffness = read_texts("stiffness", stiffness, "N/m")
-            virtual_damping = read_texts("virtual_damping", virtual_damping, "N s/m")
+        stiffness = read_texts("stiffness", stiffness, system["N/m"])
+        virtual_damping = read_texts("virtual_damping", virtual_damping, system["N s/m"])
     chosen = not isinstance(wall, NoWall)
     if stiffness is None and virtual_damping is None:
         if not chosen:
@@ -64,7 +61,7 @@ def resolve_wall(
         if chosen:
             raise InputError(
                 f"virtual_damping: none is given beside stiffness, and the scene's own wall has {wall.virtual_damping} "
-                f"{own_unit('N s/m')}; say which, 0 for a spring alone, or replace the wall: "
+                f"{system['N s/m']}; say which, 0 for a spring alone, or replace the wall: "
                 "scene.replace(stiffness=...)"
             )
         return stiffness, 0.0

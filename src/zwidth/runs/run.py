@@ -24,7 +24,6 @@ from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.words.errors import InputError
 from zwidth.words.files import hidden_beside
-from zwidth.words.rotation import use_kind
 from zwidth.words.status import note_failures
 
 AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
@@ -257,9 +256,9 @@ class _Run:
             stage.mkdir()
             try:
                 look = self.config.figure or FigureLook()
-                with use_kind(self.config.rotary), style_sheet(size=look.size, dpi=look.dpi):
+                with style_sheet(size=look.size, dpi=look.dpi, system=study.unit_system):
                     outcome = study.compute(self.config.scene, alone)
-                    outcome.write(stage, study.name, look.formats)
+                    outcome.write(stage, study.name, study.unit_system, look.formats)
             except Exception as caught:
                 error = caught
             try:
@@ -297,8 +296,7 @@ class _Run:
             # Named before it is made: what a killed run leaves is its own.
             self.record.note(self._spell_sweep(plan.study, "open"))
         try:
-            with use_kind(self.config.rotary):
-                sweeps = compute_sweeps(plans, self.record.folder, about, progress=follow, **options)
+            sweeps = compute_sweeps(plans, self.record.folder, about, progress=follow, **options)
         except KeyboardInterrupt:
             # Before the first chunk began.
             self.interrupted = True

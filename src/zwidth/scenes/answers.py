@@ -45,7 +45,7 @@ class SceneAnswers(SceneParts):
 
     def normalize_walls(self, stiffness: Walls = None, virtual_damping: Walls = None) -> tuple[np.ndarray, np.ndarray]:
         """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
-        units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping, self.device.rotary)
+        units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping, self.unit_system)
         if are_numbers(*both):
             both = np.float64(both[0]), np.float64(both[1])
         elif is_traced(*both):
@@ -180,7 +180,7 @@ class SceneAnswers(SceneParts):
             ends are not stable themselves.
         """
         given = self.wall.virtual_damping if virtual_damping is None else virtual_damping
-        damping = read_texts("virtual_damping", given, "N s/m")
+        damping = read_texts("virtual_damping", given, self.unit_system["N s/m"])
         beta = as_float64("virtual_damping", damping) / self.units.virtual_damping
         both = self.loop.row(beta.reshape(-1)) * self.units.stiffness
         return both.reshape(*beta.shape, *both.shape[1:])
@@ -194,7 +194,7 @@ class SceneAnswers(SceneParts):
         Returns:
             Array (n, 2) in N s/m. The ends are not stable themselves.
         """
-        stiffness = resolve_wall(self.wall, None, None)[0] if stiffness is None else stiffness
+        stiffness = resolve_wall(self.wall, None, None, self.unit_system)[0] if stiffness is None else stiffness
         alpha, _ = one_wall(*self.normalize_walls(stiffness, 0.0))
         return self.loop.column(alpha) * self.units.virtual_damping
 
@@ -227,7 +227,9 @@ class SceneAnswers(SceneParts):
         """
         check_choice("method", method, STABILITY_METHODS)
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        walls = (np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping))
+        walls = (
+            np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping, self.unit_system)
+        )
         K, B = np.broadcast_arrays(*walls)
         return self.loop.decide(alpha, beta, method, (K, B))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -18,9 +18,9 @@ from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
 from zwidth.words.results import Margins
-from zwidth.words.rotation import in_own_units
-from zwidth.words.showing import ResultList, shown
+from zwidth.words.showing import ResultList, find_unit, shown, with_units
 from zwidth.words.status import RidgeKind, Status
+from zwidth.words.unit_system import LINEAR, UnitSystem
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
 
@@ -78,10 +78,14 @@ class Assessment:
     modulus_margin: float  # the least distance of the open loop from -1
     gain_crossover: float  # where the first two are taken, in Hz
     phase_crossover: float
+    unit_system: UnitSystem = LINEAR
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields as plain JSON values, None in place of NaN and infinities."""
-        return to_json(asdict(self))
+        """Return the fields except the unit system as JSON values, with None in place of NaN and infinity."""
+        return to_json({name: getattr(self, name) for name in _NUMBERS})
+
+
+_NUMBERS = [field.name for field in fields(Assessment) if field.name != "unit_system"]
 
 
 @of_scene
@@ -138,6 +142,7 @@ def assess(scene: SceneOptima) -> Assessment:
         time_constant=math.inf if slowest.rate == 0 else period / slowest.rate,
         frequency=slowest.angle / (2.0 * math.pi * period),
         **{name: float(getattr(stands, name)) for name in _MARGINS},
+        unit_system=scene.unit_system,
     )
 
 
@@ -186,9 +191,8 @@ def assess_many(scenes: Iterable[SceneOptima] | Mapping[str, SceneOptima]) -> li
     """
     named: Any = scenes.items() if isinstance(scenes, Mapping) else enumerate(scenes)
     records = [_record(name, scene) for name, scene in named]
-    answers = [field.name for field in fields(Assessment)]
-    given = [name for record in records for name in record if name not in answers]
-    names = list(dict.fromkeys([*given, *answers]))
+    given = [name for record in records for name in record if name not in _NUMBERS]
+    names = list(dict.fromkeys([*given, *_NUMBERS]))
     return [{name: record.get(name) for name in names} for record in records]
 
 
@@ -229,7 +233,7 @@ class Limit(NamedTuple):
 
     def spell(self) -> str:
         """Describe the improvement and the increase of the stiffness that it brings."""
-        K = with_unit(round_safely(self.stiffness, "below"), "N/m")
+        K = with_unit(round_safely(self.stiffness, "below"), find_unit(self, "N/m"))
         kept = f"; {self.note}" if self.note else ""
         return f"{self.words}: {K} (x {plain(self.gain, 3)}{kept})"
 
@@ -280,19 +284,19 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
     for name, words, improved, note in list_improvements(scene):
         stiffness = measure(improved)
         found.append(Limit(name, words, stiffness, stiffness / now, note))
-    return ResultList(sorted(found, key=lambda limit: (not limit.gain >= 0, -limit.gain)))
+    found.sort(key=lambda limit: (not limit.gain >= 0, -limit.gain))
+    return with_units(ResultList(found), scene.unit_system)
 
 
-@in_own_units
 def describe_islands(scene: SceneOptima) -> list[str]:
     """Return one line for each island, and one line if the device is unstable without a wall."""
-    lines = []
+    lines, system = [], scene.unit_system
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:
-        softest = with_unit(round_safely(least * scene.units.stiffness, "above"), "N/m")
+        softest = with_unit(round_safely(least * scene.units.stiffness, "above"), system["N/m"])
         lines.append(f"the device is unstable without a wall: no wall softer than K = {softest} is stable")
     for island in scene.islands():
-        units = {"K": (island.stiffness, "N/m"), "B": (island.virtual_damping, "N s/m")}
+        units = {"K": (island.stiffness, system["N/m"]), "B": (island.virtual_damping, system["N s/m"])}
         ends = (f"{name} from {' to '.join(tell_apart(*ends, u))}" for name, (ends, u) in units.items())
         lines.append(
             f"an island of stable walls, {', '.join(ends)}: no stable softer walls lead to it, K_max leaves it out"

@@ -25,9 +25,9 @@ from zwidth.scenes.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import WALL
-from zwidth.words.rotation import in_own_units
-from zwidth.words.showing import shown
+from zwidth.words.showing import shown, with_units
 from zwidth.words.types import Array, ArrayLike
+from zwidth.words.unit_system import UnitSystem
 from zwidth.words.xp import is_traced
 
 Owner = TypeVar("Owner", bound="SceneParts")
@@ -72,7 +72,7 @@ class SceneParts(Part):
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {example}")
         named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit")}
-        check_kind(bool(self.device.rotary), named)
+        check_kind(self.unit_system.rotary, named)
         if self.operator is not None and not isinstance(self.device, Device):
             raise InputError(
                 "operator: a hand holds a body, and of this device no body is known; make the hand a part of it"
@@ -177,13 +177,17 @@ class SceneParts(Part):
             mass=self.mass, period=self.timing.period, alpha=alpha, beta=beta, delta=self.delta, d=self.d
         )
 
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The units of the device, linear or rotary."""
+        return self.device.unit_system
+
     @cached_property
-    @in_own_units
     def units(self) -> WallSI:
         """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
         # Convert to Python floats, because concrete JAX numbers may have single precision.
         mass, period = (value if is_traced(value) else float(value) for value in (self.mass, self.timing.period))
-        return WallSI(mass / period / period, mass / period)
+        return with_units(WallSI(mass / period / period, mass / period), self.unit_system)
 
     def parameters(self) -> dict[str, Any]:
         """Every number of every part by its dotted path.
@@ -220,11 +224,10 @@ class SceneParts(Part):
                 "again at others"
             )
         made = replace_parameters(self, changes)
-        if made.device.rotary != self.device.rotary and not {"device", "rotary"} & changes.keys():
-            kind = "rotary" if made.device.rotary else "linear"
+        if made.unit_system != self.unit_system and not {"device", "rotary"} & changes.keys():
             raise InputError(
-                f"{', '.join(changes)}: the device would become a {kind} one, and other numbers of the scene mean "
-                "another unit; make a new scene, of a new zwidth.Device"
+                f"{', '.join(changes)}: these changes make the device {made.unit_system.value}, but its other "
+                "parameters have other units; make a new zwidth.Scene"
             )
         changed = sorted(changes.keys() - {"wall", "safe_limit", *WALL})
         if self.safe_limit is None or not changed or "safe_limit" in changes:
@@ -240,33 +243,36 @@ class SceneParts(Part):
 def of_scene(
     function: Callable[Concatenate[Owner, Parameters], Result],
 ) -> Callable[Concatenate[Owner, Parameters], Result]:
-    """Let a function of a scene read and write the units of its device; anything but a scene is refused."""
-    answer = in_own_units(function)
+    """Wrap a function of a scene: check the scene, and show the result in the units of its device."""
 
     @wraps(function)
     def checked(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         check_scene(scene, function.__name__)
-        return answer(scene, *args, **kwargs)
+        return with_units(function(scene, *args, **kwargs), scene.unit_system)
 
     return checked
 
 
-def require_numbers(kind: type[SceneParts], *, but: Collection[str]) -> None:
-    """Make the public methods of a scene class, except those in ``but``, raise `InputError` for traced values."""
+def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Collection[str]) -> None:
+    """Wrap the public methods of a scene class, except those in ``but``.
+
+    Their results are shown in the units of the device. Methods that are not ``traceable`` raise `InputError` for traced
+    values.
+    """
     for name in dir(kind):
         method = inspect.getattr_static(kind, name)
         if inspect.isfunction(method) and not name.startswith("_") and name not in but:
-            setattr(kind, name, _of_numbers(method))
+            setattr(kind, name, _wrap_method(method, name in traceable))
 
 
-def _of_numbers(method: Callable[Concatenate[Owner, Parameters], Result]) -> Callable[..., Result]:
+def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], traceable: bool) -> Callable[..., Result]:
     @wraps(method)
-    def checked(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if scene.traced_path is not None or is_traced(*args, *kwargs.values()):
+    def wrapped(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        if not traceable and (scene.traced_path is not None or is_traced(*args, *kwargs.values())):
             refuse_traced(method.__name__, scene, inspect.signature(method).bind(scene, *args, **kwargs).arguments)
-        return method(scene, *args, **kwargs)
+        return with_units(method(scene, *args, **kwargs), scene.unit_system)
 
-    return checked
+    return wrapped
 
 
 def refuse_traced(question: str, scene: SceneParts, arguments: Mapping[str, Any]) -> None:

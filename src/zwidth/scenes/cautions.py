@@ -11,8 +11,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
 from zwidth.scenes.assessment import Assessment, assess, round_margin
 from zwidth.scenes.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN, Wanted, choose_wall
-from zwidth.words.formatting import name_wall, plain, round_safely, with_unit
-from zwidth.words.rotation import in_own_units
+from zwidth.words.formatting import name_wall, plain, with_unit
 from zwidth.words.status import Status
 
 # Limits of acceptable walls; a wall that violates one of them gets a caution.
@@ -35,7 +34,6 @@ def find_thin(verdict: Assessment, period: float) -> list[str]:
     return [words for words, short in thin.items() if short]
 
 
-@in_own_units
 def list_cautions(recommendation: Any) -> tuple[str, ...]:
     """Return the cautions about the wall of a `Recommendation`."""
     scene, verdict, wanted, cautions = recommendation.scene, recommendation.verdict, recommendation.wanted, []
@@ -85,7 +83,7 @@ def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[
             ratio = wall.stiffness / recommendation.stiffness
             cost = f"costs {max(100.0 * (1.0 - ratio), 0.1):.2g} % of the stiffness"
             cost = cost if ratio <= 1.0 else f"{plain(ratio, 3)} times the stiffness"
-            return f"ask for {words}: {name_wall(round_safely(wall.stiffness, 'below'), wall.damping)} ({cost})"
+            return f"ask for {words}: {name_wall(wall.stiffness, wall.damping, scene.unit_system)} ({cost})"
     return otherwise
 
 
@@ -96,7 +94,7 @@ def judge_grasps(scene: Any) -> dict[str, bool]:
     """
     if not isinstance(scene.device, Device):
         return {}
-    held = list_grasps(bool(scene.device.rotary))
+    held = list_grasps(scene.unit_system.rotary)
     hands = [*held, *([("released", None)] if scene.operator is not None else [])]
     labels: dict[str, bool] = {}
     for name, grasp in hands:

@@ -17,8 +17,8 @@ from zwidth.scenes.stiffest import SceneOptima
 from zwidth.scenes.trials import LONG_DELAY, Experiment, Hardware, SustainedMotion, list_starts
 from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import plain, to_json, with_unit
-from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
+from zwidth.words.unit_system import LINEAR, UnitSystem
 
 Cause: TypeAlias = Literal["none", "instability", "quantization", "saturation", "undecided"]
 
@@ -57,6 +57,7 @@ class Diagnosis:
         outcome: code of `zwidth.MotionKind` observed for the largest sustained motion.
         remedies: changes of one parameter, each of which stops the oscillation. For limit cycles the list is empty if
             the delay exceeds 50 periods, because the search would take too long.
+        unit_system: units of the device.
     """
 
     cause: Cause
@@ -69,6 +70,7 @@ class Diagnosis:
     frequency: float
     outcome: MotionKind
     remedies: tuple[Remedy, ...] = ()
+    unit_system: UnitSystem = LINEAR
 
     @property
     def word(self) -> str:
@@ -77,10 +79,10 @@ class Diagnosis:
             return "LIMIT CYCLE" if math.isfinite(self.amplitude) else "UNBOUNDED"
         return {"none": "AT REST", "instability": "UNSTABLE"}.get(self.cause, "UNDECIDED")
 
-    @in_own_units
     def explain(self) -> str:
         """Return the cause in one sentence."""
-        size = with_unit(self.amplitude, "m", 2)
+        units = self.unit_system
+        size = with_unit(self.amplitude, units["m"], 2)
         swing = f"{size} at {with_unit(self.frequency, 'Hz', 2)}" if math.isfinite(self.amplitude) else "without bound"
         margin = f", phase margin {plain(self.phase_margin, 3)} deg" if math.isfinite(self.phase_margin) else ""
         linear = (
@@ -93,16 +95,20 @@ class Diagnosis:
             stuck = "; friction holds small displacements" if self.amplitude == 0 else ""
             return f"the linear loop is unstable at {with_unit(self.frequency, 'Hz', 3)}{limited}{stuck}"
         if self.cause == "quantization":
-            return f"{swing}, caused by the encoder's steps of {with_unit(self.hardware.resolution, 'm', 3)}; {linear}"
+            step = with_unit(self.hardware.resolution, units["m"], 3)
+            return f"{swing}, caused by the encoder's steps of {step}; {linear}"
         if self.cause == "saturation":
-            limits = [with_unit(self.hardware.max_force, "N", 3)] if math.isfinite(self.hardware.max_force) else []
-            limits += [with_unit(self.hardware.max_rate, "N/s", 3)] if math.isfinite(self.hardware.max_rate) else []
+            limits = (
+                [with_unit(self.hardware.max_force, units["N"], 3)] if math.isfinite(self.hardware.max_force) else []
+            )
+            limits += (
+                [with_unit(self.hardware.max_rate, units["N/s"], 3)] if math.isfinite(self.hardware.max_rate) else []
+            )
             return f"{swing}, caused by the motor's limit of {' and '.join(limits)}; {linear}"
         if self.cause == "undecided":
             return f"the linear loop decays too slowly to simulate until rest; {linear}"
         return f"no sustained oscillation; {linear}"
 
-    @in_own_units
     def advise(self) -> str:
         """Return the remedies in one sentence; "" if none is needed."""
         if self.cause in ("none", "undecided"):
@@ -117,7 +123,7 @@ class Diagnosis:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as JSON values, with None in place of NaN and infinity."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "unit_system"}
         values |= {"hardware": self.hardware._asdict(), "outcome": self.outcome.name}
         return to_json(values | {"remedies": [remedy._asdict() for remedy in self.remedies]})
 
@@ -172,14 +178,15 @@ def diagnose(
         >>> diagnosis.cause
         'quantization'
     """
-    K, B = (float(value) for value in resolve_wall(scene.wall, stiffness, virtual_damping, scene.device.rotary))
-    sliding = check_number("coulomb", coulomb, "N")
+    units = scene.unit_system
+    K, B = (float(value) for value in resolve_wall(scene.wall, stiffness, virtual_damping, units))
+    sliding = check_number("coulomb", coulomb, units["N"])
     hardware = Hardware(
-        check_number("resolution", resolution, "m"),
+        check_number("resolution", resolution, units["m"]),
         sliding,
-        sliding if static is None else check_number("static", static, "N"),
-        check_limit("max_force", max_force, "N"),
-        check_limit("max_rate", max_rate, "N/s"),
+        sliding if static is None else check_number("static", static, units["N"]),
+        check_limit("max_force", max_force, units["N"]),
+        check_limit("max_rate", max_rate, units["N/s"]),
     )
     scene = scene.replace(wall=VirtualWall(K, B))
     stable, dominant, margins = bool(scene.is_stable()), _find_dominant(scene), scene.margins()
@@ -197,7 +204,7 @@ def diagnose(
         changes = search_remedies(experiment, cause)
     return Diagnosis(
         cause, K, B, hardware, stable, float(margins.phase_margin), float(worst.amplitude[0]), frequency,
-        MotionKind(int(worst.outcome[0])), tuple(changes),
+        MotionKind(int(worst.outcome[0])), tuple(changes), units,
     )  # fmt: skip
 
 

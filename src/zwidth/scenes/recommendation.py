@@ -11,7 +11,7 @@ import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
-from zwidth.parts.checks import check_limit, check_number
+from zwidth.parts.checks import check_limit
 from zwidth.parts.device import Device
 from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.wall import NoWall, VirtualWall
@@ -32,9 +32,9 @@ from zwidth.scenes.wall_search import COARSE, Grasps, Wanted, choose_wall, list_
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import WALL
-from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
+from zwidth.words.unit_system import UnitSystem
 
 _UNITS = {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m"}
 _UNITS |= {"mass": "kg", "time": "s", "frequency": "Hz"}
@@ -68,6 +68,11 @@ class Recommendation:
     status: Status
     reason: str = ""
     notes: tuple[str, ...] = ()
+
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The units of the device."""
+        return self.scene.unit_system
 
     @property
     def stiffness(self) -> float:
@@ -166,7 +171,8 @@ class Recommendation:
         """
         if self.status != Status.OK:
             raise InputError(f"code: there is no wall: {self.reason}")
-        return write_wall(self.scene, language, self.cautions, check_limit("max_force", max_force, "N"))
+        limit = check_limit("max_force", max_force, self.unit_system["N"])
+        return write_wall(self.scene, language, self.cautions, limit)
 
     def lines(self) -> tuple[str, ...]:
         """Return lines with the wall, its margins and its cautions, or the reason why no wall is recommended."""
@@ -175,7 +181,9 @@ class Recommendation:
             return (f"no wall: {self.reason}",)
         # The range of the printed K, which is rounded; a negative lower end is sensitive to this.
         column = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
-        lower, upper = tell_apart(*nearest_interval(column, self.virtual_damping), "N s/m", self.read[2])
+        lower, upper = tell_apart(
+            *nearest_interval(column, self.virtual_damping), self.unit_system["N s/m"], self.read[2]
+        )
         room = f"B from {lower} to {upper} is stable at this K"
         margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
         cautions = (f"caution: {caution}" for caution in self.cautions)
@@ -183,13 +191,13 @@ class Recommendation:
 
     def spell_wall(self) -> str:
         """Return the recommended wall in words."""
-        K, B, digits = self.read
-        return f"K = {spell_stiffness(K, digits)}, B = {with_unit(B, 'N s/m', digits)}"
+        (K, B, digits), units = self.read, self.unit_system
+        return f"K = {spell_stiffness(K, units, digits)}, B = {with_unit(B, units['N s/m'], digits)}"
 
     def spell_limit(self) -> str:
         """Return, in words, the stiffness as a share of K_max and the active requirement."""
         largest = float(self.stiffest.stiffness)
-        share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {spell_stiffness(largest)}"
+        share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {spell_stiffness(largest, self.unit_system)}"
         return share if self.limited_by == "stiffness_fraction" else f"{share}; {self.spell_requirement()}"
 
     def spell_requirement(self) -> str:
@@ -228,7 +236,7 @@ class Recommendation:
         constant = math.nan if verdict is None or not verdict.stable else verdict.time_constant
         alpha, beta = scene.normalize_walls(top.stiffness, top.virtual_damping)
         result = {
-            "units": {name: own_unit(unit) for name, unit in _UNITS.items()},
+            "units": {name: scene.unit_system[unit] for name, unit in _UNITS.items()},
             "device": {**device, "velocity": type(scene.velocity).__name__, "delta": float(scene.delta), "d": scene.d},
             "maximum": {
                 "stiffness": float(top.stiffness),
@@ -264,12 +272,12 @@ class Recommendation:
         return to_json(result)
 
 
-def _describe_limit(limit: SafeLimit | None, ignored: bool) -> list[str]:
+def _describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -> list[str]:
     """Return the notes on a safe limit: one on the limit with its reason, and one for each warning."""
     if limit is None or (limit.forbids_all and not ignored):
         # No note if the limit forbids all walls, because the recommendation's reason already states it.
         return []
-    return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe()}", *limit.warnings]
+    return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]
 
 
 class SceneAdvice(SceneOptima):
@@ -332,9 +340,7 @@ class SceneAdvice(SceneOptima):
         top, notes = bare.max_stiffness(), describe_islands(bare)
         choice = choose_wall(bare, wanted, top)
         notes += [choice.note] if choice.note else []
-        notes += _describe_limit(self.safe_limit, beyond_safe)
+        notes += _describe_limit(self.safe_limit, beyond_safe, self.unit_system)
         if choice.status == Status.OK:
-            stiffness = check_number("stiffness", choice.stiffness)
-            wall = VirtualWall(stiffness, check_number("virtual_damping", choice.damping))
-            bare = bare.replace(wall=wall)
+            bare = bare.replace(wall=VirtualWall(choice.stiffness, choice.damping))
         return Recommendation(bare, top, wanted, choice.limit, choice.status, choice.reason, tuple(notes))

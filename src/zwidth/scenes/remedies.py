@@ -14,7 +14,8 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.scenes.stabilization import Remedy, count_steps
 from zwidth.scenes.trials import Experiment
 from zwidth.words.formatting import round_safely
-from zwidth.words.rotation import is_rotary
+from zwidth.words.showing import with_units
+from zwidth.words.unit_system import UnitSystem
 
 SPAN = 64.0  # largest factor by which a remedy changes its parameter
 COARSE = 12  # values of a parameter simulated over the whole span
@@ -38,12 +39,12 @@ class _Candidates(NamedTuple):
         """Return values from the last oscillating one, excluded, through the selected one to the second after it."""
         before = self.values[index - 1] if index else present or self.values[0] / 2
         values = np.geomspace(before, self.values[min(index + 2, len(self.values) - 1)], FINE + 1)[1:]
-        return self._replace(values=values).round()
+        return self._replace(values=values)
 
-    def round(self) -> _Candidates:
+    def round(self, system: UnitSystem) -> _Candidates:
         """Return the values to three significant digits, each rounded away from the parameter's current value."""
         values = [round_safely(value, "above" if self.increasing else "below", 3) for value in self.values.tolist()]
-        if self.parameter == "resolution" and is_rotary():
+        if self.parameter == "resolution" and system.rotary:
             values = [2.0 * math.pi / round_safely(count_steps(value), "above", 3) for value in self.values.tolist()]
         return self._replace(values=np.array(values))
 
@@ -60,7 +61,8 @@ def search_remedies(experiment: Experiment, cause: Literal["quantization", "satu
     for each, at_rest in zip(candidates, _try(experiment, candidates), strict=True):
         index = each.select(at_rest)
         if index < len(at_rest):
-            chosen.append((each, each.refine(index, experiment.present[each.parameter])))
+            fine = each.refine(index, experiment.present[each.parameter])
+            chosen.append((each, fine.round(experiment.scene.unit_system)))
     remedies = []
     for (coarse, fine), at_rest in zip(chosen, _try(experiment, [fine for _, fine in chosen]), strict=True):
         index = fine.select(at_rest)
@@ -68,7 +70,7 @@ def search_remedies(experiment: Experiment, cause: Literal["quantization", "satu
             value, last = float(fine.values[min(index + RESERVE, FINE - 1)]), float(coarse.values[-1])
             open_end = math.inf if coarse.parameter == "coulomb" else last
             remedies.append(Remedy(coarse.parameter, *((value, open_end) if coarse.increasing else (-math.inf, value))))
-    return remedies
+    return with_units(remedies, experiment.scene.unit_system)
 
 
 def _list_candidates(experiment: Experiment, cause: str) -> list[_Candidates]:
@@ -85,13 +87,14 @@ def _list_candidates(experiment: Experiment, cause: str) -> list[_Candidates]:
         candidates.append(_Candidates("coulomb", least * factors, True))
     # Without friction no K or B helps, because under an external force of K Q/2 the encoder reading never settles.
     if cause == "quantization" and not hardware.static:
-        return [each.round() for each in candidates]
+        return [each.round(scene.unit_system) for each in candidates]
     if K > 0:
         candidates.append(_Candidates("stiffness", K / factors, False))
     if B > 0:
         candidates.append(_Candidates("virtual_damping", B / factors, False))
         candidates.append(_Candidates("virtual_damping", B * factors, True))
-    return [each.round() for each in candidates if np.all(np.isfinite(each.values) & (each.values > 0))]
+    usable = [each for each in candidates if np.all(np.isfinite(each.values) & (each.values > 0))]
+    return [each.round(scene.unit_system) for each in usable]
 
 
 def _try(experiment: Experiment, candidates: list[_Candidates]) -> list[np.ndarray]:

@@ -8,10 +8,9 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_float64
 from zwidth.loops.linear.border import Outline
-from zwidth.scenes.base import WallSI, require_numbers
+from zwidth.scenes.base import WallSI, wrap_methods
 from zwidth.scenes.recommendation import SceneAdvice
 from zwidth.simulation.simulate import simulate
-from zwidth.words.rotation import wrap_methods
 from zwidth.words.showing import ResultList
 from zwidth.words.types import ArrayLike
 from zwidth.words.xp import is_traced, namespace
@@ -94,6 +93,5 @@ TRACEABLE = (
     "spectral_radius",
     "to_si",
 )
-require_numbers(Scene, but=TRACEABLE)
-# Labels have no units, and walls that are texts are read in those of the device.
-wrap_methods(Scene, but=("is_stable", "normalize_walls"))
+# The two exceptions are traceable and return numbers without units; a wrapper would slow down single verdicts.
+wrap_methods(Scene, traceable=TRACEABLE, but=("is_stable", "normalize_walls"))

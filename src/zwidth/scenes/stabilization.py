@@ -14,8 +14,7 @@ from zwidth.scenes.stiffest import SceneOptima
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, round_safely, tell_apart, with_unit
 from zwidth.words.quantities import FIELDS
-from zwidth.words.rotation import is_rotary
-from zwidth.words.showing import shown
+from zwidth.words.showing import find_unit, shown
 
 # Parameters with their direction of search, 1 (increase) or -1 (decrease), and the largest factor of the change.
 DIRECTIONS = {
@@ -62,11 +61,11 @@ class Remedy(NamedTuple):
 
     def spell(self, digits: int = 4) -> str:
         """Return the range in words, both ends rounded into the range."""
-        name, unit = NAMES.get(self.parameter, self.parameter), FIELDS[self.parameter].unit
+        name, unit = NAMES.get(self.parameter, self.parameter), find_unit(self, FIELDS[self.parameter].unit)
         kept = f" ({self.note})" if self.note else ""
         if self.parameter == "velocity.samples":
             return f"{name} of at most {self.high:g} samples"
-        if self.parameter == "resolution" and is_rotary():
+        if self.parameter == "resolution" and unit == "rad":
             kept = f" (at least {count_steps(self.high):,} counts per turn)"
         if self.high == math.inf:
             return f"{name} at least {with_unit(round_safely(self.low, 'above', digits), unit, digits)}{kept}"

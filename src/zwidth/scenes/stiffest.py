@@ -17,7 +17,6 @@ from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import SceneAnswers, allows_negative
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import FIELDS, WALL
-from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
@@ -104,11 +103,11 @@ class RequiredValue(NamedTuple):
     status: Status
 
 
-def _read_stiffness(given: Any) -> float:
-    """A stiffness that is wanted, in N/m."""
-    stiffness = read_texts("stiffness", given, "N/m")
+def _read_stiffness(given: Any, unit: str) -> float:
+    """Return a required stiffness in its SI unit."""
+    stiffness = read_texts("stiffness", given, unit)
     if not (isinstance(stiffness, int | float | np.number) and math.isfinite(to_float(stiffness)) and stiffness > 0):
-        raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in {own_unit('N/m')})")
+        raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in {unit})")
     return float(stiffness)
 
 
@@ -138,7 +137,7 @@ def _range(scene: SceneAnswers, parameter: str, now: float, within: tuple[Any, A
         }
         low, high = ends.get(parameter, (0.0, math.inf))
         return max(now / _REACH, float(low)), min(now * _REACH, float(high))
-    low, high = (to_float(end) for end in read_texts("within", within, FIELDS[parameter].unit))
+    low, high = (to_float(end) for end in read_texts("within", within, scene.unit_system[FIELDS[parameter].unit]))
     if not 0 < low < high < math.inf:
         raise InputError(f"within: got {within!r}; two finite numbers with 0 < low < high are needed")
     return low, high
@@ -300,7 +299,7 @@ class SceneOptima(SceneAnswers):
             >>> print(f"{needed.value:.2f} N s/m or {needed.enough}")
             18.62 N s/m or above
         """
-        stiffness = _read_stiffness(stiffness)
+        stiffness = _read_stiffness(stiffness, self.unit_system["N/m"])
         now = _present_value(self, parameter)
         low, high = _range(self, parameter, now, within)
 
@@ -377,7 +376,9 @@ class SceneOptima(SceneAnswers):
             25.8 N s/m, spectral radius 0.759
         """
         check_choice("goal", goal, get_args(Goal))
-        stiffness = _read_stiffness(resolve_wall(self.wall, None, None)[0] if stiffness is None else stiffness)
+        if stiffness is None:
+            stiffness = resolve_wall(self.wall, None, None, self.unit_system)[0]
+        stiffness = _read_stiffness(stiffness, self.unit_system["N/m"])
         units = self.units
 
         def radius(beta: Any) -> np.ndarray:

@@ -21,19 +21,19 @@ from zwidth.parts.velocity import Estimate
 from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import check_choice
 from zwidth.words.formatting import name_wall, with_unit
-from zwidth.words.rotation import is_rotary, own_unit
+from zwidth.words.unit_system import UnitSystem
 
 _COLUMNS = 100  # characters per line of a comment
 # A root is real whose imaginary part is no more of it than rounding.
 _ROUNDED = 1e-13
 
 
-def _describe_call() -> tuple[str, str]:
-    """What goes in and what comes out, in two lines."""
-    position, force = ("angle in rad", "torque") if is_rotary() else ("position in m", "force")
+def _describe_call(system: UnitSystem) -> tuple[str, str]:
+    """Return two lines that describe argument and result of the function that a control loop calls."""
+    position, force = ("angle in rad", "torque") if system.rotary else ("position in m", "force")
     return (
         f"x is the {position}, 0 at the surface of the wall and positive inside of it; the {force} on the device is",
-        f"in {own_unit('N')}, and 0 outside of the wall.",
+        f"in {system['N']}, and 0 outside of the wall.",
     )
 
 
@@ -41,7 +41,7 @@ def _describe_cautions(scene: SceneParts, cautions: Sequence[str]) -> list[str]:
     """Return the lines on the safe limit and the cautions in the comment at the head of a program."""
     limit, texts = scene.safe_limit, [f"CAUTION: {caution}" for caution in cautions]
     if limit is not None:
-        texts += [f"Safe limit: {limit.describe()}", *(f"Warning: {text}" for text in limit.warnings)]
+        texts += [f"Safe limit: {limit.describe(scene.unit_system)}", *(f"Warning: {text}" for text in limit.warnings)]
         if not limit.allows(float(scene.wall.stiffness), float(scene.wall.virtual_damping)):
             texts.insert(0, "WARNING: this wall exceeds the safe limit; it may be unstable.")
     # Replace character sequences that would end the comment or start an escape, because the texts come from a file.
@@ -89,6 +89,7 @@ class WallProgram(NamedTuple):
     force: list[str]  # from the position x to the velocity v
     law: str
     max_force: float  # largest force; infinite for none
+    system: UnitSystem
 
 
 def write_wall(
@@ -127,17 +128,12 @@ def lay_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: floa
         parts = [f"{factor!r} * {name}" for factor, name in zip(top, ("w", *names), strict=True) if factor]
         force += [f"w = u{back}", f"u = {' + '.join(parts)}", *(f"{last} += {name}" for name in inner)]
         force.append(f"{names[0]} += w")
-    K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
+    K, B, system = float(scene.wall.stiffness), float(scene.wall.virtual_damping), scene.unit_system
     estimated = f"velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}"
-    limited = (
-        f" {'Torque' if is_rotary() else 'Force'} limited to {with_unit(max_force, 'N')}."
-        if max_force < math.inf
-        else ""
-    )
-    head = "\n".join([f"Virtual wall: {name_wall(K, B)}, {estimated}.{limited}", *_describe_cautions(scene, cautions)])
-    return WallProgram(
-        head, count, states, start, [*force, f"v = {gain!r} * u"], f"-({K!r} * x + {B!r} * v)", float(max_force)
-    )
+    limited = f" {'Torque' if system.rotary else 'Force'} limited to {with_unit(max_force, system['N'])}."
+    wall = f"Virtual wall: {name_wall(K, B, system)}, {estimated}.{limited if max_force < math.inf else ''}"
+    head, law = "\n".join([wall, *_describe_cautions(scene, cautions)]), f"-({K!r} * x + {B!r} * v)"
+    return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], law, float(max_force), system)
 
 
 def _write_c(program: WallProgram) -> str:
@@ -160,7 +156,7 @@ def _write_c(program: WallProgram) -> str:
     words = "\n   ".join(
         [
             "/* " + program.head.replace("\n", "\n   "),
-            *_describe_call(),
+            *_describe_call(program.system),
             "Call wall_start once, then wall_force once a period. */",
         ]
     )
@@ -179,7 +175,7 @@ def _write_python(program: WallProgram) -> str:
     words = "\n    ".join(
         [
             '    """' + program.head.replace("\n", "\n    ") + "\n",
-            *_describe_call(),
+            *_describe_call(program.system),
             "Make one, then call force once a period.",
             '"""',
         ]

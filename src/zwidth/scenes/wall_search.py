@@ -120,7 +120,7 @@ def list_held(scene: SceneOptima, wanted: Wanted) -> list[SceneOptima]:
     """Return the scene in each required grasp, and without its operator if grasps are required and it has one."""
     if not isinstance(scene.device, Device) or wanted.grasps == "none":
         return []
-    pairs = list_grasps(bool(scene.device.rotary))
+    pairs = list_grasps(scene.unit_system.rotary)
     hands: list[Any] = [hand for name, hand in pairs if wanted.grasps == "all" or name.startswith(wanted.grasps)]
     return [scene.replace(operator=hand) for hand in (*hands, *([None] if scene.operator is not None else []))]
 

@@ -18,6 +18,7 @@ from zwidth.simulation.batch import GROUP, name_bodies
 from zwidth.simulation.parameters import Settings, TracedLaw
 from zwidth.words.errors import InputError, ResourceError, describe_choice
 from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
+from zwidth.words.unit_system import LINEAR, UnitSystem
 from zwidth.words.xp import is_traced
 
 RECORDED_BYTES = 2 * 14 * 8  # per recorded instant, including its conversion to SI units
@@ -53,6 +54,13 @@ def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))], which
 
 
+def find_system(scenes: list[Any]) -> UnitSystem:
+    """Return the unit system of the scenes; raise `InputError` if they have two."""
+    if len(systems := {scene.device.unit_system for scene in scenes}) > 1:
+        raise InputError("scenes: got both rotary and linear devices; simulate one kind per call")
+    return systems.pop() if systems else LINEAR
+
+
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
     """Return the arguments with one initial value per body."""
     bodies = dict.fromkeys(["position", *(name for scene in scenes for name in name_bodies(scene))])
@@ -68,7 +76,7 @@ def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
 
 def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, periods: int) -> Any:
     """Return the external force of operators with a moving far end, averaged over each period."""
-    places = _read_history("hand_history", hand, periods + 1, "m")
+    places = _read_history("hand_history", hand, periods + 1, find_system(scenes)["m"])
     for scene in scenes:
         if scene.operator is None or not scene.operator.rigid or scene.device.coupling is not None:
             raise InputError(
@@ -136,20 +144,22 @@ def read_arguments(
     """Return the numbers of all simulations by name, the scene index in the batch shape, and a mask of usable rows."""
     if given["static"] is None:
         given = {**given, "static": given["coulomb"]}
-    walls = [resolve_wall(scene.wall, given["stiffness"], given["virtual_damping"]) for scene in scenes]
+    system = find_system(scenes)
+    walls = [resolve_wall(scene.wall, given["stiffness"], given["virtual_damping"], system) for scene in scenes]
     if given["stiffness"] is None:
         own = np.array(walls, float).reshape(-1, 2)[which]
         given = {**given, "stiffness": own[..., 0], "virtual_damping": own[..., 1]}
     elif given["virtual_damping"] is None:
         given = {**given, "virtual_damping": 0.0}
     arrays = {
-        name: as_float64(_spell(name), read_texts(_spell(name), value, _unit(name))) for name, value in given.items()
+        name: as_float64(_spell(name), read_texts(_spell(name), value, system[_unit(name)]))
+        for name, value in given.items()
     }
     seeds, pushes = _read_seeds(seed), None
     shapes = {"scenes": which.shape, **{_spell(name): array.shape for name, array in arrays.items()}}
     shapes["seed"] = seeds.shape
     if history is not None:
-        pushes = _read_history("push_history", history, periods, "N")
+        pushes = _read_history("push_history", history, periods, system["N"])
         shapes["push_history without its last axis"] = pushes.shape[:-1]
     shape = join_shapes((name, part) for name, part in shapes.items() if part or name == "scenes")
     if not math.prod(shape):
@@ -160,7 +170,7 @@ def read_arguments(
     for name, array in arrays.items():
         usable, allowed = _check(name, array, arrays, clock[which] if array.ndim else clock.min())
         if array.ndim == 0 and not np.all(usable):
-            raise InputError(f"{_spell(name)}: got {float(array):g} {_unit(name)}; {allowed}")
+            raise InputError(f"{_spell(name)}: got {float(array):g} {system[_unit(name)]}; {allowed}")
         good &= usable
     numbers: dict[str, Any] = {
         name: np.where(good, np.broadcast_to(array, shape), 0.0).reshape(-1) for name, array in arrays.items()

@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth.simulation.result import Motion, MotionKind
 from zwidth.words.formatting import with_unit
-from zwidth.words.rotation import in_own_units
+from zwidth.words.showing import find_unit
 
 WORDS = {
     MotionKind.REST: "comes to rest",
@@ -21,7 +21,6 @@ WORDS = {
 }
 
 
-@in_own_units
 def describe_ending(motion: Motion, index: Any = ()) -> str:
     """Return the observed behavior of a recorded motion in words; ``index`` selects one entry of a batch."""
     kind = MotionKind(int(motion.outcome[index]))
@@ -37,11 +36,11 @@ def describe_ending(motion: Motion, index: Any = ()) -> str:
         return left + (", comes to rest outside" if kind is MotionKind.REST else "") + f" within {duration}"
     if kind not in (MotionKind.REST, MotionKind.DECAYING) and hits.size > 1:
         speeds = motion.velocity[index].reshape(contact.size, -1)[hits, 0]
-        first, last = (with_unit(float(speed), "m/s", 3) for speed in speeds[[0, -1]])
+        first, last = (with_unit(float(speed), find_unit(motion, "m/s"), 3) for speed in speeds[[0, -1]])
         return f"bounces: impact velocity from {first} to {last} over {hits.size} impacts within {duration}"
     frequency = float(motion.frequency[index])
     if kind in (MotionKind.STEADY, MotionKind.UNCLEAR) and np.isfinite(frequency):
-        amplitude = with_unit(float(motion.amplitude[index]), "m", 3)
+        amplitude = with_unit(float(motion.amplitude[index]), find_unit(motion, "m"), 3)
         return f"{WORDS[kind]} at {with_unit(frequency, 'Hz', 3)}, amplitude {amplitude}, after {duration}"
     if kind is MotionKind.UNCLEAR:
         return f"undecided after {duration}: too few oscillations; simulate longer"

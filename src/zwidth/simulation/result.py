@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.words.errors import InputError
-from zwidth.words.showing import draw_line, shown
+from zwidth.words.showing import draw_line, find_unit, shown
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -182,7 +182,7 @@ class Motion:
             value = getattr(self, name)
             if value is not None:
                 over = (*names, "time") if name in OF_MOTION else names
-                variables[name] = (over, value, {"long_name": long_name, "units": units})
+                variables[name] = (over, value, {"long_name": long_name, "units": find_unit(self, units)})
         data = xarray.Dataset(variables)
         if self.time is not None:
             over = "time" if self.time.ndim == 1 else (*names, "time")

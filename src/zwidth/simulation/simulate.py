@@ -22,7 +22,7 @@ from zwidth.simulation.batch import find_structure, run_scenes
 from zwidth.simulation.parameters import Law, Settings
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
 from zwidth.words.errors import check_choice
-from zwidth.words.rotation import in_own_units
+from zwidth.words.showing import with_units
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
@@ -30,7 +30,6 @@ Contact = Literal["bilateral", "unilateral", "push_only"]
 CONTACTS: tuple[Contact, ...] = ("bilateral", "unilateral", "push_only")
 
 
-@in_own_units
 def simulate(
     scenes: Any,
     stiffness: ArrayLike | None = None,
@@ -161,7 +160,7 @@ def simulate(
         name: column if name == "time" and column.ndim == 1 else column.reshape((*shape, *column.shape[1:]))[()]
         for name, column in found.items()
     }
-    return Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped))
+    return with_units(Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped)), known[0].unit_system)
 
 
 def _build_time(known: list[Any], which: np.ndarray, steps: np.ndarray, drawn: np.ndarray | None) -> np.ndarray:

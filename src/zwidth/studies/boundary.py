@@ -212,8 +212,10 @@ class CompareStudy(ComputedStudy):
         return Outcome(
             table=stack(rows),
             figures={"": partial(figures.draw_stable_set, table, walls)} if table else {},
-            documents={f"{self.name}_outlines.csv": csv_text(table)},
-            answer=tuple(f"{row['label']}: {spell_stiffest(row)}" for row in rows if row["kind"] != "none"),
+            documents={f"{self.name}_outlines.csv": csv_text(table, self.unit_system)},
+            answer=tuple(
+                f"{row['label']}: {spell_stiffest(row, self.unit_system)}" for row in rows if row["kind"] != "none"
+            ),
             notes=tuple(f"{row['label']}: no wall is stable" for row in rows if row["kind"] == "none"),
         )
 

@@ -31,8 +31,8 @@ from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiff
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, short, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
-from zwidth.words.rotation import is_rotary, own_unit
 from zwidth.words.status import Status
+from zwidth.words.unit_system import UnitSystem
 
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
 # Scenes that the search for one value asks about.
@@ -111,7 +111,7 @@ class DesignStudy(ComputedStudy):
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
         if not (least := float(self.stiffness.values().min())) > 0:
-            yield ("stiffness",), problem(f"got {short(least)} {own_unit('N/m')}", "it must be greater than 0")
+            yield ("stiffness",), problem(f"got {short(least)} {self.unit_system['N/m']}", "it must be greater than 0")
         known = self._list_parameters()
         if self.find not in known:
             has = f"this device has {listing(known)}"
@@ -150,11 +150,12 @@ class DesignStudy(ComputedStudy):
     @property
     def _name(self) -> str:
         """Name of the parameter: "inertia" for the mass of a rotary device."""
-        return "inertia" if self.find == "mass" and is_rotary() else self.find
+        return "inertia" if self.find == "mass" and self.unit_system.rotary else self.find
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         nominal = self.device.to_scene()
-        rows, answer, notes, ranges, unit = [], [], [], [], PARAMETERS[self.find].unit
+        rows, answer, notes, ranges, units = [], [], [], [], self.unit_system
+        unit = units[PARAMETERS[self.find].unit]
         for stiffness in self.stiffness.values().tolist():
             needed = nominal.required(self.find, self.reserve * stiffness, within=self.within)
             ranges.append(needed.range)
@@ -162,14 +163,14 @@ class DesignStudy(ComputedStudy):
             notes += self._note(stiffness, needed)
             if needed.crossings and needed.status == Status.OK:
                 value = spell_enough(needed.value, needed.enough, [one.value for one in needed.crossings], unit)
-                answer.append(f"K_max = {with_unit(self.reserve * stiffness, 'N/m')}: {self._name} of {value}")
+                answer.append(f"K_max = {with_unit(self.reserve * stiffness, units['N/m'])}: {self._name} of {value}")
         low, high = min(ends[0] for ends in ranges), max(ends[1] for ends in ranges)
         curve = self._trace(nominal, low, high)
         table = stack(rows)
         return Outcome(
             table=table,
             figures={"": partial(figures.draw_requirement, curve, table)},
-            documents={f"{self.name}_curve.csv": csv_text(curve)},
+            documents={f"{self.name}_curve.csv": csv_text(curve, units)},
             answer=tuple(answer),
             notes=tuple(notes),
         )
@@ -210,8 +211,8 @@ class DesignStudy(ComputedStudy):
         return dict(zip(names, (drawn.stable, drawn.stable_low, drawn.stable_high, drawn.stiffness), strict=True))
 
     def _note(self, stiffness: float, needed: RequiredValue) -> Iterable[str]:
-        wanted = with_unit(self.reserve * stiffness, "N/m")
-        low, high = (with_unit(end, PARAMETERS[self.find].unit) for end in needed.range)
+        wanted = with_unit(self.reserve * stiffness, self.unit_system["N/m"])
+        low, high = (with_unit(end, self.unit_system[PARAMETERS[self.find].unit]) for end in needed.range)
         if needed.status != Status.OK:
             yield f"{wanted}: {self._name} from {low} to {high}: {Status(needed.status).message}"
         elif needed.enough == "everywhere":
@@ -316,13 +317,13 @@ class FiltersStudy(ComputedStudy):
             best = {id(max(those, key=itemgetter(SI_COLUMNS[0]))) for _, those in own}
             rows = [{**row, "best": id(row) in best} for row in rows]
             drawn["_noise"] = partial(figures.draw_filter_noise, stack(rows), limit)
-        answer = tuple(_spell_best(row) for row in rows if row.get("best"))
+        answer = tuple(_spell_best(row, self.unit_system) for row in rows if row.get("best"))
         return Outcome(table=stack(rows), figures=drawn, answer=answer)
 
 
-def _spell_best(row: dict[str, Any]) -> str:
-    """The best filter of a damping, in a line."""
+def _spell_best(row: dict[str, Any], system: UnitSystem) -> str:
+    """Return the best filter for a damping in one line."""
     size = f"{row['samples']:g} samples"
     size = size if row["samples"] == row["samples"] else with_unit(row["cutoff_Hz"], "Hz")
-    damping, estimate = with_unit(row["damping_N_s_per_m"], "N s/m"), row["estimate"].replace("_", " ")
-    return f"b = {damping}: {estimate}, {size}: {spell_stiffest(row)}"
+    damping, estimate = with_unit(row["damping_N_s_per_m"], system["N s/m"]), row["estimate"].replace("_", " ")
+    return f"b = {damping}: {estimate}, {size}: {spell_stiffest(row, system)}"

@@ -32,13 +32,12 @@ from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, member
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
-from zwidth.config.values import Quantity
+from zwidth.config.values import Quantity, find_system
 from zwidth.parts.wall import NoWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe
 from zwidth.words.quantities import Range
-from zwidth.words.rotation import is_rotary
 from zwidth.words.units import looks_like_number
 
 FORMAT_VERSION = 1
@@ -143,13 +142,13 @@ class Config(Strict, what="a configuration"):
     studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""
 
-    _rotary: bool = PrivateAttr(default_factory=is_rotary)
+    _rotary: bool = PrivateAttr(default_factory=lambda: find_system().rotary)
 
     _place: _Place = PrivateAttr(default_factory=lambda: _Place(find_file("").absolute()))
 
     @property
     def rotary(self) -> bool:
-        """Whether its devices turn."""
+        """True if its devices are rotary."""
         return self._rotary
 
     @property

@@ -29,8 +29,8 @@ from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, plain, with_unit
 from zwidth.words.quantities import OF_LOGS, POSITIVE
-from zwidth.words.rotation import in_own_units
 from zwidth.words.status import Status
+from zwidth.words.unit_system import LINEAR, UnitSystem
 
 # 95 % of chi-squared with three degrees of freedom, and of a normal distribution within so many standard deviations.
 _CHANCE, _NORMAL = 7.815, 1.96
@@ -196,6 +196,11 @@ class FitStudy(ComputedStudy):
     def points(self) -> int:
         return sum(motion.position.size for motion in self._motions) + len(self.buzz or ())
 
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The linear system: the names of the columns already have the units of the fitted device."""
+        return LINEAR
+
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         fits = self._fit()
         gathered = [gather_evidence(each.fit, each.source, each.points) for each in fits]
@@ -237,7 +242,6 @@ class FitStudy(ComputedStudy):
         return fits
 
 
-@in_own_units
 def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
     """One row: every number with its standard error and its 95 % interval."""
     row: dict[str, Any] = {"fitted_to": source, "status": Status(fit.status).name}
@@ -246,8 +250,8 @@ def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
     for name in (*fit.numbers[:3], "stiffness_max", *fit.numbers[3:], *of_log):
         ends = fit.intervals[name]
         numbers = {"": fit.value_of(name), "_error": errors[name], "_low": ends.low, "_high": ends.high}
-        row |= {header(name + end, unit_of(name)): value for end, value in numbers.items()}
-    return row | {header(name, unit_of(name)): getattr(fit, name) for name in ("offset", "resolution")}
+        row |= {header(name + end, unit_of(name, fit.unit_system)): value for end, value in numbers.items()}
+    return row | {header(name, unit_of(name, fit.unit_system)): getattr(fit, name) for name in ("offset", "resolution")}
 
 
 def _compare(one: DeviceFit, other: DeviceFit) -> str:

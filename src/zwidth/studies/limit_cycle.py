@@ -25,6 +25,7 @@ from zwidth.studies.outcome import Outcome, csv_text
 from zwidth.studies.simulate import Circumstances, SimulatedStudy
 from zwidth.words.formatting import header, spell_short, with_unit
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.showing import find_unit
 from zwidth.words.status import Status
 
 _COLUMNS = {known.name: column for column, known in AXES.items()}
@@ -120,7 +121,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         scene = self.device.to_scene()
         silence, widest = self.bound_amplitudes(scene)
         if widest <= silence:
-            low, high = (with_unit(end, "m") for end in (silence, widest))
+            low, high = (with_unit(end, scene.unit_system["m"]) for end in (silence, widest))
             name = "silence" if self.widest is None else "widest"
             received = f"got silence {low}, widest {high}"
             yield (name,), problem(received, "silence must be less than widest", "raise widest or lower silence")
@@ -146,7 +147,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
             return self.silence, self.widest
         steps = [self.resolution, *(each.resolution or 0.0 for each in self.conditions)]
         steps += self.axes.resolution.values().tolist() if self.axes.resolution is not None else []
-        return self.silence, max(WIDEST[bool(scene.device.rotary)], WIDEST_STEPS * max(steps))
+        return self.silence, max(WIDEST[scene.unit_system.rotary], WIDEST_STEPS * max(steps))
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -180,13 +181,13 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         if short or len(varied) == 1:
             family = _COLUMNS[short[0]] if len(varied) > 1 else ""
             draw = partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
-        low, high = (spell_short(bound, "m") for bound in bounds)
+        low, high = (spell_short(bound, self.unit_system["m"]) for bound in bounds)
         rest = f"at rest: an amplitude below {low} in the last quarter of {self.duration}"
         notes.append(f"{rest}; limit cycle: amplitude from {low} to {high}")
         return Outcome(
             arrays=arrays,
             figures={"": draw},
-            documents={f"{self.name}_boundary.csv": csv_text(table)} if table else {},
+            documents={f"{self.name}_boundary.csv": csv_text(table, self.unit_system)} if table else {},
             notes=tuple(notes),
         )
 
@@ -216,7 +217,11 @@ def describe_outcomes(motion: Any, stable: np.ndarray, bounds: tuple[float, floa
     wide = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > bounds[1])
     rest = ~wide & (motion.amplitude < bounds[0])
     known = motion.status == Status.OK
-    ends = {"at rest": rest, "in a limit cycle": ~rest & ~wide, f"larger than {spell_short(bounds[1], 'm')}": wide}
+    ends = {
+        "at rest": rest,
+        "in a limit cycle": ~rest & ~wide,
+        f"larger than {spell_short(bounds[1], find_unit(motion, 'm'))}": wide,
+    }
     words = []
     for name, kind in {"linearly stable ": 1, "linearly unstable ": 0, "": -1}.items():
         those = known & (stable == kind)

@@ -22,7 +22,8 @@ from zwidth.figures.table import SI_COLUMNS
 from zwidth.scenes.assessment import name_kind
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
-from zwidth.words.formatting import own_header, round_safely, to_cell, with_unit
+from zwidth.words.formatting import convert_header, round_safely, to_cell, with_unit
+from zwidth.words.unit_system import LINEAR, UnitSystem
 
 Item = TypeVar("Item")
 
@@ -49,14 +50,16 @@ class Outcome:
     answer: tuple[str, ...] = ()  # what was found, in a line or two for a terminal
     notes: tuple[str, ...] = ()  # what a reader of the results must know, such as points without an answer
 
-    def write(self, folder: Path, name: str, formats: Sequence[str] = ("png", "svg")) -> None:
-        """Write everything, data before figures."""
+    def write(
+        self, folder: Path, name: str, system: UnitSystem = LINEAR, formats: Sequence[str] = ("png", "svg")
+    ) -> None:
+        """Write everything, data before figures; columns have the names of linear units, and are renamed here."""
         for file, text in self.documents.items():
             (folder / file).write_text(text, encoding="utf-8")
         if self.table:
-            (folder / f"{name}.csv").write_text(csv_text(self.table), encoding="utf-8")
+            (folder / f"{name}.csv").write_text(csv_text(self.table, system), encoding="utf-8")
         if self.arrays:
-            arrays = {own_header(key): array for key, array in self.arrays.items()}
+            arrays = {_name_column(key, system): array for key, array in self.arrays.items()}
             np.savez_compressed(folder / f"{name}.npz", **arrays)  # pyright: ignore[reportArgumentType]
         for addition, draw in self.figures.items():
             figures.save(draw(), folder / f"{name}{addition}", formats)
@@ -145,16 +148,22 @@ def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
     return {**found, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 
 
-def spell_stiffest(row: Mapping[str, Any]) -> str:
-    """The stiffest wall of a row of `summarize_stiffest`, rounded down: it holds as it is read."""
+def spell_stiffest(row: Mapping[str, Any], system: UnitSystem) -> str:
+    """Return K and B of a row of `summarize_stiffest` with units, K rounded down."""
     stiffness, damping = (row[name] for name in SI_COLUMNS)
-    return f"K_max = {with_unit(round_safely(stiffness, 'below'), 'N/m')} at B = {with_unit(damping, 'N s/m')}"
+    K, B = with_unit(round_safely(stiffness, "below"), system["N/m"]), with_unit(damping, system["N s/m"])
+    return f"K_max = {K} at B = {B}"
 
 
-def csv_text(table: dict[str, np.ndarray]) -> str:
-    """A table as CSV; numbers are written with all digits that tell them apart, texts so that no program runs them."""
+def _name_column(name: str, system: UnitSystem) -> str:
+    """Return the name of a column with the units of rotary devices if the system is rotary."""
+    return convert_header(name, system) if system.rotary else name
+
+
+def csv_text(table: dict[str, np.ndarray], system: UnitSystem = LINEAR) -> str:
+    """Return a table as CSV: numbers with all their digits, and texts that no spreadsheet takes for formulas."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(map(own_header, table))
+    writer.writerow([_name_column(name, system) for name in table])
     writer.writerows(zip(*(map(to_cell, column.tolist()) for column in table.values()), strict=True))
     return buffer.getvalue()

@@ -25,7 +25,6 @@ from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.studies.paper_figures import limit_slope, maximize_alpha
 from zwidth.words.formatting import with_unit
-from zwidth.words.rotation import use_kind
 
 SOURCE = "Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006"
 
@@ -112,12 +111,11 @@ def _with_lag() -> str:
     # Use a window of 2 lag/T differences, because the mean of n differences lags by n/2 periods.
     walls = [scene, scene.replace(velocity=WindowedDifference(round(2 * FILTER_LAG / PERIOD)))]
     before, after = (wall.max_stiffness() for wall in walls)
-    with use_kind(False):
-        return (
-            f"for b = 0 it lowers K_max from {with_unit(before.stiffness, 'N/m')} to "
-            f"{with_unit(after.stiffness, 'N/m')}, B there from {with_unit(before.virtual_damping, 'N s/m')} to "
-            f"{with_unit(after.virtual_damping, 'N s/m')}"
-        )
+    return (
+        f"for b = 0 it lowers K_max from {with_unit(before.stiffness, 'N/m')} to "
+        f"{with_unit(after.stiffness, 'N/m')}, B there from {with_unit(before.virtual_damping, 'N s/m')} to "
+        f"{with_unit(after.virtual_damping, 'N s/m')}"
+    )
 
 
 def _ridge(delta: float, d: float) -> tuple[float, float]:

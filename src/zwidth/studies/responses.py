@@ -39,7 +39,6 @@ from zwidth.scenes.wall_search import RANGES, Grasps
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit
 from zwidth.words.quantities import WALL_RANGE, Range
-from zwidth.words.rotation import is_rotary
 
 
 class ResponseStudy(ComputedStudy):
@@ -155,7 +154,7 @@ class StepStudy(WallsStudy, ResponseStudy):
             label = device.label or f"device {number}"
             if not device.label and isinstance(device, PhysicalDevice):
                 wall = device.to_scene().to_si(alpha=alpha, beta=beta)
-                label = name_wall(wall.stiffness, wall.virtual_damping)
+                label = name_wall(wall.stiffness, wall.virtual_damping, self.unit_system)
             part, note = self.respond(device, alpha, beta, label=label, physical=physical)
             parts.append(part)
             notes += [f"{label}: {note}"] if note else []
@@ -247,7 +246,8 @@ def _describe(found: Recommendation, told: dict[str, Any]) -> str:
         said.append(f"stable {every}")
     if settled is not None:
         said.append(
-            f"settles to 2 % of a step of {'torque' if is_rotary() else 'force'} in about {with_unit(settled, 's')}"
+            f"settles to 2 % of a step of {'torque' if found.unit_system.rotary else 'force'} in about "
+            f"{with_unit(settled, 's')}"
         )
     lines = [
         *("# Recommended virtual wall", ""),

@@ -234,10 +234,11 @@ class WorkspaceStudy(ComputedStudy):
         coordinates = self.poses.tabulate()
         table = {**coordinates, "mass_kg": mass, "damping_N_s_per_m": damping}
         table |= dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))
-        known, file = np.isfinite(stiffness), self.poses.csv
+        known, file, units = np.isfinite(stiffness), self.poses.csv, self.unit_system
         notes = [
-            f"{self.poses.spell(k)}: mass {with_unit(mass[k], 'kg')} and damping {with_unit(damping[k], 'N s/m')} "
-            f"(delta = {plain(delta[k])}) have no K_max: {Status(int(top.status[k])).message} Correct this pose in "
+            f"{self.poses.spell(k)}: mass {with_unit(mass[k], units['kg'])} and damping "
+            f"{with_unit(damping[k], units['N s/m'])} (delta = {plain(delta[k])}) have no K_max: "
+            f"{Status(int(top.status[k])).message} Correct this pose in "
             f"{file}, or leave it out."
             for k in np.flatnonzero(~known).tolist()
         ]
@@ -248,10 +249,10 @@ class WorkspaceStudy(ComputedStudy):
         wall = round_safely(RECOMMENDED_SHARE * stiffness[weakest], "below"), float(f"{virtual_damping[weakest]:.4g}")
         bears = np.asarray(is_stable(wall[0] * self.period / rate, wall[1] / rate, delta, d))
         ends = stiffness[weakest], np.nanmax(stiffness)
-        low, high = (with_unit(round_safely(float(each), "below"), "N/m") for each in ends)
+        low, high = (with_unit(round_safely(float(each), "below"), units["N/m"]) for each in ends)
         answer = (
             f"K_max from {low} at {self.poses.spell(weakest)} to {high}",
-            f"{name_wall(*wall)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
+            f"{name_wall(*wall, units)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
             f"stable in {np.count_nonzero(bears)} of {np.count_nonzero(known)} poses",
         )
         draw = partial(figures.draw_workspace, table, *coordinates, names=self.poses.names)

@@ -150,7 +150,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
             else (each.alpha * scene.units.stiffness, each.beta * scene.units.virtual_damping)
             for each in self.walls or ()
         ]
-        return [(name_wall(*wall), *wall) for wall in walls]
+        return [(name_wall(*wall, scene.unit_system), *wall) for wall in walls]
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         placed = self.place(self.device.to_scene())
@@ -173,7 +173,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
         return Outcome(
             table=table,
             figures={addition: partial(draw, table) for addition, draw in drawn.items()},
-            documents={f"{self.name}_summary.csv": csv_text(stack(rows))},
+            documents={f"{self.name}_summary.csv": csv_text(stack(rows), placed.unit_system)},
             notes=tuple(notes),
         )
 

@@ -12,7 +12,6 @@ from zwidth.config.device_table import LABEL
 from zwidth.config.sweep import SweepStudy
 from zwidth.loops.rigid.normalization import normalize
 from zwidth.words.quantities import PARAMETERS, WALL, Family
-from zwidth.words.rotation import own_unit
 
 
 class Block(NamedTuple):
@@ -51,7 +50,7 @@ class Grid:
     """The dimensions of a sweep, those of walls last, and what lies at each of their points."""
 
     def __init__(self, study: SweepStudy) -> None:
-        self.axes = study.axes
+        self.axes, self.unit_system = study.axes, study.unit_system
         self.physical = study.axes.physical
         self.of_wall = ("stiffness", "virtual_damping") if self.physical else ("alpha", "beta")
         sizes = study.axes.sizes
@@ -83,7 +82,7 @@ class Grid:
             found["device"] = (("device",), np.array(labels), {"long_name": f"{LABEL} of the device"})
         for name, values in self._values.items():
             in_periods = name == "delay" and self.axes.delay_in_periods
-            units = "sampling periods" if in_periods else own_unit(PARAMETERS[name].unit)
+            units = "sampling periods" if in_periods else self.unit_system[PARAMETERS[name].unit]
             attributes = {"long_name": PARAMETERS[name].long_name, "units": units}
             variable, dim = PARAMETERS[name].variable, self._dim_of(name)
             dims = () if dim is None else (dim.replace(".", "_"),)

@@ -29,7 +29,6 @@ from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.words.errors import InputError, StoreError, how_to_install
 from zwidth.words.files import hidden_beside, remove_quietly, write_whole
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
-from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
 
 SUFFIX = ".zarr"
@@ -277,7 +276,7 @@ def _build(path: Path, plan: Plan) -> None:
             output = OUTPUTS[name]
             attributes = {"long_name": output.long_name, **output.flags}
             if output.dtype == "float64":
-                attributes["units"] = own_unit(output.units_in(plan.grid.physical))
+                attributes["units"] = plan.grid.unit_system[output.units_in(plan.grid.physical)]
             attributes["ancillary_variables"] = STATUS_OF[family.family]
             group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
         kept = common | keeping["uint8"]

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from zwidth.words.rotation import ROTARY, is_rotary, own_unit
+from zwidth.words.unit_system import UNIT_PAIRS, UnitSystem
 
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 LONGEST_VALUE = 60
@@ -27,16 +27,13 @@ def plain(value: float, digits: int = 4) -> str:
 
 
 def with_unit(value: float, unit: str, digits: int = 4) -> str:
-    """A quantity with an SI prefix on its unit: ``19.87 kN/m``, ``100.0 g`` of kilograms.
+    """Return a quantity with an SI prefix on its unit: ``19.87 kN/m``, and ``100.0 g`` for kilograms.
 
-    The unit is that of a linear device; of a rotary one in question its own is written. A number without unit, "1" or
-    "", has no prefix either.
+    Numbers without unit, "1" or "", have no prefix. Inertias are in g cm^2, as in data sheets of motors.
     """
-    unit = own_unit(unit)
     if unit in ("", "1"):
         return plain(value, digits)
     if unit == "kg m^2":
-        # What data sheets of rotors have.
         return f"{plain(1e7 * value, digits)} g cm^2" if math.isfinite(value) else plain(value)
     if unit == "kg":
         value, unit = 1e3 * value, "g"
@@ -61,10 +58,10 @@ def spell_short(value: float, unit: str, digits: int = 3) -> str:
     return f"{float(number):g}{space}{name}" if math.isfinite(value) else number
 
 
-def name_wall(stiffness: Any, virtual_damping: Any) -> str:
-    """A wall by its numbers, K rounded down: it holds as it is read."""
-    K = with_unit(round_safely(float(stiffness), "below"), "N/m")
-    return f"K = {K}, B = {with_unit(float(virtual_damping), 'N s/m')}"
+def name_wall(stiffness: Any, virtual_damping: Any, system: UnitSystem) -> str:
+    """Return K and B of a wall with units, K rounded down, so that the printed wall is stable if this one is."""
+    K = with_unit(round_safely(float(stiffness), "below"), system["N/m"])
+    return f"K = {K}, B = {with_unit(float(virtual_damping), system['N s/m'])}"
 
 
 # Words behind a number, by the side of it on which there is enough.
@@ -91,14 +88,11 @@ def count_digits_apart(values: list[float], least: int = 4) -> int:
     return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)), least)
 
 
-def spell_stiffness(value: float, digits: int = 4) -> str:
-    """A stiffness with its unit, rounded down: most are the largest of which something holds.
-
-    Of a rotary device per degree as well, as people picture it.
-    """
-    text = with_unit(round_safely(value, "below", digits), "N/m", digits)
-    turned = round_safely(value * 1e3 * math.pi / 180, "below", digits)
-    return f"{text} ({plain(turned, digits)} mN m/deg)" if is_rotary() and math.isfinite(value) else text
+def spell_stiffness(value: float, system: UnitSystem, digits: int = 4) -> str:
+    """Return a stiffness with its unit, rounded down because most are upper limits; rotary ones also per degree."""
+    text = with_unit(round_safely(value, "below", digits), system["N/m"], digits)
+    per_degree = round_safely(value * 1e3 * math.pi / 180, "below", digits)
+    return f"{text} ({plain(per_degree, digits)} mN m/deg)" if system.rotary and math.isfinite(value) else text
 
 
 def tell_apart(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
@@ -128,21 +122,17 @@ def header(name: str, unit: str) -> str:
     return f"{name}_{unit.replace('/', '_per_').replace(' ', '_').replace('^', '')}"
 
 
-_ENDINGS = [tuple(header("", unit) for unit in pair) for pair in sorted(ROTARY.items(), key=lambda pair: -len(pair[0]))]
+# Endings of headers for linear and for rotary devices, the longest first, because "_m" also ends "_N_per_m".
+_ENDINGS = sorted(([header("", unit) for unit in pair] for pair in UNIT_PAIRS), key=lambda pair: -len(pair[0]))
 
 
-def turn_header(name: str, rotary: bool) -> str:
-    """The name of a column, as ``stiffness_N_m_per_rad``, with the unit of a rotary device, or of a linear one."""
-    for linear, turned in _ENDINGS:
-        old, new = (linear, turned) if rotary else (turned, linear)
+def convert_header(name: str, system: UnitSystem) -> str:
+    """Return the name of a column, such as ``stiffness_N_per_m``, with the unit of the given system."""
+    for pair in _ENDINGS:
+        old = pair[not system.rotary]
         if name.endswith(old):
-            return name.removesuffix(old) + new
+            return name.removesuffix(old) + pair[system.rotary]
     return name
-
-
-def own_header(name: str) -> str:
-    """The same with the unit of the kind of device in question, where that of a linear one is given."""
-    return turn_header(name, True) if is_rotary() else name
 
 
 def to_json(value: Any) -> Any:

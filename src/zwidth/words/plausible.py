@@ -7,7 +7,7 @@ from typing import Any
 
 from zwidth.words.formatting import short
 from zwidth.words.quantities import FIELDS
-from zwidth.words.rotation import is_rotary, own_unit
+from zwidth.words.unit_system import UnitSystem
 
 # What devices have, by what kind of quantity it is, from and up to in its SI unit. An inertia of a rotary device, in
 # kg m^2, is far below any mass.
@@ -40,32 +40,35 @@ _SLIPS = {
 }
 
 
-def list_doubts(given: Mapping[str, Any], spell: Callable[[str, str], str]) -> list[str]:
-    """A line for every value in SI units, by path, that lies far from what any device has.
+def list_doubts(given: Mapping[str, Any], spell: Callable[[str, str], str], system: UnitSystem) -> list[str]:
+    """Return a warning for each implausible value.
 
-    ``spell`` says how a path is written, with a value or, where that is empty, alone.
+    Args:
+        given: values in SI units by path.
+        spell: returns the text of a path with a value, or of the path alone if the value is "".
+        system: units of the device.
     """
     lines = []
     for path, value in given.items():
         unit, name = FIELDS[path].unit if path in FIELDS else "", path.rpartition(".")[2]
         kind = name if name in _PLAUSIBLE and path != "coupling.stiffness" else _OF_UNIT.get(unit, "")
-        if isinstance(value, int | float) and kind in _PLAUSIBLE and not _is_plausible(kind, value):
+        if isinstance(value, int | float) and kind in _PLAUSIBLE and not _is_plausible(kind, value, system):
             number = short(value)
             meant = [
                 text or spell(other or path, f"{number} {smaller}")
                 for other, smaller, scale, text in _SLIPS.get(kind, ())
-                if _is_plausible(other or kind, value * scale) and not (is_rotary() and own_unit(unit) != unit)
+                if _is_plausible(other or kind, value * scale, system) and system[unit] == unit
             ]
             if kind == "delay" and meant:
                 meant[0] += f" or {spell(path, f'{number} periods')}"
             remedy = f"did you mean {meant[0]}?" if meant else "check its unit"
             if kind == "resolution" and value > 1:
-                per = "rev" if is_rotary() else "mm"
+                per = "rev" if system.rotary else "mm"
                 remedy = f"write counts as {spell(path, f'{number} counts/{per}')}"
-            lines.append(f"{spell(path, '')} is {number} {own_unit(unit)}, far from any device; {remedy}")
+            lines.append(f"{spell(path, '')} is {number} {system[unit]}, far from any device; {remedy}")
     return lines
 
 
-def _is_plausible(kind: str, value: float) -> bool:
-    low, high = _STEP_ANGLE if kind == "resolution" and is_rotary() else _PLAUSIBLE[kind]
+def _is_plausible(kind: str, value: float, system: UnitSystem) -> bool:
+    low, high = _STEP_ANGLE if kind == "resolution" and system.rotary else _PLAUSIBLE[kind]
     return value == 0 or low <= abs(value) <= high

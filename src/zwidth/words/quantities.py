@@ -1,7 +1,6 @@
-"""Every parameter of the loop and every output of a sweep, declared once.
+"""Registry of quantities: every parameter and every output of a sweep, with unit, range, symbol and description.
 
-From here come the admissible range of a value in a configuration and on the command line, its unit in files and stores,
-what a store says of it, and what a figure writes beside it.
+Configurations, options of the command line, stores and figures are generated from the entries.
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from zwidth.words.rotation import is_rotary
 from zwidth.words.status import Status
+from zwidth.words.unit_system import UnitSystem
 
 
 class Range(NamedTuple):
@@ -47,7 +46,7 @@ FRACTION = Range(0.0, 1.0, low_open=True, high_open=True)
 # Wide enough for any sampled loop, narrow enough that T^2 and 1/T^2 stay within float64.
 PERIODS = Range(1e-12, 1e9)
 RATES = Range(1e-9, 1e12)
-# Where the model is computed: SI quantities, alpha and beta are 0 or of these magnitudes, delta and d at most so large.
+# Range of the model: SI quantities, alpha and beta are 0 or of these magnitudes; largest delta and d.
 SI_RANGE = (1e-30, 1e30)
 WALL_RANGE = (1e-60, 1e60)
 LARGEST_DAMPING = 1e12
@@ -91,22 +90,19 @@ class Parameter:
         """What a figure and the explorer call it."""
         return self.short_name or self.long_name
 
-    @property
-    def own_words(self) -> str:
-        """The name for the current kind of device: "inertia" replaces "mass" for rotary devices."""
-        return self.words.replace("mass", "inertia") if is_rotary() else self.words
+    def words_in(self, system: UnitSystem) -> str:
+        """Return the name in figures; "inertia" replaces "mass" for rotary devices."""
+        return self.words.replace("mass", "inertia") if system.rotary else self.words
 
-    @property
-    def own_symbol(self) -> str:
-        """The symbol for the current kind of device, in mathtext: J replaces m for rotary devices."""
-        return re.sub(r"^m(?=_|$)", "J", self.symbol) if is_rotary() else self.symbol
+    def symbol_in(self, system: UnitSystem) -> str:
+        """Return the symbol in mathtext; J replaces m for rotary devices."""
+        return re.sub(r"^m(?=_|$)", "J", self.symbol) if system.rotary else self.symbol
 
-    @property
-    def axis_label(self) -> str:
-        """The label of a figure axis: name, symbol and definition for the current kind of device."""
+    def label_in(self, system: UnitSystem) -> str:
+        """Return the label of a figure axis: name, symbol and definition."""
         definition = f" = {self.definition}" if self.definition else ""
-        definition = definition.replace("/m", "/J") if is_rotary() else definition
-        return f"{self.own_words}  ${self.own_symbol}{definition}$"
+        definition = definition.replace("/m", "/J") if system.rotary else definition
+        return f"{self.words_in(system)}  ${self.symbol_in(system)}{definition}$"
 
     @property
     def sentence(self) -> str:
@@ -114,8 +110,7 @@ class Parameter:
         return self.long_name[0].upper() + self.long_name[1:]
 
 
-# Modes that files, axes and the command line name; in Python there may be more.
-MOST_MODES = 3
+MOST_MODES = 3  # modes in files, on axes and on the command line; in Python there is no limit
 
 
 def _describe_mode(path: str, name: str, index: str) -> tuple[Parameter, ...]:
@@ -128,7 +123,7 @@ def _describe_mode(path: str, name: str, index: str) -> tuple[Parameter, ...]:
     )
 
 
-# In the order of a store's dimensions: a plane of walls lies together, at the end.
+# In the order of a store's dimensions, the wall last, so that a plane of walls is contiguous.
 _PARAMETERS = (
     Parameter("period", "sampling period T", "T", PERIODS, "s", (5e-5, 0.02), short_name="sampling period"),
     Parameter("rate", "sampling rate 1/T", "1/T", RATES, "Hz", None, "in place of the period", "sampling rate"),
@@ -225,12 +220,10 @@ _PARAMETERS = (
 PARAMETERS = {parameter.name: parameter for parameter in _PARAMETERS}
 NORMALIZED = ("alpha", "beta", "delta", "d")
 PHYSICAL = tuple(name for name in PARAMETERS if name not in NORMALIZED)
-OF_PARTS = tuple(name for name in PARAMETERS if "." in name)
-"""Parameters of the parts beside device and timing, by the path that leads to them in a scene."""
-VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}
-"""The same by their names in a store."""
+OF_PARTS = tuple(name for name in PARAMETERS if "." in name)  # paths of the parameters of parts, as in a scene
+VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}  # parameters by their names in a store
 _NOISE = Parameter("velocity.noise", "largest error of a measured position", "", POSITIVE, "m", note="one count")
-# Of a simulated motion, beside its scene.
+# Arguments of simulations.
 _OF_MOTIONS = (
     Parameter(
         "start_position", "where the motion starts", "x_0", ANY, "m",
@@ -254,7 +247,6 @@ OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
 # Encoder, friction and motor: arguments of `zwidth.diagnose` and `zwidth.simulate`.
 HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
 FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
-"""Every number of a part or a motion by its name; the noise of an estimate without stable walls is no axis."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 
 
@@ -271,23 +263,18 @@ CHOICES = {
     "coupling.sensor": Choice(("motor", "tip"), "Where the position is measured; at the motor by default"),
 }
 
-OF_LOGS = {
+OF_LOGS = {  # options of log files
     "time": "Time column: its header, or HEADER:ms; HEADER:s+HEADER:ns for two columns. Default: by the headers.",
     "position": "Column of the position: its header, or HEADER:mm, :counts, :deg.",
     "force": "Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.",
     "resolution": "Encoder step, as 0.03mm, 0.09deg or '4000 counts/rev'.",
     "motor_constant": "What an ampere of a force in A makes, as 5N/A.",
 }
-"""What stands in the columns of a log, and what counts and amperes stand for."""
 
-Family: TypeAlias = Literal["wall", "device"]
-"""Whether an output belongs to each wall, or to each device and delay whatever its wall."""
-
+Family: TypeAlias = Literal["wall", "device"]  # an output per wall, or per device and delay
+# Color scales: truth values; numbers with a good and a bad side; other numbers; positive numbers; unbounded ones.
 Look: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
-"""Truth values; numbers with a good and a bad side; numbers; positive ones; and those that grow without end."""
-
-NOT_COMPUTED = 255
-"""The status of a point whose chunk is not there yet; the other codes are those of `zwidth.Status`."""
+NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other codes are those of `zwidth.Status`
 
 
 @dataclass(frozen=True)
@@ -398,12 +385,12 @@ _OUTPUTS = (
 OUTPUTS = {output.name: output for output in _OUTPUTS}
 
 RADIUS_OUTPUTS = frozenset(name for name, output in OUTPUTS.items() if "spectral_radius" in (name, output.source))
+# NaN means that the wall has no such margin (`zwidth.margins`).
 MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
-"""NaN there means that the wall has no such margin, as `zwidth.margins` says."""
 OUTPUTS_WITH_PARTS = tuple(name for name, output in OUTPUTS.items() if output.with_parts)
 
+# Name of the status variable of each family.
 STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
-"""The variable that says for each point of a family why it has the values it has."""
 
 
 def status_flags() -> dict[str, Any]:

@@ -12,10 +12,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from zwidth.words.formatting import round_safely, with_unit
-from zwidth.words.rotation import in_own_units, is_rotary, wrap_methods
 from zwidth.words.status import Status
+from zwidth.words.unit_system import ROTARY, UnitSystem
 
 Kind = TypeVar("Kind", bound=type)
+Result = TypeVar("Result")
 # A unit, or the names of codes.
 Unit = str | type[IntEnum]
 
@@ -32,45 +33,56 @@ def shown(
     missing: Mapping[str, str] = MappingProxyType({}),
     **units: Unit,
 ) -> Callable[[Kind], Kind]:
-    """Give a result, a dataclass or a named tuple, a short ``repr`` and a table in notebooks.
+    """Return a decorator that gives a result class, dataclass or named tuple, a short ``repr`` and an HTML table.
 
-    ``units`` are those of its fields, or the codes that stand there; a stiffness, a virtual damping and a status need
-    none. ``only`` are the fields that are shown, all where left out; ``missing`` says by field why one is NaN;
-    ``picture`` draws what stands below the table, as HTML.
+    The attribute ``unit_system`` of a result, which `with_units` sets, selects linear or rotary units.
+
+    Args:
+        only: names of the fields to show; all if empty.
+        picture: returns an HTML picture of the result, which follows the table.
+        missing: reasons for NaN, by field.
+        **units: units of linear devices, or enumerations of codes, by field; stiffness, virtual damping and status have
+            defaults.
     """
 
     def decorate(kind: Kind) -> Kind:
-        names = only or getattr(kind, "_fields", None) or tuple(getattr(kind, "__dataclass_fields__", ()))
-
+        shown_kind: Any = kind
+        base: Any = kind
+        if issubclass(kind, tuple):
+            # Named tuples have no place for an attribute, but their subclasses have. To JAX both are the same tuple.
+            names = ("__module__", "__qualname__", "__doc__")
+            shown_kind = type(kind.__name__, (kind,), {name: getattr(kind, name) for name in names})
+            shown_kind._replace = lambda self, **changes: with_units(base._replace(self, **changes), self.unit_system)
+        if not hasattr(kind, "unit_system"):
+            shown_kind.unit_system = None
+        fields = (
+            only
+            or getattr(kind, "_fields", None)
+            or tuple(name for name in getattr(kind, "__dataclass_fields__", ()) if name != "unit_system")
+        )
         known = _USUAL | units
 
-        def spell(self: Any) -> dict[str, str]:
-            texts = {name: spell_value(getattr(self, name), known.get(name, "")) for name in names}
-            return {
-                name: f"{text}{',' if text == 'NaN' else '; NaN:'} {missing[name]}"
-                if name in missing and "NaN" in text
-                else text
-                for name, text in texts.items()
-            }
+        def spell(self: Any, name: str, value: Any) -> str:
+            text = spell_value(value, find_unit(self, known.get(name, "")))
+            if name in missing and "NaN" in text:
+                text += f"{',' if text == 'NaN' else '; NaN:'} {missing[name]}"
+            return text
 
         def as_text(self: Any) -> str:
-            parts = [f"{name}={text}" for name, text in spell(self).items()]
+            parts = [f"{name}={spell(self, name, getattr(self, name))}" for name in fields]
             line = f"{kind.__name__}({', '.join(parts)})"
             return line if len(line) <= _LINE else f"{kind.__name__}(\n    " + ",\n    ".join(parts) + ",\n)"
 
         def as_html(self: Any) -> str:
-            columns, below = {name: getattr(self, name) for name in names}, picture(self) if picture else ""
+            columns, below = {name: getattr(self, name) for name in fields}, picture(self) if picture else ""
             if _is_table(columns.values()):
-                cells = [
-                    [spell_value(each, known.get(name, "")) for each in column] for name, column in columns.items()
-                ]
-                return write_table(kind.__name__, list(zip(*cells, strict=True)), names) + below
-            return write_table(kind.__name__, spell(self).items()) + below
+                cells = [[spell(self, name, each) for each in column] for name, column in columns.items()]
+                return write_table(kind.__name__, list(zip(*cells, strict=True)), fields) + below
+            rows = [(name, spell(self, name, value)) for name, value in columns.items()]
+            return write_table(kind.__name__, rows) + below
 
-        for name, method in (("__repr__", as_text), ("_repr_html_", as_html)):
-            setattr(kind, name, in_own_units(method))
-        _add_rotary(kind)
-        return kind
+        shown_kind.__repr__, shown_kind._repr_html_ = as_text, as_html
+        return shown_kind
 
     return decorate
 
@@ -82,20 +94,23 @@ class ResultList(list[Any]):
         return "\n".join(each._repr_html_() for each in self)
 
 
-def _add_rotary(kind: Any) -> None:
-    """Let results made for a rotary device keep its units: they are of a class below, ``kind.InRotaryUnits``."""
-    name, plain_new = "InRotaryUnits", kind.__new__
-    below = type(name, (kind,), {"__slots__": (), "__module__": kind.__module__, "in_rotary_units": True})
-    # As pickle finds it.
-    below.__qualname__ = f"{kind.__qualname__}.{name}"
-    wrap_methods(below, of=kind)
+def find_unit(result: Any, unit: Any) -> Any:
+    """Return a unit in the unit system of a result; "" for units that depend on the system if it is not known."""
+    if isinstance(unit, type) or ROTARY[unit] == unit:
+        return unit
+    return result.unit_system[unit] if result.unit_system else ""
 
-    def make(cls: type, *args: Any, **kwargs: Any) -> Any:
-        chosen = below if cls is kind and is_rotary() else cls
-        return object.__new__(chosen) if plain_new is object.__new__ else plain_new(chosen, *args, **kwargs)
 
-    kind.__new__, kind.in_rotary_units = make, False
-    setattr(kind, name, below)
+def with_units(result: Result, system: UnitSystem | None) -> Result:
+    """Return a result, or a list of results, after setting the unit system in which it is shown.
+
+    JAX ignores the unit system: results returned by `jit`, `vmap` and `tree.map` are shown in SI units without symbols.
+    """
+    for each in result if isinstance(result, list) else [result]:
+        # Scenes have a unit system of their own.
+        if getattr(type(each), "unit_system", "") is None:
+            object.__setattr__(each, "unit_system", system)
+    return result
 
 
 def spell_value(value: Any, unit: Unit = "") -> str:

@@ -1,7 +1,7 @@
 """Read quantities with units, such as ``10 kN/m``. Numbers without a unit are in the SI unit of their field.
 
-The usual units of each dimension, which messages list, are in tables. `zwidth.words.unit_symbols` reads any other unit
-of the same dimension, such as ``N/um`` or ``ozf in``.
+Messages list the usual units of each dimension. `zwidth.words.unit_symbols` reads these and any other unit of the same
+dimension, such as ``N/um`` or ``ozf in``.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any, NoReturn
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import describe, resembling, short
 from zwidth.words.quantities import ANY, SI_RANGE, Range
-from zwidth.words.rotation import ROTARY, is_rotary, own_unit
-from zwidth.words.unit_symbols import Exponents, measure_unit, normalize_symbols
+from zwidth.words.unit_symbols import Exponents, UnitSize, measure_unit, normalize_symbols
+from zwidth.words.unit_system import UNIT_PAIRS
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
 _QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.{0,30})", re.DOTALL)
@@ -34,22 +34,19 @@ _GROUPED = re.compile(r"[1-9][0-9]{0,2}(?:(?P<mark>[.,'’_\u00a0\u2009\u202f ])
 
 @dataclass(frozen=True, eq=False)
 class Dimension:
-    """The units of one kind of quantity, the base unit first, each with its power of ten over that.
+    """A physical dimension with the units that messages list; all other units of the dimension are read as well."""
 
-    Units that are no power of ten stand apart, with their factors.
-    """
-
-    powers: dict[str, int]
+    names: str  # usual units, separated by commas, the base unit first; "" for ratios
     example: str
-    factors: dict[str, float] = field(default_factory=dict)
+    factors: dict[str, float] = field(default_factory=dict)  # further units with other exponents, such as rad/s for Hz
 
     @property
     def units(self) -> tuple[str, ...]:
-        return (*self.powers, *self.factors)
+        return (*self.names.split(", "), *self.factors)
 
     @property
     def base(self) -> str:
-        return next(iter(self.powers))
+        return self.units[0]
 
     @cached_property
     def exponents(self) -> Exponents | None:
@@ -57,73 +54,52 @@ class Dimension:
         size = measure_unit(self.base)
         return None if size is None else size.exponents
 
+    def measure(self, unit: str) -> UnitSize | None:
+        """Return the size of a unit; None for a unit of another dimension."""
+        return measure_unit(unit, self.exponents) if self.exponents and unit else None
+
     def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
         """Return ``mantissa * 10**exponent`` units in the base unit; None for a unit of another dimension."""
-        own = next((name for name in self.units if _canonical(name) == _canonical(unit)), None)
-        if own in self.factors:
-            return float(f"{mantissa}e{exponent}") * self.factors[own]
-        if own is not None:
-            # Shift the decimal exponent, because a product would round twice: 0.3 ms is exactly the float64 of 0.0003.
-            return float(f"{mantissa}e{exponent + self.powers[own]}")
-        size = measure_unit(unit, self.exponents) if self.exponents and unit else None
+        if unit in self.factors:
+            return float(f"{mantissa}e{exponent}") * self.factors[unit]
+        size = self.measure(unit)
+        # Shift the decimal exponent, because a product would round twice: 0.3 ms is exactly the float64 of 0.0003.
         return None if size is None else float(f"{mantissa}e{exponent + size.power}") * size.factor
 
 
-MASS = Dimension({"kg": 0, "g": -3, "mg": -6}, "0.1 kg")
-TIME = Dimension({"s": 0, "ms": -3, "us": -6, "µs": -6, "ns": -9}, "1 ms")
-RATE = Dimension({"Hz": 0, "kHz": 3, "MHz": 6}, "1 kHz")
-DAMPING = Dimension(
-    {"N s/m": 0, "mN s/m": -3, "kN s/m": 3, "N s/mm": 3, "mN s/mm": 0, "N s/cm": 2, "kg/s": 0}, "10 N s/m"
-)
-STIFFNESS = Dimension({"N/m": 0, "mN/m": -3, "kN/m": 3, "MN/m": 6, "N/mm": 3, "kN/mm": 6, "N/cm": 2}, "10 kN/m")
-FORCE = Dimension({"N": 0, "mN": -3, "kN": 3}, "0.2 N")
-LENGTH = Dimension({"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "nm": -9}, "10 um")
-ANGLE = Dimension(
-    {"rad": 0, "mrad": -3},
-    "0.1 deg",
-    {"deg": math.pi / 180, "°": math.pi / 180, **dict.fromkeys(("rev", "turn", "turns"), 2 * math.pi)},
-)
-TORQUE = Dimension(
-    {"N m": 0, "mN m": -3, "uN m": -6, "µN m": -6, "kN m": 3, "N mm": -3, "mN mm": -6, "N cm": -2}, "50 mN m"
-)
-ANGULAR_STIFFNESS = Dimension(
-    {"N m/rad": 0, "mN m/rad": -3, "uN m/rad": -6, "µN m/rad": -6, "kN m/rad": 3},
-    "0.5 N m/rad",
-    {"N m/deg": 180 / math.pi, "mN m/deg": 0.18 / math.pi},
-)
-ANGULAR_DAMPING = Dimension(
-    {"N m s/rad": 0, "mN m s/rad": -3, "uN m s/rad": -6, "µN m s/rad": -6},
-    "2 mN m s/rad",
-    {"N m s/deg": 180 / math.pi, "mN m s/deg": 0.18 / math.pi},
-)
-INERTIA = Dimension(
-    {"kg m^2": 0, "g m^2": -3, "kg cm^2": -4, "kg mm^2": -6, "g cm^2": -7, "g mm^2": -9, "mg mm^2": -12}, "12 g cm^2"
-)
-ANGULAR_SPEED = Dimension({"rad/s": 0, "mrad/s": -3}, "0.1 rad/s", {"deg/s": math.pi / 180})
-TORQUE_RATE = Dimension({"N m/s": 0, "mN m/s": -3}, "0.5 N m/s")
-SPEED = Dimension({"m/s": 0, "cm/s": -2, "mm/s": -3, "um/s": -6}, "1 mm/s")
-FORCE_RATE = Dimension({"N/s": 0, "kN/s": 3, "N/ms": 3}, "500 N/s")
-RATIO = Dimension({"": 0}, "0.02")
+MASS = Dimension("kg, g, mg", "0.1 kg")
+TIME = Dimension("s, ms, us, µs, ns", "1 ms")
+RATE = Dimension("Hz, kHz, MHz", "1 kHz")
+DAMPING = Dimension("N s/m, mN s/m, kN s/m, N s/mm, mN s/mm, N s/cm, kg/s", "10 N s/m")
+STIFFNESS = Dimension("N/m, mN/m, kN/m, MN/m, N/mm, kN/mm, N/cm", "10 kN/m")
+FORCE = Dimension("N, mN, kN", "0.2 N")
+LENGTH = Dimension("m, cm, mm, um, µm, nm", "10 um")
+ANGLE = Dimension("rad, mrad, deg, °, rev, turn, turns", "0.1 deg")
+TORQUE = Dimension("N m, mN m, uN m, µN m, kN m, N mm, mN mm, N cm", "50 mN m")
+ANGULAR_STIFFNESS = Dimension("N m/rad, mN m/rad, uN m/rad, µN m/rad, kN m/rad, N m/deg, mN m/deg", "0.5 N m/rad")
+ANGULAR_DAMPING = Dimension("N m s/rad, mN m s/rad, uN m s/rad, µN m s/rad, N m s/deg, mN m s/deg", "2 mN m s/rad")
+INERTIA = Dimension("kg m^2, g m^2, kg cm^2, kg mm^2, g cm^2, g mm^2, mg mm^2", "12 g cm^2")
+ANGULAR_SPEED = Dimension("rad/s, mrad/s, deg/s", "0.1 rad/s")
+TORQUE_RATE = Dimension("N m/s, mN m/s", "0.5 N m/s")
+SPEED = Dimension("m/s, cm/s, mm/s, um/s", "1 mm/s")
+FORCE_RATE = Dimension("N/s, kN/s, N/ms", "500 N/s")
+RATIO = Dimension("", "0.02")
 _SCALES = (
     *(MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED),
     *(INERTIA, ANGULAR_DAMPING, ANGULAR_STIFFNESS, TORQUE, TORQUE_RATE, ANGLE, ANGULAR_SPEED),
 )
-_OF_UNIT = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
-_OTHER_KIND = {one: other for pair in ROTARY.items() for one, other in (pair, pair[::-1])}
+DIMENSIONS = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
+_OTHER_KIND = {one: other for pair in UNIT_PAIRS for one, other in (pair, pair[::-1])}
+_ROTARY_UNITS = [rotary for _, rotary in UNIT_PAIRS]
 
 PERIOD_WORDS = ("periods", "period")
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
 """Units of encoder positions, which are converted with the resolution of the encoder."""
 
 
-def find_dimension(unit: str) -> Dimension:
-    """The units of a quantity by its SI unit, that of a linear device: of the kind of device in question."""
-    return _OF_UNIT[own_unit(unit)]
-
-
 def find_other(dimension: Dimension) -> Dimension | None:
     """The same quantity of the other kind of device, linear or rotary; None where both have one unit."""
-    return _OF_UNIT.get(_OTHER_KIND.get(dimension.base, ""))
+    return DIMENSIONS.get(_OTHER_KIND.get(dimension.base, ""))
 
 
 def tell_kind(value: Any) -> bool | None:
@@ -142,9 +118,10 @@ def tell_kind(value: Any) -> bool | None:
 
 
 def spell_exactly(value: float, unit: str) -> str:
-    """A quantity in SI units as the shortest text that is read back as the same float64: ``0.1, "kg"`` as ``100 g``."""
-    number = Decimal(repr(float(value)))
-    powers = {name: power for name, power in find_dimension(unit).powers.items() if not power % 3}
+    """Return a quantity in SI units as the shortest text that is read as the same float64: 0.1 kg as ``100 g``."""
+    number, dimension = Decimal(repr(float(value))), DIMENSIONS[unit]
+    sizes = [(name, size) for name in dimension.units if (size := dimension.measure(name)) is not None]
+    powers = {name: size.power for name, size in sizes if size.factor == 1.0 and not size.power % 3}
     fitting = [name for name, power in powers.items() if abs(number.scaleb(-power)) >= 1]
     # The first name of a power is the usual one.
     chosen = max(fitting, key=lambda name: powers[name]) if fitting else unit
@@ -189,7 +166,7 @@ def _canonical(unit: str) -> str:
 
 
 _KIND_OF_EXPONENTS = {
-    _OF_UNIT[base].exponents: kind == 1 for pair in ROTARY.items() for kind, base in enumerate(pair) if base in _OF_UNIT
+    DIMENSIONS[base].exponents: kind == 1 for pair in UNIT_PAIRS for kind, base in enumerate(pair) if base in DIMENSIONS
 }
 
 
@@ -296,7 +273,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
         raise UnusableValueError(got, allowed, remedy)
     other = find_other(dimension)
     if other is not None and other.in_base(mantissa, 0, unit) is not None:
-        that = "linear" if is_rotary() else "rotary"
+        that = "linear" if dimension.base in _ROTARY_UNITS else "rotary"
         _refuse_kind(
             got,
             dimension,
@@ -308,7 +285,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
 
 def _refuse_kind(got: str, dimension: Dimension, remedy: str) -> NoReturn:
     """Raise `UnusableValueError` for a rotary unit in a linear device or a linear unit in a rotary device."""
-    this, that = ("rotary", "linear") if is_rotary() else ("linear", "rotary")
+    this, that = ("rotary", "linear") if dimension.base in _ROTARY_UNITS else ("linear", "rotary")
     names = ", ".join(dimension.units)
     raise UnusableValueError(
         f"{got}, a unit of a {that} device where the device is {this}", f"the units allowed are {names}", remedy

@@ -13,7 +13,7 @@ from zwidth.cli import cli
 from zwidth.fitting.device_fit import RivalDevice
 from zwidth.fitting.words import spell_rival
 from zwidth.studies.document import load_config
-from zwidth.words.rotation import use_kind
+from zwidth.words.unit_system import LINEAR, ROTARY
 
 pytestmark = pytest.mark.usefixtures("fitted_once", "unpainted")
 KNOB = make_knob(4, samples=1000)
@@ -146,6 +146,5 @@ def test_a_normalized_scene_has_no_hardware(tmp_path):
 
 def test_the_inertia_of_a_rotary_device_has_the_symbol_j():
     rival = RivalDevice(1e-5, 1e-4, 1e-3, 1.0)
-    with use_kind(True):
-        assert spell_rival(rival).startswith("J = 100.0 g cm^2")
-    assert spell_rival(rival).startswith("m = ")
+    assert spell_rival(rival, ROTARY).startswith("J = 100.0 g cm^2")
+    assert spell_rival(rival, LINEAR).startswith("m = ")

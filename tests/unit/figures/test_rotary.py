@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import zwidth
+from zwidth.config.values import read_in_units
 from zwidth.figures import draw_curves, draw_plane
+from zwidth.figures.style import style_sheet
 from zwidth.studies import Config
 from zwidth.studies.outcome import ComputedStudy
-from zwidth.words.rotation import use_kind
+from zwidth.words.unit_system import ROTARY
 
 KNOB = {"mass": "60 g cm^2", "damping": "0.02 mN m s/rad", "rate": "1 kHz", "delay": "0.7 periods"}
 
 
 def draw(addition="", **study):
     """The Axes of a study of the knob."""
-    with use_kind(True):
+    with read_in_units(ROTARY), style_sheet(system=ROTARY):
         config = Config.model_validate({"version": 1, "name": "k", "scene": KNOB, "studies": [{"name": "it", **study}]})
         (made,) = config.studies
         assert isinstance(made, ComputedStudy)

@@ -11,8 +11,8 @@ from zwidth.fitting.columns import fit_motions, read_log
 from zwidth.fitting.repair import find_glitches, repair_log
 from zwidth.fitting.words import summarize_fit
 from zwidth.words.errors import InputError
-from zwidth.words.rotation import use_kind
 from zwidth.words.status import Status
+from zwidth.words.unit_system import ROTARY
 
 KNOB = make_knob(3)
 ROWS = range(KNOB.reading.size)
@@ -149,8 +149,7 @@ def test_repairs_are_right(seed):
     count = count.copy()
     # A third to two thirds of a turn away from the true count.
     count[wild] = np.mod(count[wild] + rng.integers(knob.counts // 3, 2 * knob.counts // 3, wild.size), knob.counts)
-    with use_kind(True):
-        found = repair_log(None, knob.step * count, knob.torque, knob.step)
+    found = repair_log(None, knob.step * count, knob.torque, knob.step, ROTARY)
     away = found.position - knob.step * knob.reading[found.row]
     away = np.delete(away, np.flatnonzero(np.isin(found.row, wild)))
     assert np.ptp(away) < 1e-9

@@ -6,13 +6,15 @@ import pickle
 import re
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 import zwidth
 from zwidth.words.formatting import with_unit
-from zwidth.words.rotation import ROTARY, is_rotary, use_kind
-from zwidth.words.units import find_dimension
+from zwidth.words.showing import find_unit
+from zwidth.words.unit_system import LINEAR, ROTARY, UNIT_PAIRS
+from zwidth.words.units import DIMENSIONS
 
 LINEAR_UNITS = re.compile(r"\b(k|m|µ|M)?(N/m|N s/m|g)\b(?! ?cm\^2)|\bkg\b(?! m\^2)")
 
@@ -72,9 +74,9 @@ def test_a_rotary_scene_has_the_numbers_of_the_linear_one(seed):
     )
     assert one.verdict is not None
     assert other.verdict is not None
-    np.testing.assert_equal(dataclasses.asdict(one.verdict), dataclasses.asdict(other.verdict))
+    np.testing.assert_equal(one.verdict.as_dict(), other.verdict.as_dict())
     walls = [scene.replace(stiffness=K[0], virtual_damping=B[0]) for scene in (linear, rotary)]
-    first, second = (dataclasses.asdict(zwidth.assess(scene)) for scene in walls)
+    first, second = (zwidth.assess(scene).as_dict() for scene in walls)
     np.testing.assert_equal(first, second)
     # One of each: a program is compiled.
     if seed <= 3:
@@ -102,8 +104,6 @@ def test_results_are_shown_in_the_units_of_their_device():
     assert "angle in rad" in found.code()
     assert "angle in rad" in found.code("python")
     assert "N m/rad" in zwidth.limits_of(scene)[0].spell()
-    # The kind in question ends with the question.
-    assert not is_rotary()
     assert "N/m" in repr(zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3)).max_stiffness())
 
 
@@ -171,12 +171,58 @@ def test_no_typing_error_of_a_rotary_unit_is_taken_for_a_linear_one():
 
 
 def test_every_unit_of_the_table_is_read_and_written():
-    for linear, rotary in ROTARY.items():
-        with use_kind(True):
-            assert with_unit(1.0, linear) == with_unit(1.0, rotary)
-            if linear != "m/N":
-                assert find_dimension(linear).base == rotary
-        assert find_dimension("kg").base == "kg"
-    with use_kind(True):
-        assert with_unit(4.5e-4, "kg") == "4500 g cm^2"
-        assert with_unit(2.0, "N/m per kg") == "2.000 N m/rad per kg m^2"
+    for linear, rotary in UNIT_PAIRS:
+        assert (LINEAR[linear], ROTARY[linear], ROTARY[rotary]) == (linear, rotary, rotary)
+        if linear != "m/N":
+            assert [DIMENSIONS[unit].base for unit in (linear, rotary)] == [linear, rotary]
+    assert with_unit(4.5e-4, ROTARY["kg"]) == "4500 g cm^2"
+    assert with_unit(2.0, ROTARY["N/m per kg"]) == "2.000 N m/rad per kg m^2"
+
+
+def test_results_of_both_kinds_of_device_have_one_class_and_one_pytree():
+    rotary, linear = make_rotary().max_stiffness(), zwidth.Scene(LINEAR_DEVICE, TIMING).max_stiffness()
+    assert type(rotary) is type(linear)
+    assert [find_unit(each, "N/m") for each in (rotary, linear)] == ["N m/rad", "N/m"]
+    assert jax.tree.structure(rotary) == jax.tree.structure(linear)
+    ratio = jax.tree.map(lambda one, other: float(one / max(other, 1)), rotary, linear)
+    K, B, *_ = rotary
+    assert (ratio.stiffness, ratio.virtual_damping) == (K / linear.stiffness, B / max(linear.virtual_damping, 1))
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda wall: jax.tree.map(np.asarray, wall),
+        lambda wall: jax.jit(lambda each: each)(wall),
+        lambda wall: jax.vmap(lambda each: each)(jax.tree.map(np.atleast_1d, wall)),
+    ],
+)
+def test_results_of_jax_are_shown_without_units_that_may_be_wrong(transform):
+    found = transform(make_rotary().max_stiffness())
+    assert type(found).__name__ == "StiffestWall"
+    assert found.unit_system is None
+    assert "Hz" in repr(found)
+    assert "N" not in repr(found).replace("NO_", "").removeprefix("StiffestWall")
+
+
+def test_numbers_without_units_are_those_of_a_linear_device():
+    found = zwidth.sensitivities(mass=0.1, period=1e-3)
+    assert "kN/m" in repr(found)
+    assert "kN/m" in repr(found._replace(per_mass=1.0))
+    assert "kN/m" in repr(zwidth.denormalize(mass=0.1, period=1e-3, alpha=0.1))
+    traced = jax.jit(lambda mass: zwidth.sensitivities(mass=mass, period=1e-3))(0.1)
+    assert float(traced.stiffness_max) == pytest.approx(float(found.stiffness_max), rel=1e-5)
+
+
+def test_a_motion_has_its_units_in_a_dataset():
+    data = make_rotary().simulate(start_position="1 deg", periods=50).to_dataset()
+    assert (data.position.units, data.velocity.units, data.command.units) == ("rad", "rad/s", "N m")
+
+
+def test_walls_without_units_are_rotary_if_asked_for():
+    points = [(0.4, 0.0, 40.0), (0.9, 1e-3, 68.0), (1.1, 2e-3, 89.0)]
+    fit = zwidth.fit_buzz(points, period="1 ms", noise=0.02, rotary=True)
+    assert fit.scene.device.rotary
+    assert "N m" in repr(fit)
+    with pytest.raises(zwidth.InputError, match=r"^rotary: got False"):
+        zwidth.fit_buzz([("0.4 N m/rad", 0, 40), ("0.9 N m/rad", 1e-3, 68)], period=1e-3, rotary=False)

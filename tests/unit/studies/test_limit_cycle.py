@@ -7,8 +7,10 @@ from pydantic import ValidationError
 import zwidth
 from zwidth import figures
 from zwidth.config.fields import problems_of
+from zwidth.config.values import read_in_units
+from zwidth.figures.style import style_sheet
 from zwidth.studies.limit_cycle import LimitCycleStudy
-from zwidth.words.rotation import use_kind
+from zwidth.words.unit_system import ROTARY
 
 DEVICE = {"mass": 0.1, "damping": 0.1, "period": 1e-3, "delay": "1 periods"}
 SCENE = zwidth.Scene(zwidth.Device(0.1, 0.1), zwidth.Timing(period=1e-3, delay=1e-3))
@@ -133,7 +135,7 @@ def knob_of(**keys):
 
 def test_the_bounds_of_a_rotary_device_are_angles():
     """2,000 counts are steps of 3.14 mrad: a limit cycle within a step is one, and is drawn."""
-    with use_kind(True):
+    with read_in_units(ROTARY), style_sheet(system=ROTARY):
         study = knob_of()
         assert study.bound_amplitudes(study.device.to_scene()) == (1e-6, pytest.approx(np.radians(20)))
         outcome = study.compute(None, True)
@@ -153,7 +155,7 @@ def test_the_bounds_follow_a_coarse_encoder():
 
 
 def test_a_figure_without_limit_cycles_gives_the_reason():
-    with use_kind(True):
+    with read_in_units(ROTARY), style_sheet(system=ROTARY):
         outcome = knob_of(widest="0.1 mrad").compute(None, True)
         (draw,) = outcome.figures.values()
         upper, _ = draw()

@@ -7,12 +7,12 @@ import pytest
 
 from zwidth.parts.checks import Span
 from zwidth.words.errors import UnusableValueError
-from zwidth.words.rotation import use_kind
 from zwidth.words.units import (
     ANGLE,
     ANGULAR_DAMPING,
     ANGULAR_STIFFNESS,
     DAMPING,
+    DIMENSIONS,
     FORCE,
     INERTIA,
     LENGTH,
@@ -21,7 +21,6 @@ from zwidth.words.units import (
     STIFFNESS,
     TIME,
     TORQUE,
-    find_dimension,
     read_quantity,
     spell_exactly,
 )
@@ -113,14 +112,13 @@ def test_units_that_no_table_lists_are_read(dimension, text, value):
 
 def test_counts_per_revolution_or_length_are_the_step_of_an_encoder():
     step = math.pi / 1000
-    with use_kind(True):
-        for text in ("2000 counts/rev", "2000 cpr", "2,000.0 counts/turn", "2e3 ticks/rev"):
-            assert read_quantity(text, find_dimension("m"))[0] == pytest.approx(step, rel=1e-15)
-        assert read_quantity("2000 counts", find_dimension("m"), counts=True)[0] == pytest.approx(step, rel=1e-15)
-        assert read_quantity("14 bit", find_dimension("m"))[0] == 2 * math.pi / 2**14
-        # Elsewhere counts are no angle: how many make a turn is open.
-        with pytest.raises(UnusableValueError, match="units allowed are rad"):
-            read_quantity("20 counts", find_dimension("m"))
+    for text in ("2000 counts/rev", "2000 cpr", "2,000.0 counts/turn", "2e3 ticks/rev"):
+        assert read_quantity(text, ANGLE)[0] == pytest.approx(step, rel=1e-15)
+    assert read_quantity("2000 counts", ANGLE, counts=True)[0] == pytest.approx(step, rel=1e-15)
+    assert read_quantity("14 bit", ANGLE)[0] == 2 * math.pi / 2**14
+    # Elsewhere counts are no angle: how many make a turn is open.
+    with pytest.raises(UnusableValueError, match="units allowed are rad"):
+        read_quantity("20 counts", ANGLE)
     assert read_quantity("50 counts/mm", LENGTH)[0] == pytest.approx(2e-5, rel=1e-15)
     with pytest.raises(UnusableValueError, match=r"unit of a rotary device where .*50 counts/mm"):
         read_quantity("2000 counts", LENGTH, counts=True)
@@ -238,4 +236,4 @@ def test_a_spelled_quantity_is_read_back_bit_by_bit(value, unit, text):
     mantissa, _, shown = spelled.partition(" ")
     assert len(mantissa) <= 25
     digits, _, exponent = mantissa.partition("E")
-    assert find_dimension(unit).in_base(digits, int(exponent or 0), shown) == value
+    assert DIMENSIONS[unit].in_base(digits, int(exponent or 0), shown) == value

@@ -27,7 +27,7 @@ from zwidth.scenes.stiffest import choose_damping
 from zwidth.studies.document import Config, load_config
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OF_PARTS, PARAMETERS, Parameter
-from zwidth.words.rotation import ROTARY, own_unit, use_kind
+from zwidth.words.unit_system import LINEAR, ROTARY, UnitSystem
 from zwidth.words.units import spell_exactly
 
 # Beyond so many, the poles cannot follow a drag.
@@ -63,17 +63,15 @@ class Slider(NamedTuple):
     whole: bool = False
 
 
-def _make_slider(parameter: Parameter, rotary: bool = False) -> Slider:
+def _make_slider(parameter: Parameter, system: UnitSystem) -> Slider:
     unit, per_si = _SHOWN.get(parameter.unit, (parameter.unit.removeprefix("1"), 1.0))
     low, high = parameter.slider or (0.0, 0.0)
-    words, symbol = parameter.words, parameter.symbol.lstrip(chr(92))
-    if rotary and parameter.unit in _TURNED:
+    if system.rotary and parameter.unit in _TURNED:
         # Walls are set on a chart that is in SI units.
         unit, per_si = (ROTARY[parameter.unit], 1.0) if parameter.name in _WALL else _TURNED[parameter.unit]
         low, high = low * _SMALLER[parameter.unit], high * _SMALLER[parameter.unit]
-        with use_kind(True):
-            words, symbol = parameter.own_words, parameter.own_symbol.lstrip(chr(92))
-    return Slider(f"{words} {symbol}", unit, per_si, low * per_si, high * per_si, parameter.whole)
+    name = f"{parameter.words_in(system)} {parameter.symbol_in(system).lstrip(chr(92))}"
+    return Slider(name, unit, per_si, low * per_si, high * per_si, parameter.whole)
 
 
 # The units of the page, and how many of them are one SI unit; of rotary devices those that differ.
@@ -84,8 +82,9 @@ _SMALLER = {"kg": 1e-3, "N s/m": 1e-3, "N/m": 1e-3}
 _BARE = ("device", "timing", "wall")
 _DEVICE, _WALL = ("mass", "damping", "period", "delay", "delta", "d"), ("stiffness", "virtual_damping", "alpha", "beta")
 # By the path in a scene. A range that begins at 0 is cubic on the page, one above logarithmic.
-SLIDERS = {name: _make_slider(PARAMETERS[name]) for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider}
-ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], True) for name in SLIDERS}
+_MOVED = [name for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider]
+SLIDERS = {name: _make_slider(PARAMETERS[name], LINEAR) for name in _MOVED}
+ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], ROTARY) for name in _MOVED}
 # With m = 1 and T = 1 these are the scene's own numbers.
 _NORMALIZED = {"delta": "damping", "d": "delay", "alpha": "stiffness", "beta": "virtual_damping"}
 CHOICES = {
@@ -319,17 +318,16 @@ def _spell_section(controls: Controls) -> dict[str, Any]:
     """The section ``scene`` of a configuration; quantities have their units."""
     if controls.normalized:
         return {name: value for name, value in controls.shown().items() if name != "mode"}
-    with use_kind(controls.rotary):
-        return _add_units(spell_scene(controls.scene))
+    return _add_units(spell_scene(controls.scene), controls.scene.unit_system)
 
 
-def _add_units(value: Any, path: str = "") -> Any:
-    """Numbers of a section as texts with units, found by their paths."""
+def _add_units(value: Any, system: UnitSystem, path: str = "") -> Any:
+    """Return a section with all numbers as text with the unit of their path."""
     if isinstance(value, dict):
-        return {name: _add_units(part, f"{path}.{name}".lstrip(".")) for name, part in value.items()}
+        return {name: _add_units(part, system, f"{path}.{name}".lstrip(".")) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_add_units(part, f"{path}.{k}") for k, part in enumerate(value)]
-    unit = unit_of(path)
+        return [_add_units(part, system, f"{path}.{k}") for k, part in enumerate(value)]
+    unit = system[unit_of(path)]
     return spell_exactly(value, unit) if unit else value
 
 
@@ -345,10 +343,11 @@ def to_yaml(controls: Controls) -> str:
 
 def to_python(controls: Controls) -> str:
     """A script that builds the scene, judges its wall and draws the stable set."""
-    with use_kind(controls.rotary):
-        parts, units = spell_part(controls.scene), not controls.normalized
-        given = {name: _spell(part, "" if name in _BARE else name, units) for name, part in parts.items()}
-        notes, unit, damper = "", own_unit("N/m"), own_unit("N s/m")
+    system = controls.scene.unit_system
+    units = None if controls.normalized else system
+    parts = spell_part(controls.scene).items()
+    given = {name: _spell(part, "" if name in _BARE else name, units) for name, part in parts}
+    notes, unit, damper = "", system["N/m"], system["N s/m"]
     x, y = f"stiffness K in {unit}", f"virtual damping B in {damper}"
     if controls.normalized:
         notes, unit = "# Normalized: with m = 1 and T = 1, K is alpha and B is beta.\n", "(alpha)"
@@ -357,16 +356,16 @@ def to_python(controls: Controls) -> str:
     return _SCRIPT.format(scene=f"zwidth.Scene(\n{text})", notes=notes, unit=unit, x=x, y=y)
 
 
-def _spell(value: Any, path: str, units: bool) -> str:
-    """A part, or a number of one, as Python writes it."""
+def _spell(value: Any, path: str, system: UnitSystem | None) -> str:
+    """Return the Python expression of a part or a number; numbers have units if a unit system is given."""
     if isinstance(value, LinearDevice):
         form = tuple([float(c) for c in part] for part in value.system[:2])
         return f"zwidth.LinearDevice({form})"
     if hasattr(value, "__dataclass_fields__"):
         given = spell_part(value).items()
-        words = (f"{name}={_spell(own, f'{path}.{name}'.lstrip('.'), units)}" for name, own in given)
+        words = (f"{name}={_spell(own, f'{path}.{name}'.lstrip('.'), system)}" for name, own in given)
         return f"zwidth.{type(value).__name__}({', '.join(words)})"
     if isinstance(value, tuple) and any(hasattr(own, "__dataclass_fields__") for own in value):
-        return f"[{', '.join(_spell(own, f'{path}.{k}', units) for k, own in enumerate(value))}]"
+        return f"[{', '.join(_spell(own, f'{path}.{k}', system) for k, own in enumerate(value))}]"
     unit = unit_of(path)
-    return json.dumps(spell_exactly(value, unit)) if units and unit else repr(value)  # pyright: ignore
+    return json.dumps(spell_exactly(value, system[unit])) if system and unit else repr(value)  # pyright: ignore

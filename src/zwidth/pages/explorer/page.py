@@ -23,7 +23,6 @@ from zwidth.pages.words import spell_radius
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import ZwidthError
-from zwidth.words.rotation import is_rotary, own_unit, use_kind
 
 # A message holds some dozen numbers, or an address.
 _LONGEST_MESSAGE = 16_000
@@ -194,11 +193,12 @@ class Page:
         self.plots["plane"].legend.label_text_color = inks["ink"]
 
     def _name_axes(self) -> None:
-        spring, damper = own_unit("N/m"), own_unit("N s/m")
+        units = self.controls.scene.unit_system
+        spring, damper = units["N/m"], units["N s/m"]
         hertz, time, walls = "frequency in Hz", "time in s", (f"stiffness K in {spring}", f"damping B in {damper}")
-        deflection = "angle" if is_rotary() else "position"
-        place, step = (f"{deflection} in m{own_unit(unit)}" for unit in ("m", "m/N"))
-        force = f"wall {'torque' if is_rotary() else 'force'} in {own_unit('N')}"
+        deflection = "angle" if units.rotary else "position"
+        place, step = (f"{deflection} in m{units[unit]}" for unit in ("m", "m/N"))
+        force = f"wall {'torque' if units.rotary else 'force'} in {units['N']}"
         if self.controls.normalized:
             hertz, time, walls = "cycles per period", "time in periods", ("alpha", "beta")
             place, step, force = "position", "position", "wall force"
@@ -246,8 +246,7 @@ class Page:
             with IMPORTING:
                 before = self.controls if link is None else read_link(link) if link else self.start
                 controls = before.change(changes)
-                with use_kind(controls.rotary):
-                    self._show_at_once(controls, rest)
+                self._show_at_once(controls, rest)
         except Exception as error:
             self.tell({"error": _explain(error), "state": self.controls.shown(), "busy": False})
             return
@@ -318,11 +317,10 @@ class Page:
     def _compute(self, generation: int, scene: Scene, *frame: model.Range, **wanted: bool) -> None:
         """In the worker's thread: compute part by part, unless something newer is wanted."""
         try:
-            with use_kind(bool(scene.device.rotary)):
-                for update in compute_details(scene, *frame, **wanted):
-                    if generation != self.generation:
-                        return
-                    self._hand_over(generation, update)
+            for update in compute_details(scene, *frame, **wanted):
+                if generation != self.generation:
+                    return
+                self._hand_over(generation, update)
             self._hand_over(generation, {"busy": False})
         except Exception as error:
             # What belongs to the wall before goes.

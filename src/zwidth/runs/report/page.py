@@ -21,7 +21,7 @@ from matplotlib.colors import to_hex
 from zwidth.config.study import KINDS
 from zwidth.figures.grid import choose_axes, in_order
 from zwidth.figures.plane import ColorScale, Edges, choose_scale
-from zwidth.figures.style import pick_evenly, save, style_sheet, write_unit
+from zwidth.figures.style import pick_evenly, save, style_sheet, units, write_unit
 from zwidth.figures.table import is_of_rotary
 from zwidth.runs.draw import figures_of, make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
@@ -31,8 +31,8 @@ from zwidth.words.errors import StoreError
 from zwidth.words.files import write_whole
 from zwidth.words.formatting import tell_apart
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, VARIABLES
-from zwidth.words.rotation import use_kind
 from zwidth.words.status import Status
+from zwidth.words.unit_system import SYSTEMS
 
 if TYPE_CHECKING:
     import xarray
@@ -166,7 +166,7 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
                 if not data.attrs["complete"]:
                     raise StoreError(f"{path}: chunks are missing; 'zwidth run CONFIG --resume' computes them")
                 edges = make_edges(Store(path))
-                with use_kind(is_of_rotary(data)):
+                with style_sheet(system=SYSTEMS[is_of_rotary(data)]):
                     shown = [*find_slices(data, edges), *_draw_curves(data, entry["name"])]
                 yield "".join(shown) or (
                     '<p class="soft">It holds no plane of numbers and no curve; zwidth export writes its table.</p>'
@@ -311,4 +311,4 @@ def _unit(values: xarray.DataArray) -> str:
 
 
 def _words(dim: str) -> str:
-    return VARIABLES[dim].own_words if dim in VARIABLES else dim
+    return VARIABLES[dim].words_in(units()) if dim in VARIABLES else dim
