@@ -62,7 +62,7 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
 
 
 def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
-    """Return requirements that may enlarge the margins, by the options that ask for them."""
+    """Return requirements that may enlarge the margins, by the options that select them."""
     phase = max(DEFAULT_PHASE_MARGIN, wanted.phase_margin or 0.0)
     gain = max(DEFAULT_GAIN_MARGIN, wanted.gain_margin or 0.0)
     by_phase, by_gain = f"--phase-margin {phase:g}", f"--gain-margin {gain:g}"
@@ -71,7 +71,7 @@ def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
     if wanted.passive:
         tried[f"{by_phase} without --passive"] = wanted._replace(phase_margin=phase, passive=False)
     defaults = Wanted.check(None, None, None, False, wanted.beyond_safe, wanted.grasps)
-    return tried | {"the default margins (no option for margins)": defaults}
+    return tried | {"without options for margins": defaults}
 
 
 def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[Any], bool], otherwise: str) -> str:
@@ -83,7 +83,7 @@ def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[
             ratio = wall.stiffness / recommendation.stiffness
             cost = f"costs {max(100.0 * (1.0 - ratio), 0.1):.2g} % of the stiffness"
             cost = cost if ratio <= 1.0 else f"{plain(ratio, 3)} times the stiffness"
-            return f"ask for {words}: {name_wall(wall.stiffness, wall.damping, scene.unit_system)} ({cost})"
+            return f"use recommend {words}: {name_wall(wall.stiffness, wall.damping, scene.unit_system)} ({cost})"
     return otherwise
 
 

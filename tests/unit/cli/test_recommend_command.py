@@ -37,7 +37,7 @@ def test_a_person_reads_what_to_set_and_what_to_buy():
 def test_a_wall_on_the_brink_carries_a_caution():
     text = " ".join(recommend("--passive").stdout.split())
     assert "CAUTION phase margin 0.89 deg, gain margin 1.04, delay margin" in text
-    assert "rings for 470 ms; ask for --phase-margin 30: K = 3.979 kN/m, B = 7.75" in text
+    assert "rings for 470 ms; use recommend --phase-margin 30: K = 3.979 kN/m, B = 7.75" in text
     assert "N s/m (costs 52 % of the stiffness)" in text
     assert "limited by passivity; CAUTION: small margins device" in text
     assert "requirements (not checked in the reference grasps):" in text
@@ -46,7 +46,7 @@ def test_a_wall_on_the_brink_carries_a_caution():
 def test_a_wall_stable_in_every_grasp():
     text = " ".join(recommend("--stiffness-fraction", "95%").stdout.split())
     assert "CAUTION: small margins, unstable in a hand device" in text
-    assert "unstable in the hand (firm, light damping); ask for --grasps all: K = 15." in text
+    assert "unstable in the hand (firm, light damping); use recommend --grasps all: K = 15." in text
     text = " ".join(recommend("--stiffness-fraction", "95%", "--grasps", "all").stdout.split())
     assert "limited by stability in all six reference grasps" in text
     assert "in a hand stable in all six reference grasps" in text

@@ -250,13 +250,13 @@ def test_a_wall_on_the_brink_carries_a_caution_with_a_remedy_that_holds():
         for wanted in wishes:
             found = scene.recommend(**wanted)
             assert found.cautions, wanted
-            match = re.search(r"ask for (.*?) \((?:costs|gains) (\S+) %", found.cautions[0])
+            match = re.search(r"use recommend (.*?) \((?:costs|gains) (\S+) %", found.cautions[0])
             assert match is not None
             asked, cost = match.groups()
             more = dict(wanted)
             for name, value in re.findall(r"--(\S+) ([\d.]+)", asked):
                 more[name.replace("-", "_")] = float(value)
-            if "without" in asked:
+            if "without --passive" in asked:
                 del more["passive"]
             again = scene.recommend(**more)
             assert again.verdict is not None
@@ -272,7 +272,7 @@ def test_grasps_that_destabilize_a_wall_are_named_with_a_wall_that_none_destabil
     held = scene.replace(operator=zwidth.Operator(**hand))
     assert not held.is_stable(found.stiffness, found.virtual_damping)
     assert [name for name, stable in found.grasps.items() if not stable] == ["firm, light damping"]
-    wall = r"in the hand \(firm, light damping\); ask for --grasps all: K = (.*?), B = (.*?) \(costs"
+    wall = r"in the hand \(firm, light damping\); use recommend --grasps all: K = (.*?), B = (.*?) \(costs"
     match = re.search(wall, found.cautions[1])
     assert match is not None
     K, B = match.groups()
