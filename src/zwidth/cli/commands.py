@@ -79,7 +79,7 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
     if diagnosis is not None:
         result["diagnosis"] = diagnosis.as_dict()
     if as_json:
-        result["cautions"] = words.silent_cautions(scene, find_silent())
+        result["cautions"] = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
         result["islands"] = [island._asdict() for island in scene.islands()]
         unstable = verdict.stable is False and not verdict.marginal
         if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
@@ -326,7 +326,8 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option(
     "--grasps",
     type=click.Choice(("all", "soft", "none")),
-    help="Reference grasps in which the wall must be stable.  [default: soft, with the default margins]",
+    help="Reference grasps in which the wall must be stable; for every hand, use --passive.  [default: soft, with the "
+    "default margins]",
 )
 @hardware_options
 @beyond_safe_option

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from zwidth.cli.commands import cli
+from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.hardware import diagnose_wall
 from zwidth.cli.help import show_example
 from zwidth.cli.options import (
@@ -105,7 +105,7 @@ def fit(
     heard. With LOG.csv: from its free motion under a force that a computer commanded, friction included; several logs
     are of one device and have the same columns. Units stand in headers, as 'encoder [counts]', or behind a colon.
     SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, and the period of walls and of
-    logs without a column of times; options override it.
+    logs without a column of times; options override it. Exit code 1: no wall is recommended (0 with --yaml).
     """
     from zwidth.fitting.words import list_units, write_scene
 
@@ -147,6 +147,8 @@ def fit(
         evidence: dict[str, Any] = gather_evidence(found, source, points)
         wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
     if code:
+        if found.recommended.status != Status.OK:
+            raise click.ClickException(found.recommended.reason)
         click.echo(found.recommended.code(code), nl=False)
         return
     if as_yaml:
@@ -157,8 +159,10 @@ def fit(
     if as_json:
         checks = {"diagnosis": None if diagnosis is None else diagnosis.as_dict()}
         print_json({**found.as_dict(), "units": list_units(found), **checks})
-        return
-    print_folded([*_list_lines(found, source, diagnosis, verbose), *wrote], LABEL)
+    else:
+        print_folded([*_list_lines(found, source, diagnosis, verbose), *wrote], LABEL)
+    if found.recommended.status != Status.OK:
+        raise SystemExit(EXIT_FAILED)
 
 
 def _diagnose(found: Any) -> Any:

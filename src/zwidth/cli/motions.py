@@ -52,7 +52,8 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
     diagnosis = find_cause(scene, **hardware)
     remedy = diagnosis.advise()
     lines = [row(diagnosis.word, diagnosis.explain()), *([row("to stop it", remedy)] if remedy else [])]
-    lines += [row("CAUTION", text) for text in words.silent_cautions(scene, find_silent())]
+    cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
+    lines += [row("CAUTION", text) for text in cautions]
     words.tell(diagnosis.as_dict(), lines, as_json)
 
 
@@ -106,16 +107,19 @@ def simulate(
     ]
     force = max(abs(float(motion.command.min())), abs(float(motion.command.max())))
     load = "torque" if units.rotary else "force"
-    depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}"
-    depth += f", {load} up to {with_unit(force, units['N'], 3)}"
+    depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}, "
+    depth += f"{load} up to {with_unit(force, units['N'], 3)}; "
+    # The extremes of a growing motion depend on the simulated time alone.
+    depth = "" if int(motion.outcome) == MotionKind.GROWING else depth
     lines = [
         row("start", ", ".join(filter(None, start)) or "at rest"),
-        row("motion", f"{depth}; {ending}"),
+        row("motion", depth + ending),
         row(cause.word, cause.explain()),
     ]
     if cause.cause not in ("none", "undecided"):
         lines.append(row("remedies", "zwidth diagnose, with the same options"))
-    lines += [row("CAUTION", text) for text in words.silent_cautions(scene, find_silent())]
+    cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
+    lines += [row("CAUTION", text) for text in cautions]
     if figure is not None:
         from zwidth.figures import plot
 

@@ -112,7 +112,9 @@ def repair_log(
     if modulus:
         # Count wraps after the removal of glitches, because a glitch may hide a wrap.
         count = int(np.count_nonzero(np.round(np.diff(position) / modulus)))
-        turn = "360 deg, " if system.rotary and np.isclose(modulus, 2 * np.pi) else ""
+        turns = modulus / (2 * np.pi) if system.rotary else 1.0
+        turn = "360 deg, " if system.rotary else ""
+        turn = turn if np.isclose(turns, 1.0) else f"{turns:.4g} turns: if it should be 1, check the encoder step; "
         size = with_unit(modulus, system["m"], 6)
         notes.append(f"the position wraps at {size} ({turn}{_count(count, 'time')}) and was unwrapped")
         position = unwrap(position, modulus)

@@ -13,6 +13,7 @@ from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.pages.words import (
     diagnosis_lines,
     fold,
+    limit_cautions,
     line,
     part_lines,
     scene_notes,
@@ -88,8 +89,10 @@ def check_lines(
     if isinstance(scene.device, Device):
         wall_words += f" (alpha {plain(verdict.alpha)}, beta {plain(verdict.beta)})"
         device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
-    alarm = f"; CAUTION: {diagnosis.word.lower()}" if diagnosis is not None and diagnosis.cause != "none" else ""
-    lines = [line(word, wall_words + (alarm if word == "STABLE" else "")), line("device", device_words)]
+    alarms = ["exceeds the safe limit"] if limit_cautions(scene) else []
+    alarms += [diagnosis.word.lower()] if diagnosis is not None and diagnosis.cause != "none" else []
+    alarm = f"; CAUTION: {', '.join(alarms)}" if alarms and word == "STABLE" else ""
+    lines = [line(word, wall_words + alarm), line("device", device_words)]
     lines += part_lines(scene)
     lines += [line("CAUTION", text) for text in silent_cautions(scene, silent)]
     # A measured response has no poles.
@@ -103,6 +106,7 @@ def check_lines(
     elif word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no stabilizing change of one parameter was found"]
         lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
+        lines.append(line("", "these are limits of stability, without margins: for a wall to set, use recommend"))
     lines += margin_lines(verdict)
     lines += decay_lines(verdict)
     if word != "UNSTABLE" or verbose:

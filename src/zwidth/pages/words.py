@@ -155,15 +155,17 @@ def scene_notes(scene: Scene) -> list[str]:
 
 def _compare_with_limit(scene: Scene) -> list[str]:
     """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
+    limit = scene.safe_limit
+    return [] if limit is None or isinstance(scene.wall, NoWall) else [*limit_cautions(scene), *limit.warnings]
+
+
+def limit_cautions(scene: Scene) -> list[str]:
+    """Return the caution that a wall exceeds the safe limit of its scene; an empty list if it does not."""
     limit, wall = scene.safe_limit, scene.wall
-    if limit is None or isinstance(wall, NoWall):
+    allowed = limit is None or isinstance(wall, NoWall)
+    if limit is None or allowed or limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
         return []
-    if limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
-        return list(limit.warnings)
-    return [
-        f"this wall exceeds the safe limit: the real device may be unstable. {limit.describe(scene.unit_system)}",
-        *limit.warnings,
-    ]
+    return [f"this wall exceeds the safe limit: the real device may be unstable. {limit.describe(scene.unit_system)}"]
 
 
 def spell_diagnosis(found: Diagnosis | None) -> list[tuple[str, str]]:

@@ -27,6 +27,7 @@ FEWEST_PERIODS = 2000  # length of the shortest simulation, in sampling periods
 MOST_PERIODS = 200_000  # length of the longest simulation, in sampling periods; limits the run time
 SETTLED = 2.0  # time constants that must be simulated before a motion may count as sustained
 CONFIRMED = "simulated at these and larger changes: check the value that you choose with diagnose"
+WITHOUT_MARGINS = "these are limits of stability, without margins: for a wall to set, use recommend"
 FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in proportion to its steps"
 
 
@@ -117,6 +118,7 @@ class Diagnosis:
         advice = ", or ".join(remedy.spell(3 if simulated else 4) for remedy in self.remedies)
         parts = [advice or "no remedy by a change of one parameter was found"]
         parts += [CONFIRMED] if advice and simulated else []
+        parts += [] if simulated else [WITHOUT_MARGINS]
         # Without friction the loop scales with the encoder step, and between two force steps no equilibrium exists.
         parts += [FRICTIONLESS] if self.cause == "quantization" and not self.hardware.static else []
         return "; ".join(parts)

@@ -33,7 +33,7 @@ def _describe_call(system: UnitSystem) -> tuple[str, str]:
     position, force = ("angle in rad", "torque") if system.rotary else ("position in m", "force")
     return (
         f"x is the {position}, 0 at the surface of the wall and positive inside of it; the {force} on the device is",
-        f"in {system['N']}, and 0 outside of the wall.",
+        f"in {system['N']}, and 0 outside of the wall. x must be continuous: unwrap an encoder that restarts.",
     )
 
 

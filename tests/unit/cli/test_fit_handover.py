@@ -95,17 +95,21 @@ def test_beyond_the_safe_limit_only_on_demand_and_with_a_warning(tmp_path):
 def test_warnings_forbid_a_wall_in_every_command(tmp_path):
     true, force, position = record_hidden_mode()
     log = write_log(tmp_path, true, force, 1e4 * position)
-    lines = run("fit", *log).splitlines()
+    lines = run("fit", *log, code=1).splitlines()
     assert lines[0] == "NO WALL    resolve the warnings first, then record again"
     assert any(line.startswith("WARNING ") for line in lines)
     file, out = tmp_path / "fitted.yaml", tmp_path / "run"
     file.write_text(run("fit", *log, "--yaml"), encoding="utf-8")
-    (warning,) = json.loads(run("fit", *log, "--json"))["safe_limit"]["warnings"][:1]
-    assert "NO WALL" in run("recommend", file)
+    (warning,) = json.loads(run("fit", *log, "--json", code=1))["safe_limit"]["warnings"][:1]
+    assert "NO WALL" in run("recommend", file, code=1)
     run("run", file, "--out", out)
     assert warning in (out / "recommendation.md").read_text("utf-8")
-    run("recommend", file, "--code", "c", code=2)
-    run("fit", *log, "--code", "c", code=2)
+    run("recommend", file, "--code", "c", code=1)
+    run("fit", *log, "--code", "c", code=1)
+    wall = "--stiffness", "10 N/m", "--virtual-damping", "0.1 N s/m"
+    assert "; CAUTION: exceeds the safe limit" in " ".join(run("check", file, *wall).split())
+    assert "this wall exceeds the safe limit" in json.loads(run("check", file, *wall, "--json"))["cautions"][0]
+    assert "this wall exceeds the safe limit" in " ".join(run("simulate", file, *wall).split())
 
 
 def test_the_reserve_is_the_same_if_the_safe_limit_binds():
