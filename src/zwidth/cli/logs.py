@@ -23,7 +23,7 @@ from zwidth.cli.options import (
     verbose_option,
     warn_implausible,
 )
-from zwidth.cli.records import Loop, log_options, loop_options, read_logs
+from zwidth.cli.records import RecordLoop, log_options, loop_options, read_logs
 from zwidth.pages.words import LABEL, line, print_folded, print_json, row, spell_diagnosis, tell
 from zwidth.parts.checks import find_kind
 from zwidth.parts.measured import MeasuredDevice
@@ -90,7 +90,7 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 def fit(
     logs: tuple[Path, ...],
     walls: tuple[Any, ...],
-    loop: Loop,
+    loop: RecordLoop,
     noise: float | None,
     figure: Path | None,
     code: Any,
@@ -204,7 +204,7 @@ _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
 @click.option("--out", type=_FILE, default=Path("play.csv"), show_default=True, help="The file to play.")
 @json_option
 def excite(
-    loop: Loop,
+    loop: RecordLoop,
     force: float | None,
     resolution: float | None,
     duration: float,
@@ -272,7 +272,7 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
 @json_option
 def respond(
     logs: tuple[Path, ...],
-    loop: Loop,
+    loop: RecordLoop,
     cycle: float | None,
     save: Path | None,
     figure: Path | None,

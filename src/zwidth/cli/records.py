@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _LONG = 2**23  # bytes; the user is informed that reading a longer log takes a while
 
 
-class Loop(NamedTuple):
+class RecordLoop(NamedTuple):
     """The control loop of a record: options, completed by a scene file."""
 
     period: float | None  # in s, from the options
@@ -49,7 +49,7 @@ class Loop(NamedTuple):
             )
 
 
-def _make_loop(given: dict[str, Any], _: UnitSystem) -> Loop:
+def _make_loop(given: dict[str, Any], _: UnitSystem) -> RecordLoop:
     """Return the loop described by options, given by path, and by the scene of a file."""
     scene = given.pop("scene", None)
     if {"period", "rate"} <= given.keys():
@@ -57,8 +57,8 @@ def _make_loop(given: dict[str, Any], _: UnitSystem) -> Loop:
     period = 1.0 / given["rate"] if "rate" in given else given.get("period")
     changes = {path: value for path, value in given.items() if path.startswith("velocity.")}
     if scene is not None:
-        return Loop(period, change_scene(scene, changes).velocity, scene)
-    return Loop(
+        return RecordLoop(period, change_scene(scene, changes).velocity, scene)
+    return RecordLoop(
         period,
         make_velocity({path.removeprefix("velocity."): value for path, value in changes.items()}) if changes else None,
         None,
@@ -73,8 +73,8 @@ def _is_scene(path: Path) -> bool:
 def loop_options(*, logs: bool) -> Callable[[Command], Command]:
     """Add the options of period and velocity estimate, and the argument for a scene file.
 
-    The command receives a `Loop` as ``loop``. With ``logs``, the arguments are logs, one of which may be a scene file,
-    and the command receives the paths of the others as ``logs``.
+    The command receives a `RecordLoop` as ``loop``. With ``logs``, the arguments are logs, one of which may be a scene
+    file, and the command receives the paths of the others as ``logs``.
     """
     paths = ("period", "rate", *(path for path in (*CHOICES, *OF_PARTS) if path.startswith("velocity.")))
     take = take_options("loop", paths, _make_loop)
@@ -106,7 +106,7 @@ def log_options(command: Command) -> Command:
 
 
 def read_logs(
-    logs: Iterable[Path], loop: Loop, *, resolution: str | None, motor_constant: str | None, **columns: Any
+    logs: Iterable[Path], loop: RecordLoop, *, resolution: str | None, motor_constant: str | None, **columns: Any
 ) -> list[Any]:
     """Return the motions of logs; report on the error stream which logs are read if that takes long.
 
