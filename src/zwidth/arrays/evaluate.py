@@ -12,31 +12,22 @@ import math
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from functools import cache, partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.threads import run_in_threads
+from zwidth.arrays.blocks import count_points, map_blocks
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
-from zwidth.words.xp import WIDE, is_jax, is_traced, known_options, store_once, tree_map
+from zwidth.words.xp import WIDE, compute_concretely, is_jax, is_traced, known_options, store_once, tree_map
 
 # The types whose conversion needs no check; bool and 0-d arrays take the long way.
 _PLAIN = frozenset({float, int, np.float64})
 _NUMBERS = (int, float, np.floating, np.integer)
-
-
-@contextmanager
-def compute_concretely() -> Iterator[None]:
-    """Compute in float64 and at once, also inside a JAX transformation that traces other values, in this thread."""
-    import jax
-
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        yield
 
 
 def are_numbers(*values: ArrayLike) -> bool:
@@ -190,8 +181,6 @@ FEW = 1 << 18
 # At most so many points go at one time to NumPy, whose arrays then stay in caches, and to what is compiled: one
 # compilation, bounded memory, work for every processor.
 _AT_ONCE, BLOCK = 1 << 15, 1 << 16
-# The compiler treats shorter arrays differently, to the last place.
-_LEAST = 1 << 4
 
 
 def evaluate(
@@ -231,7 +220,7 @@ def evaluate_columns(
     kernel: Callable[..., Any], columns: Sequence[np.ndarray], *static: Any, weight: int = 1, route: Route = "auto"
 ) -> Any:
     """`evaluate` of concrete columns of one length; one of a single value goes to the kernel as a number."""
-    count = _length(columns)
+    count = count_points(columns)
     if route == "jax" or (route == "auto" and count > max(1, FEW // weight)):
         return map_blocks(compile_columns(kernel, static), columns, BLOCK // weight)
 
@@ -239,7 +228,7 @@ def evaluate_columns(
         with np.errstate(all="ignore"):
             result = kernel(*(part[0] if part.size == 1 else part for part in parts), *static)
         # A copy: a view of an argument, or of one value, could not be written to. One point has its axis first, too.
-        shape = (_length(parts),)
+        shape = (count_points(parts),)
         if shape == (1,):
             return tree_map(lambda leaf: np.array(leaf)[None], result)
         return tree_map(lambda leaf: leaf if np.ndim(leaf) > 1 else np.array(np.broadcast_to(leaf, shape)), result)
@@ -352,55 +341,7 @@ def compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Call
     import jax
 
     def whole(*columns: Any) -> Any:
-        count = _length(columns)
+        count = count_points(columns)
         return kernel(*(column[0] if column.size == 1 < count else column for column in columns), *static)
 
     return jax.jit(whole, compiler_options=known_options(WIDE))
-
-
-def map_blocks(
-    function: Callable[..., Any],
-    columns: Sequence[np.ndarray],
-    block: int,
-    threads: int | None = None,
-    within: Callable[[], Any] = compute_concretely,
-    exact: bool = False,
-) -> Any:
-    """Apply a function to columns of one length, or of one value, block by block on every processor."""
-    # One array of a million points is 2.5 times slower for the ridge (benchmarks/bench_xla.py): what the function holds
-    # meanwhile leaves the cache. ``exact``: few points fill up a whole block too.
-    count = _length(columns)
-    # A power of two, so that batches of many sizes share a few compilations.
-    size = block if exact else min(block, 1 << max(count - 1, _LEAST - 1).bit_length())
-    flagged = [(column, column.size == 1 < count) for column in columns]
-
-    def run(start: int) -> Any:
-        with within():
-            parts = (column if shared else _piece(column, start, size) for column, shared in flagged)
-            return tree_map(np.asarray, function(*parts))
-
-    first = run(0)
-    # A copy, because JAX's own memory is read-only.
-    whole = tree_map(lambda leaf: np.empty((count, *leaf.shape[1:]), leaf.dtype), first)
-
-    def store(start: int, result: Any) -> None:
-        stop = min(start + size, count)
-        tree_map(lambda to, leaf: np.copyto(to[start:stop], leaf[: stop - start]), whole, result)
-
-    store(0, first)
-    # The first piece has compiled the function; JAX lets go of the interpreter while it computes.
-    run_in_threads(lambda start: store(start, run(start)), range(size, count, size), threads)
-    return whole
-
-
-def _length(columns: Sequence[np.ndarray]) -> int:
-    return np.broadcast_shapes(*(column.shape for column in columns))[0]
-
-
-def _piece(column: np.ndarray, start: int, size: int) -> np.ndarray:
-    part = column[start : start + size]
-    missing = size - part.size
-    if not missing:
-        return part
-    # The last point is repeated: a neutral filler would need to be known to be good for every kernel.
-    return np.concatenate([part, np.full(missing, part[-1] if part.size else 0.0)])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64, compute_concretely, join_shapes
+from zwidth.arrays.evaluate import as_float64, join_shapes
 from zwidth.arrays.threads import processors
 from zwidth.parts.checks import read_texts
 from zwidth.parts.linear_device import LinearDevice
@@ -19,7 +19,7 @@ from zwidth.simulation.parameters import Settings, TracedLaw
 from zwidth.words.errors import InputError, ResourceError, describe_choice
 from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
 from zwidth.words.unit_system import LINEAR, UnitSystem
-from zwidth.words.xp import is_traced
+from zwidth.words.xp import compute_concretely, is_traced
 
 RECORDED_BYTES = 2 * 14 * 8  # per recorded instant, including its conversion to SI units
 JITTER_BYTES = 20 * 8  # per instant of the running simulations

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import compute_concretely
 from zwidth.arrays.threads import run_in_threads
 from zwidth.parts.chain import chain_of
 from zwidth.parts.device import Device
@@ -26,6 +25,7 @@ from zwidth.simulation.parameters import (
     spread_scenes,
 )
 from zwidth.simulation.result import OF_ENERGY, convert_to_si
+from zwidth.words.xp import compute_concretely
 
 GROUP = 1 << 10  # simulations per call: enough for vector units, few enough that a state stays in the cache
 

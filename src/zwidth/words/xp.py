@@ -9,7 +9,8 @@ cores with AVX-512. Importing this imports no JAX.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache, reduce
 from math import factorial
 from typing import Any, TypeVar
@@ -37,6 +38,15 @@ def is_traced(*values: Any) -> bool:
     """Whether any argument is inside a JAX transformation."""
     kind = getattr(getattr(sys.modules.get("jax"), "core", None), "Tracer", None)
     return kind is not None and any(isinstance(value, kind) for value in values)
+
+
+@contextmanager
+def compute_concretely() -> Iterator[None]:
+    """Compute in float64 without tracing in this thread, also inside a JAX transformation of other values."""
+    import jax
+
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        yield
 
 
 def namespace(*values: Any) -> Any:

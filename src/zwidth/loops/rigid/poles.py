@@ -15,7 +15,8 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64, map_blocks, to_caller
+from zwidth.arrays.blocks import map_blocks
+from zwidth.arrays.evaluate import as_float64, to_caller
 from zwidth.arrays.polynomials import companion, square
 from zwidth.loops.rigid.circle import Loop, factor_loop
 from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
