@@ -277,7 +277,7 @@ class JoinedArcs(NamedTuple):
         return cls(w, beta, rest[0], *bands(w, *rest), keys, dampings, first, *ends, *own)
 
     def sum_met(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the sum of weights of the arcs that each row meets; a row through an end of an arc counts as above it."""
+        """Return the sum of weights of the arcs that each row meets; a row through an end counts as just above it."""
         sums = np.cumsum(np.concatenate([[0.0], np.concatenate([weights, -weights])[self.order]]))
         return sums[np.searchsorted(self.sorted_ends, beta, side="right")]
 
