@@ -32,7 +32,7 @@ ARGUMENTS = {
     for name in ("stiffness", "virtual_damping", *OF_MOTIONS)
 } | {"jitter": ("s", NOT_NEGATIVE)}
 """Unit and range of each numeric argument of `simulate`."""
-LIMITS = ("max_force", "max_rate")  # infinite if the motor has no limit
+LIMITS = ("max_force", "max_rate")  # may be infinite: the motor then has no such limit
 
 
 def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
@@ -62,7 +62,7 @@ def find_system(scenes: list[Any]) -> UnitSystem:
 
 
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments with one initial value per body."""
+    """Return the arguments with initial values of every body; bodies without their own start with the device."""
     bodies = dict.fromkeys(["position", *(name for scene in scenes for name in name_bodies(scene))])
     for name in STARTS:
         start = given.pop(name)
@@ -75,7 +75,7 @@ def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
 
 
 def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, periods: int) -> Any:
-    """Return the external force of operators with a moving far end, averaged over each period."""
+    """Return the mean external force on the device per period, including the force of the moving hand."""
     places = _read_history("hand_history", hand, periods + 1, find_system(scenes)["m"])
     for scene in scenes:
         if scene.operator is None or not scene.operator.rigid or scene.device.coupling is not None:
@@ -141,7 +141,7 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
 def read_arguments(
     scenes: list[Any], which: np.ndarray, given: dict[str, Any], seed: Any, history: Any, periods: int
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Return the numbers of all simulations by name, the scene index in the batch shape, and a mask of usable rows."""
+    """Return numbers by name, one per simulation; scene indices in the batch shape; and a mask of valid simulations."""
     if given["static"] is None:
         given = {**given, "static": given["coulomb"]}
     system = find_system(scenes)

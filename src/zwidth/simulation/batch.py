@@ -31,7 +31,7 @@ GROUP = 1 << 10  # simulations per call: enough for vector units, few enough tha
 
 
 def find_structure(scene: Parts) -> tuple[Any, ...]:
-    """Return the properties that scenes of one compiled program share."""
+    """Return the properties that must be equal for scenes to share a compiled program."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
     orders = len(scene.device.modes), 0 if scene.device.actuator is None else scene.device.actuator.order
     # Linear systems have no common structure, so each device and period has a program of its own.
@@ -41,7 +41,7 @@ def find_structure(scene: Parts) -> tuple[Any, ...]:
 
 
 def name_bodies(scene: Parts) -> tuple[str, ...]:
-    """Return the names in `Motion` of the positions of all bodies."""
+    """Return the fields of `Motion` with the positions of the bodies."""
     tip = ("tip_position",) if scene.device.coupling is not None else ()
     hand = ("hand_position",) if scene.operator is not None and not scene.operator.rigid else ()
     return "position", *tip, *hand
@@ -96,13 +96,14 @@ def run_scenes(
         record=settings.record,
         law=settings.law,
     )
-    # The minima avoid further compilations; a longer ring takes no more time.
+    # Lengths of the rings of positions and of commands. The minimum lengths save compilations; longer rings than needed
+    # take no more time.
     rings = (
         round_up(max(3, *(model.window for model in models)) + 1),
         round_up(max(5, *(model.late for model in models)) + 3),
     )
     names, count = name_bodies(scenes[0]), which.size
-    # The energies of a linear system are unknown, because its bodies are.
+    # The energies of a linear system are unknown, because its masses and springs are unknown.
     unknown = set() if isinstance(scenes[0].device, Device) else OF_ENERGY
 
     def run(rows: np.ndarray) -> dict[str, np.ndarray]:

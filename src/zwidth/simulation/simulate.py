@@ -77,8 +77,8 @@ def simulate(
         substeps: recorded instants per period, >= 1.
         start_position: in m; one value for all bodies, or a mapping by their names in `Motion`, as ``{"position": 0,
             "hand_position": 1e-3}``; other bodies start with the device.
-        start_velocity: in m/s, likewise. Before the start, the measured positions lie on the line of this velocity.
-        push: constant external force on the device, in N; a `LinearDevice` feels it at the input of the command.
+        start_velocity: in m/s, likewise. Before the start, the device moves at its start velocity.
+        push: constant external force on the device, in N; on a `LinearDevice` it acts where the wall acts.
         push_history: external force in N, constant over each period, (..., periods); added to ``push``.
         hand_history: recorded position in m of the far end of the spring and damper of a rigid `zwidth.Operator`,
             (..., periods + 1), linear between samples; its force is averaged over each period.
@@ -94,13 +94,13 @@ def simulate(
         seed: integer >= 0, one for all or one per simulation; equal seeds give equal noise and jitter.
         tail: number of periods at the end from which amplitude, frequency, trend and outcome are computed; a quarter
             of ``periods`` if left out.
-        record: also return the motion over time.
+        record: return the motion over time in addition to its statistics.
 
     Returns:
         Motion: arrays over time and statistics of each motion, see `zwidth.Motion`.
 
     Raises:
-        InputError: a number is not usable; friction with a pole of more than 64 rad per period; JAX cannot trace the
+        InputError: an argument is invalid; friction with a pole of more than 64 rad per period; JAX cannot trace the
             law, or the law keeps values between calls.
         ResourceError: the recorded or random numbers need more than 4 GiB.
 
@@ -173,4 +173,5 @@ def _build_time(known: list[Any], which: np.ndarray, steps: np.ndarray, drawn: n
 
 
 def _missing(dtype: np.dtype) -> Any:
+    """Return the value of a result that does not exist."""
     return np.nan if dtype.kind == "f" else 0
