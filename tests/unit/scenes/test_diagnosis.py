@@ -60,7 +60,8 @@ def test_without_friction_the_limit_cycle_scales_with_the_encoder_step() -> None
     ratios = []
     for step in (2e-5, 2e-6, 2e-7):
         found = zwidth.diagnose(PHANTOM, 8008, 33.45, resolution=step, remedies=False)
-        assert (found.cause, found.remedies) == ("quantization", ())
+        assert (found.cause, found.remedies) == ("quantization", None)
+        assert found.advise().startswith("zwidth diagnose searches")
         ratios.append(found.amplitude / step)
     assert ratios == pytest.approx([ratios[0]] * 3, rel=1e-3)
     assert found.advise().endswith(
@@ -115,7 +116,7 @@ def test_a_pure_damper_is_not_unstable() -> None:
 def test_the_wall_of_the_scene() -> None:
     scene = PHANTOM.replace(wall=zwidth.VirtualWall(8008, 33.45))
     found = zwidth.diagnose(scene, resolution=2e-5, remedies=False)
-    assert (found.stiffness, found.virtual_damping, found.remedies) == (8008, 33.45, ())
+    assert (found.stiffness, found.virtual_damping, found.remedies) == (8008, 33.45, None)
     assert found.as_dict()["hardware"]["max_force"] is None
 
 
