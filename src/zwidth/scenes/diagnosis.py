@@ -10,6 +10,7 @@ import numpy as np
 
 from zwidth.parts.checks import check_limit, check_number
 from zwidth.parts.wall import VirtualWall, resolve_wall
+from zwidth.scenes.answers import one_wall
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.remedies import search_remedies
 from zwidth.scenes.stabilization import Remedy, stabilize
@@ -186,7 +187,7 @@ def diagnose(
         'quantization'
     """
     units = scene.unit_system
-    K, B = (float(value) for value in resolve_wall(scene.wall, stiffness, virtual_damping, units))
+    K, B = one_wall(*map(np.asarray, resolve_wall(scene.wall, stiffness, virtual_damping, units)))
     sliding = check_number("coulomb", coulomb, units["N"])
     hardware = Hardware(
         check_number("resolution", resolution, units["m"]),

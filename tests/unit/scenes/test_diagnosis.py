@@ -127,6 +127,8 @@ def test_the_wall_of_the_scene() -> None:
 def test_bad_input(options: dict[str, Any], field: str) -> None:
     with pytest.raises(zwidth.InputError, match=f"^{field}: got"):
         zwidth.diagnose(PHANTOM, 8008, 33, **options)
+    with pytest.raises(zwidth.InputError, match=r"got shape \(2,\); one wall"):
+        zwidth.diagnose(PHANTOM, [8008, 9000], 33)
     with pytest.raises(zwidth.InputError, match="stiffness: none is given"):
         zwidth.diagnose(PHANTOM)
 
