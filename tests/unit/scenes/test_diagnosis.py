@@ -34,6 +34,7 @@ def test_encoder_of_a_knob() -> None:
     # Amplitude and frequency of an oscillation within a step of the encoder.
     assert 0.1 * STEP < found.amplitude < STEP
     assert 20 < found.frequency < 200
+    assert found.remedies is not None
     remedies = {remedy.parameter: remedy for remedy in found.remedies}
     assert set(remedies) == {"resolution", "coulomb", "stiffness"}
     # With an external force of half a step times K, friction below K Q/2 cannot hold the device.
@@ -48,6 +49,7 @@ def test_remedies_are_simulated() -> None:
     options: dict[str, Any] = {"resolution": "20 um", "coulomb": "50 mN"}
     found = zwidth.diagnose(PHANTOM, "8.008 kN/m", 33.45, **options)
     assert found.cause == "quantization"
+    assert found.remedies is not None
     assert len(found.remedies) >= 2
     for remedy in found.remedies:
         value = remedy.high if remedy.high < math.inf else remedy.low
@@ -82,6 +84,7 @@ def test_linear_instability() -> None:
     # The motor's limit keeps the oscillation bounded.
     assert 0 < found.amplitude < 1
     assert math.isfinite(found.frequency)
+    assert found.remedies is not None
     for remedy in found.remedies:
         for end, step in ((remedy.low, 0.98), (remedy.high, 1.02)):
             if math.isfinite(end):
@@ -127,8 +130,9 @@ def test_the_wall_of_the_scene() -> None:
 def test_bad_input(options: dict[str, Any], field: str) -> None:
     with pytest.raises(zwidth.InputError, match=f"^{field}: got"):
         zwidth.diagnose(PHANTOM, 8008, 33, **options)
+    walls: Any = [8008, 9000]
     with pytest.raises(zwidth.InputError, match=r"got shape \(2,\); one wall"):
-        zwidth.diagnose(PHANTOM, [8008, 9000], 33)
+        zwidth.diagnose(PHANTOM, walls, 33)
     with pytest.raises(zwidth.InputError, match="stiffness: none is given"):
         zwidth.diagnose(PHANTOM)
 
