@@ -18,6 +18,7 @@ from zwidth.cli.options import (
     beyond_safe_option,
     figure_option,
     find_silent,
+    get_hardware,
     json_option,
     quantity_type,
     read_factor,
@@ -75,7 +76,7 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
 
     verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
     result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
-    lines, diagnosis = list[str](), diagnose_wall(scene, hardware)
+    lines, diagnosis = list[str](), diagnose_wall(scene, hardware, remedies=not get_hardware())
     if diagnosis is not None:
         result["diagnosis"] = diagnosis.as_dict()
     if as_json:
@@ -369,7 +370,7 @@ def recommend(
             click.echo(f"zwidth: {caution}", err=True)
         click.echo(found.code(code, max_force=hardware.get("max_force", math.inf)), nl=False)
         return
-    diagnosis = diagnose_wall(found.scene, hardware) if found.status == Status.OK else None
+    diagnosis = diagnose_wall(found.scene, hardware, remedies=not get_hardware()) if found.status == Status.OK else None
     notes, lines, result = [*words.coded_period_notes(scene), *found.notes], list[str](), dict[str, Any]()
     if as_json:
         result = found.as_dict() | {"notes": notes}

@@ -52,10 +52,13 @@ def hardware_options(command: Command) -> Command:
     return decorated
 
 
-def diagnose_wall(scene: Scene, hardware: dict[str, Any]) -> Any:
-    """Return the `zwidth.diagnose` result of a wall with the given hardware; None without hardware."""
+def diagnose_wall(scene: Scene, hardware: dict[str, Any], *, remedies: bool) -> Any:
+    """Return the `zwidth.diagnose` result of a wall with the given hardware; None without hardware.
+
+    ``remedies=False`` omits the search for remedies, which takes most of the run time.
+    """
     if not hardware:
         return None
     from zwidth.scenes.diagnosis import diagnose
 
-    return diagnose(scene, **hardware)
+    return diagnose(scene, **hardware, remedies=remedies)

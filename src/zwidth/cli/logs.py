@@ -170,7 +170,9 @@ def _diagnose(found: Any) -> Any:
     from zwidth.fitting.words import list_hardware
 
     recommended = found.recommended
-    return diagnose_wall(recommended.scene, list_hardware(found)) if recommended.status == Status.OK else None
+    if recommended.status != Status.OK:
+        return None
+    return diagnose_wall(recommended.scene, list_hardware(found), remedies=False)
 
 
 def _list_lines(found: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:

@@ -345,7 +345,7 @@ def to_control(scene: SceneAnswers, stiffness: Wall = None, virtual_damping: Wal
 
 
 def one_wall(alpha: np.ndarray, beta: np.ndarray) -> tuple[float, float]:
-    """The numbers of a single wall."""
+    """Return K and B (or alpha and beta) of one wall as floats; raise `InputError` for several walls."""
     alpha, beta = np.broadcast_arrays(alpha, beta)
     if alpha.size != 1:
         raise InputError(f"stiffness, virtual_damping: got shape {alpha.shape}; one wall of finite numbers is needed")

@@ -10,6 +10,7 @@ import numpy as np
 
 from zwidth.parts.checks import check_limit, check_number
 from zwidth.parts.wall import VirtualWall, resolve_wall
+from zwidth.scenes.answers import one_wall
 from zwidth.scenes.base import of_scene
 from zwidth.scenes.remedies import search_remedies
 from zwidth.scenes.stabilization import Remedy, stabilize
@@ -27,6 +28,7 @@ FEWEST_PERIODS = 2000  # length of the shortest simulation, in sampling periods
 MOST_PERIODS = 200_000  # length of the longest simulation, in sampling periods; limits the run time
 SETTLED = 2.0  # time constants that must be simulated before a motion may count as sustained
 CONFIRMED = "simulated at these and larger changes: check the value that you choose with diagnose"
+UNSEARCHED = f"zwidth diagnose searches for changes (delay of at most {LONG_DELAY:g} periods)"
 WITHOUT_MARGINS = "these are limits of stability, without margins: for a wall to set, use recommend"
 FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in proportion to its steps"
 
@@ -56,8 +58,8 @@ class Diagnosis:
         frequency: frequency of the largest sustained motion in Hz; NaN at rest. For an unstable linear loop whose
             simulation shows no frequency: frequency of the dominant pole.
         outcome: code of `zwidth.MotionKind` observed for the largest sustained motion.
-        remedies: changes of one parameter, each of which stops the oscillation. For limit cycles the list is empty if
-            the delay exceeds 50 periods, because the search would take too long.
+        remedies: changes of one parameter, each of which stops the oscillation; empty if the search found none or if
+            none is needed. None without a search: by choice, or for a limit cycle with a delay of more than 50 periods.
         unit_system: units of the device.
     """
 
@@ -70,7 +72,7 @@ class Diagnosis:
     amplitude: float
     frequency: float
     outcome: MotionKind
-    remedies: tuple[Remedy, ...] = ()
+    remedies: tuple[Remedy, ...] | None = ()
     unit_system: UnitSystem = LINEAR
 
     @property
@@ -115,10 +117,13 @@ class Diagnosis:
         if self.cause in ("none", "undecided"):
             return ""
         simulated = self.cause != "instability"
-        advice = ", or ".join(remedy.spell(3 if simulated else 4) for remedy in self.remedies)
-        parts = [advice or "no remedy by a change of one parameter was found"]
-        parts += [CONFIRMED] if advice and simulated else []
-        parts += [] if simulated else [WITHOUT_MARGINS]
+        if self.remedies is None:
+            parts = [UNSEARCHED]
+        elif self.remedies:
+            changes = ", or ".join(remedy.spell(3 if simulated else 4) for remedy in self.remedies)
+            parts = [changes, CONFIRMED if simulated else WITHOUT_MARGINS]
+        else:
+            parts = ["no remedy by a change of one parameter was found"]
         # Without friction the loop scales with the encoder step, and between two force steps no equilibrium exists.
         parts += [FRICTIONLESS] if self.cause == "quantization" and not self.hardware.static else []
         return "; ".join(parts)
@@ -127,7 +132,8 @@ class Diagnosis:
         """Return the fields as JSON values, with None in place of NaN and infinity."""
         values = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "unit_system"}
         values |= {"hardware": self.hardware._asdict(), "outcome": self.outcome.name}
-        return to_json(values | {"remedies": [remedy._asdict() for remedy in self.remedies]})
+        remedies = None if self.remedies is None else [remedy._asdict() for remedy in self.remedies]
+        return to_json(values | {"remedies": remedies})
 
 
 @of_scene
@@ -181,7 +187,7 @@ def diagnose(
         'quantization'
     """
     units = scene.unit_system
-    K, B = (float(value) for value in resolve_wall(scene.wall, stiffness, virtual_damping, units))
+    K, B = one_wall(*map(np.asarray, resolve_wall(scene.wall, stiffness, virtual_damping, units)))
     sliding = check_number("coulomb", coulomb, units["N"])
     hardware = Hardware(
         check_number("resolution", resolution, units["m"]),
@@ -199,14 +205,14 @@ def diagnose(
     cause, frequency = _find_cause(experiment, worst, dominant), float(worst.frequency[0])
     if cause == "instability" and not math.isfinite(frequency):
         frequency = dominant.angle / (2.0 * math.pi * scene.timing.period)
-    changes: list[Remedy] = []
-    if remedies and cause == "instability":
-        changes = stabilize(scene)
-    elif remedies and (cause == "quantization" or cause == "saturation") and scene.d <= LONG_DELAY:
-        changes = search_remedies(experiment, cause)
+    changes: list[Remedy] | None = []
+    if cause == "instability":
+        changes = stabilize(scene) if remedies else None
+    elif cause == "quantization" or cause == "saturation":
+        changes = search_remedies(experiment, cause) if remedies and scene.d <= LONG_DELAY else None
     return Diagnosis(
         cause, K, B, hardware, stable, float(margins.phase_margin), float(worst.amplitude[0]), frequency,
-        MotionKind(int(worst.outcome[0])), tuple(changes), units,
+        MotionKind(int(worst.outcome[0])), None if changes is None else tuple(changes), units,
     )  # fmt: skip
 
 

@@ -34,6 +34,7 @@ def test_encoder_of_a_knob() -> None:
     # Amplitude and frequency of an oscillation within a step of the encoder.
     assert 0.1 * STEP < found.amplitude < STEP
     assert 20 < found.frequency < 200
+    assert found.remedies is not None
     remedies = {remedy.parameter: remedy for remedy in found.remedies}
     assert set(remedies) == {"resolution", "coulomb", "stiffness"}
     # With an external force of half a step times K, friction below K Q/2 cannot hold the device.
@@ -48,6 +49,7 @@ def test_remedies_are_simulated() -> None:
     options: dict[str, Any] = {"resolution": "20 um", "coulomb": "50 mN"}
     found = zwidth.diagnose(PHANTOM, "8.008 kN/m", 33.45, **options)
     assert found.cause == "quantization"
+    assert found.remedies is not None
     assert len(found.remedies) >= 2
     for remedy in found.remedies:
         value = remedy.high if remedy.high < math.inf else remedy.low
@@ -60,7 +62,8 @@ def test_without_friction_the_limit_cycle_scales_with_the_encoder_step() -> None
     ratios = []
     for step in (2e-5, 2e-6, 2e-7):
         found = zwidth.diagnose(PHANTOM, 8008, 33.45, resolution=step, remedies=False)
-        assert (found.cause, found.remedies) == ("quantization", ())
+        assert (found.cause, found.remedies) == ("quantization", None)
+        assert found.advise().startswith("zwidth diagnose searches")
         ratios.append(found.amplitude / step)
     assert ratios == pytest.approx([ratios[0]] * 3, rel=1e-3)
     assert found.advise().endswith(
@@ -81,6 +84,7 @@ def test_linear_instability() -> None:
     # The motor's limit keeps the oscillation bounded.
     assert 0 < found.amplitude < 1
     assert math.isfinite(found.frequency)
+    assert found.remedies is not None
     for remedy in found.remedies:
         for end, step in ((remedy.low, 0.98), (remedy.high, 1.02)):
             if math.isfinite(end):
@@ -115,7 +119,7 @@ def test_a_pure_damper_is_not_unstable() -> None:
 def test_the_wall_of_the_scene() -> None:
     scene = PHANTOM.replace(wall=zwidth.VirtualWall(8008, 33.45))
     found = zwidth.diagnose(scene, resolution=2e-5, remedies=False)
-    assert (found.stiffness, found.virtual_damping, found.remedies) == (8008, 33.45, ())
+    assert (found.stiffness, found.virtual_damping, found.remedies) == (8008, 33.45, None)
     assert found.as_dict()["hardware"]["max_force"] is None
 
 
@@ -126,6 +130,9 @@ def test_the_wall_of_the_scene() -> None:
 def test_bad_input(options: dict[str, Any], field: str) -> None:
     with pytest.raises(zwidth.InputError, match=f"^{field}: got"):
         zwidth.diagnose(PHANTOM, 8008, 33, **options)
+    walls: Any = [8008, 9000]
+    with pytest.raises(zwidth.InputError, match=r"got shape \(2,\); one wall"):
+        zwidth.diagnose(PHANTOM, walls, 33)
     with pytest.raises(zwidth.InputError, match="stiffness: none is given"):
         zwidth.diagnose(PHANTOM)
 
