@@ -219,7 +219,7 @@ def evaluate(
 def evaluate_columns(
     kernel: Callable[..., Any], columns: Sequence[np.ndarray], *static: Any, weight: int = 1, route: Route = "auto"
 ) -> Any:
-    """`evaluate` of concrete columns of one length; one of a single value goes to the kernel as a number."""
+    """Evaluate a kernel on concrete columns of one length; pass a column of length 1 as a number."""
     count = count_points(columns)
     if route == "jax" or (route == "auto" and count > max(1, FEW // weight)):
         return map_blocks(compile_columns(kernel, static), columns, BLOCK // weight)
@@ -227,7 +227,7 @@ def evaluate_columns(
     def at_once(*parts: np.ndarray) -> Any:
         with np.errstate(all="ignore"):
             result = kernel(*(part[0] if part.size == 1 else part for part in parts), *static)
-        # A copy: a view of an argument, or of one value, could not be written to. One point has its axis first, too.
+        # Copy, because views of an argument or of a single value are read-only. Add the axis of a single point.
         shape = (count_points(parts),)
         if shape == (1,):
             return tree_map(lambda leaf: np.array(leaf)[None], result)
@@ -337,7 +337,7 @@ def _no_change(leaf: Any) -> Any:
 
 @cache
 def compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
-    """A kernel compiled for blocks of columns."""
+    """Return a kernel, compiled for blocks of columns."""
     import jax
 
     def whole(*columns: Any) -> Any:

@@ -27,7 +27,7 @@ _NEWTON_STEPS = 16
 
 
 def bisect(holds: Function, low: Array, high: Array) -> Array:
-    """Return the point between ``low``, where a condition holds, and ``high``, from which it does not."""
+    """Return the point between ``low`` and ``high`` up to which a condition holds, by bisection."""
     xp = namespace(low, high)
 
     def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -38,7 +38,7 @@ class RationalResponse(NamedTuple):
 
 
 class WholeDevice:
-    """Base of devices that are given as a whole: what a `Device` has beside its mass, and no body of these has."""
+    """Base of devices without bodies: defines the attributes of a `Device` that they do not have."""
 
     coupling: ClassVar[None] = None
     actuator: ClassVar[None] = None

@@ -1,4 +1,4 @@
-"""The wall that is rendered, and which wall a question means."""
+"""The virtual wall of a scene, and the wall that arguments select."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zwidth.words.units import to_float
 
 @dataclass(frozen=True, repr=False)
 class VirtualWall(Part):
-    """A spring and a damper, the damper acting on the velocity estimate.
+    """A spring and a damper; the damper acts on the velocity estimate.
 
     Args:
         stiffness: K in N/m.
@@ -26,7 +26,7 @@ class VirtualWall(Part):
 
 @dataclass(frozen=True, repr=False)
 class NoWall(VirtualWall):
-    """What a scene has in place of a wall where none was chosen: no force, and no wall that a question could mean."""
+    """Placeholder in scenes without a wall: no force, and no default for stiffness and damping."""
 
     stiffness: Any = field(default=0.0, init=False, repr=False)
     virtual_damping: Any = field(default=0.0, init=False, repr=False)
@@ -40,7 +40,7 @@ def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any, system
     # Integers that overflow float64 become infinite.
     both = stiffness, virtual_damping
     stiffness, virtual_damping = (to_float(v) if isinstance(v, int) and v.bit_length() > 1023 else v for v in both)
-    # Most questions are of numbers, in which there is no text to look for.
+    # Skip plain numbers, because most calls have no text to convert.
     if not (isinstance(stiffness, int | float) and isinstance(virtual_damping, int | float | None)):
         stiffness = read_texts("stiffness", stiffness, system["N/m"])
         virtual_damping = read_texts("virtual_damping", virtual_damping, system["N s/m"])

@@ -15,7 +15,7 @@ LONGEST_VALUE = 60
 
 
 def plain(value: float, digits: int = 4) -> str:
-    """A number with a fixed count of significant digits, without an exponent where it stays short."""
+    """Return a number with a fixed number of significant digits, without exponent between 1e-4 and 1e6."""
     if not math.isfinite(value):
         return "none" if math.isnan(value) else ("infinite" if value > 0 else "-infinite")
     # A zero has no sign.
@@ -40,7 +40,7 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     if not math.isfinite(value) or value == 0:
         return f"{plain(value)} {unit}" if value == 0 else plain(value)
     power = min(9, max(-9, 3 * math.floor(math.log10(abs(value)) / 3)))
-    # 999.96 with four digits reads 1000: the next prefix is meant.
+    # Use the next prefix if rounding yields 1000, as for 999.96 with four digits.
     if abs(float(f"{value / 10**power:.{digits - 1}e}")) >= 1000 and power < 9:
         power += 3
     return f"{plain(value / 10**power, digits)} {PREFIXES[power]}{unit}"
@@ -116,7 +116,7 @@ def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, 
 
 
 def header(name: str, unit: str) -> str:
-    """The name of a column with its unit, as ``stiffness_N_per_m``; a number without unit has its name alone."""
+    """Return the name of a column with its unit, as ``stiffness_N_per_m``; only the name if it has no unit."""
     if unit in ("", "1", "sampling periods"):
         return name
     return f"{name}_{unit.replace('/', '_per_').replace(' ', '_').replace('^', '')}"

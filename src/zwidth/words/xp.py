@@ -42,7 +42,7 @@ def is_traced(*values: Any) -> bool:
 
 @contextmanager
 def compute_concretely() -> Iterator[None]:
-    """Compute in float64 without tracing in this thread, also inside a JAX transformation of other values."""
+    """Compute in float64 without tracing inside the context, also during a JAX transformation of other values."""
     import jax
 
     with jax.enable_x64(True), jax.ensure_compile_time_eval():

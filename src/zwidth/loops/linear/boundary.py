@@ -186,7 +186,7 @@ class Boundary:
         return JoinedArcs.join(self.arcs)
 
     def arc_at(self, w: np.ndarray) -> np.ndarray:
-        """The arc that an angle lies on."""
+        """Return the index of the arc that contains each angle."""
         return np.searchsorted(self._steps.slowest, w, side="right") - 1
 
     @cached_property

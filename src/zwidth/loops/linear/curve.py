@@ -229,10 +229,10 @@ def level_arc(w: np.ndarray, here: CurvePoints, beta: float) -> Arc:
 def bands(
     w: np.ndarray, alpha: np.ndarray, alpha_slope: np.ndarray, beta_slope: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each step if alpha may be interpolated linearly in beta, and a bound of the error of this alpha.
+    """Return a mask of the steps over which alpha may be interpolated linearly in beta, and bounds of its error.
 
-    The arguments are those of joined arcs; alpha is NaN at their ends. A step that may not be interpolated is
-    represented by the mean alpha of both ends.
+    The arguments are those of joined arcs; alpha is NaN at their ends. Use the mean alpha of both ends for the other
+    steps.
     """
     # If the slope of beta hardly changes over a step, linear interpolation misses alpha by at most an eighth of the
     # step times the change of alpha's slope, plus the curvature of beta. Allow four times this error. For other steps
@@ -265,7 +265,7 @@ class JoinedArcs(NamedTuple):
 
     @classmethod
     def join(cls, arcs: tuple[Arc, ...]) -> JoinedArcs:
-        """Return the arcs of a boundary, joined."""
+        """Join the arcs of a boundary."""
         w, beta, *rest = map(np.concatenate, zip(*(arc[:6] for arc in arcs), strict=True))
         sizes = [arc.w.size for arc in arcs]
         dampings, keys = np.unique(beta, return_inverse=True)
@@ -277,15 +277,15 @@ class JoinedArcs(NamedTuple):
         return cls(w, beta, rest[0], *bands(w, *rest), keys, dampings, first, *ends, *own)
 
     def sum_met(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the sum of weights of the arcs that each row meets; a row through an end counts as just above it."""
+        """Return the sum of the weights of the arcs that contain each beta, without the larger end of each arc."""
         sums = np.cumsum(np.concatenate([[0.0], np.concatenate([weights, -weights])[self.order]]))
         return sums[np.searchsorted(self.sorted_ends, beta, side="right")]
 
     def meet(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the arcs that rows meet, the rows, and the first node after each crossing."""
+        """Return for each crossing of an arc with a beta the indices of arc and beta, and the first node after it."""
         place, row = np.nonzero((beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None]))
         return place, row, self.find(place, np.searchsorted(self.dampings, beta)[row])
 
     def find(self, place: np.ndarray, among: np.ndarray) -> np.ndarray:
-        """Return the first node of each arc after its crossing; ``among``: index of the row in the sorted dampings."""
+        """Return the first node of each arc after its crossing; ``among``: index of the beta in the sorted dampings."""
         return np.maximum(np.searchsorted(self.keys, place * self.dampings.size + among), self.first[place] + 1)

@@ -130,6 +130,7 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
 
 
 def _check_radius(method: str, accuracy: float | None) -> float:
+    """Return the accuracy; raise `InputError` for an unknown method or an accuracy out of range."""
     check_choice("method", method, get_args(RadiusMethod))
     if accuracy is None:
         return ACCURACY
