@@ -25,7 +25,14 @@ from zwidth.arrays.balls import BITS, available
 from zwidth.arrays.evaluate import evaluate_columns
 from zwidth.arrays.held_mass import DelayClasses, DeviceTerms, PhiFunctions, classify_delays, held_plant
 from zwidth.arrays.held_mass import device as discretize
-from zwidth.loops.rigid.crossover import Lag, Verdict, compute_lag, first_zero, long_verdict, short_verdict
+from zwidth.loops.rigid.crossover import (
+    DelayPhase,
+    Verdict,
+    decide_long_delay,
+    decide_short_delay,
+    evaluate_phase,
+    find_first_root,
+)
 from zwidth.loops.rigid.folding import Points
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.words.quantities import WALL_RANGE
@@ -107,9 +114,9 @@ def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayCla
     xp, plant = namespace(alpha, beta, delta), size_device(delta, d, kind)
     wall, verdicts = (Sized(alpha), Sized(beta)), []
     if kind.short:
-        verdicts.append(short_verdict(*wall, plant))
+        verdicts.append(decide_short_delay(*wall, plant))
     if kind.long:
-        verdicts.append(long_verdict(*wall, plant.whole, plant, enclose_zero, size_lag))
+        verdicts.append(decide_long_delay(*wall, plant.whole, plant, enclose_zero, size_lag))
     stable, unstable = (xp.where(plant.whole < 1, *pair) for pair in zip(verdicts[0], verdicts[-1], strict=True))
     # At alpha = 0 the verdict is on the poles other than z = 1, for beta > delta (docs/theory, S15b). For alpha > 0 the
     # lobe lies above beta = -delta (L16). P(1) = phi1 alpha < 0 implies a real pole above 1.
@@ -136,18 +143,20 @@ def size_device(delta: Array, d: Array, kind: DelayClasses) -> DeviceTerms:
 
 def enclose_zero(cubic: tuple[Sized, ...]) -> tuple[Sized, Array]:
     """Return the zero of the cubic, and whether sign changes certify it to `CROSSOVER_WIDTH`."""
-    u = first_zero(tuple(h.value for h in cubic))
+    u = find_first_root(tuple(h.value for h in cubic))
     low, high = (horner(Sized(u * (1.0 + side)), cubic) for side in (-CROSSOVER_WIDTH, CROSSOVER_WIDTH))
     found = (low.value > CUBIC_TOLERANCE * low.size) & (high.value < -CUBIC_TOLERANCE * high.size)
     return Sized(u, abs(u) + TINY), found & (u > 0) & (u <= 1.0)
 
 
-def size_lag(u: Sized, whole: Array) -> Lag:
+def size_lag(u: Sized, whole: Array) -> DelayPhase:
     """Return the delay phase at the crossover."""
-    lag = compute_lag(u.value, whole)
+    lag = evaluate_phase(u.value, whole)
     # The half angle h is at most pi/2, so that h <= pi/2 sin h.
-    cosine, sine = Sized(lag.cosine, 1.0), Sized(lag.sine, 4.0 * roots(lag.rise)[0] + TINY)
-    return Lag(cosine, sine, Sized(lag.rise, 5.0 * lag.rise + TINY), lag.within, lag.beyond)
+    cosine, sine = Sized(lag.cosine, 1.0), Sized(lag.sine, 4.0 * roots(lag.half_sine_squared)[0] + TINY)
+    return DelayPhase(
+        cosine, sine, Sized(lag.half_sine_squared, 5.0 * lag.half_sine_squared + TINY), lag.within, lag.beyond
+    )
 
 
 def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
@@ -205,7 +214,11 @@ def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Ver
 
     with flint.ctx.workprec(bits):
         plant, wall = device(delta, d, bits), (flint.arb(alpha), flint.arb(beta))
-        return short_verdict(*wall, plant) if d < 1 else long_verdict(*wall, int(d), plant, _enclose_zero, _take_lag)
+        return (
+            decide_short_delay(*wall, plant)
+            if d < 1
+            else decide_long_delay(*wall, int(d), plant, _enclose_zero, _take_lag)
+        )
 
 
 @lru_cache(maxsize=64)
@@ -244,7 +257,7 @@ def _enclose_zero(cubic: tuple[flint.arb, ...]) -> tuple[flint.arb, bool]:
     mids = [h.mid() for h in cubic]
     slopes = [k * h for k, h in enumerate(mids)][1:]
     with np.errstate(all="ignore"):
-        start = float(first_zero(tuple(map(np.float64, mids))))
+        start = float(find_first_root(tuple(map(np.float64, mids))))
     u = flint.arb(start if 0 < start < 2 else 1.0)
     for _ in range(16):  # Newton steps; 10 suffice from 8 correct bits
         u = (u - horner(u, mids) / horner(u, slopes)).mid()
@@ -253,7 +266,7 @@ def _enclose_zero(cubic: tuple[flint.arb, ...]) -> tuple[flint.arb, bool]:
     return flint.arb(u, reach), bool(low > 0 and high < 2 and horner(low, cubic) > 0 and horner(high, cubic) < 0)
 
 
-def _take_lag(u: flint.arb, whole: int) -> Lag:
+def _take_lag(u: flint.arb, whole: int) -> DelayPhase:
     """Return the delay phase at the crossover, in balls."""
     import flint
 
@@ -261,4 +274,4 @@ def _take_lag(u: flint.arb, whole: int) -> Lag:
     phase, pi = w * (whole + 0.5), flint.arb.pi()
     sine, cosine = phase.sin_cos()
     half = (phase / 2).sin()
-    return Lag(cosine, sine, half * half, phase < pi, w * (whole + 1) > pi)
+    return DelayPhase(cosine, sine, half * half, phase < pi, w * (whole + 1) > pi)

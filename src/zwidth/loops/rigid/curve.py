@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.held_mass import DelayClasses, DeviceTerms, device
-from zwidth.loops.rigid.crossover import short_curve
+from zwidth.loops.rigid.crossover import expand_short_delay_curve
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (
     Angles,
@@ -42,7 +42,7 @@ class Lobe(NamedTuple):
     here: DeviceTerms
     d: Array
     is_short: Array | None  # d < 1; None unless both forms occur
-    short: Any  # `short_curve`
+    short: Any  # `expand_short_delay_curve`
     long: Any  # `LongLobe`
     end: Array  # the last x
     to_corner: Array  # the lobe ends at omega = pi with alpha > 0
@@ -72,7 +72,7 @@ def lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
     short, long, ends = None, None, []
     to_corner = here.delta < 0
     if kind.short:
-        short = short_curve(here)
+        short = expand_short_delay_curve(here)
         root, to_corner = _short_end(frozen(short, xp))
         ends.append(root)
     if kind.long:

@@ -13,7 +13,7 @@ import numpy as np
 from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.held_mass import ANY, DeviceTerms, device, split_delay
 from zwidth.arrays.roots import false_position, follow_root, narrow_dips
-from zwidth.loops.rigid.crossover import short_curve, stable_at
+from zwidth.loops.rigid.crossover import decide_in_floats, expand_short_delay_curve
 from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, gain_frequency, modulus, size_and_phase
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.results import Margins
@@ -101,7 +101,7 @@ def margins_kernel(
     delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), _NO_DAMPING)), 0.0, delta)
     here = store_once(device(delta, d), delta)
     w, phase, crosses = gain_frequency(alpha, beta, here)
-    stable = store_once(stable_at(*frozen((alpha, beta, here), xp), ANY), delta)
+    stable = store_once(decide_in_floats(*frozen((alpha, beta, here), xp), ANY), delta)
     gain, phase_crossover = _gain_margin(alpha, beta, here, xp)
     delay = distance = closest = xp.nan * alpha
     if with_delay:
@@ -143,7 +143,7 @@ def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple
         # Times a positive factor: of order one on either side of sqrt(em), where for light damping the phase itself
         # is below rounding long before it changes sign.
         w, whole, em = xp.exp(log_w), here.whole, here.em
-        (u0, u1), size, shape = short_curve(here)
+        (u0, u1), size, shape = expand_short_delay_curve(here)
         found = size_and_phase(w, alpha, beta, here)[1]
         # Below one period it vanishes at z = -1 in any case, and its other zero is lost in rounding beside that: there
         # the curve is read, which has that one only, by its sign ``beta alpha_w > alpha beta_w``.

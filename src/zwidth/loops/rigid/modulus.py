@@ -14,7 +14,7 @@ import numpy as np
 
 from zwidth.arrays.held_mass import DeviceTerms
 from zwidth.arrays.roots import follow_root, newton
-from zwidth.loops.rigid.crossover import gain_crossover
+from zwidth.loops.rigid.crossover import find_gain_crossover
 from zwidth.words.types import Array
 from zwidth.words.xp import along, apply_each, frozen, namespace, store_once
 
@@ -50,7 +50,7 @@ def _factors(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[An
 def gain_frequency(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array, Array]:
     """The gain crossover, the phase there, and whether there is one, without which both mean nothing."""
     xp = namespace(alpha, here.delta)
-    w, exists = gain_crossover(alpha, beta, here)
+    w, exists = find_gain_crossover(alpha, beta, here)
     w, exists = store_once((xp.where(exists, w, 1.0), exists), alpha)
     return w, size_and_phase(w, alpha, beta, here)[1], exists
 
@@ -115,7 +115,7 @@ def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
 
     def at(level: Array) -> Array:
         """Where |L| has a value; pi if it is larger everywhere."""
-        w, exists = gain_crossover(alpha / level, beta / level, here)
+        w, exists = find_gain_crossover(alpha / level, beta / level, here)
         w = xp.where(exists, w, np.pi)
         return store_once(w, w)
 

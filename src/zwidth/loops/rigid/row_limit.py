@@ -17,7 +17,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import FEW, Route, evaluate_columns
 from zwidth.arrays.held_mass import DeviceTerms, device
-from zwidth.loops.rigid.crossover import long_curve, short_curve
+from zwidth.loops.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve
 from zwidth.loops.rigid.folding import Points, group_by
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
@@ -61,7 +61,7 @@ def _sin_cos(x: Array) -> tuple[Array, Array]:
 
 
 def short_place(b: Array, curve: Any) -> tuple[Array, Array]:
-    """The y of a row on the lobe of `short_curve`, the first zero of a quadratic, and whether there is one."""
+    """The y of a row on the lobe of `expand_short_delay_curve`, the first zero of a quadratic, and whether there is one."""
     (u0, u1), (v0, v1, v2), _ = curve
     xp = namespace(b, u0)
     linear = u0 - b * v1
@@ -76,7 +76,7 @@ def short_row(beta: Array, device: DeviceTerms) -> Array:
     b = beta + device.delta
     # For d = 0 the row ends at phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
     whole = p1 * b * (1.0 - psi * beta) / (psi * (p1 + device.p2 * b))
-    (u0, u1), size, shape = curve = short_curve(device)
+    (u0, u1), size, shape = curve = expand_short_delay_curve(device)
     y, real = short_place(b, curve)
     # V = |N|^2 vanishes where the curve runs to infinity; rounding must not turn its sign there.
     limit = 4.0 * y * horner(y, shape) / xp.abs(horner(y, size))
@@ -97,7 +97,7 @@ def _finish(limit: Array, b: Array) -> Array:
 
 def open_lobe(device: DeviceTerms) -> LongLobe:
     """The curve alone, whose end is not known yet."""
-    g, h, v, base = long_curve(device)
+    g, h, v, base = expand_long_delay_curve(device)
     return LongLobe(device.delta, device.whole + 0.5, *g, *h, *v, *base)
 
 

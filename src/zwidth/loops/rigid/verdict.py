@@ -1,4 +1,13 @@
-"""Stability verdicts for arrays of walls."""
+"""Decide the stability of arrays of walls on rigid devices, by one of three methods.
+
+The public functions are `is_stable` (labels only) and `decide_stability` (labels, statuses and the method used). The
+methods:
+
+- "crossover": the closed form at the gain crossover (`loops.rigid.crossover`). On a large grid, alpha is compared with
+  the stability limit of its line of constant beta, by the same closed form (`loops.rigid.row_limit`).
+- "companion": the spectral radius from all eigenvalues of the companion matrix (`loops.rigid.poles`).
+- "certified": the closed form with error bounds, then ball arithmetic (`loops.rigid.certified`).
+"""
 
 from __future__ import annotations
 
@@ -22,7 +31,9 @@ from zwidth.words.xp import is_traced
 StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
 STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
 
-_ROUGH = 2e-8  # error of the eigenvalues at a double pole: about the square root of the rounding unit
+# Error of the computed eigenvalues at a double pole, about the square root of the rounding unit. The companion method
+# reports spectral radii closer to 1 than this as UNDECIDED.
+DOUBLE_POLE_ERROR = 2e-8
 
 
 def is_stable(
@@ -115,10 +126,10 @@ def decide_stability(
     if is_traced(*values):
         raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
     points, shape = fold_arguments(values)
-    stable, used, status = _decide(points, method)
-    ranged = wall_status(*points)
-    status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
-    codes = np.broadcast_to(status, points.shape).astype(np.int32), np.asarray(used, np.int32)
+    stable, deciding_method, status = _decide(points, method)
+    input_status = wall_status(*points)
+    status = input_status if status is None else np.where(input_status == Status.OK, status, input_status)
+    codes = np.broadcast_to(status, points.shape).astype(np.int32), np.asarray(deciding_method, np.int32)
     return to_caller(Stability(*(spread(leaf, shape) for leaf in (stable, *codes))), values)
 
 
@@ -126,8 +137,8 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
     """Return labels, the method that decided them, and statuses unless all are OK."""
     if method == "companion":
         radius = np.asarray(radius_by_companion(*points))
-        rough = (np.abs(radius - 1.0) < _ROUGH) & (np.asarray(points[0]) != 0)
-        return radius < 1.0, Method.COMPANION, np.where(rough, Status.UNDECIDED, Status.OK)
+        inconclusive = (np.abs(radius - 1.0) < DOUBLE_POLE_ERROR) & (np.asarray(points[0]) != 0)
+        return radius < 1.0, Method.COMPANION, np.where(inconclusive, Status.UNDECIDED, Status.OK)
     if method == "certified":
         # Import only on demand, because most programs never certify.
         from zwidth.loops.rigid.certified import certify_labels

@@ -98,7 +98,7 @@ def at_precision(alpha, beta, bits):
     """The verdict of a rational wall at delta = 0, d = 1."""
     with flint.ctx.workprec(bits):
         wall = flint.arb(alpha), flint.arb(beta)
-        return certified.long_verdict(
+        return certified.decide_long_delay(
             *wall, 1, certified.device(0.0, 1.0, bits), certified._enclose_zero, certified._take_lag
         )
 
