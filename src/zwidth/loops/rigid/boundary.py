@@ -12,7 +12,7 @@ from zwidth.arrays.held_mass import DelayClasses, classify_delays, valid_device
 from zwidth.arrays.roots import follow_root, integrate
 from zwidth.loops.rigid.curve import column_end, frequency, lobe, on_line, peak, row_end, wall
 from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.polynomial import Wall, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.polynomial import Wall, build_frequency_loop, find_boundary_wall
 from zwidth.loops.rigid.ridge import ridge_kernel
 from zwidth.parts.checks import check_whole
 from zwidth.words.errors import InputError, check_choice
@@ -62,7 +62,7 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
     ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     spoiled = nan_with_nan_slopes(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
-    curve = frequency_boundary(omega, frequency_loop(delta, d))
+    curve = find_boundary_wall(omega, build_frequency_loop(delta, d))
     return Wall(curve.alpha + spoiled, curve.beta + spoiled)
 
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from zwidth.arrays.roots import polish
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.normalization import device_status, wall_status
-from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, build_frequency_loop, find_boundary_wall
 from zwidth.loops.rigid.ridge_newton import corner, expand_curve
 from zwidth.parts.circle import circle
 from zwidth.words.status import RidgeKind, Status
@@ -52,7 +52,7 @@ def bisect(function: Callable[..., Array], lower: Array, upper: Array, *args: An
 def lobe_end(loop: FrequencyLoop, d: Array) -> Array:
     """The frequency at which the boundary curve first returns to alpha = 0, pi where it reaches the corner before."""
     limit = jnp.minimum(jnp.pi, jnp.pi / (d + 0.5))
-    end, found = bisect(lambda omega, loop: frequency_boundary(omega, loop).alpha, 1e-6 * limit, limit, loop)
+    end, found = bisect(lambda omega, loop: find_boundary_wall(omega, loop).alpha, 1e-6 * limit, limit, loop)
     return jnp.where(found & ~corner(expand_curve(loop.plant), loop.lag).reached, end, jnp.pi)
 
 
@@ -89,13 +89,13 @@ def _residual(line: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Arra
 
 def _solve(line: str, start: Array, bracketed: Array, number: Array, loop: FrequencyLoop) -> tuple[Array, Wall]:
     """The frequency at which the three equations hold, next to a start, and the wall there, differentiable."""
-    wall = jax.lax.stop_gradient(store_once(frequency_boundary(start, loop), start))
+    wall = jax.lax.stop_gradient(store_once(find_boundary_wall(start, loop), start))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
     unknowns = jnp.stack([*wall, start]) / scales
     omega = polish(lambda *at: _residual(line, *at), unknowns, (loop, number, scales), bracketed)[2]
     omega = store_once(omega, start)
-    return omega, frequency_boundary(omega, loop)
+    return omega, find_boundary_wall(omega, loop)
 
 
 @jnp.vectorize
@@ -105,11 +105,11 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
     ok, inputs = status == Status.OK, (delta, d)
     # Replace NaN, because a solver may stop all batch entries at the NaN of one.
     delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
-    loop = store_once(frequency_loop(delta, d), delta)
+    loop = store_once(build_frequency_loop(delta, d), delta)
     summit = corner(expand_curve(loop.plant), loop.lag)
 
     def slope(omega: Array, loop: FrequencyLoop) -> Array:
-        return jax.grad(lambda w: frequency_boundary(w, loop).alpha)(omega)
+        return jax.grad(lambda w: find_boundary_wall(w, loop).alpha)(omega)
 
     end = store_once(lobe_end(loop, d), d)
     # Below, the slope is positive; at pi itself it vanishes by symmetry whatever the optimum.
@@ -139,14 +139,14 @@ def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: C
     given = wall_status(*((0.0 * number, number) if is_row else (number, 0.0 * number)), delta, d)
     ok = given == Status.OK
     delta, d, number = (jnp.where(ok, value, 1.0) for value in inputs)
-    loop = frequency_loop(delta, d)
+    loop = build_frequency_loop(delta, d)
     ridge, end = jax.lax.stop_gradient(find_ridge(delta, d)), lobe_end(loop, d)
 
     def offset(wall: Wall, number: Array) -> Array:
         return (wall.beta if is_row else wall.alpha) - number
 
     start, on_lobe = bisect(
-        lambda omega, loop, number: offset(frequency_boundary(omega, loop), number),
+        lambda omega, loop, number: offset(find_boundary_wall(omega, loop), number),
         ridge.omega if line == "upper" else jnp.zeros_like(end),
         ridge.omega if line == "lower" else end,
         loop,

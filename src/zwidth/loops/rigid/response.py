@@ -20,7 +20,7 @@ from zwidth.arrays.held_mass import phi_functions
 from zwidth.arrays.roots import bisect
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.folding import find_degree
-from zwidth.loops.rigid.outermost_poles import slowest_pole
+from zwidth.loops.rigid.outermost_poles import find_dominant_pole
 from zwidth.parts.checks import check_whole
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, Samples
@@ -52,7 +52,7 @@ def settling_time(alpha: float, beta: float, delta: float, d: float) -> float:
     wall = alpha, beta, delta, d
     with np.errstate(all="ignore"):
         stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
-        rate = slowest_pole(wall)[1] if stable else math.nan
+        rate = find_dominant_pole(wall)[1] if stable else math.nan
     periods = 2.0 * (d + 2.0 - math.log(SETTLING_BAND) / rate) if rate > 0 else math.inf
     while periods < MOST_PERIODS:
         last = _last_outside(wall, math.ceil(periods))

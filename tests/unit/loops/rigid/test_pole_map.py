@@ -6,7 +6,13 @@ from bounds import bound_radius
 
 import zwidth
 from zwidth.loops.rigid.folding import Points, fold
-from zwidth.loops.rigid.outermost_poles import FEW_FOR_CELLS, SMALLEST_MAP, area_poles, as_area, outermost_poles
+from zwidth.loops.rigid.outermost_poles import (
+    FEW_FOR_CELLS,
+    SMALLEST_MAP,
+    area_poles,
+    arrange_as_area,
+    compute_dominant_poles,
+)
 from zwidth.loops.rigid.pole_map import Area, follow_poles
 from zwidth.words.status import Status
 
@@ -14,7 +20,7 @@ ALPHA, BETA = np.linspace(-0.1, 1.5, 223), np.linspace(-0.3, 1.5, 157)
 
 
 def laid_out(*values):
-    return as_area(Points(*map(fold, np.broadcast_arrays(*map(np.asarray, values)))))
+    return arrange_as_area(Points(*map(fold, np.broadcast_arrays(*map(np.asarray, values)))))
 
 
 def check_against_points(found, walls, seed, count=1500):
@@ -62,7 +68,7 @@ def test_every_accuracy_is_kept(d, accuracy):
     assert left.mean() < 0.1
     row, column = rng.integers(0, 320, (2, 2000))
     row, column = row[~left[row, column]], column[~left[row, column]]
-    exact = outermost_poles([alpha[column], beta[row], np.full(row.size, 0.1), np.full(row.size, d)], 1e-9)
+    exact = compute_dominant_poles([alpha[column], beta[row], np.full(row.size, 0.1), np.full(row.size, d)], 1e-9)
     assert (np.abs(found[row, column] - exact.re) <= accuracy + exact.error).all()
 
 
@@ -126,7 +132,7 @@ def test_two_poles_that_meet_are_followed_together(z, d, width):
     found = np.log(follow_poles(area, 1e-9).radius[0])
     assert np.isnan(found).sum() < 64
     columns = [np.tile(alphas, 64), np.repeat(betas, 64), np.full(4096, 0.1), np.full(4096, d)]
-    alone = outermost_poles(columns, 1e-9)
+    alone = compute_dominant_poles(columns, 1e-9)
     error, known = np.abs(found - alone.re.reshape(64, 64)), ~np.isnan(found)
     assert (error <= 1e-9 + alone.error.reshape(64, 64))[known].all()
     # The double pole is the outermost one, known to the root of rounding.
@@ -163,7 +169,7 @@ def test_poles_of_nearly_one_size_need_not_be_told_apart(d, low):
     known = ~np.isnan(found)
     assert known.mean() > low
     row, column = np.nonzero(known)
-    alone = outermost_poles([alpha[column], beta[row], np.full(row.size, 0.5), np.full(row.size, d)], 1e-9)
+    alone = compute_dominant_poles([alpha[column], beta[row], np.full(row.size, 0.5), np.full(row.size, d)], 1e-9)
     assert (np.abs(np.log(found[known]) - alone.re) <= 1e-2 + alone.error).all()
     stable = zwidth.is_stable(alpha[column], beta[row], 0.5, d)
     sure = np.abs(alone.re) > 1.1e-5
@@ -176,5 +182,5 @@ def test_cells_know_the_pair_of_a_short_delay_that_is_neither_slow_nor_of_the_ri
     found = follow_poles(Area.whole(alpha[None], beta[None], *np.transpose([device])), 1e-9).radius[0]
     assert np.isfinite(found).mean() > 0.95
     row, column = np.nonzero(np.isfinite(found))
-    alone = outermost_poles([alpha[column], beta[row], *(np.full(row.size, x) for x in device)], 1e-9)
+    alone = compute_dominant_poles([alpha[column], beta[row], *(np.full(row.size, x) for x in device)], 1e-9)
     assert (np.abs(np.log(found[row, column]) - alone.re) <= 1e-9 + alone.error).all()
