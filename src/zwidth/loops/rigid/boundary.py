@@ -10,7 +10,15 @@ import numpy as np
 from zwidth.arrays.evaluate import as_number, check_scalars, evaluate
 from zwidth.arrays.held_mass import DelayClasses, classify_delays, valid_device
 from zwidth.arrays.roots import follow_root, integrate
-from zwidth.loops.rigid.curve import column_end, frequency, lobe, on_line, peak, row_end, wall
+from zwidth.loops.rigid.curve import (
+    build_lobe,
+    compute_corner_line,
+    compute_frequency,
+    evaluate_lobe,
+    find_column_end,
+    find_peak,
+    find_row_end,
+)
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.loops.rigid.polynomial import Wall, build_frequency_loop, find_boundary_wall
 from zwidth.loops.rigid.ridge import ridge_kernel
@@ -142,30 +150,32 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
     """Return the boundary point at the beta ("row") or alpha ("lower", "upper") that ``number`` contains."""
     xp, is_row, zero = namespace(delta, d, number), line == "row", 0.0 * number
     given = wall_status(*((zero, number) if is_row else (number, zero)), delta, d)
-    curve = lobe(delta, d, kind)
+    curve = build_lobe(delta, d, kind)
     fixed, still = frozen((curve, number), xp)
     if is_row:
-        row = store_once(row_end(still, fixed), delta)
+        row = store_once(find_row_end(still, fixed), delta)
         x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
-        x = follow_root(lambda x, curve, b: wall(x, curve).b - b, x, lambda *_: True, curve, number + delta)
-        at = wall(x, curve)
+        x = follow_root(lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta)
+        at = evaluate_lobe(x, curve)
         # Return the value that `zwidth.is_stable` compares alpha with, with the derivatives of the curve.
         alpha = row.alpha if xp is np else frozen(row.alpha, xp) + (at.alpha - frozen(at.alpha, xp))
         beta = number
     else:
-        top = peak(fixed, kind)
+        top = find_peak(fixed, kind)
         exists = (still > 0) & (still < top.alpha)
         goal = xp.where(exists, still, 0.5 * top.alpha)
-        x, cut = store_once(column_end(goal, top, fixed, line == "upper"), delta)
+        x, cut = store_once(find_column_end(goal, top, fixed, line == "upper"), delta)
         on_lobe = ~cut
-        x = follow_root(lambda x, curve, alpha: wall(x, curve).alpha - alpha, x, lambda *_: True, curve, number)
-        at = wall(x, curve)
+        x = follow_root(
+            lambda x, curve, alpha: evaluate_lobe(x, curve).alpha - alpha, x, lambda *_: True, curve, number
+        )
+        at = evaluate_lobe(x, curve)
         # Take no further step, because near the ridge it would be a quotient of rounding errors.
         alpha, beta = number, at.b - delta
-    omega = frequency(x, curve)
+    omega = compute_frequency(x, curve)
     if curve.short is not None and line != "lower":
         # On the line with a pole at z = -1, alpha + 2 beta is constant.
-        rest = on_line(curve) - (2.0 * number if is_row else number)
+        rest = compute_corner_line(curve) - (2.0 * number if is_row else number)
         alpha = xp.where(on_lobe, alpha, rest) if is_row else alpha
         beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * rest)
         omega = xp.where(on_lobe, omega, np.pi)
@@ -207,9 +217,9 @@ def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices,
     points = check_whole("points", points, 8, 10**7)
     kind = classify_delays(d)
     with np.errstate(all="ignore"):
-        whole = lobe(np.float64(known["delta"]), np.float64(known["d"]), kind)
-        top = peak(whole, kind).x
-        first, last = (float(frequency(x, whole)) for x in (top, whole.end))
+        whole = build_lobe(np.float64(known["delta"]), np.float64(known["d"]), kind)
+        top = find_peak(whole, kind).x
+        first, last = (float(compute_frequency(x, whole)) for x in (top, whole.end))
     # Space the points more closely at both ends and at the ridge, where the curvature is largest.
     half = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))
     omega = np.concatenate([first * half, first + (last - first) * half[1:]]) if first < last else last * half
@@ -287,10 +297,10 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
 
 def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
-    curve = lobe(delta, d, kind)
+    curve = build_lobe(delta, d, kind)
     end = frozen(curve.end, xp)
     # From a corner, which stays, back to alpha = 0 along alpha + 2 beta = const.
-    at = wall(end, curve)
+    at = evaluate_lobe(end, curve)
     last = xp.where(curve.to_corner, at.alpha, 0.0)
     if xp is not np:
         # Another end moves as the zero of alpha does, which the second derivatives of the area ask for.
@@ -299,7 +309,7 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     at_places = tree_map(lambda value: None if value is None else value[..., None], curve)
 
     def rise(x: Array) -> Array:
-        at = wall(x, at_places)
+        at = evaluate_lobe(x, at_places)
         return at.alpha * at.d_b
 
     under_lobe = integrate(rise, (0.0 * end, end), (_LOBE_NODES,))

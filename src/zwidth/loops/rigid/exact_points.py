@@ -26,7 +26,7 @@ from zwidth.arrays.roots import polish
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.normalization import device_status, wall_status
 from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, build_frequency_loop, find_boundary_wall
-from zwidth.loops.rigid.ridge_newton import corner, expand_curve
+from zwidth.loops.rigid.ridge_newton import expand_curve, find_corner
 from zwidth.parts.circle import circle
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
@@ -53,7 +53,7 @@ def lobe_end(loop: FrequencyLoop, d: Array) -> Array:
     """The frequency at which the boundary curve first returns to alpha = 0, pi where it reaches the corner before."""
     limit = jnp.minimum(jnp.pi, jnp.pi / (d + 0.5))
     end, found = bisect(lambda omega, loop: find_boundary_wall(omega, loop).alpha, 1e-6 * limit, limit, loop)
-    return jnp.where(found & ~corner(expand_curve(loop.plant), loop.lag).reached, end, jnp.pi)
+    return jnp.where(found & ~find_corner(expand_curve(loop.plant), loop.lag).reached, end, jnp.pi)
 
 
 def frequency_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyLoop) -> Array:
@@ -106,7 +106,7 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
     # Replace NaN, because a solver may stop all batch entries at the NaN of one.
     delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
     loop = store_once(build_frequency_loop(delta, d), delta)
-    summit = corner(expand_curve(loop.plant), loop.lag)
+    summit = find_corner(expand_curve(loop.plant), loop.lag)
 
     def slope(omega: Array, loop: FrequencyLoop) -> Array:
         return jax.grad(lambda w: find_boundary_wall(w, loop).alpha)(omega)

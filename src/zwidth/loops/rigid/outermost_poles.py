@@ -19,8 +19,8 @@ from zwidth.loops.rigid.circle import count_poles, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.folding import Points, fold
 from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.pole_groups import DOUBTFUL
-from zwidth.loops.rigid.pole_map import Area, fill_up, follow_poles
+from zwidth.loops.rigid.pole_groups import VERDICT_WIDTH
+from zwidth.loops.rigid.pole_map import Area, compute_grid_poles, pad_to_16
 from zwidth.loops.rigid.pole_search import (
     DominantPoles,
     bisect_radius,
@@ -90,7 +90,7 @@ def _compute_by_kind(columns: list[np.ndarray], accuracy: float, fractional: boo
                 for leaf in quick_kernel(*(column[0] for column in arguments), fractional=fractional)
             ]
         elif route == "numpy" or (route == "auto" and size <= FEW):
-            padded = [column[fill_up(np.arange(size))] for column in arguments]
+            padded = [column[pad_to_16(np.arange(size))] for column in arguments]
             results = zip(
                 *_map_in_batches(lambda batch: quick_kernel(*batch, fractional=fractional), padded), strict=True
             )
@@ -117,7 +117,7 @@ def _certify_open_walls(
 
         def attempt(lists: list[np.ndarray], method: Any = method, tolerance: float = tolerance) -> np.ndarray:
             (batch,) = lists
-            padded = fill_up(batch)
+            padded = pad_to_16(batch)
             loop = factor_loop(*(column[padded] for column in columns), fractional=fractional)
             attempted = method(DominantPoles(*(leaf[padded] for leaf in poles)), tolerance, loop, fractional)
             is_finite = np.isfinite(attempted.re[: batch.size])
@@ -180,7 +180,7 @@ def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPole
 
     Nothing is compiled, and the result of a wall does not depend on the window of the grid.
     """
-    followed = follow_poles(area, accuracy, with_rate)
+    followed = compute_grid_poles(area, accuracy, with_rate)
     (radius, rate, special), certified = followed, np.ones(followed.radius.shape, bool)
     columns, is_missing = area.walls(np.stack(special)), np.isnan(radius[special])
     near_one, missing_walls = (tuple(axis_index[mask] for axis_index in special) for mask in (~is_missing, is_missing))
@@ -197,7 +197,7 @@ def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = Fal
     """Compute the dominant poles of columns of equal length, which may contain invalid walls."""
     size = columns[0].size
     if route != "auto":
-        columns = [column[fill_up(np.arange(size))] for column in columns]
+        columns = [column[pad_to_16(np.arange(size))] for column in columns]
     return _find_listed(columns, accuracy, with_rate, route)[0].map(lambda leaf: leaf[:size])
 
 
@@ -216,7 +216,7 @@ def _find_listed(
     rate = compute_rates(dominant, columns, accuracy) if with_rate else NO_RATE
     radius = np.exp(np.where(np.isinf(dominant.error), np.nan, dominant.re))
     near_one = np.flatnonzero(
-        np.abs(dominant.re) <= np.maximum(DOUBTFUL, np.where(np.isinf(dominant.error), 0.0, dominant.error))
+        np.abs(dominant.re) <= np.maximum(VERDICT_WIDTH, np.where(np.isinf(dominant.error), 0.0, dominant.error))
     )
     radius[near_one] = _place_by_verdict(radius[near_one], [column[near_one] for column in columns])
     return WallPoles(radius, dominant.error <= accuracy, rate), dominant

@@ -15,8 +15,8 @@ import numpy as np
 from zwidth.arrays.evaluate import FEW, as_number, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.held_mass import ANY, DelayClasses, classify_delays, valid_device
 from zwidth.arrays.roots import integrate
-from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by, spread
-from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by_value, restore_shape
+from zwidth.loops.rigid.needed_damping import compute_needed_damping, find_directions, solve_larger_root
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import Array, ArrayLike
@@ -35,7 +35,7 @@ def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Dela
     # At 0 with the slope from the right, which the larger of the two would halve.
     stiff = xp.where(ok & (alpha >= 0), alpha, 0.0)
     damper, delay = xp.where(ok, beta, 0.0), xp.where(ok, d, 0.0)
-    margin = delta - needed_damping(stiff, damper, delay, kind)
+    margin = delta - compute_needed_damping(stiff, damper, delay, kind)
     return _limit_margin(margin, alpha) + nan_with_nan_slopes(ok, alpha, beta, delta, d)
 
 
@@ -50,7 +50,7 @@ def table(d: float) -> tuple[float, ...]:
     """What all walls of one delay need, as one polynomial of the direction: what `_map_kernel` takes."""
     # Between its directions ``needed/(beta + (width - first) alpha)`` is analytic in ``x/(x + width alpha)``, ``x =
     # beta - first alpha``, up to beta = infinity; its Chebyshev series falls by a factor of 4 a term, for every delay.
-    first, last_turn = directions(np.float64(d))
+    first, last_turn = find_directions(np.float64(d))
     width = 0.5 * (d + 0.5)
     span = last_turn - first
     last = span / (span + width) if np.isfinite(span) else 1.0
@@ -62,7 +62,7 @@ def table(d: float) -> tuple[float, ...]:
     alpha = 1.0 - place
     beta = first * alpha + place * width
     with np.errstate(all="ignore"):
-        needed = needed_damping(alpha, beta, np.full(_TERMS, d))
+        needed = compute_needed_damping(alpha, beta, np.full(_TERMS, d))
     # place width + alpha width is the width.
     terms = cosines @ needed * (2.0 / (_TERMS * width))
     terms[0] *= 0.5
@@ -85,7 +85,7 @@ def _map_kernel(alpha: Array, beta: Array, delta: Array, *known: Any) -> Array:
     place = beyond / xp.where(beyond > 0, size, 1.0)
     y = 2.0 * place / last - 1.0
     inside = size * horner(y, powers)
-    zero, _ = larger_root(at_zero * stiff - beta, f * (1.0 - f) * stiff * stiff, xp)
+    zero, _ = solve_larger_root(at_zero * stiff - beta, f * (1.0 - f) * stiff * stiff, xp)
     pi = (1.0 - f) * (beta + 0.5 * stiff)
     needed = xp.where(beyond > 0, xp.where(place < limit, inside, pi), zero)
     return xp.where(ok, _limit_margin(delta - needed, alpha), xp.nan)
@@ -105,13 +105,13 @@ def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
     if points.size <= FEW or np.unique(points.d).size * FEW > points.size:
         return None
     out = np.full(points.shape, np.nan)
-    for delay, arrays, place in group_by(points, points.d):
+    for delay, arrays, place in group_by_value(points, points.d):
         if not 0 <= delay <= LONGEST_DELAY:
             continue
         walls = Points(*arrays)
         columns = [*walls.columns()[:3], *map(np.atleast_1d, table(float(delay)))]
         out[place] = evaluate_columns(_map_kernel, columns, route="jax").reshape(walls.shape)
-    return to_caller(spread(out, shape), values)
+    return to_caller(restore_shape(out, shape), values)
 
 
 def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -199,7 +199,7 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
 
     def stiffness(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         alpha, beta = unit * np.cos(angles), np.sin(angles)
-        needed = needed_damping(alpha, beta, np.full(angles.shape, delay))
+        needed = compute_needed_damping(alpha, beta, np.full(angles.shape, delay))
         return alpha / needed, beta / needed
 
     lower, upper = -0.49 * np.pi, 0.49 * np.pi
@@ -255,13 +255,13 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
     safe_d = xp.where(ok, d, 1.0)
     unit = 1.0 / (safe_d + 0.5)
     # Where the kinks lie does not matter to the first order.
-    first, last = (xp.arctan(t * frozen(unit, xp)) for t in directions(frozen(safe_d, xp)))
+    first, last = (xp.arctan(t * frozen(unit, xp)) for t in find_directions(frozen(safe_d, xp)))
     end = 0.5 * np.pi + 0.0 * safe_d
 
     def share(theta: Array) -> Array:
         # The straight edge alpha = 0 is the range of theta: rounding must not lead beyond it.
         alpha = xp.maximum(xp.cos(theta), 0.0) * unit[..., None]
-        return needed_damping(alpha, xp.sin(theta), safe_d[..., None] + 0.0 * theta) ** -2
+        return compute_needed_damping(alpha, xp.sin(theta), safe_d[..., None] + 0.0 * theta) ** -2
 
     inverse_squares = integrate(share, (-end, first, last, end), _PASSIVE_NODES)
     return 0.5 * delta * delta * unit * inverse_squares + nan_with_nan_slopes(ok, delta, d)

@@ -189,7 +189,7 @@ def certify_pole(
     certified = (
         (at_one | (RADIUS_AFTER_STEP * step.radius <= tolerance)) & poles_outside.all_inside & poles_outside.certain
     )
-    return DominantPoles(re, im, xp.where(certified, tolerance, np.inf), xp.where(at_one, 0.0, step.pole_error))
+    return DominantPoles(re, im, xp.where(certified, tolerance, np.inf), xp.where(at_one, 0.0, step.end_error))
 
 
 def quick_kernel(

@@ -27,8 +27,8 @@ import numpy as np
 from zwidth.arrays.blocks import map_blocks
 from zwidth.arrays.evaluate import as_float64, to_caller
 from zwidth.arrays.polynomials import companion, square
-from zwidth.loops.rigid.circle import Loop, factor_loop
-from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
+from zwidth.loops.rigid.circle import LoopFactors, factor_loop
+from zwidth.loops.rigid.folding import Degree, count_uncompiled_points, find_degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall, wall_status
 from zwidth.loops.rigid.pole_step import Pair, make_complex
 from zwidth.loops.rigid.polynomial import compute_coefficients
@@ -55,11 +55,11 @@ MAX_ABERTH_POLES = 24
 BLOCK_SIZE = 1 << 15
 
 
-def factor_with_pole_axis(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Loop:
+def factor_with_pole_axis(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> LoopFactors:
     """Return the factors of P of each wall, with a new first axis for its poles; NaN if the wall is out of range."""
     xp = namespace(alpha, beta, delta, d)
     loop = store_once(factor_loop(alpha, beta, delta, d, degree.fractional), delta)
-    return Loop(*(xp.asarray(part)[None] for part in loop))
+    return LoopFactors(*(xp.asarray(part)[None] for part in loop))
 
 
 def _raise_to_power(z: Pair, power: int) -> Pair:
@@ -71,7 +71,7 @@ def _raise_to_power(z: Pair, power: int) -> Pair:
     return squared * z if power % 2 else squared
 
 
-def _evaluate(z: Pair, loop: Loop, degree: Degree) -> tuple[Pair, Pair]:
+def _evaluate(z: Pair, loop: LoopFactors, degree: Degree) -> tuple[Pair, Pair]:
     """Return P(z) and P'(z)."""
     power = degree.poles - 2
     z_minus_1, z_minus_c = z + -1.0, z + -loop.c
@@ -90,7 +90,7 @@ def _evaluate(z: Pair, loop: Loop, degree: Degree) -> tuple[Pair, Pair]:
     ) + wall * numerator_slope + numerator * loop.s
 
 
-def _bound_rounding(z: Pair, loop: Loop, degree: Degree, unit: float) -> Array:
+def _bound_rounding(z: Pair, loop: LoopFactors, degree: Degree, unit: float) -> Array:
     """Return a bound of the rounding error of P(z)."""
     xp, power = namespace(z.real), degree.poles - 2
     # |Re| + |Im| is an upper bound of the modulus that neither overflows nor underflows.
@@ -113,7 +113,7 @@ def _subtract_pairwise(z: RootsFirst) -> list[Pair]:
     return [_split(z - twice[k : k + count]) for k in range(1, count)]
 
 
-def _take_aberth_step(z: RootsFirst, loop: Loop, degree: Degree) -> RootsFirst:
+def _take_aberth_step(z: RootsFirst, loop: LoopFactors, degree: Degree) -> RootsFirst:
     """Take one step of Aberth's iteration."""
     q, *others = _subtract_pairwise(z)
     pair = _split(z)
@@ -126,7 +126,7 @@ def _take_aberth_step(z: RootsFirst, loop: Loop, degree: Degree) -> RootsFirst:
     return make_complex(pair.real - step.real, pair.imag - step.imag)
 
 
-def _guess_poles(loop: Loop, degree: Degree) -> RootsFirst:
+def _guess_poles(loop: LoopFactors, degree: Degree) -> RootsFirst:
     """Return the starting points: two near the device's poles, the others on a circle where T and B are similar."""
     xp, n_others, no_damping = namespace(loop.c), degree.poles - 2, loop.beta == 0
     # Without virtual damping one pole is exactly 0; a step from there would not leave it.
@@ -139,7 +139,7 @@ def _guess_poles(loop: Loop, degree: Degree) -> RootsFirst:
     return xp.concatenate([first, rest, 0.0 * r + (0.9 + 0.45j), 0.0 * r + (0.75 - 0.4j)])
 
 
-def compute_discs(z: RootsFirst, loop: Loop, degree: Degree) -> tuple[RadiiFirst, Array, Array]:
+def compute_discs(z: RootsFirst, loop: LoopFactors, degree: Degree) -> tuple[RadiiFirst, Array, Array]:
     """Return Smith's discs around approximations ``z``, with the poles along the first axis.
 
     Returns:
@@ -252,7 +252,7 @@ def _compute_by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, deg
         # differentiates outside `jit`.
         return _compile_by_degree(pole_kernel, degree)(*columns)
     # Without compilation for few walls, and for large matrices, whose eigenvalues take most of the time.
-    few = alpha.size <= few_poles(degree)
+    few = alpha.size <= count_uncompiled_points(degree)
 
     def compute_block(*walls: Any) -> np.ndarray:
         if few or degree.poles > MAX_ABERTH_POLES:
@@ -324,7 +324,7 @@ def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, 
 def _find_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, method: PoleMethod) -> Roots:
     """Return the poles of columns of one degree, by Aberth's iteration for many walls of low degree."""
     columns = alpha, beta, delta, d
-    few = alpha.size <= few_poles(degree)
+    few = alpha.size <= count_uncompiled_points(degree)
     if method == "auto" and (few or is_traced(*columns) or degree.poles > MAX_ABERTH_POLES):
         method = "companion"
     if method == "companion":

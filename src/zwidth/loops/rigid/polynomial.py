@@ -18,7 +18,7 @@ from zwidth.arrays.held_mass import Plant, held_plant, split_delay
 from zwidth.arrays.polynomials import Affine
 from zwidth.loops.rigid.folding import Degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall
-from zwidth.loops.rigid.ridge_newton import expand_curve, wall, wave_at
+from zwidth.loops.rigid.ridge_newton import evaluate_wall, evaluate_wave_at, expand_curve
 from zwidth.words.types import Array, ArrayLike, Coefficients, Reals
 from zwidth.words.xp import namespace, nan_with_nan_slopes
 
@@ -77,7 +77,7 @@ def build_frequency_loop(delta: Array, d: Array) -> FrequencyLoop:
 
 def find_boundary_wall(omega: Reals, loop: FrequencyLoop) -> Wall:
     """Return the wall that has a pole at z = e^(j omega), 0 <= omega <= pi, in closed form."""
-    return Wall(*wall(wave_at(omega, loop.lag), expand_curve(loop.plant)))
+    return Wall(*evaluate_wall(evaluate_wave_at(omega, loop.lag), expand_curve(loop.plant)))
 
 
 def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Coefficients:

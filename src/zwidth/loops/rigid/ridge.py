@@ -23,12 +23,12 @@ from zwidth.loops.rigid.normalization import device_status
 from zwidth.loops.rigid.ridge_newton import (
     Ridge,
     Start,
+    evaluate_stationarity,
+    evaluate_wall,
+    evaluate_wave,
     expand_curve,
     guess_start,
-    solve,
-    stationarity,
-    wall,
-    wave,
+    solve_ridge,
 )
 from zwidth.words.errors import check_choice
 from zwidth.words.results import RidgePoint
@@ -68,12 +68,12 @@ def follow(s: Array, plant: Plant, lag: Array, kind: DelayClasses) -> tuple[Arra
     xp = namespace(s, plant.a2, lag)
     undelayed, curve, corner = not kind.long, expand_curve(plant), s >= 1.0
     inside = xp.where(corner, 0.5, s)
-    first, second = stationarity(inside, curve, lag, undelayed)
+    first, second = evaluate_stationarity(inside, curve, lag, undelayed)
     inside = xp.where(corner, 0.5, inside - first / xp.where(corner, 1.0, second))
     moved = xp.where(corner, 1.0, inside)
-    # Do not use the series of `wave`, because its derivative has fewer digits.
+    # Do not use the series of `evaluate_wave`, because its derivative has fewer digits.
     omega = xp.where(corner, np.pi, 2.0 * xp.arctan(inside / xp.sqrt((1.0 - inside) * (1.0 + inside))))
-    alpha, beta = (wall(wave(place, lag, undelayed), curve) for place in (s, moved))
+    alpha, beta = (evaluate_wall(evaluate_wave(place, lag, undelayed), curve) for place in (s, moved))
     return alpha[0], beta[1], omega, moved
 
 
@@ -82,7 +82,7 @@ def differentiable_ridge(plant: Plant, lag: Array, start: Start, kind: DelayClas
 
     For JAX arrays, the derivatives in ``plant`` and ``lag`` are those of `follow`, which are exact to any order.
     """
-    ridge = solve if namespace(plant.a2, lag) is np else _jax_ridge()
+    ridge = solve_ridge if namespace(plant.a2, lag) is np else _jax_ridge()
     return ridge(plant, lag, start, kind)
 
 
@@ -104,10 +104,10 @@ def _jax_plant() -> Any:
 
 @cache
 def _jax_ridge() -> Any:
-    """Return `solve` as a JAX function with the derivatives of `follow`."""
+    """Return `solve_ridge` as a JAX function with the derivatives of `follow`."""
     import jax
 
-    function = jax.custom_jvp(solve, nondiff_argnums=(3,))
+    function = jax.custom_jvp(solve_ridge, nondiff_argnums=(3,))
 
     def rule(kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
         # The derivative of s follows from the same rule, so derivatives of every order are exact.
@@ -200,10 +200,10 @@ class RidgeSlopes(NamedTuple):
 def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlopes:
     """Return `alpha_max` and the derivatives of alpha, elementwise; in d those from the right at integer d."""
     ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, kind)
-    xp, at = namespace(ridge.s), wave(ridge.s, lag, not kind.long)
+    xp, at = namespace(ridge.s), evaluate_wave(ridge.s, lag, not kind.long)
 
     def move(change: Plant) -> Array:
-        return push_forward(lambda plant: wall(at, expand_curve(plant))[0], (plant,), (change,), xp)
+        return push_forward(lambda plant: evaluate_wall(at, expand_curve(plant))[0], (plant,), (change,), xp)
 
     slopes = map(move, store_once(plant_slopes(delta, f), ridge.s))
     by_delta, by_d = nan_unless(converged(ridge), *slopes)

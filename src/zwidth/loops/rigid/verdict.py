@@ -18,10 +18,10 @@ import numpy as np
 from zwidth.arrays.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.held_mass import classify_delays
 from zwidth.loops.rigid.crossover import stable_kernel
-from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, spread
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, restore_shape
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.loops.rigid.poles import radius_by_companion
-from zwidth.loops.rigid.row_limit import boundary_map
+from zwidth.loops.rigid.row_limit import label_grid
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.results import Stability
 from zwidth.words.status import Method, Status
@@ -92,7 +92,7 @@ def is_stable(
             )
         return radius_by_companion(*values) < 1.0
     points, shape = fold_arguments(values)
-    return to_caller(spread(_decide(points, method)[0], shape), values)
+    return to_caller(restore_shape(_decide(points, method)[0], shape), values)
 
 
 def decide_stability(
@@ -130,7 +130,7 @@ def decide_stability(
     input_status = wall_status(*points)
     status = input_status if status is None else np.where(input_status == Status.OK, status, input_status)
     codes = np.broadcast_to(status, points.shape).astype(np.int32), np.asarray(deciding_method, np.int32)
-    return to_caller(Stability(*(spread(leaf, shape) for leaf in (stable, *codes))), values)
+    return to_caller(Stability(*(restore_shape(leaf, shape) for leaf in (stable, *codes))), values)
 
 
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
@@ -146,6 +146,6 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
         stable, status = certify_labels(points)
         return stable, Method.CERTIFIED, status
     if points.is_dense:
-        return boundary_map(points), Method.CROSSOVER, None
+        return label_grid(points), Method.CROSSOVER, None
     stable = evaluate_columns(stable_kernel, points.columns(), classify_delays(points.d))
     return stable.reshape(points.shape), Method.CROSSOVER, None
