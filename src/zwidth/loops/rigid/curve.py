@@ -72,11 +72,11 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
     is_short = plant.whole < 1
     short_curve, long_lobe, ends = None, None, []
     to_corner = plant.delta < 0
-    if kind.short_curve:
+    if kind.short:
         short_curve = expand_short_delay_curve(plant)
         root, to_corner = _find_short_end(frozen(short_curve, xp))
         ends.append(root)
-    if kind.long_lobe:
+    if kind.long:
         # Freeze the end and the fields after it, because they are only starting values of solvers.
         frozen_lobe = build_long_lobe(frozen(plant, xp))
         long_lobe = frozen_lobe if xp is np else LongLobe(*expand_long_lobe(plant)[:-5], *frozen_lobe[-5:])

@@ -66,18 +66,18 @@ class FrequencyLoop(NamedTuple):
     """The parameters of one loop that do not depend on the frequency."""
 
     plant: Plant
-    lag: Array  # n, integer part of the delay
+    n: Array  # n, integer part of the delay
 
 
 def build_frequency_loop(delta: Array, d: Array) -> FrequencyLoop:
     """Return the loop of one (delta, d), for evaluation on the unit circle."""
-    whole, fraction = split_delay(d)
-    return FrequencyLoop(held_plant(delta, fraction), whole)
+    n, fraction = split_delay(d)
+    return FrequencyLoop(held_plant(delta, fraction), n)
 
 
 def find_boundary_wall(omega: Reals, loop: FrequencyLoop) -> Wall:
     """Return the wall that has a pole at z = e^(j omega), 0 <= omega <= pi, in closed form."""
-    return Wall(*evaluate_wall(evaluate_wave_at(omega, loop.lag), expand_curve(loop.plant)))
+    return Wall(*evaluate_wall(evaluate_wave_at(omega, loop.n), expand_curve(loop.plant)))
 
 
 def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Coefficients:
