@@ -1,9 +1,9 @@
-"""The one way from a kernel to arrays.
+"""Evaluation of kernels on arrays.
 
-A kernel is a formula for one point whose text serves NumPy and JAX, elementwise. Few concrete points, and plain
-numbers above all, go through NumPy at once, in float64, whatever JAX's configuration says and without importing it;
-many are compiled by JAX, in pieces of one size; inside somebody's own transformation (`jit`, `grad`, ...) the compiled
-kernel is called and the ambient precision holds.
+A kernel is a formula for one point, applied elementwise, with the same source code for NumPy and JAX. Plain numbers and
+few concrete points are evaluated by NumPy in float64, regardless of JAX's configuration and without importing JAX. For
+many points JAX compiles the kernel and evaluates it in blocks of one size. Inside a transformation of the caller, as
+`jit` or `grad`, the compiled kernel uses the ambient precision.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The outermost pole of arrays of walls: the spectral radius, and how fast a loop settles."""
+"""The dominant pole of arrays of walls: spectral radius and decay rate."""
 
 from __future__ import annotations
 
