@@ -68,7 +68,7 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
 
 @shown()
 class BoundaryPoint(NamedTuple):
-    """A wall on the edge of stability, or an array of them."""
+    """A wall on the stability boundary, or arrays of such walls."""
 
     alpha: Array
     beta: Array
@@ -177,7 +177,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
 
 
 class Piece(IntEnum):
-    """Which pole crosses the unit circle on a part of the outline."""
+    """The pole that crosses the unit circle on a part of the outline."""
 
     COMPLEX_PAIR = 0
     MINUS_ONE = 1
@@ -186,7 +186,7 @@ class Piece(IntEnum):
 
 @shown()
 class StableRegion(NamedTuple):
-    """A closed outline: vertex k belongs to ``piece[k]``, and the last vertex joins the first along alpha = 0."""
+    """A closed outline: vertex k lies on ``piece[k]``; alpha = 0 joins the last vertex to the first."""
 
     alpha: Vertices
     beta: Vertices
@@ -253,26 +253,26 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     return StableRegion(alpha, beta, omega, piece)
 
 
-# Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic, and what a point weighs for them.
-_LOBE_NODES, _LOBE_WEIGHT = 48, 16
+_LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic
+_LOBE_WEIGHT = 16  # time and memory of a point relative to a point of other kernels
 
 
 def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
     """Return the area of the stable set in the (alpha, beta) plane.
 
-    ``A = integral of alpha d(beta)`` along the lobe of `zwidth.boundary`, closed by the line on which a real pole
-    crosses at z = -1, where that line cuts it, and by alpha = 0. In SI units the area over K and B is ``A m^2/T^3``.
+    ``A = integral of alpha d(beta)`` along the outline of `zwidth.stable_region`. In SI units, the area over K and B is
+    ``A m^2/T^3``.
 
     Args:
         delta: normalized physical damping b T/m, 0 to 1e12.
-        d: delay in periods, 0 to 1e5, whole or not (held). Both broadcast.
+        d: delay in periods, 0 to 1e5, integer or fractional. Both broadcast.
 
     Returns:
         Array of the broadcast shape; NaN out of range.
 
     Numerics:
-        Gauss-Legendre quadrature of the closed form, about 1e-13. Traceable, with first and second derivatives; at
-        whole d those in d are from the right.
+        Gauss-Legendre quadrature of the closed form, accurate to about 1e-13. JAX can differentiate it twice, in d from
+        the right at integer d.
 
     References:
         Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, section V.
@@ -289,13 +289,13 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
     curve = lobe(delta, d, kind)
     end = frozen(curve.end, xp)
-    # From a corner, which stays, back to alpha = 0 along alpha + 2 beta = const.
+    # From a corner, the outline returns to alpha = 0 along alpha + 2 beta = const.
     at = wall(end, curve)
     last = xp.where(curve.to_corner, at.alpha, 0.0)
     if xp is not np:
-        # Another end moves as the zero of alpha does, which the second derivatives of the area ask for.
+        # Without a corner, the end is a zero of alpha; second derivatives of the area need its derivative.
         end = end - xp.where(curve.to_corner, 0.0, at.alpha / frozen(xp.where(curve.to_corner, 1.0, at.d_alpha), xp))
-    # For many places of each lobe.
+    # Add an axis for the nodes.
     at_places = tree_map(lambda value: None if value is None else value[..., None], curve)
 
     def rise(x: Array) -> Array:
