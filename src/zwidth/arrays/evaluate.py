@@ -167,8 +167,8 @@ def _stack_level() -> int:
     return level
 
 
-# "auto": NumPy for few points; "numpy": NumPy for all points; "jax": always compiled, if the kernel has no NumPy code or
-# values must not depend on the number of points (both routes may differ in the last place).
+# "auto": NumPy for few points; "numpy": NumPy for all points; "jax": always compiled, if the kernel has no NumPy code
+# or values must not depend on the number of points (both routes may differ in the last place).
 Route: TypeAlias = Literal["auto", "numpy", "jax"]
 
 # Function that returns the values of a kernel at concrete points, and their derivatives in each argument.
