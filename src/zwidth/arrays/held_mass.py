@@ -1,4 +1,4 @@
-"""A damped mass between two samples: its exact discretization under a delayed, held force.
+"""Exact discretization of a damped mass under a delayed force with zero-order hold.
 
 Normalized to T = 1 and m = 1. With d = n + f (n whole, 0 <= f < 1) the force computed at sample k acts from
 k + d on: in each period the older force holds during [0, f), the newer one during [f, 1). From computed

@@ -1,6 +1,7 @@
-"""Zeros and integrals of functions of one unknown, elementwise, one text for NumPy and JAX; of several under JAX.
+"""Zeros and integrals of functions of one unknown, elementwise, for NumPy and JAX; of several unknowns for JAX only.
 
-The number of steps is fixed, so that no point of a batch waits for another, and none depends on those beside it.
+The number of steps is fixed, so that no point of a batch waits for another. The result of a point does not depend on
+the other points.
 """
 
 from __future__ import annotations

@@ -48,21 +48,20 @@ def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any, system
     if stiffness is None and virtual_damping is None:
         if not chosen:
             raise InputError(
-                "stiffness: none is given, and the scene has no wall; give stiffness (and virtual_damping), or the "
-                "scene wall=zwidth.VirtualWall(stiffness=...)"
+                "stiffness: none is given, and the scene has no wall; pass stiffness (and virtual_damping), or build "
+                "the scene with wall=zwidth.VirtualWall(stiffness=...)"
             )
         return wall.stiffness, wall.virtual_damping
     if stiffness is None:
         raise InputError(
-            "stiffness: none is given beside virtual_damping; give both, or none and the scene the wall that is meant: "
+            "stiffness: none is given with virtual_damping; pass both, or replace the scene's wall: "
             "scene.replace(stiffness=..., virtual_damping=...)"
         )
     if virtual_damping is None:
         if chosen:
             raise InputError(
-                f"virtual_damping: none is given beside stiffness, and the scene's own wall has {wall.virtual_damping} "
-                f"{system['N s/m']}; say which, 0 for a spring alone, or replace the wall: "
-                "scene.replace(stiffness=...)"
+                f"virtual_damping: none is given with stiffness, and the scene's wall has {wall.virtual_damping} "
+                f"{system['N s/m']}; pass it, 0 for a spring only, or replace the wall: scene.replace(stiffness=...)"
             )
         return stiffness, 0.0
     return stiffness, virtual_damping

@@ -1,4 +1,4 @@
-"""Display of results at the prompt and in notebooks: short, with units, names of codes, and reasons of NaN."""
+"""Display of results at the prompt and in notebooks: short, with units, names of codes, and reasons for NaN."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def spell_value(value: Any, unit: Unit = "") -> str:
 
 
 def _spell_number(value: Any, unit: Unit) -> str:
-    """One number with its unit, or the name of a code."""
+    """Return one number with its unit, or the name of a code."""
     if isinstance(unit, type):
         return unit(int(value)).name
     if isinstance(value, np.bool_ | np.integer):

@@ -1,7 +1,8 @@
-"""Rows of the boundary of any linear loop, and how many poles of each wall lie outside (docs/theory/scenes.md).
+"""The boundary of any linear loop at constant damping, and the number of poles outside the unit circle of each wall.
 
-A row meets each arc of `loops.linear.curve` once at most (V12). Along it a pole leaves the circle where
-``Im(q' - beta F') > 0``, which at z = 1 and z = -1 holds for the real poles as well. Hence
+A line of constant damping (a row) crosses each arc of `loops.linear.curve` at most once (docs/theory/scenes.md, V12).
+As alpha increases, poles leave the unit circle at a crossing if ``Im(q' - beta F') > 0``, also at z = 1 and z = -1.
+Hence
 
     poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
 
@@ -57,7 +58,7 @@ class Crossings(NamedTuple):
 
 @dataclass(frozen=True)
 class Boundary:
-    """The boundary of one loop, laid out for rows."""
+    """The boundary of one loop, prepared for lines of constant damping."""
 
     loop: LoopRoots
     w: np.ndarray
@@ -183,6 +184,7 @@ class Boundary:
 
     @cached_property
     def _steps(self) -> JoinedArcs:
+        """The nodes of all arcs, in one sequence."""
         return JoinedArcs.join(self.arcs)
 
     def arc_at(self, w: np.ndarray) -> np.ndarray:

@@ -82,7 +82,7 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
 
 @shown()
 class BoundaryPoint(NamedTuple):
-    """A wall on the edge of stability, or an array of them."""
+    """A wall on the stability boundary, or arrays of such walls."""
 
     alpha: Array
     beta: Array
@@ -193,7 +193,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
 
 
 class Piece(IntEnum):
-    """Kind of pole that crosses the unit circle on a part of the outline."""
+    """The pole that crosses the unit circle on a part of the outline."""
 
     COMPLEX_PAIR = 0
     MINUS_ONE = 1
@@ -202,7 +202,7 @@ class Piece(IntEnum):
 
 @shown()
 class StableRegion(NamedTuple):
-    """A closed outline: vertex k belongs to ``piece[k]``, and the last vertex joins the first along alpha = 0."""
+    """A closed outline: vertex k lies on ``piece[k]``; alpha = 0 joins the last vertex to the first."""
 
     alpha: Vertices
     beta: Vertices
@@ -273,17 +273,15 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     return StableRegion(alpha, beta, omega, piece)
 
 
-# Gauss-Legendre nodes along the lobe, on which alpha d(beta) is analytic.
-LOBE_NODES = 48
-# Weight of a point for `evaluate`, because of its nodes.
-LOBE_WEIGHT = 16
+LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic
+LOBE_WEIGHT = 16  # time and memory of a point relative to a point of other kernels
 
 
 def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
     """Return the area of the stable set in the (alpha, beta) plane.
 
-    ``A = integral of alpha d(beta)`` along the lobe of `zwidth.boundary`, closed by the line of walls with a pole at
-    z = -1, if the lobe meets this line, and by alpha = 0. In SI units the area over K and B is ``A m^2/T^3``.
+    ``A = integral of alpha d(beta)`` along the outline of `zwidth.stable_region`. In SI units, the area over K and B is
+    ``A m^2/T^3``.
 
     Args:
         delta: normalized physical damping b T/m, 0 to 1e12.
@@ -293,8 +291,8 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
         Array of the broadcast shape; NaN out of range.
 
     Numerics:
-        Gauss-Legendre quadrature of the closed form, about 1e-13. Traceable, with first and second derivatives; at
-        integer d the derivatives in d are those from the right.
+        Gauss-Legendre quadrature of the closed form, accurate to about 1e-13. JAX can differentiate it twice, in d from
+        the right at integer d.
 
     References:
         Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, section V.
@@ -312,15 +310,15 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
     curve = build_lobe(delta, d, kind)
     end = frozen(curve.end, xp)
-    # The outline leads from a corner along alpha + 2 beta = const to alpha = 0.
+    # From a corner, the outline returns to alpha = 0 along alpha + 2 beta = const.
     point = evaluate_lobe(end, curve)
     corner_alpha = xp.where(curve.to_corner, point.alpha, 0.0)
     if xp is not np:
-        # Any other end moves with the zero of alpha; this affects the second derivatives of the area only.
+        # Without a corner, the end is a zero of alpha; second derivatives of the area need its derivative.
         end = end - xp.where(
             curve.to_corner, 0.0, point.alpha / frozen(xp.where(curve.to_corner, 1.0, point.d_alpha), xp)
         )
-    # Add an axis, because the integrand is evaluated at many points of each lobe.
+    # Add an axis for the nodes.
     expanded = tree_map(lambda value: None if value is None else value[..., None], curve)
 
     def integrand(x: Array) -> Array:
