@@ -113,7 +113,7 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     Numerics:
         The logarithm of the dominant pole of `zwidth.spectral_radius`, computed from z - 1. For soft walls the rate has
         at least 11 digits, however small it is; for a pole pair near the unit circle its absolute error is about 1e-16.
-        A certified error bound is below a thousandth of the rate, otherwise the rate is NaN. If the magnitudes of several
+        A certified error bound is below a thousandth of the rate, otherwise the rate is NaN. If the magnitudes of some
         poles agree within 1e-12, the rate is that of any of them. Inside `jit` it has the ambient precision and no
         error bound.
 

@@ -12,7 +12,7 @@ from proved import certified_stable
 import oracles
 from zwidth.arrays.held_mass import classify_delays, phi_functions
 from zwidth.loops.rigid import certified
-from zwidth.loops.rigid.certified import CROSSOVER_WIDTH, CUBIC_TOLERANCE, TOLERANCE, Sized, enclose_zero, size_device
+from zwidth.loops.rigid.certified import CROSSOVER_WIDTH, CUBIC_TOLERANCE, TOLERANCE, Sized, enclose_root, size_device
 from zwidth.loops.rigid.crossover import (
     decide_long_delay,
     decide_short_delay,
@@ -132,10 +132,10 @@ def test_bounds_of_the_crossover_hold(d, monkeypatch):
     with np.errstate(all="ignore"):
         plant = size_device(delta, d, classify_delays(d))
         cubic = expand_gain_difference(*wall, plant)
-        u, found = enclose_zero(cubic)
-        computed = certified.size_lag(u, np.floor(d))
+        u, found = enclose_root(cubic)
+        computed = certified.size_phase(u, np.floor(d))
     differences = computed_differences(
-        monkeypatch, lambda: decide_long_delay(*wall, plant.whole, plant, enclose_zero, certified.size_lag)
+        monkeypatch, lambda: decide_long_delay(*wall, plant.whole, plant, enclose_root, certified.size_phase)
     )
     seen = 0
     for index in range(alpha.size):
@@ -147,10 +147,10 @@ def test_bounds_of_the_crossover_hold(d, monkeypatch):
             assert max(errors(*numbers(plant, exact), index)) < CUBIC_TOLERANCE / 2
             if not found[index]:
                 continue
-            root, sure = certified._enclose_zero(true_cubic)
+            root, sure = certified._enclose_root_in_balls(true_cubic)
             assert sure
             assert float(abs(root / u.value[index] - 1).upper()) < CROSSOVER_WIDTH
-            lag = certified._take_lag(root, int(d[index]))
+            lag = certified._evaluate_phase_in_balls(root, int(d[index]))
             assert not computed.within[index] or lag.within
             assert not computed.beyond[index] or lag.beyond
             if not lag.within:
