@@ -1,4 +1,4 @@
-"""Certified verdicts of the rigid loop: the closed form with a static error bound, then ball arithmetic.
+"""Certify stability verdicts of rigid loops: by the closed form with a static error bound, then by ball arithmetic.
 
 Both steps evaluate the source code of `loops.rigid.crossover`, with other numbers:
 

@@ -22,9 +22,10 @@ d >= 1: Compute the crossover as the root of the cubic |B|^2 - |T|^2 in u (a qua
 d < 1: Eliminate the crossover. A line of constant beta meets the stability lobe at the root of a quadratic in y; the
     wall is stable if and only if alpha is below the boundary there, and below the line of poles at z = -1.
 
-The same source code runs on NumPy and JAX arrays, on float64 balls (`arrays.balls`), on affine forms, and on balls of
-python-flint. In the last three a value represents a set of numbers, and a comparison is true only if it holds for every
-number of the set. Therefore ``stable`` and ``unstable`` are decided separately, and both may be false.
+The same source code runs on NumPy and JAX arrays, on float64 numbers with an error bound, and on balls of python-flint
+(both in `loops.rigid.certified`). In the last two a value represents a set of numbers, and a comparison is true only if
+it holds for every number of the set. Therefore ``stable`` and ``unstable`` are decided separately, and both may be
+false.
 
 References:
     docs/theory/one-crossover.md (Theorems 1 and 2, S15a, S15b), docs/theory/boundary.md (B1: E, H, V),
@@ -173,7 +174,7 @@ def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
     ends_at_nyquist = (stiffness_at_nyquist > 0) & (plant.gap > 0)
     ends_earlier = (stiffness_at_nyquist < 0) | (plant.gap < 0)
     # At the beta of the corner, where the lobe meets that line, y = 1; the sets of certified arithmetic then contain
-    # values on both sides. ``left < right`` suffices for a lobe that ends at z = -1, whichever side is the true one.
+    # values on both sides of 1. For a lobe that ends at z = -1, ``left < right`` implies stability on either side.
     stable = crosses & (
         (meets_lobe & (left < right)) | (ends_at_nyquist & (misses_lobe | (meets_curve & (left < right))))
     )

@@ -1,15 +1,16 @@
 """Compute the physical damping that a passive wall on a rigid device needs, for any delay: a maximum over frequency.
 
-Notation of docs/theory/passivity.md: d = n + f, k = n + 1, a = alpha/2, b = beta + a, u = 1 - cos w, kappa = 4 f (1 -
-f). At one frequency the wall needs the damping N, the larger root of
+Notation of docs/theory/passivity.md: d = n + f, k = n + 1, a = alpha/2, b = beta + a, u = 1 - cos w and
+kappa = 4 f (1 - f). At one frequency the wall needs the damping N, the larger root of
 
     N^2 - A N - S/4 = 0,    S = kappa (a^2 + (b^2 - a^2) u/2)
 
 A is linear in (a, beta). The maximum over frequency is at w = 0, at w = pi, or at a single peak in between, depending
 on the direction beta/alpha (P1 to P3, for alpha >= 0). N is homogeneous in (alpha, beta). At the peak dN/du = 0, i.e.
 
-    E = A' + kappa (b^2 - a^2)/(8 N) = 0,   a prime denotes d/du; a digit after a name, the order of this derivative
+    E = A' + kappa (b^2 - a^2)/(8 N) = 0
 
+A prime denotes d/du; in the code, a digit after a name is the order of this derivative.
 """
 
 from __future__ import annotations

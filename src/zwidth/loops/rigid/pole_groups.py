@@ -6,8 +6,8 @@ u), alpha = alpha0 + a xi and beta = beta0 + b eta, the poles of the walls solve
     A(u) = tau(u),   tau = a xi + b eta f(z),   f = 1 - 1/z          (docs/theory/maps.md)
 
 A *group* is one pole, or two poles close to the real axis that may meet there. Two poles that meet are not analytic in
-xi and eta, but their sums are. The series of such sums are integrals along a circle around the group (C1). The circle
-is chosen such that ``|A| > R |tau|`` on it for all walls (C2); powers of 1/R bound the truncation error (C3).
+xi and eta, but their sums are. Their coefficients are integrals along a circle around the group (C1). The circle is
+chosen such that ``|A| > R |tau|`` on it for all walls (C2); powers of 1/R bound the truncation error (C3).
 """
 
 from __future__ import annotations

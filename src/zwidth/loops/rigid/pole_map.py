@@ -156,7 +156,7 @@ class GridPoles(NamedTuple):
     special: tuple[np.ndarray, ...]
 
 
-class _Canvas:
+class _ResultArrays:
     """Result arrays of a window, extended to whole cells, and a list of the walls that need special treatment."""
 
     def __init__(self, area: Area, sides: tuple[int, int], with_rate: bool) -> None:
@@ -176,15 +176,11 @@ class _Canvas:
             for part, start in zip(window, self.first[1:, 0].tolist(), strict=True)
         )
         radius, rate = (values[:, rows, columns] for values in (self.radius, self.rate))
-        positions = np.concatenate([np.empty((3, 0), int), *self.special], axis=1) - [
-            [0],
-            [rows.start],
-            [columns.start],
-        ]
-        is_inside = (positions[1:] >= 0).all(0) & (positions[1] < radius.shape[1]) & (positions[2] < radius.shape[2])
+        index = np.concatenate([np.empty((3, 0), int), *self.special], axis=1) - [[0], [rows.start], [columns.start]]
+        is_inside = (index[1:] >= 0).all(0) & (index[1] < radius.shape[1]) & (index[2] < radius.shape[2])
         # Walls at which two groups were compared may occur twice.
         is_special = np.zeros(radius.shape, bool)
-        is_special[tuple(positions[:, is_inside])] = True
+        is_special[tuple(index[:, is_inside])] = True
         return GridPoles(radius, rate, np.unravel_index(np.flatnonzero(is_special), radius.shape))
 
 
@@ -204,16 +200,16 @@ def _view_as_cells(values: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
     return values.reshape(devices, rows // height, height, columns // width, width).swapaxes(2, 3)
 
 
-class _CellSize:
-    """The cells of one size."""
+class _CellGrid:
+    """The cells of one size, and the computation of their poles."""
 
-    def __init__(self, area: Area, sides: tuple[int, int], errors: AllowedErrors, canvas: _Canvas) -> None:
-        self.area, self.sides, self.errors, self.canvas = area, sides, errors, canvas
+    def __init__(self, area: Area, sides: tuple[int, int], errors: AllowedErrors, results: _ResultArrays) -> None:
+        self.area, self.sides, self.errors, self.results = area, sides, errors, results
         self.axes = _AxisPieces(area.alpha, sides[1]), _AxisPieces(area.beta, sides[0])
-        self.radius, self.rate = _view_as_cells(canvas.radius, sides), _view_as_cells(canvas.rate, sides)
+        self.radius, self.rate = _view_as_cells(results.radius, sides), _view_as_cells(results.rate, sides)
         # Step in walls between neighboring cells, along the axes device, row and column.
         self.steps = np.array([[1], *([side] for side in sides)])
-        self.first = canvas.first // self.steps
+        self.first = results.first // self.steps
 
     def split(self, positions: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
         """Divide cells of the given size into cells of this size, without those outside the window."""
@@ -330,16 +326,12 @@ class _CellSize:
         for k, order in enumerate(ORDERS):
             index = selected[group.order[selected] == k]
             for start in range(0, index.size, CELLS_PER_BATCH):
-                batch_index = index[start : start + CELLS_PER_BATCH]
-                padded = pad_to_16(batch_index)
-                batch_group = select_cells(group, padded)
+                chosen = index[start : start + CELLS_PER_BATCH]
+                padded = pad_to_16(chosen)
+                batch = select_cells(group, padded)
                 with np.errstate(all="ignore"):
                     self._write(
-                        positions[:, batch_index],
-                        expand_sums(batch_group, select_cells(cells, padded), order),
-                        batch_group,
-                        k,
-                        merge,
+                        positions[:, chosen], expand_sums(batch, select_cells(cells, padded), order), batch, k, merge
                     )
 
     def _write(self, positions: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
@@ -426,7 +418,7 @@ class _CellSize:
         index = np.flatnonzero(~(np.abs(radius - 1.0) > 1.01 * self.errors.uncertain_width))
         cell, *offset = np.unravel_index(index, radius.shape)
         corner = (self.steps * (positions - self.first))[1:, cell]
-        self.canvas.special.append(np.concatenate([positions[:1, cell], corner + offset]))
+        self.results.special.append(np.concatenate([positions[:1, cell], corner + offset]))
 
 
 def compute_grid_poles(area: Area, accuracy: float, with_rate: bool = False) -> GridPoles:
@@ -435,26 +427,22 @@ def compute_grid_poles(area: Area, accuracy: float, with_rate: bool = False) -> 
     # computed separately.
     sizes, errors = _list_cell_sizes(area.beta.shape[1], area.alpha.shape[1]), AllowedErrors(accuracy, with_rate)
     is_fractional = area.d != np.floor(area.d)
-    canvas = _Canvas(area, sizes[0], with_rate)
+    results = _ResultArrays(area, sizes[0], with_rate)
     corners = [np.arange(w.start // side, -(-w.stop // side)) for w, side in zip(area.window, sizes[0], strict=True)]
     open_cells = [
         np.stack(
-            [
-                part.reshape(-1)
-                for part in np.meshgrid(np.flatnonzero(is_fractional == fractional), *corners, indexing="ij")
-            ]
+            [part.reshape(-1) for part in np.meshgrid(np.flatnonzero(is_fractional == kind), *corners, indexing="ij")]
         )
-        for fractional in (False, True)
+        for kind in (False, True)
     ]
     with np.errstate(all="ignore"):
         for sides, larger in zip(sizes, (sizes[0], *sizes), strict=False):
-            level = _CellSize(area, sides, errors, canvas)
+            level = _CellGrid(area, sides, errors, results)
             open_cells = [
-                level.solve_all(level.split(cells, larger), fractional == 1)
-                for fractional, cells in enumerate(open_cells)
+                level.solve_all(level.split(cells, larger), kind == 1) for kind, cells in enumerate(open_cells)
             ]
             if not any(cells.size for cells in open_cells):
                 break
             if sides == sizes[-1]:
                 level.mark_open(np.concatenate(open_cells, axis=1))
-    return canvas.cut_out(area.window)
+    return results.cut_out(area.window)

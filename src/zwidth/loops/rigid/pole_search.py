@@ -51,9 +51,9 @@ RADIUS_AFTER_STEP = 1.4
 COUNT_ROUNDING = 4096.0  # rounding error of a count, in rounding units of log r
 RATE_WIDTH = 2e-11  # relative to |re|, for the accuracy of decay rates
 
-# Bisection of the radius, from the smallest positive float64 to full precision. The last digits matter if many poles
-# have nearly the same modulus, because the angles of the crossovers depend on them.
-MIN_LOG_RADIUS = -690.0
+# Bisection of the radius to full precision. The last digits matter if many poles have nearly the same modulus, because
+# the angles of the crossovers depend on them.
+MIN_LOG_RADIUS = -690.0  # e^-690 = 2e-300 is close to the smallest float64
 BISECTIONS = 62
 POLISHING_STEPS = 6  # Halley steps after the bisection
 NEWTON_STEPS = 3  # Newton steps after those, in `_find_in_rounds`
@@ -122,7 +122,7 @@ def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
 
 
 def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
-    """Approximate the first pair: |T| = |B| there, extrapolated from the unit circle by the dominant factor |z|^n."""
+    """Approximate the first pair: its angle from the delay, and its radius from |T| = |B|, by z^(1+n) alone."""
     xp = namespace(loop.alpha)
     im = np.pi / (loop.d_plus_1 + 1.0)
     # If beta is negative enough that W is nearly a negative multiple of z - 1, arg T and arg B coincide half a turn

@@ -1,4 +1,4 @@
-"""P and its derivatives at one point; Newton and Halley steps toward a pole, and a bound on the distance to a pole.
+"""Evaluate the characteristic polynomial P and its derivatives at a point, and take Newton or Halley steps to a pole.
 
 The polynomial is evaluated in factored form (`loops.rigid.circle.LoopFactors`),
 

@@ -1,6 +1,7 @@
-"""All closed-loop poles: eigenvalues of the companion matrix, or Aberth's iteration for many walls at once.
+"""Compute all closed-loop poles: by eigenvalues, or by Aberth's iteration for many walls at once.
 
-The eigenvalues are polished by Newton's method on the factored polynomial (`loops.rigid.circle`, `LoopFactors`).
+The eigenvalues are those of the companion matrix of the characteristic polynomial P. Newton's method on the factors of
+P (`loops.rigid.circle.LoopFactors`) then refines them.
 
 Aberth's iteration (Ehrlich 1967, Aberth 1973) updates all approximations z_i of a wall together. With P monic of
 degree N, q_i the product of z_i - z_j over all j != i, and q_i' its derivative in z_i, one step subtracts
@@ -13,7 +14,7 @@ disjoint, each of them contains exactly one zero (Smith 1970). Walls without thi
 eigenvalues instead.
 
 References:
-    Aberth 1973, Math. Comp. 27, 339-344. Smith 1970, J. ACM 17, 661-674.
+    Ehrlich 1967, Commun. ACM 10, 107-108. Aberth 1973, Math. Comp. 27, 339-344. Smith 1970, J. ACM 17, 661-674.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The characteristic polynomial of device and virtual wall, by its coefficients or on the unit circle.
+"""Compute the characteristic polynomial of device and virtual wall: its coefficients, or walls with a given zero.
 
 For the delay d = n + f (n integer, 0 <= f < 1) and N(z) = a2 z^2 + a1 z + a0 of the discretized plant
 (`arrays.held_mass`),
