@@ -97,7 +97,6 @@ class _Circle(NamedTuple):
 
 def _evaluate_on_circle(log_r: Array, loop: LoopFactors, fractional: bool, xp: Any) -> _Circle:
     """Evaluate the loop on the circle |z| = e^log_r."""
-
     r, r_minus_1 = xp.exp(log_r), xp.expm1(log_r)
     r_minus_c, wall, numerator = r_minus_1 + loop.em, loop.alpha * r + loop.beta * r_minus_1, loop.a2 * r + loop.h
     power = loop.n_plus_1 * log_r

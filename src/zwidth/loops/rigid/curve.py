@@ -113,7 +113,6 @@ def evaluate_lobe(x: Array, lobe: Lobe) -> LobePoint:
 
 def _evaluate_short(y: Array, short_curve: Any) -> LobePoint:
     """Return the point of the lobe at y, for n = 0."""
-
     (u0, u1), modulus_terms, (a, s, t) = short_curve
     dV, inverse = modulus_terms[1] + 2.0 * y * modulus_terms[2], 1.0 / horner(y, modulus_terms)
     alpha, b = 4.0 * y * (a + y * (s + y * t)) * inverse, y * (u0 + y * u1) * inverse
@@ -123,7 +122,6 @@ def _evaluate_short(y: Array, short_curve: Any) -> LobePoint:
 
 def _evaluate_long(omega: Array, long_lobe: LongLobe) -> LobePoint:
     """Return the point of the lobe at omega, for n >= 1."""
-
     terms = LobeTerms(omega, long_lobe)
     alpha_terms = evaluate_alpha_terms(terms)
     numerator, d_numerator, denominator, d_denominator = evaluate_offset(terms)

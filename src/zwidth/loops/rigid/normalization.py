@@ -72,7 +72,6 @@ def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
 
 def _is_valid(name: str, value: Array) -> Array:
     """Return whether a value is finite and has the sign that its parameter requires."""
-
     return namespace(value).isfinite(value) & PARAMETERS[name].sign.holds(value)
 
 

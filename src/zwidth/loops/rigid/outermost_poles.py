@@ -32,8 +32,8 @@ from zwidth.loops.rigid.pole_search import (
 )
 from zwidth.words.status import Status
 
-# If the rounding error of a count is too large for the accuracy, the error bound is increased by these factors, up to
-# `MAX_ERROR`.
+# If a count is uncertain at the required accuracy because of rounding errors, the error bound is increased by these
+# factors, up to `MAX_ERROR`.
 ERROR_FACTORS = 10.0 ** np.arange(12)
 MAX_ERROR = 0.1
 # Largest float64 below 1.
@@ -55,7 +55,7 @@ PIECE = BLOCK >> 3
 
 # Default relative error of radii and rates.
 ACCURACY = 1e-9
-NO_RATE = np.empty(0)
+NO_RATE = np.empty(0)  # placeholder for rates that are not requested
 
 
 def compute_dominant_poles(columns: list[np.ndarray], accuracy: float, route: Route = "auto") -> DominantPoles:
@@ -79,7 +79,6 @@ def compute_dominant_poles(columns: list[np.ndarray], accuracy: float, route: Ro
 
 def _compute_by_kind(columns: list[np.ndarray], accuracy: float, fractional: bool, route: Route) -> DominantPoles:
     """Return the dominant poles of walls whose delays are all fractional or all integer."""
-
     size = columns[0].size
     arguments = [*columns, np.full(size, accuracy)]
     with np.errstate(all="ignore"):
@@ -137,7 +136,7 @@ def _map_in_batches(function: Callable[[list[np.ndarray]], Any], columns: list[n
 
 
 def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
-    """Arrange points as a grid of alpha and beta for one or several devices; None if they are no large enough grid.
+    """Arrange points as a grid of alpha and beta for one or several devices; None if they form no such grid or a small one.
 
     A line of walls is a grid, too: its missing axis is the first one, which must have length 1.
 
@@ -203,15 +202,14 @@ def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = Fal
 
 def find_dominant_pole(wall: tuple[float, float, float, float]) -> tuple[float, float, float]:
     """Return the spectral radius of one wall, its decay rate and the angle of its dominant pole."""
-    poles, poles_found = _find_listed([np.array([value]) for value in wall], ACCURACY, True, "auto")
-    return float(poles.radius[0]), float(poles.rate[0]), abs(float(poles_found.im[0]))
+    results, dominant = _find_listed([np.array([value]) for value in wall], ACCURACY, True, "auto")
+    return float(results.radius[0]), float(results.rate[0]), abs(float(dominant.im[0]))
 
 
 def _find_listed(
     columns: list[np.ndarray], accuracy: float, with_rate: bool, route: Route
 ) -> tuple[WallPoles, DominantPoles]:
     """Return the results for columns of walls: radii with rates, and the dominant poles."""
-
     dominant = compute_dominant_poles(columns, accuracy, route)
     rate = compute_rates(dominant, columns, accuracy) if with_rate else NO_RATE
     radius = np.exp(np.where(np.isinf(dominant.error), np.nan, dominant.re))
@@ -255,7 +253,7 @@ def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: flo
             if not index.size:
                 continue
             loop = factor_loop(*(column[index] for column in columns), fractional=fractional)
-            # A count on a smaller circle shows if no other pole is nearly as large; then the rate is that of the pole.
+            # Count on a smaller circle. If no other pole is nearly as large, the error of the rate is that of the pole.
             poles_outside = count_poles(poles.re[index] - width[index], loop, fractional)
             is_only = poles_outside.certain & (
                 poles_outside.outside == np.where(np.sin(poles.im[index]) < REAL_AXIS_WIDTH, 1, 2)

@@ -268,7 +268,6 @@ def _compute_by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, deg
 @cache
 def _compile_by_degree(kernel: Callable[..., Any], degree: Degree) -> Any:
     """Return the compiled kernel for one degree, cached."""
-
     import jax
 
     return jax.jit(lambda *arrays: kernel(*arrays, degree))

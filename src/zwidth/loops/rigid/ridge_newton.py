@@ -192,7 +192,6 @@ NEWTON_STEPS = 3
 
 def _evaluate_bivariate(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
     """Evaluate a polynomial in t whose coefficients are polynomials in u."""
-
     return horner(t, [horner(u, list(row)) for row in rows])
 
 

@@ -25,7 +25,7 @@ from zwidth.words.xp import COSINE, SINE, horner, namespace, nan_beyond, repeat
 
 # Newton steps. Each doubles the number of correct digits.
 END_STEPS = 6  # to the end of a lobe; the last one only confirms
-ROW_STEPS = 2  # to the frequency of a limit, which then has a relative error of 2e-9; a last step in alpha squares it
+ROW_STEPS = 2  # to the frequency of a limit; they leave a relative error of 2e-9, which a last step in alpha squares
 
 # Abramowitz, Stegun 1964, eq. (4.4.47): arctan t on [0, 1] within 1e-5.
 ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
@@ -35,16 +35,16 @@ class LongLobe(NamedTuple):
     """The boundary curve of a device with d >= 1, in powers of y = sin^2(w/2), and the starting values for Newton."""
 
     delta: Array
-    k: Array
-    E0: Array
+    k: Array  # n + 1/2
+    E0: Array  # E = E0 + E1 y + E2 y^2
     E1: Array
     E2: Array
-    H0: Array
+    H0: Array  # H = H0 + H1 y
     H1: Array
-    V0: Array
+    V0: Array  # V = V0 + V1 y + V2 y^2
     V1: Array
     V2: Array
-    excess1: Array
+    excess1: Array  # delta V - E = excess1 y + excess2 y^2
     excess2: Array
     end: Any = None  # w at the end of the lobe
     end_b: Any = None  # b at the end of the lobe
@@ -95,7 +95,6 @@ def limit_short_delay(beta: Array, plant: DeviceTerms) -> Array:
 
 def _mask_limit(limit: Array, b: Array) -> Array:
     """Set the limit to 0 if no alpha is stable, and to NaN if b is not finite."""
-
     xp = namespace(b)
     return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
 
@@ -131,7 +130,7 @@ def build_long_lobe(plant: DeviceTerms) -> LongLobe:
 
 
 class LobeTerms:
-    """The trigonometric terms of the curve at one frequency, from two short series."""
+    """The terms of the curve at one frequency: with s, c of w/2, sin_k, cos_k of k w, and derivatives d... in w."""
 
     def __init__(self, omega: Array, lobe: LongLobe):
         _, k, E0, E1, E2, H0, H1, V0, V1, V2, excess1, excess2, *_ = lobe
@@ -308,13 +307,11 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route 
 
 def _short_limit(beta: Array, delta: Array, d: Array) -> Array:
     """Return the limits for d < 1."""
-
     return limit_short_delay(beta, device(delta, d))
 
 
 def _long_limit(beta: Array, delta: Array, d: Array) -> Array:
     """Return the limits for d >= 1."""
-
     return find_limit_long_delay(beta, build_long_lobe(device(delta, d)))[0]
 
 
