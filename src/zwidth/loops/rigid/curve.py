@@ -134,7 +134,7 @@ def _evaluate_long(omega: Array, long_lobe: LongLobe) -> LobePoint:
 
 
 def compute_frequency(x: Array, lobe: Lobe) -> Array:
-    """Return omega of x; at a corner, where x is the end, without a derivative."""
+    """Return omega at x. At the corner its derivative is 0, because the corner remains at omega = pi."""
     if lobe.short_curve is None:
         return x
     xp = namespace(x)
@@ -151,7 +151,7 @@ def compute_corner_line(lobe: Lobe) -> Array:
 
 
 class RowLimit(NamedTuple):
-    """The largest stable alpha at one beta: on the lobe, or after the corner on the line with a pole at z = -1."""
+    """The largest stable alpha at one beta: on the lobe, or beyond the corner on the line of poles at z = -1."""
 
     x: Array  # the nearer end of the lobe if no point of the lobe has this beta
     meets_lobe: Array  # a point of the lobe has this beta
@@ -193,10 +193,10 @@ def find_peak(lobe: Lobe, kind: DelayClasses) -> Peak:
 
 
 def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return x of the point with 0 < alpha < ``top.alpha``, and whether it is on the line of poles at z = -1 instead.
+    """Return x of the point with a given alpha, or whether this point is on the line of poles at z = -1 instead.
 
     Args:
-        alpha: Normalized stiffness of the column.
+        alpha: Normalized stiffness, 0 < alpha < ``top.alpha``.
         top: Point of largest alpha.
         lobe: The lobe.
         upper: Return the point with the larger beta, i.e. after the peak; otherwise the one before the peak.

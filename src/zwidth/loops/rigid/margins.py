@@ -151,7 +151,7 @@ def _find_gain_margin(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) ->
     # The phase of L does not depend on the factor, and the gain crossover increases with the factor. So the wall is
     # stable up to the first zero of the phase; if there is none below z = -1, up to ``|L(-1)| = 1``.
 
-    def phase(log_w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> Array:
+    def evaluate_phase(log_w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> Array:
         # Multiply the phase by a positive factor that makes it of order 1 on both sides of w = sqrt(em), because for
         # light damping the phase itself is below its rounding error long before its sign changes.
         w, n, em = xp.exp(log_w), plant.whole, plant.em
@@ -175,11 +175,11 @@ def _find_gain_margin(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) ->
     n, em = plant.whole, plant.em
     slowness = 1.0 / xp.where(em > 0, em, 1e-9) + n + 2.0 + xp.abs(beta) / alpha
     wall, (low, high) = frozen(((alpha, beta, plant), (-xp.log(2.0 * slowness), xp.log(np.pi / (n + 1.0)))), xp)
-    start, end = apply_each(lambda x: phase(x, *wall), [low, high], xp)
+    start, end = apply_each(lambda x: evaluate_phase(x, *wall), [low, high], xp)
     never_stable = ~(start > 0)
     bracket = low, high, xp.where(never_stable, 1.0, start), -1.0 + 0.0 * low
-    phase_at_w = false_position(lambda x: phase(x, *wall), *bracket, FALSE_POSITION_STEPS, 1e-15)
-    w = xp.minimum(xp.exp(follow_root(phase, phase_at_w, _is_falling, alpha, beta, plant)), np.pi)
+    log_w = false_position(lambda x: evaluate_phase(x, *wall), *bracket, FALSE_POSITION_STEPS, 1e-15)
+    w = xp.minimum(xp.exp(follow_root(evaluate_phase, log_w, _is_falling, alpha, beta, plant)), np.pi)
     gain_at_zero = 1.0 / evaluate_gain_and_phase(w, alpha, beta, plant)[0]
     wall_at_nyquist = xp.abs(plant.gap * (alpha + 2.0 * beta))
     gain_at_nyquist = 2.0 * (1.0 + plant.c) / xp.where(wall_at_nyquist > 0, wall_at_nyquist, 1.0)
@@ -250,7 +250,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
 
 
 def _grade_fractions(delta: Array, xp: Any) -> Array:
-    """Return fractions from 0 to almost 1 along a last axis; geometric at both ends, even for light damping."""
+    """Return fractions from 0 to almost 1 along a last axis, denser at both ends; equidistant for light damping."""
     share = along(np.arange(N_FRACTIONS + 1) / N_FRACTIONS, xp.asarray(delta))
     growth = xp.log1p(GRADING * xp.maximum(delta, LIGHT_DAMPING))[..., None]
     from_end = 0.5 * xp.expm1(2.0 * xp.minimum(share, 1.0 - share) * growth) / xp.expm1(growth)

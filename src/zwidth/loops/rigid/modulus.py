@@ -26,10 +26,9 @@ from zwidth.words.xp import along, apply_each, frozen, namespace, store_once
 
 
 def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
-    """Return the gain ``|L|`` and the phase of L relative to -pi, at w in (0, pi].
+    """Return the gain ``|L|`` and the phase of L plus pi, at w in (0, pi].
 
     With ``u = 1 - cos w``, ``s = sin w``, ``W = alpha + beta u + j beta s``, M at e^(j w) and ``Z = s + j (em - u)``,
-    at e^(j w) and ``Z = s + j (em - u)``,
 
         |L|^2 = |W|^2 |M|^2 / (2 u (em^2 + 2 c u))
         phase = arg W + arg M + arg Z - (n + 1/2) w = pi + arg L
@@ -37,14 +36,14 @@ def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: DeviceTe
     The principal values of these arguments are continuous in w, so the phase needs no unwrapping.
     """
     xp = namespace(w, alpha)
-    _, _, u, s, (wall_re, wall_im), (m_re, m_im) = _factors(w, alpha, beta, plant)
+    _, _, u, s, (wall_re, wall_im), (m_re, m_im) = _evaluate_factors(w, alpha, beta, plant)
     numerator = (wall_re * wall_re + wall_im * wall_im) * (m_re * m_re + m_im * m_im)
     gain = xp.sqrt(numerator / (2.0 * u * (plant.em * plant.em + 2.0 * plant.c * u)))
     phase = xp.arctan2(wall_im, wall_re) + xp.arctan2(m_im, m_re) + xp.arctan2(plant.em - u, s)
     return gain, phase - (plant.whole + 0.5) * w
 
 
-def _factors(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Any, ...]:
+def _evaluate_factors(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Any, ...]:
     """Return sin(w/2), cos(w/2), u, s, and the real and imaginary parts of W and of M."""
     xp = namespace(w, alpha)
     sine, cosine = xp.sin(0.5 * w), xp.cos(0.5 * w)
@@ -77,7 +76,7 @@ def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DeviceT
     """Return ``|1 + L|^2`` at w in (0, pi]: ``L = -W M Z e^(-j (n + 1/2) w)/(2 h |Z|^2)`` with h = sin(w/2)."""
     xp = namespace(w, alpha)
     delay_phase = (2.0 * plant.whole + 1.0) * (0.5 * w)
-    sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = _factors(w, alpha, beta, plant)
+    sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = _evaluate_factors(w, alpha, beta, plant)
     re, im = wall_re * m_re - wall_im * m_im, wall_re * m_im + wall_im * m_re
     em_minus_u = plant.em - u
     re, im = re * s - im * em_minus_u, re * em_minus_u + im * s
@@ -94,7 +93,7 @@ def _differentiate_distance(w: Array, alpha: Array, beta: Array, plant: DeviceTe
     """Return half the first and half the second derivative of the squared distance, from the derivatives of log L."""
     xp = namespace(w, alpha)
     n_plus_half, c = plant.whole + 0.5, xp.cos(w)
-    sine, cosine, u, s, wall, m = _factors(w, alpha, beta, plant)
+    sine, cosine, u, s, wall, m = _evaluate_factors(w, alpha, beta, plant)
     z, delay = c + 1j * s, xp.cos(n_plus_half * w) - 1j * xp.sin(n_plus_half * w)
     wall, m, wall_slope = wall[0] + 1j * wall[1], m[0] + 1j * m[1], beta * (s + 1j * c)
     total, difference = plant.a2 + plant.a0, plant.a2 - plant.a0
@@ -116,8 +115,8 @@ def find_modulus_margin(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[
     xp = namespace(alpha, plant.c)
     wall = alpha, beta, plant
 
-    def is_dip(w: Array, bend: Array, _: Array) -> Array:
-        return (w < np.pi) & (bend > 0)
+    def is_dip(w: Array, curvature: Array, _: Array) -> Array:
+        return (w < np.pi) & (curvature > 0)
 
     lowest = _find_lowest(*frozen(wall, xp), xp)
     w = follow_root(

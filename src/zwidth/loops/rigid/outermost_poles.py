@@ -136,7 +136,7 @@ def _map_in_batches(function: Callable[[list[np.ndarray]], Any], columns: list[n
 
 
 def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
-    """Arrange points as a grid of alpha and beta for one or several devices; None if they form no such grid or a small one.
+    """Arrange points as a grid of alpha and beta for one or more devices; None if they form no grid or a small one.
 
     A line of walls is a grid, too: its missing axis is the first one, which must have length 1.
 
