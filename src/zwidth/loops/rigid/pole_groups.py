@@ -208,7 +208,7 @@ def enclose_poles(
         The groups. Those that no circle encloses have infinite errors and no order.
     """
     loop, points, orders = cells.loop, POINTS_PER_POLE * poles, np.arange(N_TERMS + 1)
-    a, f, w, (abs_z_minus_1, abs_z_minus_c, lead, rho, abs_late) = _expand_taylor(re, im, loop, fractional, N_TERMS)
+    a, f, w, (abs_z_minus_1, abs_z_minus_c, abs_q0, rho, abs_late) = _expand_taylor(re, im, loop, fractional, N_TERMS)
     r, abs_f, abs_w, sizes = np.exp(re), np.abs(f), np.abs(w), np.abs(a)
     limit = 1.0 / np.maximum(1.0, np.maximum(rho, abs_late) if fractional else rho)
     largest = np.minimum(2.0 / loop.n_plus_1, 0.4 * limit)
@@ -216,7 +216,7 @@ def enclose_poles(
     # Bound the remainder of the Taylor series by a wider disk, on which each factor is at most its value at |u|.
     wider_disk = np.minimum(4.0 * disk, 0.5 * (disk + limit))
     majorant = (
-        lead
+        abs_q0
         * np.exp(loop.n_plus_1 * wider_disk)
         * (abs_z_minus_1 + r * wider_disk)
         * (abs_z_minus_c + r * wider_disk)
@@ -233,20 +233,25 @@ def enclose_poles(
     low = 2.0 * main_term - total - remainder
     ratio = low / (cells.a + cells.b * (abs_f + abs_w * disk / (1.0 - disk)))
     score = np.where(ratio > 1.02, ratio / (1.0 + 1e3 / errors.accuracy * remainder / low), 0.0)
-    # A mean over points of the circle has a very small error if no pole lies between it and two neighboring circles.
-    offset, cells_of = CIRCLE_OFFSET[poles], np.arange(re.size)
+    # The error of a mean over points of the circle is bounded by its values on two neighboring circles, between which
+    # no pole may lie (C3).
+    offset, cell_index = CIRCLE_OFFSET[poles], np.arange(re.size)
     # If the truncation error is negligible for every order, prefer a smaller circle, because it is farther from
     # singularities outside.
     rank = np.minimum(score, AMPLE_RATIO) * (1.0 + 0.01 * np.arange(CIRCLE_RADII.size)[:, None])
     best = (rank[offset:-offset] * (score[: -2 * offset] > 0) * (score[2 * offset :] > 0)).argmax(0) + offset
-    chosen, spread, alias = (best, cells_of), np.log(main_term / low) - np.log1p(-1.0 / ratio), np.full(re.size, np.inf)
+    chosen, spread, alias = (
+        (best, cell_index),
+        np.log(main_term / low) - np.log1p(-1.0 / ratio),
+        np.full(re.size, np.inf),
+    )
     for step in (offset, offset + 1):
         outer, inner = np.maximum(best - step, 0), np.minimum(best + step, CIRCLE_RADII.size - 1)
-        between = (outer + inner == 2 * best) & (np.minimum(score[outer, cells_of], score[inner, cells_of]) > 0)
+        between = (outer + inner == 2 * best) & (np.minimum(score[outer, cell_index], score[inner, cell_index]) > 0)
         # Error of the means of the powers of tau/A; and of the mean for the poles at the center of the cell, which is
         # larger by up to the number of points.
         missed = 2.0 ** (-0.5 * step * points) * (1 + points)
-        missed = missed * (4.5 * spread[outer, cells_of] + spread[inner, cells_of])
+        missed = missed * (4.5 * spread[outer, cell_index] + spread[inner, cell_index])
         alias = np.where(between, np.fmin(alias, missed), alias)
     is_enclosed = score[chosen] > 0
     if poles == 1:
@@ -268,8 +273,8 @@ def enclose_poles(
         farthest = np.where(ratio > 1.02, np.log1p(-disk), -np.inf)
     group = Group(poles, re, im, a, f, w, disk[chosen], re + farthest.max(0), error, best)
     least = np.maximum(np.abs(re) - (re - group.low), MIN_LOG_RADIUS)
-    majorant = errors.limit(least) * (1.0 if poles == 1 else PAIR_FACTOR)
-    return group._replace(order=(~(group.log_error <= majorant)).sum(0))
+    allowed = errors.limit(least) * (1.0 if poles == 1 else PAIR_FACTOR)
+    return group._replace(order=(~(group.log_error <= allowed)).sum(0))
 
 
 def _compute_powers(x: Any, count: int, factor: Any = 1.0) -> np.ndarray:
