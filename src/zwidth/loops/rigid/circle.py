@@ -96,7 +96,7 @@ class _Circle(NamedTuple):
 
 
 def _evaluate_on_circle(log_r: Array, loop: LoopFactors, fractional: bool, xp: Any) -> _Circle:
-    """Evaluate the loop on the circle |z| = e^log_r."""
+    """Evaluate the factors of T and B, and |T|^2 - |B|^2, on the circle |z| = e^log_r."""
     r, r_minus_1 = xp.exp(log_r), xp.expm1(log_r)
     r_minus_c, wall, numerator = r_minus_1 + loop.em, loop.alpha * r + loop.beta * r_minus_1, loop.a2 * r + loop.h
     power = loop.n_plus_1 * log_r
@@ -195,7 +195,7 @@ def _find_only_zero(circle: _Circle, xp: Any) -> tuple[Array, Array]:
 def _evaluate_phase_difference(
     x: Array, circle: _Circle, loop: LoopFactors, fractional: bool, xp: Any
 ) -> tuple[Array, Array, Array]:
-    """Return the phase difference at a crossover, and how fast it changes.
+    """Return arg T - arg B at a crossover, and a bound of its derivative in w.
 
     Returns:
         ``arg T - arg B``, continuous from w = 0; w; and a bound of the derivative of the difference in w.
@@ -312,8 +312,8 @@ def count_poles_in_cell(
     circle = _evaluate_on_circle(log_r, loop, fractional, np)
     a, b = half
     r, abs_r_minus_1, power = circle.r, np.abs(circle.r_minus_1), loop.n_plus_1 * log_r
-    # Bounds for all walls of the cell: of the change of W = alpha z + beta (z - 1) at x = 0, and of the change of both
-    # coefficients of |W|^2 = w0 + w1 x.
+    # Bounds that hold for all walls of the cell: on the change of W = alpha z + beta (z - 1) at x = 0, and on the
+    # changes of the coefficients w0 and w1 of |W|^2 = w0 + w1 x.
     wall_change, w1 = a * r + b * abs_r_minus_1, 4.0 * r * loop.s * loop.beta
     e0 = (2.0 * np.abs(circle.wall) * wall_change + wall_change * wall_change) * WIDENING + 1e-14 * circle.wall**2
     e1 = 4.0 * r * (np.abs(loop.s) * b + (np.abs(loop.beta) + b) * (a + b)) * WIDENING + 1e-14 * np.abs(w1)

@@ -193,7 +193,7 @@ def find_peak(lobe: Lobe, kind: DelayClasses) -> Peak:
 
 
 def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return x of the point with a given alpha, or whether this point is on the line of poles at z = -1 instead.
+    """Return x of the point with a given alpha, and whether this point is on the line of poles at z = -1 instead.
 
     Args:
         alpha: Normalized stiffness, 0 < alpha < ``top.alpha``.

@@ -130,7 +130,7 @@ def find_modulus_margin(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[
 
 
 def _find_lowest(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> Array:
-    """Return the frequency w of the minimum."""
+    """Return the frequency w at which |1 + L| is smallest."""
 
     def find_frequency_of_gain(level: Array) -> Array:
         """Return the frequency at which |L| has a value; pi if |L| is larger everywhere."""

@@ -202,7 +202,7 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
 
 
 def passive_stiffness_slope(d: float) -> tuple[float, float]:
-    """Return stiffness and damping of the stiffest passive wall for one delay, both divided by delta."""
+    """Return alpha/delta and beta/delta of the stiffest passive wall for one delay."""
     check_scalars({"d": d})
     delay = as_number("d", d, 0.0)
     period = delay + 1.0

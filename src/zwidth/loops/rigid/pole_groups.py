@@ -36,7 +36,8 @@ COARSE_ACCURACY = 1e-5
 # Reason: one in ten radii of walls with alpha >= 1e-18 rounds to 1, and one in ten of those within 1e-10 of the
 # stability boundary is on the wrong side.
 VERDICT_WIDTH = 1e-7
-# Factor on the errors allowed for the sums of two poles, because the poles contain the square root of a difference.
+# Factor on the errors allowed for the sums over two poles, because each pole depends on the square root of a difference
+# of these sums.
 PAIR_FACTOR = 1e-3
 # Relative error of decay rates; walls with a larger error are computed one by one.
 RATE_ACCURACY = 1e-6
@@ -49,7 +50,8 @@ REAL_AXIS_WIDTH = 1e-7
 NEWTON_STEPS = 4
 # Radii of the circles that are tried, relative to the largest one.
 CIRCLE_RADII = 2.0 ** (-0.5 * np.arange(14))
-# For a group of one or two poles: index distance of the neighboring circles that the error of a mean requires.
+# For groups of one and of two poles: distance, in indices of `CIRCLE_RADII`, of the neighboring circles that bound the
+# error of a mean over points.
 CIRCLE_OFFSET = {1: 2, 2: 1}
 # R above this value gives no further advantage.
 AMPLE_RATIO = 100.0
@@ -213,7 +215,7 @@ def enclose_poles(
     limit = 1.0 / np.maximum(1.0, np.maximum(rho, abs_late) if fractional else rho)
     largest = np.minimum(2.0 / loop.n_plus_1, 0.4 * limit)
     disk = largest * CIRCLE_RADII[:, None]
-    # Bound the remainder of the Taylor series by a wider disk, on which each factor is at most its value at |u|.
+    # Bound the remainder of the Taylor series by the moduli of the factors of A on a wider disk.
     wider_disk = np.minimum(4.0 * disk, 0.5 * (disk + limit))
     majorant = (
         abs_q0

@@ -109,7 +109,7 @@ class _AxisPieces:
         self._tables: dict[Any, np.ndarray] = {}
 
     def table(self, function: Callable[[np.ndarray, int], np.ndarray], order: int, pieces: Any) -> np.ndarray:
-        """Return ``function``, i.e. powers or interpolation weights, for the walls of pieces: (pieces, walls, ...)."""
+        """Evaluate powers or interpolation weights (``function``) at the walls of pieces: (pieces, walls, ...)."""
         if self._positions.size > MAX_CACHED:
             return function(self._positions[pieces], order)
         if (function, order) not in self._tables:

@@ -44,8 +44,8 @@ STEPS_ON_ALL = 10  # without a certificate again: on four starting points
 
 # A sequence has converged if a pole is within this distance of log z.
 CONVERGED_RADIUS = 1e-6
-# If a pole is within R of log z before a Newton step, it is within this factor times R after it: R is at least
-# N |P/P'| (degree N >= 3), and the step |P/P'| is at most R/N.
+# Factor by which a Newton step increases the known distance of a pole at most. The distance before the step is bounded by
+# R = N |P/P'|, where N >= 3 is the degree, and the step has the length R/N.
 RADIUS_AFTER_STEP = 1.4
 # Distance between a pole and the circle of the count, see `certification_width`.
 COUNT_ROUNDING = 4096.0  # rounding error of a count, in rounding units of log r

@@ -70,7 +70,7 @@ class FrequencyLoop(NamedTuple):
 
 
 def build_frequency_loop(delta: Array, d: Array) -> FrequencyLoop:
-    """Return the loop of one (delta, d), for evaluation on the unit circle."""
+    """Return the discretized plant and the integer delay of one (delta, d)."""
     n, fraction = split_delay(d)
     return FrequencyLoop(held_plant(delta, fraction), n)
 

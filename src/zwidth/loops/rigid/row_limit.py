@@ -94,7 +94,7 @@ def limit_short_delay(beta: Array, plant: DeviceTerms) -> Array:
 
 
 def _mask_limit(limit: Array, b: Array) -> Array:
-    """Set the limit to 0 if no alpha is stable, and to NaN if b is not finite."""
+    """Return the limit, but 0 if no alpha is stable, and NaN if b is not finite."""
     xp = namespace(b)
     return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
 
@@ -220,7 +220,8 @@ def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
             omega - remaining / (n_plus_1 * size + (terms.E * alpha_terms.dF - alpha_terms.F * terms.dE)), limit
         )
 
-    # Use a loop and not unrolled steps, because each device is solved once, and the compile time is a fifth.
+    # Use a loop, which compiles five times faster than unrolled steps. Its slower execution does not matter, because each
+    # device is solved once.
     start = 0.5 * np.pi / n_plus_1 * (1.0 + 0.7 * start_ratio / (start_ratio + 1.0 / n_plus_1))
     return repeat(END_STEPS, step, start, xp)
 
