@@ -27,23 +27,19 @@ from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
-# By default the longest delay, in periods.
-_LONGEST = 20
-# The lightest and the heaviest device, the longest way and the largest force, linear and rotary: beyond, a unit is
-# suspected.
+_LONGEST = 20  # default of the largest delay, in periods
+# Smallest and largest mass, largest range of positions and largest force, in SI units, by "is rotary". A value outside
+# causes a warning about its unit.
 _USUAL = {False: (2e-3, 10.0, 3.0, 1e3), True: (1e-8, 10.0, 100.0, 300.0)}
-# Positions beyond the past forces.
-_FEWEST = 20
-# Fewer positions than this are explained by other devices as well, far outside of the errors.
-_FEW = 60
-# So many positions of all logs are fitted, minutes of a record: more would cost gigabytes and narrow errors alone.
-_MOST = 200_000
+_FEWEST = 20  # least number of fitted positions per stretch; the positions before them only provide past forces
+_FEW = 60  # fewer fitted positions cause a warning, because very different devices may fit equally well
+_MOST = 200_000  # largest number of fitted positions of all logs; more need gigabytes and only reduce the errors
 _FINER = 0.3  # residuals below this share of the quantization noise of an encoder exclude its step
-# A slope of less than so many of its standard errors is none.
-_SEEN = 5.0
-# So much of the motion's squares may stay unexplained by anything, where it is so far from noise.
-_UNEXPLAINED, _SMOOTH = 0.01, 5.0
-# What to do about a device that is more than the model.
+_SEEN = 5.0  # least effect of the force on the positions, in standard errors
+# A fit is refused if both limits are exceeded.
+_UNEXPLAINED = 0.01  # residual sum of squares, relative to that of the motion without a force
+_SMOOTH = 5.0  # excess of the residuals over white noise (`FittedModel.excess`)
+# Remedy for residuals with dynamics that the model lacks.
 _RECORD_NEXT = (
     "the device has dynamics that the model lacks, so K_max stays open; play a force of zwidth.excite and use "
     "zwidth.respond, which needs no model"
@@ -83,14 +79,15 @@ def fit_log(
             damping in N m s/rad, and so on.
 
     Returns:
-        DeviceFit: the errors of ``friction`` and ``offset`` are NaN where the log leaves open how much is of which, as
-        of a mass that slides one way only; ``doubts`` as of a unit or of residuals that are no noise: then there is no
-        safe wall; ``status``: UNREACHABLE if the delay is at the end of the search range, NOT_CONVERGED, UNDECIDED if
-        the residuals are not white noise: then K_max is NaN; ``response`` bounds the safe wall.
+        DeviceFit: the errors of ``friction`` and ``offset`` are NaN if the log does not distinguish them, as for motion
+        in one direction only; ``doubts``: warnings, as about a unit or residuals that are not white noise; with a
+        warning there is no safe wall; ``status``: UNREACHABLE if the delay is at the end of the search range;
+        NOT_CONVERGED; UNDECIDED, with K_max NaN, if the residuals are not white noise; ``response`` bounds the safe
+        wall.
 
     Raises:
-        InputError: times are uneven, the force or the position never changes, the device runs away from its force, most
-            of the motion is of another force, or the log cannot tell the numbers apart.
+        InputError: times are uneven, the force or the position never changes, the fitted mass is negative, another
+            force causes most of the motion, or the log does not determine mass, damping and delay.
 
     Numerics:
         Closed forms between samples, turns and sticking included, exact derivatives, Levenberg's and Marquardt's steps
@@ -168,7 +165,7 @@ def _fit(
     unexplained = _find_unexplained(best, pole, period, system) if bank else []
     doubts = odd + doubts + _doubt(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
-    # The device that bears K_max is another one then.
+    # The true device has another K_max then.
     status = Status.UNDECIDED if status == Status.OK and unexplained else status
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
@@ -200,7 +197,7 @@ def _fit(
 
 
 def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float, system: UnitSystem) -> list[str]:
-    """What the residuals show beyond noise, with the record to make next."""
+    """Return a warning with cause and remedy if the residuals are not white noise, or if the lag may be a resonance."""
     cause = explain_residuals(best, system) if pole is not None or best.excess > ALIKE else ""
     if cause:
         remedy = "log the force with more digits" if "rounded" in cause else _RECORD_NEXT
@@ -220,12 +217,12 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float,
 
 
 def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
-    """A force over the mass as a force, and its standard error."""
+    """Return a force with its standard error; ``k`` is the index of the force, divided by the mass, in theta."""
     g = best.theta[0]
     value, those = best.theta[k] / g, [0, k]
     slope = np.array([-value / g, 1.0 / g])
     error = float(np.sqrt(slope @ best.covariance[np.ix_(those, those)] @ slope))
-    # At the least friction that is looked for there is none.
+    # The lower bound of the friction in the search means no friction.
     none = k == -1 and value <= 2.0 * LEAST * best.model.largest
     return 0.0 if none else float(value), error
 
@@ -233,8 +230,8 @@ def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
 def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[list[float], list[str]]:
     """Return the candidates for the encoder step, coarsest first, and warnings about a given step.
 
-    An ideal sensor is rounded to the step of the column only. A constant force moves it by nearly whole multiples of a
-    much larger step, which the positions do not distinguish from an encoder step; the residuals do.
+    Positions of an ideal sensor have only the rounding step of the column. Under a constant force they may nevertheless
+    be near integer multiples of a much larger step. Only the residuals distinguish this step from an encoder step.
     """
     if resolution is None:
         columns = zip(*read.steps, strict=True)
@@ -258,9 +255,9 @@ def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[
 
 
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:
-    """Raise `InputError` where the force explains nothing of the motion, the contrary of it, or too little."""
+    """Raise `InputError` if the force explains too little of the motion, or if the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
-    # What there would be without any force, not even friction.
+    # Residuals of the motion without any force, friction included.
     alone = model.follow(np.append(theta[:-2], [0.0, 0.0])).slopes[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
@@ -279,7 +276,7 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
         )
     if theta[0] <= 0 and (cause.reversed or left < _UNEXPLAINED):
         raise InputError(
-            "force: the device runs away from it, as if its mass were "
+            "force: the device accelerates against it, as with a mass of "
             f"{with_unit(period**2 / theta[0], system['kg'])}; turn the sign of the "
             "force, or of the position; a velocity given as a position looks so too"
         )
@@ -299,6 +296,7 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
 
 
 def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Recording, ...]) -> list[str]:
+    """Return warnings about units, and about parameters that the log hardly determines."""
     mass, damping, delay = scene.device.mass, scene.device.damping, scene.timing.delay
     doubts, residuals, units = [], best.residuals, scene.unit_system
     lightest, heaviest, farthest, strongest = _USUAL[units.rotary]
@@ -325,7 +323,7 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
         )
     size = float(residuals @ residuals)
     if size <= EXACT**2 * residuals.size * way**2:
-        # Nothing but rounding is left.
+        # The residuals are rounding errors.
         return doubts
     if damping == 0:
         doubts.append("the damping is 0 at best: a negative one would fit better")
@@ -351,7 +349,7 @@ def _place(
     skip: int,
     period: float,
 ) -> tuple[FittedMotion, ...]:
-    """Every log beside its fit, NaN at the first samples, behind a gap as well, and where it is too long."""
+    """Return each log with its fitted positions, NaN for samples that are not fitted (first ones, and after gaps)."""
     motions, parts = [], iter(best.model.split(best.motion.position))
     for log, place, own in zip(logs, places, stretches, strict=True):
         modelled = np.full(log.force.size, np.nan)
