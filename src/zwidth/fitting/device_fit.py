@@ -265,8 +265,8 @@ class DeviceFit(DeviceEstimate):
             SafeWall: ``stiffness`` K in N/m and ``virtual_damping`` B in N s/m, both 0 if no wall is stable on so many
             devices; ``share``, the proportion of the random devices on which the wall is stable by their poles;
             ``status``: that of the fit, or UNDECIDED if the fit has warnings, the poles do not confirm the wall, or
-            most random devices are impossible; everything else is NaN unless it is OK; ``resonance``, the frequency in
-            Hz of the undetected resonance that limits the wall, NaN if none does.
+            almost no random device is possible; all numbers are NaN unless it is OK; ``resonance``, the frequency in Hz
+            of the undetected resonance that limits the wall, NaN if none does.
 
         Raises:
             InputError: an invalid reliability.

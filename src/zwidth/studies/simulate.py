@@ -96,7 +96,7 @@ class Circumstances(Strict):
 
 
 class SimulatedStudy(ComputedStudy):
-    """What the studies that simulate share."""
+    """Base of the studies that simulate."""
 
     from_scene = ("device", *HARDWARE)
     takes_parts = True
