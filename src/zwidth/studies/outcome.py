@@ -76,7 +76,7 @@ class ComputedStudy(Study):
     reads_scene: ClassVar[bool] = False
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """Compute all results for the scene of the file; ``alone``: no other study of this kind. Drawing comes later."""
+        """Compute all results in the scene of the file; ``alone``: no other study of this kind. Drawing comes later."""
         raise NotImplementedError
 
 
