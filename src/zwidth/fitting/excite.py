@@ -165,10 +165,10 @@ def _design(
     scene = None if response is None else Scene(response, Timing(period), velocity=velocity)
     limit = None if scene is None else find_nominal_limit(scene)
     if scene is None or limit is None or limit.status != Status.OK:
-        lines = _lay_lines(count, period, np.full(count // 2, _SPACING))
+        lines = _build_frequency_grid(count, period, np.full(count // 2, _SPACING))
         shape = np.minimum(1.0, lines / (count * period) / _SOFT)
     else:
-        lines, shape = _lay_second(scene, limit, count)
+        lines, shape = _design_second(scene, limit, count)
     rng = np.random.default_rng(seed)
     stretches = [_make_period(lines, shape, count, rng) for _ in range(_STRETCHES)]
     scale = most / max(float(np.abs(one).max()) for one in stretches)
@@ -184,7 +184,7 @@ def _design(
     return Excitation(played, period, count * period, hertz, amplitude, deviation, expected, limit, system.rotary)
 
 
-def _lay_lines(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
+def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
     """Return the frequencies in cycles per period; ``spacing`` is relative, one value per frequency."""
     line, lines = max(_FIRST, int(np.ceil(_LOWEST * count * period))), []
     while line < _HIGHEST * count / 2:
@@ -201,7 +201,7 @@ def _answer_at(scene: Scene, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return S / unit, F, np.interp(w, c.w, np.maximum(c.gap - 0.5 * c.band, 0.0)) / unit
 
 
-def _lay_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _design_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return frequencies and relative amplitudes of a second record, for walls close to the stiffest one."""
     period, units = scene.timing.period, scene.units
     all_lines = np.arange(1, count // 2)
@@ -211,7 +211,7 @@ def _lay_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.ndarr
     spacing = _SPACING * np.minimum(1.0, np.sqrt(_GAP * distance / np.maximum(gap, 1e-300)))
     # Limit the ratio of neighboring spacings to 2.
     spacing = np.minimum(spacing, np.minimum(np.roll(spacing, 1), np.roll(spacing, -1)) * 2.0)
-    lines = _lay_lines(count, period, np.append(spacing[:1], spacing))
+    lines = _build_frequency_grid(count, period, np.append(spacing[:1], spacing))
     shape = distance.min() / distance[lines - 1]
     return lines, np.maximum(shape / shape.max(), _WEAKEST)
 

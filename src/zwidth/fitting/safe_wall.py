@@ -209,7 +209,7 @@ class _SearchedDevices:
 def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damping: float) -> np.ndarray:
     """Which devices bear a wall and softer ones of its damping, by the eigenvalues of their closed loops."""
     estimate, devices = fit.velocity.estimate(fit.period), fit.normalize(drawn)
-    A, B, _ = (np.moveaxis(part, -1, 0) for part in _lay_chain(devices, estimate).realize())
+    A, B, _ = (np.moveaxis(part, -1, 0) for part in _build_chain(devices, estimate).realize())
     whole, f = np.floor(devices.d).astype(int), estimate_matrices(estimate)
     rate, size = np.concatenate([A, B[..., None]], -1), B.shape[-1]
     times = np.stack([np.ones_like(devices.d), whole + 1.0 - devices.d], -1)
@@ -228,7 +228,7 @@ def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damp
     return borne
 
 
-def _lay_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
+def _build_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
     """The bodies, modes and amplifiers of all devices as arrays."""
     modes = tuple(Resonance(turns, ratio, 1.0 / share) for turns, ratio, share in devices.modes)
     lag = 1.0 / devices.lag[0] if devices.lag else None
