@@ -204,13 +204,13 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float,
         return [f"the residuals are not white noise: {cause}; {remedy}"]
     if pole is not None and pole.instead:
         near = with_unit(pole.frequency / period, "Hz", 3)
-        what = f"an amplifier's lag explains the log, and so does a resonance near {near}, whose K_max is another one"
+        what = f"an actuator lag and a resonance near {near}, with another K_max, fit equally well"
         return [f"{what}: {SEE_MORE}"]
     if pole is not None:
-        kind = "most like a resonance near" if pole.rings else "with a lag, most like one of"
-        what = f"they follow the force{',' if pole.rings else ''} {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
+        kind = "a resonance near" if pole.rings else "an actuator lag with a corner frequency near"
+        what = f"they indicate {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
     elif best.excess > ALIKE:
-        what = f"their sums spread {plain(np.sqrt(best.excess), 2)} times as far, as a hand or a compliance would cause"
+        what = f"their sums are {plain(np.sqrt(best.excess), 2)} times as large, as with a hand or a compliance"
     else:
         return []
     return [f"the residuals are not white noise: {what}; {_RECORD_NEXT}"]
@@ -241,7 +241,7 @@ def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[li
     if step and not all(fits_steps(log.position, step, slack=column) for log, (_, column) in pairs):
         text = with_unit(step, system["m"])
         return [0.0], [
-            f"the positions are no multiples of {text}, so their errors are treated as noise: check resolution"
+            f"the positions are not multiples of {text}, so their errors are treated as noise: check resolution"
         ]
     return [step], []
 
@@ -288,10 +288,8 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
         )
     if unexplained:
         raise InputError(
-            f"force: it leaves {plain(100 * np.sqrt(left), 2)} % of the motion unexplained, and that is smooth, not "
-            "noise: something else pushes, as a hand, a spring, a stop or gravity along the way, the motor gives less "
-            "than is commanded, a column holds something else, as a velocity or the other one's numbers, or samples "
-            "are missing; record every sample of the device left alone"
+            f"force: {plain(100 * np.sqrt(left), 2)} % of the motion is unexplained and no noise: another force, a "
+            "saturated motor, a wrong column or missing samples; record every sample of the free device"
         )
 
 
@@ -318,25 +316,25 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
         doubts.append(MASS_OPEN)
     if residuals.size < _FEW:
         doubts.append(
-            f"only {residuals.size} positions count, for those before serve as past force: so few may suit quite "
-            "another device, and the errors do not say so; record longer, or give a shorter max_delay"
+            f"only {residuals.size} positions are fitted, because earlier ones only provide past forces: the errors "
+            "may be larger; record longer, or give a shorter max_delay"
         )
     size = float(residuals @ residuals)
     if size <= EXACT**2 * residuals.size * way**2:
         # The residuals are rounding errors.
         return doubts
     if damping == 0:
-        doubts.append("the damping is 0 at best: a negative one would fit better")
+        doubts.append("the damping is 0 at best: a negative damping would fit better")
     elif errors[1] > VAGUE * damping:
         span = max(log.force.size for log in logs)
         doubts.append(
             f"the damping is hardly seen, its standard error is {with_unit(errors[1], units['N s/m'], 2)}; record "
-            f"longer than these {span} samples, or let the device run faster"
+            f"more than {span} samples, or a faster motion"
         )
     if delay == 0 and (away := best.step_beyond(2)) < -BEYOND:
         doubts.append(
-            f"the delay is 0 at best: the position would have to precede the force to fit better, by {plain(-away, 2)} "
-            "standard errors; is a column shifted?"
+            f"the delay is 0 at best: a negative delay would fit better, by {plain(-away, 2)} standard errors; check "
+            "for a shifted column"
         )
     return doubts
 

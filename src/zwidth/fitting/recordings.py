@@ -165,8 +165,8 @@ def find_stretches(log: Recording, system: UnitSystem) -> list[str]:
         first, last = _longest_run((log.position == end) & (log.force * way > 0))
         if last - first >= _STUCK:
             doubts.append(
-                f"the position stays at {with_unit(end, system['m'], 4)} from sample {first} to {last - 1} though the "
-                "force pushes on: an end stop, a saturated sensor, or friction that holds; leave such stretches out"
+                f"the position stays at {with_unit(end, system['m'], 4)} from sample {first} to {last - 1} despite a "
+                "force: end stop, saturated sensor or static friction; omit such stretches"
             )
     for end in (log.force.max(), log.force.min()):
         at_end = log.force == end
@@ -175,7 +175,7 @@ def find_stretches(log: Recording, system: UnitSystem) -> list[str]:
         if inside > _MANY * at_end.size and last - first >= _STUCK:
             doubts.append(
                 f"the force stays at {with_unit(end, system['N'], 4)} from sample {first} to {last - 1} and varies "
-                "elsewhere: is that what the motor gave, or where it saturates? Log the force that is given"
+                "elsewhere: if the motor saturates, log the force after saturation"
             )
     return doubts
 
