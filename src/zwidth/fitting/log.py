@@ -57,26 +57,26 @@ def fit_log(
     resample: bool = False,
     rotary: bool = False,
 ) -> DeviceFit:
-    """Find mass, damping and delay from a log of free motion under a force that a computer commands.
+    """Fit mass, damping and delay of a device to a log of its free motion under commanded forces.
 
-    ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, the force held from sample to sample, least squares of the
-    positions. The constant force f0 and the friction F_c are always sought, and widen the errors of the others: left
-    out where a log hardly shows them, they would bias the rest by many standard errors. An amplifier's lag, of first or
-    second order, and resonances are added where Schwarz's criterion asks for them.
+    The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with the force held between samples; the positions
+    are fitted by least squares. The constant force f0 and the friction F_c are always fitted, which increases the
+    errors of the other parameters. Omitting them if the log hardly shows them would bias the others by many standard
+    errors. An actuator lag of first or second order and resonances are added if Schwarz's criterion requires them.
 
     Args:
-        time: of the samples in s, evenly spaced, or their period alone. Where samples are missing, what lies before and
-            behind a gap is fitted as two logs. With lists of arrays for all three, several logs of one device.
-        position: measured at the samples, in m.
-        force: commanded at the samples, in N, positive towards growing positions.
-        velocity: how the loop whose K_max is asked for estimates its velocity; the backward difference by default.
-        max_delay: the longest delay looked for, in s; 20 periods by default. So much of the beginning serves only as
-            past force. Of all logs the first 200,000 samples are fitted.
-        resolution: step of the encoder, in m; found from the positions where left out; 0 for none.
-        resample: whether times off by up to a quarter of a period are those of a clock that wavers: the samples are
-            taken as they are, even, with the period of all times; 5 % otherwise.
-        rotary: whether the position is an angle in rad and the force a torque in N m; then mass is an inertia in kg m²,
-            damping in N m s/rad, and so on.
+        time: times of the samples in s, evenly spaced, or only the sampling period. The parts before and after missing
+            samples are fitted as two logs. Lists of arrays for time, position and force are several logs of one device.
+        position: sampled positions in m.
+        force: commanded forces at the same samples in N, positive in the direction of increasing positions.
+        velocity: velocity estimate of the loop for which K_max is computed; the backward difference by default.
+        max_delay: largest delay of the search in s; 20 periods by default. The positions within this time from the
+            start are not fitted, because past forces are unknown. At most 200,000 samples of all logs are fitted.
+        resolution: encoder step in m; by default determined from the positions; 0 for none.
+        resample: accept timestamp jitter of up to a quarter of the period instead of 5 %. The samples are treated as
+            evenly spaced, with the period that fits all times.
+        rotary: True if the position is an angle in rad and the force a torque in N m. The mass is then an inertia in
+            kg m², the damping in N m s/rad, and so on.
 
     Returns:
         DeviceFit: the errors of ``friction`` and ``offset`` are NaN if the log does not distinguish them, as for motion
@@ -90,20 +90,20 @@ def fit_log(
             force causes most of the motion, or the log does not determine mass, damping and delay.
 
     Numerics:
-        Closed forms between samples, turns and sticking included, exact derivatives, Levenberg's and Marquardt's steps
-        in NumPy: a log of 3,000 samples takes about half a second, and unlike in JAX nothing is compiled for its
-        length. Friction makes false optima, one for every turn or rest that is missed: starts of no friction and of 0.3
-        to 35 % of the largest force are followed from the first 300 samples to ever more. Where none at all explains
-        the log nearly as well, the errors reach to it; they know that an encoder errs alike in neighboring samples, of
-        which a rest counts as one. A resonance more than the log asks for counts as likely as none before the log is
-        known: the interval of K_max is that of 200 devices with one, weighed by how the residuals fit it, and of the
-        device without. How often the intervals hold the true device is measured in docs/fitting.md.
+        Closed forms between samples, including reversals and sticking; exact derivatives; Levenberg-Marquardt steps in
+        NumPy. A log of 3,000 samples takes about half a second, without compilation. Friction causes local minima, one
+        for each missed reversal or rest. Therefore fits begin with no friction and with 0.3 to 35 % of the largest
+        force, for the first 300 samples, and continue with more and more samples. If a fit without friction is almost
+        as good, the errors include it. They account for the autocorrelated errors of the encoder; all samples of a rest
+        count as one. The prior odds of one more resonance are 1: the interval of K_max is that of 200 devices with such
+        a resonance, weighted by their likelihood, and of the device without it (docs/theory/hidden.md).
+        docs/fitting.md lists how often the intervals contain the true values.
 
     References:
         Ljung 1999, System Identification, section 4.2 (output error). Leeb, Poetscher 2005, Econometric Theory 21,
-        21-59 (intervals after a choice of models do not hold). Hoeting, Madigan, Raftery, Volinsky 1999, Statistical
+        21-59 (invalid intervals after model selection). Hoeting, Madigan, Raftery, Volinsky 1999, Statistical
         Science 14, 382-417 (intervals over all models). Schwarz 1978, Annals of Statistics 6, 461-464 (further
-        numbers that explain no more than chance). Widrow, Kollar 2008, Quantization Noise (an encoder's error). Hulin,
+        parameters). Widrow, Kollar 2008, Quantization Noise (quantization errors). Hulin,
         Preusche, Hirzinger 2006, eq. (9).
 
     Example:
