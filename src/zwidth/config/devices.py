@@ -217,11 +217,8 @@ def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
     """Return problems of parameters that a linear system or measured response already contains."""
     for key in keys:
         if key.partition(".")[0] in ("mass", "damping", *PARTS, "modes") and keys[key]:
-            allowed = "the linear system or response of the device contains it"
-            yield (
-                (key,),
-                problem(f"got {key!r} in addition to a system or response", allowed, "remove one", on_key=True),
-            )
+            what, allowed = f"got {key!r} together with a system or response", "the system or response contains it"
+            yield (key,), problem(what, allowed, "remove one", on_key=True)
 
 
 def read_rotary(value: Any = None) -> bool | None:
