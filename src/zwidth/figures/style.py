@@ -270,11 +270,6 @@ def is_exact(curve: Any) -> bool:
     return getattr(curve, "delay_model", "held") == "held"
 
 
-def dash_of(curve: Any) -> Any:
-    """Return the line style of a curve: solid for the exact delay, dashed for the paper's fractional power."""
-    return SOLID if is_exact(curve) else DASHED
-
-
 def delay_model_handles(found: Sequence[Any]) -> list[Line2D]:
     """Return legend entries for solid and dashed lines if fractional powers are drawn."""
     both = not all(map(is_exact, found))
