@@ -145,12 +145,12 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
     """Draw alpha_max/delta over delta with its limit g(d), and g over the delay.
 
     Args:
-        table: columns of a ridge study: d, delta, alpha_max.
+        table: columns of a ridge study: d, delta, alpha_max; of a study of kind paper_fig10, the exact delays count.
         slopes: columns d and slope, the limit g(d), over a range of delays that includes those of ``table``.
         axes: an existing Axes for the first panel only, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2, gridspec_kw={"width_ratios": [1.15, 1.0]})
-    paths, limits = curves(table, "d", over="delta"), select(slopes)
+    paths, limits = list(filter(style.is_exact, _list_curves(table))), select(slopes)
     colors = style.color_by_value([path.d for path in paths])
     for path in paths:
         path.limit = float(limits["slope"][limits["d"] == path.d][0])
