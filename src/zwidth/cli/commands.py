@@ -173,7 +173,7 @@ def _say_stiffer(scene: Any) -> list[str]:
     top = find_nominal_limit(scene)
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
     K_max = spell_stiffness(float(top.stiffness), scene.unit_system)
-    return [f"K_max = {K_max} by the curve without its deviation; {text}" for text in said]
+    return [f"K_max = {K_max} for the measured curve without its error band; {text}" for text in said]
 
 
 @cli.command()

@@ -260,14 +260,14 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
     lines = [
         row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), units['N'])}"),
         row("lines", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"),
-        row("deviation", f"{_compliance(made.deviation, units)} to expect, in the median"),
+        row("deviation", f"{_compliance(made.deviation, units)} expected (median)"),
     ]
     result: dict[str, Any] = {"file": str(out), "samples": made.force.size, "cycle": made.cycle}
     if made.expected is not None and made.limit is not None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
         expected = name_wall(made.expected.stiffness, made.expected.virtual_damping, units)
-        lines += [row("will tell", f"{expected} as safe, {100 * share:.0f} % of K_max by now")]
+        lines += [row("expected", f"safe wall {expected}, {100 * share:.0f} % of the present K_max")]
     tell(result, [*lines, row("wrote", str(out))], as_json)
 
 
@@ -310,26 +310,26 @@ def _print_response(
     from zwidth.scenes.scene import Scene
 
     device, period, doubts = found.device, found.period, found.doubts
-    kind = "stretches of a force that repeats" if found.cycle else "pieces"
+    kind = "parts of a repeating force" if found.cycle else "parts"
     source = f"{' and '.join(log.name for log in logs)}, {found.records} {kind}"
     scene = Scene(device, Timing(period), velocity=velocity or BackwardDifference())
     top, safe = find_nominal_limit(scene), scene.max_stiffness()
     low, high = (with_unit(float(end), "Hz") for end in device.frequency[[0, -1]])
     lines = [row("response of", source), row("lines", f"{device.frequency.size} from {low} to {high}")]
     if device.deviation is not None:
-        lines.append(row("deviation", f"{_compliance(device.deviation, device.unit_system)} in the median"))
+        lines.append(row("deviation", f"{_compliance(device.deviation, device.unit_system)} (median)"))
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
     words = (
-        f"{name_wall(*top[:2], device.unit_system)}, by the curve that was measured"
+        f"{name_wall(*top[:2], device.unit_system)}, for the measured curve without its error band"
         if top.status == Status.OK
         else "undecided"
     )
     lines.append(row("K_max", words))
     given = safe.status == Status.OK and device.deviation is not None and not doubts
-    words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none is told"
+    words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none"
     lines.append(row("safe wall", words))
-    lines += [row("a stiffer one" if k == 0 else "", text) for k, text in enumerate(said)]
-    lines += [row("doubt", text) for text in doubts]
+    lines += [row("stiffer wall" if k == 0 else "", text) for k, text in enumerate(said)]
+    lines += [row("warning", text) for text in doubts]
     lines += [row("note", text) for text in found.notes]
     if save is not None:
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
