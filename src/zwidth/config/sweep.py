@@ -188,7 +188,7 @@ class SweepStudy(_Parts, Study):
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The unit system of the study's devices."""
+        """The unit system of the study's devices, also for a study that is read from a store."""
         return SYSTEMS[bool(self.rotary)]
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
