@@ -217,7 +217,7 @@ TIMES = PERIOD * np.arange(200)
         ),
         (TIMES, PLACES, 0.0 * FORCE + 2, "it is 2.000 N all the time"),
         (TIMES, 0.0 * PLACES, FORCE, "position: it never changes"),
-        (TIMES, PLACES, -FORCE, "runs away"),
+        (TIMES, PLACES, -FORCE, "accelerates against"),
         (TIMES, PLACES[:-1], FORCE, "shapes differ"),
         (TIMES, np.full(200, np.nan), FORCE, "position: it contains no number"),
         (TIMES[:30], PLACES[:30], np.resize([1.0, -1.0], 30), "record longer"),
