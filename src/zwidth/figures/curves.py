@@ -15,10 +15,8 @@ from zwidth.words.quantities import OUTPUTS, VARIABLES, WALL
 if TYPE_CHECKING:
     import xarray
 
-# Characters of names that fit beside each other above the panels.
-_LINE = 56
-# More curves than this in one panel cannot be told apart.
-_CURVES = 9
+_LINE = 56  # characters of names that fit in one line above the panels
+_CURVES = 9  # largest number of distinguishable curves in a panel
 
 
 @draws_tables

@@ -1,4 +1,4 @@
-"""What a device is designed by: the stiffest wall behind velocity filters, and over the parameter that is wanted."""
+"""Figures for design: maximum stiffness with velocity filters, and over a parameter of the device."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),
     "windowed_difference": ("samples", "length of the window  $n$  in periods"),
 }
-# The look of each over the noise, and its name in a legend.
+# Line style, marker and name in the legend of each kind of velocity estimate.
 _KINDS: dict[str, tuple[Any, str, str]] = {
     "low_pass": (style.SOLID, "", "low-pass"),
     "windowed_difference": (style.DOTTED, "", "window"),
@@ -28,11 +28,11 @@ _KINDS: dict[str, tuple[Any, str, str]] = {
 
 @draws_tables
 def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the stiffest stable wall over the cut-off of a low-pass and over the length of a window.
+    """Draw the maximum stiffness over the cutoff of a low-pass filter and over the length of a window.
 
     Args:
         table: columns of a filters study.
-        axes: Axes of yours, one for each kind of filter that the table has.
+        axes: existing Axes, one for each kind of filter in the table.
     """
     kinds = [kind for kind in _OVER if kind in np.asarray(table["estimate"])]
     panels = style.panels(axes, len(kinds), 3.6 * len(kinds) + 0.4, 3.6, len(kinds), sharey=True)
@@ -62,12 +62,12 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
 @draws_tables
 def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the stiffest stable wall over the noise of the velocity that its filter lets through.
+    """Draw the maximum stiffness over the noise of the filtered velocity.
 
     Args:
         table: columns of a filters study with a resolution.
-        limit: the noise that is allowed, in m/s; NaN where there is none.
-        axes: an Axes of yours.
+        limit: largest allowed noise in m/s; NaN for no limit.
+        axes: an existing Axes.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 4.0)
     colors, factor, words = _scale(table)
@@ -93,7 +93,7 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
 
 
 def _scale(table: Table) -> tuple[dict[float, Any], float, str]:
-    """Colors of the dampings, and the factor and the label of the axis of stiffnesses."""
+    """Return the colors of the dampings, and factor and label of the stiffness axis."""
     factor, unit = style.si_unit(table[_STIFFNESS], "N/m")
     words = f"maximum stable stiffness  $K_{{\\max}}$  in {unit}"
     return style.color_by_value(table["damping_N_s_per_m"]), factor, words
@@ -104,7 +104,7 @@ def _name_damping(damping: float) -> str:
 
 
 def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) -> str:
-    """Mark the stiffest wall within the limit; returns the filter that allows it, for the legend."""
+    """Mark the stiffest wall within the noise limit; return its filter in words for the legend."""
     spelled = ""
     for row in zip(*(rows[name] for name in (_NOISE, _STIFFNESS, "cutoff_Hz", "samples")), strict=True):
         noise, stiffness, cutoff, samples = map(float, row)
@@ -116,19 +116,19 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) 
 
 
 def _dots(rows: Table) -> dict[str, Any]:
-    """Few values are dots on their line."""
+    """Return a look with dots if there are few values."""
     return {"marker": "o", "markersize": 3.5} if len(rows[_STIFFNESS]) <= 24 else {}
 
 
 @draws_tables
 def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the stiffest stable wall over a parameter, and where it reaches each wanted stiffness.
+    """Draw the maximum stiffness over a parameter, and the values at which it reaches the required stiffnesses.
 
     Args:
-        curve: columns parameter, value with its unit (as ``value_Hz``), stiffness_N_per_m.
+        curve: columns parameter, value with its unit (such as ``value_Hz``), stiffness_N_per_m.
         required: columns of a design study: stiffness_N_per_m, reserve, present and value and
-            other_crossings with their unit, enough, and stable_share where tolerances are given.
-        axes: an Axes of yours.
+            other_crossings with their unit, enough, and stable_share if tolerances are given.
+        axes: an existing Axes.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 3.8)
     parameter = PARAMETERS[str(np.asarray(curve["parameter"])[0])]
@@ -152,7 +152,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     for target, value, enough, others in zip(targets, *columns, strict=True):
         known = enough in ENOUGH
         _mark_required(ax, curve_drawn, target * factor, value * scale if known else np.nan, colors[target])
-        # As a design study writes them.
+        # Parse the format of a design study.
         crossings = [float(each.split()[0]) for each in str(others).split("; ") if each]
         name = spell_enough(float(value), enough, crossings, style.units()[parameter.unit], 3) if known else ""
         names.append(name.replace("g cm^2", style.write_unit("g cm^2")))
@@ -164,7 +164,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         xlabel=f"{parameter.label_in(style.units())}  in {spelled}",
         ylabel=f"maximum stable stiffness  $K_{{\\max}}$  in {unit}",
     )
-    # Beside the panel: below its dot a value would stand on the line of the next one.
+    # Write values to the right of the panel, because below a dot they would overlap the next line.
     style.name_heights(ax, names, (targets * factor).tolist(), [colors[target] for target in targets])
     handles = [style.line(words, style.DASHED, color=colors[at]) for at, words in _name_targets(required, factor, unit)]
     handles.append(style.line("as it is", "", color=style.BLACK, marker="s", markerfacecolor="white", markersize=5))
@@ -173,19 +173,19 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
 
 
 def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[float, str]]:
-    """What each dashed line stands for: the wanted stiffness, its reserve, and the share of devices that bear it."""
+    """Yield each required K_max and the legend of its line: stiffness, reserve and share of stable devices."""
     borne = "stable_share" in required
     shares = required["stable_share"] if borne else np.full(len(required["reserve"]), np.nan)
     digits = count_digits_apart(np.asarray(required[SI_COLUMNS[0]]).tolist(), 3)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.{digits}g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
-        # Not 100 % where one of many does not.
+        # Round down, so that 100 % means all devices.
         percent = f"{round_safely(100.0 * share, 'below', 3):.3g}"
         yield wanted * reserve, words + (f": stable on {percent} % of devices" if np.isfinite(share) else "")
 
 
 def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, color: Any) -> None:
-    """Mark the wanted stiffness, and where on the curve there is enough for it."""
+    """Mark a required stiffness, the curve above it, and the value at which the curve reaches it."""
     ax.axhline(target, color=color, linewidth=0.9, linestyle=style.DASHED, zorder=2, label=f"wanted {target:g}")
     x, y = (np.append(part, end) for part, end in zip(curve, (value, target), strict=True))
     order = np.argsort(x)

@@ -1,4 +1,4 @@
-"""What the figures of sweeps share: axes, panels and values in units of few digits, and the labels of contours."""
+"""Common parts of figures of sweeps: axes, panels, values in units with few digits, and labels of contours."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def list_varied(data: xarray.Dataset, name: str) -> list[str]:
 def choose_axes(
     data: xarray.Dataset, name: str, x: str | None = None, y: str | None = None, *, but: Sequence[str | None] = ()
 ) -> list[str]:
-    """One or two parameters that a variable is drawn over: those given, and the first others that it varies over."""
+    """Return the one or two parameters over which a variable is drawn: the given ones, then the first that vary."""
     dims = list_varied(data, name)
     free = iter([dim for dim in _ORDER if dim in dims and dim not in (x, y, *but)])
     axes = [x or next(free, None), y or next(free, None)]
@@ -60,13 +60,13 @@ def choose_axes(
 
 
 def in_order(data: Data) -> Data:
-    """Results by rising values of every parameter, which a sweep may have in any order; devices as they are."""
+    """Return results in ascending order of each parameter; devices keep their order."""
     mixed = [dim for dim, index in data.indexes.items() if dim != "device" and not index.is_monotonic_increasing]
     return data.sortby(mixed) if mixed else data
 
 
 def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
-    """Some variables of one family as they are drawn."""
+    """Return some variables of one family, prepared for drawing."""
     # Only dimensions with two values or more remain, in rising order, single values of the others beside them. All is
     # in units with few digits, which the attribute ``units`` names. What was not computed is NaN; truth values are 0
     # and 1.
@@ -105,7 +105,7 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
 def panels(
     data: xarray.Dataset, over: list[str], plane: Sequence[str] = (), col: str | None = None
 ) -> tuple[list[xarray.Dataset], int]:
-    """A part of a dataset for each panel, and how many panels are beside each other."""
+    """Return the part of a dataset for each panel, and the number of panels per row."""
     # A panel has the dimensions ``over``, of which those of a ``plane`` resolve so many values and no more. The last
     # two others vary from panel to panel, or ``col`` alone, all others at their first value.
     free = [str(dim) for dim in next(iter(data.data_vars.values())).dims if dim not in over]
@@ -125,19 +125,19 @@ def panels(
 
 
 def spell(value: xarray.DataArray) -> str:
-    """A single value of a parameter, with symbol and unit, and as many digits as tell it from the others."""
+    """Return a value of a parameter with symbol and unit, with enough digits to distinguish it from the others."""
     if value.name == "device":
         return style.literal(value.values)
     number = f"{float(value):.{value.attrs.get('digits', 4)}g}"
     unit = style.write_unit(value.attrs["units"]).removeprefix("sampling ")
     unit = unit.removesuffix("s") if unit == "periods" and number == "1" else unit
-    # Within mathematics as it is.
+    # Write the unit upright within the formula.
     unit = rf"\,\mathrm{{{unit.replace(' ', '~').replace('$', '')}}}" if unit else ""
     return rf"${VARIABLES[str(value.name)].symbol_in(style.units())} = {number}{unit}$"
 
 
 def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
-    """Write the single values of its part above a panel; of more than fit those that tell it from others."""
+    """Write the parameter values of each panel above it; if there are many, only those that differ."""
     first = parts[0]
     names = [name for name in ("device", *VARIABLES) if name in first.coords and not first[name].ndim]
     if len(names) > _FITTING and len(parts) > 1:
@@ -147,12 +147,12 @@ def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
 
 
 def axis_label(data: xarray.Dataset, name: str) -> str:
-    """A parameter in words, with symbol and unit."""
+    """Return the axis label of a parameter, with symbol and unit."""
     return VARIABLES[name].label_in(style.units()) + _in_unit(data, name)
 
 
 def output_label(data: xarray.Dataset, name: str) -> str:
-    """A variable in words, with symbol and unit."""
+    """Return the axis label of an output, with symbol and unit."""
     return f"{OUTPUTS[name].words}  ${OUTPUTS[name].symbol}$" + _in_unit(data, name)
 
 
@@ -162,7 +162,7 @@ def _in_unit(data: xarray.Dataset, name: str) -> str:
 
 
 def logarithmic(values: np.ndarray) -> bool:
-    """Whether the values of an axis are in equal ratios, or nearly so and far apart, as 1, 2, 5 and 10 are."""
+    """Return whether values have equal ratios, or approximately equal ones over a wide range, such as 1, 2, 5, 10."""
     values = np.asarray(values, dtype=np.float64)
     if values.size < 3 or not (values > 0).all():
         return False

@@ -22,8 +22,7 @@ AXES = {
     header(name, FIELDS[name].unit): FIELDS[name] for name in ("stiffness", "virtual_damping", "resolution", "coulomb")
 }
 """Parameters that may be an axis of these figures, by column name."""
-# Up to so many points of a curve are seen one by one.
-_FEW = 12
+_FEW = 12  # largest number of points of a curve that are drawn as large dots
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
 _BEYOND: dict[str, Any] = {"facecolor": grid.MISSING, "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
@@ -38,10 +37,10 @@ def draw_limit_cycles(
     White: at rest. Hatched: amplitude above the upper bound. Line: stability boundary of the linear theory.
 
     Args:
-        arrays: what the npz file of a limit_cycle study holds.
-        edges: columns condition, number and those of the two parameters; nothing where there is no linear boundary.
+        arrays: arrays of the npz file of a limit_cycle study.
+        edges: columns condition, number and the two parameters; empty if there is no linear boundary.
         bounds: smallest and largest amplitude counted as a limit cycle, in m.
-        axes: Axes of yours, one for each condition.
+        axes: existing Axes, one per condition.
     """
     across, along = names = [name for name in AXES if name in arrays]
     arrays = grid_in_order(arrays, names)
@@ -59,7 +58,7 @@ def draw_limit_cycles(
     for k, (ax, label) in enumerate(zip(panels, labels, strict=False)):
         x, y = arrays[across] * scales[across][0], arrays[along] * scales[along][0]
         if beyond[k].any():
-            # Seen where the values above it are left out.
+            # Visible where amplitudes above the upper bound are omitted.
             ax.fill_between([x.min(), x.max()], y.min(), y.max(), **_BEYOND, zorder=0.5)
         shown = np.where(beyond[k], np.nan, np.maximum(arrays["amplitude_m"][k], 1e-300)) * factor
         look: dict[str, Any] = {"shading": "nearest", "rasterized": True, "zorder": 1}
@@ -105,11 +104,11 @@ def draw_limit_cycle_curves(
     Vertical line: stability boundary of the linear theory.
 
     Args:
-        arrays: what the npz file of a limit_cycle study holds.
-        edges: columns condition, number and the parameter; nothing where there is no linear boundary.
+        arrays: arrays of the npz file of a limit_cycle study.
+        edges: columns condition, number and the parameter; empty if there is no linear boundary.
         bounds: smallest and largest amplitude counted as a limit cycle, in m.
-        family: the name of the parameter that has a curve for each of its values; "" where there is none.
-        axes: Axes of yours, those of the amplitudes first.
+        family: parameter with one curve per value; "" for a single curve.
+        axes: existing Axes, those of the amplitudes first.
     """
     names = [name for name in AXES if name in arrays]
     arrays = grid_in_order(arrays, names)
@@ -118,16 +117,16 @@ def draw_limit_cycle_curves(
     size = (max(1.0 + 2.7 * len(labels), 5.8), 4.8)
     panels = style.panels(axes, 2 * len(labels), *size, len(labels), sharex=True, sharey="row")
     scale, unit = style.si_unit(arrays[over], AXES[over].unit)
-    # The curves along the axis before the last one.
+    # Order the axes: condition, curve, parameter.
     grids = {name: arrays[name] if family else arrays[name][:, None] for name in _CYCLES}
     cycles = {name: values.swapaxes(1, 2) if names[-1] == family else values for name, values in grids.items()}
     buzzes = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
     factor, meter = style.si_unit(cycles["amplitude_m"][buzzes], "m")
-    # Panels of a row share the axis: ticks that fit all of them.
+    # Choose ticks for the amplitudes of all panels, because panels of a row share the axis.
     amplitudes = cycles["amplitude_m"][buzzes] * factor
     quantities = (("amplitude_m", factor, f"amplitude  in {meter}"), ("frequency_Hz", 1.0, "frequency  in Hz"))
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
-    # A wall that buzzes between two that do not is a dot without a line.
+    # Draw dots, because a limit cycle between two walls at rest has no line.
     dots = {"marker": "o", "markersize": 3.5 if arrays[over].size <= _FEW else 1.25, "clip_on": False}
     largest = spell_short(bounds[1], style.units()["m"])
     for row, (name, times, words) in enumerate(quantities):
@@ -155,7 +154,7 @@ def draw_limit_cycle_curves(
 
 
 def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest: np.ndarray, widest: str) -> None:
-    """Write into a panel which curves have no limit cycle, and why."""
+    """Write the names of curves without limit cycles, and the reason, into a panel."""
     reasons: dict[str, list[str]] = {}
     for look, cycle, still in zip(looks, cycles, rest, strict=True):
         if not cycle.any():
@@ -176,7 +175,7 @@ def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest
 
 
 def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarray) -> list[dict[str, Any]]:
-    """The look of every curve, and its label: which value it belongs to, and where no wall of it is linearly stable."""
+    """Return look and label of each curve; the label is its value, with "unstable" if no wall is linearly stable."""
     if not family:
         return [{**style.look(0), "label": "limit cycle"}]
     values, known = arrays[family], AXES[family]

@@ -1,4 +1,4 @@
-"""What records of a device tell: a fit with the boundary that follows, and a measured response with its band."""
+"""Figures of fits with their stability boundary, and of measured responses with their error band."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
 from zwidth.words.formatting import round_safely
 
-# Samples that one panel shows; of longer logs every n-th.
-_MOST = 4000
+_MOST = 4000  # largest number of samples in a panel; of longer logs, every n-th sample is drawn
 _TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder": 6}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}
 _LOW, _HIGH = "stiffness_low_N_per_m", "stiffness_high_N_per_m"
@@ -32,21 +31,20 @@ def draw_device_fit(
     correlation: Table | None = None,
     step: float = 0.0,
 ) -> np.ndarray:
-    """Draw what a fit rests on and what follows: motion, residuals, their autocorrelation, and the stable walls.
+    """Draw the data of a fit and its result: motion, residuals, their autocorrelation, and the stable walls.
 
-    The last panel is the boundary with its 95 % band, the stiffest wall, the wall to set, and the walls that buzzed.
-    Before it stand the position measured and modelled, what is left of it, and how that is correlated, with the 95 %
-    band of white noise; and of walls that buzzed how far they lie from the fit, in units of their noise.
+    The last panel shows the boundary with its 95 % band, the stiffest wall, the wall to set, and the walls at the onset
+    of instability. The panels before it show the measured and the modelled position, the residuals, and their
+    autocorrelation with the 95 % band of white noise; for onsets, the residuals relative to their noise.
 
     Args:
-        boundary: columns virtual_damping and stiffness with its low and high end, of one or several fits by the column
-            ``fitted_to``.
+        boundary: columns fitted_to (name of the fit), virtual_damping, and stiffness with its low and high end.
         walls: columns fitted_to, kind ("stiffest", "set" or "buzzing"), stiffness, its error, virtual_damping,
-            frequency; and stiffness_residual and frequency_residual of those that buzzed.
-        axes: Axes of yours, one a panel.
-        motion: columns log, time, position, modelled and residual, of a log.
-        correlation: columns lag, autocorrelation and band, of a log.
-        step: of the encoder, to draw beside the residuals; 0 for none.
+            frequency; and stiffness_residual and frequency_residual of onsets ("buzzing").
+        axes: existing Axes, one per panel.
+        motion: columns log, time, position, modelled and residual of the logs.
+        correlation: columns lag, autocorrelation and band of the residuals.
+        step: encoder step to draw with the residuals; 0 for none.
     """
     names = [*(_ROWS[:3] if motion is not None and correlation is not None else ())]
     names += ["walls"] if "buzzing" in np.asarray(walls["kind"]) else []
@@ -65,7 +63,7 @@ def draw_device_fit(
 
 
 def _make_panels(axes: style.AnyAxes | None, rows: int) -> Any:
-    """So many panels below each other, and a high one to the right of them."""
+    """Return ``rows`` panels below each other, and a high one to the right of them."""
     if axes is not None:
         return np.asarray(axes, dtype=object).ravel()[: rows + 1]
     figure, _ = style.new_figure(8.8, max(3.6, 1.55 * rows + 0.7))
@@ -121,7 +119,7 @@ def _draw_correlation(ax: Axes, correlation: Table) -> None:
 
 
 def _put_above(ax: Axes, handles: Any = None) -> None:
-    """A legend in one line above the panel, beside its letter."""
+    """Add a legend in one line above the panel, to the right of its letter."""
     found = handles or ax.get_legend_handles_labels()[0]
     place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderaxespad": 0.0}
     ax.legend(handles=found, ncols=len(found), columnspacing=1.2, **place)
@@ -144,7 +142,7 @@ def _draw_onsets(ax: Axes, walls: Table) -> None:
 
 
 def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
-    """The stable walls: B over K."""
+    """Draw the stable walls in the plane of K and B."""
     every, high, dampings = np.asarray(walls[SI_COLUMNS[0]]), np.asarray(boundary[_HIGH]), boundary[SI_COLUMNS[1]]
     to_spring, spring = style.si_unit(every, "N/m")
     to_damper, damper = style.si_unit(dampings, "N s/m")
@@ -155,17 +153,17 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
         K, low, up = (own[name] * to_spring for name in (SI_COLUMNS[0], _LOW, _HIGH))
         B = own[SI_COLUMNS[1]] * to_damper
         ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {source}")
-        # Up to where it meets K = 0.
+        # Draw the boundary up to K = 0.
         ends = np.flatnonzero(K > 0)
         shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
         ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
         ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {source}", zorder=3)
         handles.append(style.line(f"boundary with its 95 % band, {source}", dash, color=color))
-    # Of one fit they are black, of two in the colors of their boundaries.
+    # Marks of a single fit are black, those of two fits have the colors of their boundaries.
     colors = colors if len(colors) > 1 else dict.fromkeys(colors, style.BLACK)
     handles += _mark_walls(ax, walls, colors, (to_spring, spring), (to_damper, damper))
     ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to_spring)
-    # Room for the legend.
+    # Leave space for the legend.
     highest = float(np.max(dampings)) * to_damper
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
     name_axes(ax, spring, damper)
@@ -175,7 +173,7 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
 def _mark_walls(
     ax: Axes, walls: Table, colors: dict[str, str], stiffness: tuple[float, str], damping: tuple[float, str]
 ) -> list[Any]:
-    """The stiffest walls, those to set, and those that buzzed, in such units; returns entries of a legend."""
+    """Mark the stiffest walls, the walls to set and the onsets in the given units; return entries of the legend."""
     handles, kinds = [], {}
     for kind in ("stiffest", "set", "buzzing"):
         found = select(walls, kind=kind)
@@ -186,7 +184,7 @@ def _mark_walls(
         for fit, K, B in zip(found["fitted_to"], *values, strict=True):
             color = colors.get(fit, style.BLACK)
             mark_wall(ax, (K, B), kind, kind=mark, color=color)
-            # With four digits and K rounded down the wall holds as it is read.
+            # Print four digits with K rounded down, so that the printed wall is stable.
             numbers = f"$K = {round_safely(K, 'below'):.4g}$ {stiffness[1]}, $B = {B:.4g}$ {damping[1]}"
             handles.append(style.line(f"{words}: {numbers}", "", color=color, **MARKS[mark]))
     if not kinds["set"][1].size:
@@ -198,7 +196,7 @@ def _mark_walls(
         ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
         middle = float(np.max(kinds["stiffest"][2]))
         for x, y, heard in zip(K, B, found["frequency_Hz"], strict=True):
-            # Outside of the stable walls.
+            # Place labels outside the stable walls.
             place = (11, -10) if y < middle else (11, 5)
             ax.annotate(f"{heard:.3g} Hz", (x, y), xytext=place, color=style.VERMILION, **_TEXT)
         handles.append(style.line("began to buzz at this frequency", "", **look))
@@ -207,25 +205,24 @@ def _mark_walls(
 
 _NEEDED = ("frequency_Hz", "real_m_per_N", "imag_m_per_N")
 _KNOWN = ("deviation_m_per_N", "open_loop_real", "open_loop_imag")
-# Half the width of the picture around -1.
-_REACH = 1.6
+_REACH = 1.6  # half of the width of the Nyquist plot around -1
 
 
 @draws_tables
 def draw_response(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw a response over frequency, and, of a wall, the open loop around the point -1 that no response may reach.
+    """Draw a frequency response with its error band, and the open loop of a wall around the point -1.
 
     Args:
-        table: columns frequency_Hz, real_m_per_N, imag_m_per_N; where they are known deviation_m_per_N, the radius of
-            the band, and open_loop_real and open_loop_imag of a wall.
-        axes: Axes of yours, for the size alone, for the phase as well, and for the open loop.
+        table: columns frequency_Hz, real_m_per_N, imag_m_per_N; optionally deviation_m_per_N, the radius of the error
+            band, and open_loop_real and open_loop_imag of a wall.
+        axes: existing Axes for the magnitude, the phase and the open loop, in this order; fewer draw fewer of them.
     """
     columns: Any = {name: np.asarray(table[name], float) for name in (*_NEEDED, *_KNOWN) if name in table}
     f, G = columns["frequency_Hz"], columns["real_m_per_N"] + 1j * columns["imag_m_per_N"]
     radius, size = columns.get("deviation_m_per_N", np.zeros(f.size)), np.abs(G)
     looped = "open_loop_real" in columns
     panels = style.panels(axes, 2 + looped, style.WIDTH, 2.7, columns=2 + looped)
-    # Where the band reaches 0 there is any phase.
+    # The phase is undetermined where the band includes 0.
     clear = radius < size
     band: Any = {"color": style.SKY, "alpha": 0.5, "linewidth": 0}
     least = 0.3 * float(size.min())
@@ -252,7 +249,7 @@ def draw_response(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
 
 
 def _draw_loop(ax: Any, L: np.ndarray, share: np.ndarray) -> None:
-    """The open loop, a disc around each line that the band makes of it, and -1."""
+    """Draw the open loop with its error band, a disc at each frequency, and the point -1."""
     near = np.abs(1.0 + L) < 2.0 * _REACH
     wide = 2.0 * (share * np.abs(L))[near]
     look: Any = {"units": "xy", "offset_transform": ax.transData, "color": style.SKY, "alpha": 0.3, "linewidth": 0}

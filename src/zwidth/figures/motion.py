@@ -13,7 +13,7 @@ from zwidth.figures.table import Table, curves, draws_tables
 
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
-# A force is held until the next one.
+# Forces are held constant between samples.
 _HELD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}
 # Axis limit if a motion grows without bound, as a multiple of the smallest motion's largest value.
 _CLIP = 8.0
@@ -49,10 +49,10 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw step responses from force to position, with final values (thin) and settling times (dots).
 
     Args:
-        table: columns of a step study: label, alpha, beta, time, position, wall_force, final_position, settling_time;
-            those of a device in SI units have their units behind their names, as in time_s and position_m. The times
-            of settling may be left out, and for positions alone the forces.
-        axes: an Axes of yours for the positions alone, or two.
+        table: columns of a step study: label, alpha, beta, time, position, wall_force, final_position, settling_time.
+            Columns in SI units end with their units, such as time_s and position_m. Settling times are optional, and
+            so are forces if only positions are drawn.
+        axes: an existing Axes for the positions only, or two.
     """
     panels = style.panels(axes, 2, 5.6, 5.0, height_ratios=(1.8, 1.2), sharex=True)
     clock, unit = draw_positions(panels[0], table)
@@ -64,24 +64,24 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
         ax.set_ylabel(f"{_name_force()} in {style.units()['N']}" if unit else "wall force  in $F$")
     for ax in panels:
-        # The last sample ends before the time that was asked for.
+        # Extend the axis by one step, because the last sample is before the end of the requested time.
         ax.set_xlim(0.0, max(float(each.time[-1] + each.time[1]) for each in responses) * clock)
     panels[-1].set_xlabel(f"time  $t$  in {unit}" if unit else "time  $t/T$  in sampling periods")
     handles = [line for line in panels[0].lines if not line.get_label().startswith("_")]
     if any(each.settled for each in responses):
         handles.append(Line2D([], [], color=style.GRAY, label="settled to 2 %", **_DOT))
-    # Responses swing over all of the panel.
+    # Place the legend outside, because responses fill the panel.
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels
 
 
 def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
-    """Draw the position of every response over time; returns the scale and the unit of time, "" where normalized."""
+    """Draw the position of each response over time; return scale and unit of the time axis, "" if normalized."""
     responses, physical = _read_responses(table), "time_s" in table
     clock, unit, factor, length = 1.0, "", 1.0, ""
     if physical:
         clock, unit = style.si_unit([each.time[-1] for each in responses], "s")
-        # The final position: an unstable response has no largest one worth a unit.
+        # Choose the unit by final positions, because unstable responses grow without bound.
         finals = [abs(each.final_position) for each in responses if np.isfinite(each.final_position)]
         largest = max(float(np.nanmax(np.abs(each.position))) for each in responses)
         factor, length = style.si_unit(max(finals, default=largest), "m")
@@ -102,7 +102,7 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
 
 
 def _read_responses(table: Table) -> list[Any]:
-    """The responses in a table; ``settled``: for good, at the end of the time shown; None where that is not known."""
+    """Return the responses in a table; ``settled`` is None if the table has no settling times."""
     spelled = ((name, key) for name, unit in _UNITS.items() for key in (name + unit, name))
     columns = {name: np.asarray(table[key]) for name, key in spelled if key in table}
     columns |= {name: table[name] for name in ("label", "alpha", "beta")}
@@ -116,14 +116,14 @@ def _read_responses(table: Table) -> list[Any]:
 
 @draws_tables
 def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the position of every motion over time and the force of the wall; thin: the bodies behind links.
+    """Draw the position of each motion over time and the force of the wall; thin: bodies connected by links.
 
     If all motions leave the wall, the time axis ends at three times the end of the last contact. A motion that grows
     without bound is clipped at eight times the largest value of the smallest motion.
 
     Args:
         table: columns of a simulate study.
-        axes: an Axes of yours for the positions alone, or two.
+        axes: an existing Axes for the positions only, or two.
     """
     motions = _read_motions(table)
     panels = style.panels(axes, 2, 6.4, 4.8, height_ratios=(1.6, 1.0), sharex=True)
@@ -149,11 +149,11 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
 @draws_tables
 def draw_phase_plane(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the velocity of every motion over its position, with the wall; a dot where each starts.
+    """Draw the velocity of each motion over its position, with the wall; a dot marks the start.
 
     Args:
         table: columns of a simulate study.
-        axes: an Axes of yours.
+        axes: an existing Axes.
     """
     motions = _read_motions(table)
     (ax,) = panels = style.panels(axes, 1, 5.6, 4.2)
@@ -175,11 +175,11 @@ def draw_phase_plane(table: Table, axes: style.AnyAxes | None = None) -> np.ndar
 
 @draws_tables
 def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw for every motion what wall and hand have given, what dampers and friction have taken, and what there is.
+    """Draw the energy balance of each motion: energy of the bodies, work of wall and hand, and dissipated energy.
 
     Args:
         table: columns of a simulate study.
-        axes: Axes of yours, one for each motion.
+        axes: existing Axes, one per motion.
     """
     motions = _read_motions(table)
     motions = [motions[k] for k in style.pick_evenly(len(motions), _MOST_PANELS)]
@@ -204,7 +204,7 @@ def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
 
 def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
-    """The motions in a table, each with its look; two of them may be alike in all but that each begins at time 0."""
+    """Return the motions in a table with their looks; each motion begins at time 0."""
     columns = {str(name): np.asarray(table[name]) for name in table}
     motions = curves({**columns, "number": np.cumsum(columns[time] == 0.0)}, "number")
     for k, each in enumerate(motions):
@@ -230,12 +230,12 @@ def _trim(motions: list[Any]) -> list[Any]:
 
 
 def _begin_at_zero(ax: Axes, end: float) -> None:
-    """The axis of a time; of one instant as of a motion that is over at once it has any end."""
+    """Set a time axis from 0 to ``end``, or to 1 if the motion has a single instant."""
     ax.set_xlim(0.0, end or 1.0)
 
 
 def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[float, str]:
-    """Set the range of an axis, so that one that grows without end does not hide the others; returns its unit."""
+    """Set the range of an axis and clip motions that grow without bound; return factor and unit."""
     finite = [each[np.isfinite(each)] for each in values]
     largest = [float(np.abs(each).max(initial=0.0)) for each in finite]
     growing = any(_grows(np.abs(each)) for each in values)
@@ -254,7 +254,7 @@ def _grows(sizes: np.ndarray) -> bool:
 
 
 def _mark_wall(ax: Axes, which: str, motions: list[Any]) -> None:
-    """Mark the wall's surface, and where the wall is unless it acts on both sides."""
+    """Mark the surface of the wall, and shade the wall unless it acts on both sides."""
     line = ax.axhline if which == "y" else ax.axvline
     line(0.0, color=style.GRAY, linewidth=1.0, zorder=2)
     if all(np.all(each.contact) for each in motions):
@@ -271,7 +271,7 @@ def _in_math(label: str) -> str:
 
 
 def _explain(panels: np.ndarray, motions: list[Any], *more: Line2D, outside: bool) -> None:
-    """A legend with each motion that has a name; of long ones two side by side."""
+    """Add a legend of the named motions, in two columns if names are long."""
     named = [each for each in motions if each.label]
     lines = [style.line(_in_math(each.label), each.look["linestyle"], color=each.look["color"]) for each in named]
     columns = 2 if max(len(each.label) for each in motions) > 20 else 4

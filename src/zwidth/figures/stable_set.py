@@ -1,4 +1,4 @@
-"""Stable sets in a plane of walls: regions within exact outlines, islands and holes, and the walls that matter."""
+"""Stable walls in a plane: regions within exact outlines, islands and holes, and marked walls."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def mark_wall(
     room: float = np.inf,
     **look: Any,
 ) -> None:
-    """Mark a wall, its stiffness and damping, with words to the right or to the left, where ``room`` points are."""
+    """Mark a wall (stiffness, damping) with a text to the right, or to the left within ``room`` points."""
     look = {"linestyle": "", "color": style.BLACK, "zorder": 5, "clip_on": False, **MARKS[kind], **look}
     ax.plot(*wall, label=label, **look)
     if text:
@@ -80,7 +80,7 @@ def mark_wall(
 
 
 def draw_zeros(ax: Axes) -> None:
-    """Lines where stiffness and damping are zero."""
+    """Draw the lines of zero stiffness and zero damping."""
     ax.axvline(0.0, color=style.GRAY, linewidth=0.6, zorder=0.5)
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
 
@@ -97,7 +97,7 @@ def name_axes(ax: Axes, spring: str, damper: str) -> None:
 
 
 def agrees(outlines: Outlines, x: np.ndarray, y: np.ndarray, good: np.ndarray) -> bool:
-    """Whether the cells (y, x) that are good lie within, but for those next to a change, which the outline parts."""
+    """Return whether the good cells (y, x) lie within the outlines; cells next to a change may differ."""
     inside = _cells_inside(outlines, x, y)
     return not np.any((inside != good) & ~_changes(inside) & ~_changes(good))
 
@@ -160,7 +160,7 @@ def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
 
 
 def tabulate_walls(scene: Scene, stiffness: Any, virtual_damping: Any) -> dict[str, Any]:
-    """Walls as columns, normalized and in SI units."""
+    """Return walls as columns, normalized and in SI units."""
     normalized = {"alpha": stiffness / scene.units.stiffness, "beta": virtual_damping / scene.units.virtual_damping}
     return {**normalized, **dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))}
 

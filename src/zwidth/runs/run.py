@@ -222,7 +222,7 @@ class _Run:
         return bool(self.hopeless) or self.interrupted
 
     def do(self, pieces: list[ComputedStudy]) -> None:
-        """Compute what is not done yet; whatever goes wrong is recorded, for the others do not depend on it."""
+        """Compute the remaining studies; record errors and continue, because studies are independent."""
         for index, study in enumerate(pieces, start=1):
             event = StudyEvent(index, self.total, study.name, study.kind_name())
             entry, faults = self.record.entry(study.name), self.record.faults(study.name)
@@ -276,7 +276,7 @@ class _Run:
         return StudyResult(study.name, study.kind_name(), *ended, *told)
 
     def sweep(self, plans: list[Plan], about: dict[str, Any], **options: Any) -> None:
-        """Compute the sweeps, all together, so that workers are started once."""
+        """Compute all sweeps together, so that workers start only once."""
         clock = time.perf_counter()
         number = {plan.study.name: len(self.results) + k for k, plan in enumerate(plans, start=1)}
         # Chunks end one by one, those of several sweeps mixed where there are workers: to each the time before its end.

@@ -23,8 +23,13 @@ from zwidth.words.xp import known_options
 BLOCK = 128  # periods per compiled call
 SEGMENTS = 6  # equal parts of the tail; an even number, because the trend compares the halves
 SLACK = 1.0 + 1e-9  # factor on the bound of FOAW; rounding errors must not exclude deviations of exactly one count
-# XLA's older loop emitters without splitting: half the compile time at the same speed.
-COMPILER_OPTIONS = ("xla_cpu_use_fusion_emitters", False), ("xla_cpu_parallel_codegen_split_count", 1)
+# XLA's older loop emitters without splitting: half the compile time at the same speed. Full optimization even if
+# XLA_FLAGS asks for less, because a simulation runs for thousands of periods.
+COMPILER_OPTIONS = (
+    ("xla_cpu_use_fusion_emitters", False),
+    ("xla_cpu_parallel_codegen_split_count", 1),
+    ("xla_backend_optimization_level", 3),
+)
 
 
 class Controller(NamedTuple):

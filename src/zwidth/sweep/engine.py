@@ -206,8 +206,8 @@ def check_same(store: Store, study: SweepStudy) -> None:
 
 
 def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> None:
-    """Raise a `StoreError` that names every key in which results were made from another study."""
-    # Ignore the keys delay_model and delay_models of earlier releases with the only model that is left.
+    """Raise a `StoreError` that names all keys in which the study of existing results differs from the current one."""
+    # Earlier releases wrote delay_model and delay_models; "held" is the exact delay, the only model of this release.
     changed = [each for each in differences(old, new) if each[1:] not in (("held", None), (["held"], None))]
     if changed:
         lines = [
@@ -222,7 +222,7 @@ def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> Non
 
 
 def refuse_versions(where: Path, old: dict[str, str]) -> None:
-    """Refuse to go on with results of other releases: together they are not what either of them would compute."""
+    """Raise a `StoreError` if results are from other releases, because their values may differ."""
     for key, now in versions().items():
         if key != "python" and old.get(key) != now:
             what = f"{where}: made with {key} {old.get(key)}, now there is {now}"
@@ -230,7 +230,7 @@ def refuse_versions(where: Path, old: dict[str, str]) -> None:
 
 
 def repair(store: Store, tasks: Iterable[Task]) -> list[str]:
-    """Take back the marks of chunks that are damaged, and write damaged coordinates again; returns what was found."""
+    """Unmark damaged chunks and rewrite damaged coordinates; return descriptions of the repairs."""
     found = []
     names = store.damaged_files()
     if names:

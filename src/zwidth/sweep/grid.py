@@ -47,7 +47,7 @@ class SceneBlock(NamedTuple):
 
 
 class Grid:
-    """The dimensions of a sweep, those of walls last, and what lies at each of their points."""
+    """Grid of a sweep: its dimensions, those of walls last, and the parameters at its points."""
 
     def __init__(self, study: SweepStudy) -> None:
         self.axes, self.unit_system = study.axes, study.unit_system
@@ -67,14 +67,14 @@ class Grid:
 
     @cached_property
     def _values(self) -> dict[str, np.ndarray]:
-        """Every parameter that is given, as a flat array."""
+        """All given parameters, as flat arrays."""
         table = self.axes.devices
         columns = {name: table.values(name) for name in table.columns} if table else {}
         own = {name: getattr(self.axes, name) for name in PARAMETERS}
         return columns | {name: axis.values() for name, axis in own.items() if axis is not None}
 
     def coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]]:
-        """Dimensions, values and attributes of every parameter by its name in a store, and the labels of devices."""
+        """Return dimensions, values and attributes of each parameter by its name in a store, and labels of devices."""
         table = self.axes.devices
         found: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
         if table is not None:
@@ -90,7 +90,7 @@ class Grid:
         return found
 
     def scene_block(self, place: tuple[slice, ...]) -> SceneBlock:
-        """A block as its parameters are given; ``place`` has a slice for every dimension, or for those of devices."""
+        """Return a block with its given parameters; ``place`` has a slice per dimension, at least those of devices."""
         slices = dict(zip(self.dims, place, strict=False))
         for name in self.wall_dims:
             slices.setdefault(name, slice(0, 1))
@@ -100,7 +100,7 @@ class Grid:
         return SceneBlock(parameters, *(np.broadcast_to(part, (math.prod(shape), part.shape[1])) for part in walls))
 
     def block(self, place: tuple[slice, ...]) -> Block:
-        """The same normalized, with the walls of the whole grid."""
+        """Return a block in normalized parameters, with the walls of the whole grid."""
         alphas = betas = slice(0, 1)
         if len(place) == len(self.dims):
             slices = dict(zip(self.dims, place, strict=True))
@@ -117,7 +117,7 @@ class Grid:
         rate = given.parameters.get("rate")
         period = given.parameters["period"] if rate is None else 1.0 / rate
         in_periods = self.axes.delay_in_periods
-        # Beyond float64 is a status of the point, not a warning.
+        # Suppress warnings, because the status of a point reports an overflow.
         with np.errstate(all="ignore"):
             device = normalize(mass=mass, damping=damping, period=period, delay=none if in_periods else delay)
             units = {"mass": mass[:, None], "period": period[:, None]}
@@ -127,7 +127,7 @@ class Grid:
         return Block(device.delta, d, alpha, beta, alphas, betas, mass, period, rows)
 
     def _device(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
-        """A parameter of the devices of a block, flat; 0 where it is not given."""
+        """Return a parameter of the devices of a block as a flat array; 0 if it is not given."""
         values = self._values.get(name, np.zeros(1))
         dim = self._dim_of(name)
         if dim is not None:
@@ -136,7 +136,7 @@ class Grid:
         return np.broadcast_to(values, shape or (1,)).ravel()
 
     def _wall(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
-        """A parameter of the walls of a block: one row for all devices, or one column with an entry a device."""
+        """Return a parameter of the walls of a block: one row for all devices, or one row per device."""
         if name in self.wall_dims:
             return self._values[name][slices[name]][None, :]
         return self._device(name, slices, shape)[:, None]

@@ -81,7 +81,7 @@ class Store:
             raise StoreError(f"{self.path}: {'; '.join(faults)}; start again in a new folder")
         if (version := description["attributes"].get("zwidth_format")) not in (OLD_FORMAT, FORMAT):
             raise StoreError(f"{self.path}: format {version}, this release reads format {FORMAT}; use another release")
-        # Ignore a key of earlier releases: every delay of a sweep was exact ("held").
+        # Earlier releases wrote delay_model, which was always "held", the exact delay.
         description["attributes"]["study"].pop("delay_model", None)
         return description
 

@@ -19,8 +19,9 @@ import numpy as np
 from matplotlib.colors import to_hex
 
 from zwidth.config.study import KINDS
+from zwidth.figures.color_scale import ColorScale, choose_scale
 from zwidth.figures.grid import choose_axes, in_order
-from zwidth.figures.plane import ColorScale, Edges, choose_scale
+from zwidth.figures.plane import Edges
 from zwidth.figures.style import pick_evenly, save, style_sheet, units, write_unit
 from zwidth.figures.table import is_of_rotary
 from zwidth.runs.draw import figures_of, make_edges
@@ -182,7 +183,7 @@ def _show_figure(path: Path, study: str) -> str:
 def _draw_curves(data: xarray.Dataset, study: str) -> Iterator[str]:
     """What a sweep has over one parameter, as `zwidth figures` draws it."""
     data = data.reset_coords(drop=True)
-    with TemporaryDirectory() as place, style_sheet():
+    with TemporaryDirectory() as place:
         for name, draw in figures_of(data):
             if name in OUTPUTS and len(choose_axes(data, name)) == 1:
                 (file,) = save(draw(), Path(place) / f"{study}_{name}", ("svg",))
