@@ -25,9 +25,9 @@ from zwidth.sweep.files import (
     ELSEWHERE,
     LOCKS,
     check_folder,
-    digest,
+    hash_json,
     is_plain_name,
-    versions,
+    list_versions,
 )
 from zwidth.sweep.store import SUFFIX
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
@@ -70,7 +70,7 @@ class Record:
         if not isinstance(content, dict) or not isinstance(content.get("studies"), list):
             raise StoreError(f"{where}: no record of a run; {remedy}")
         seal = content.pop(_SEAL, None)
-        if seal is not None and digest(content) != seal:
+        if seal is not None and hash_json(content) != seal:
             self.damaged = True
             if content.get("format") == RUN_FORMAT:
                 # Which files are the run's can be believed, for they are made anew; what was found cannot.
@@ -141,7 +141,7 @@ class Record:
 
     def start(self, **about: Any) -> None:
         about |= {"format": RUN_FORMAT, "started": datetime.now(UTC).isoformat(timespec="seconds")}
-        about |= {"precision": "float64", "versions": versions(*_PACKAGES)}
+        about |= {"precision": "float64", "versions": list_versions(*_PACKAGES)}
         self._update({**about, "started": self.content.get("started", about["started"])})
 
     def keep_config(self, text: str, inputs: Mapping[str, bytes]) -> None:
@@ -173,7 +173,7 @@ class Record:
         studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
         content["studies"] = [*studies, *([] if entry is None else [entry])]
         self.content = content
-        sealed = json.dumps(content | {_SEAL: digest(content)}, indent=2) + "\n"
+        sealed = json.dumps(content | {_SEAL: hash_json(content)}, indent=2) + "\n"
         write_whole(self.folder / RUN_FILE, sealed.encode())
 
     def faults(self, name: str) -> list[str]:

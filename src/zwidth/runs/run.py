@@ -18,8 +18,8 @@ from zwidth.figures.style import style_sheet
 from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
 from zwidth.studies.outcome import LISTENER, ComputedStudy, Outcome
-from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
-from zwidth.sweep.files import hopeless, lock_folder
+from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove_store, store_path
+from zwidth.sweep.files import is_fatal, lock_folder
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.words.errors import InputError
@@ -176,9 +176,9 @@ def run(
         if overwrite:
             record.clear()
             for study in sweeps:
-                remove(folder, study)
+                remove_store(folder, study)
         record.check_same({study.name: inputs[study.name] for study in (*pieces, *sweeps)})
-        check_stores(sweeps, folder, going_on=resume)
+        check_stores(sweeps, folder, resume=resume)
         record.sweep_up()
         job = _Run(config, record, inputs, progress or (lambda event: None), len(pieces) + len(plans))
         digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
@@ -268,7 +268,7 @@ class _Run:
                 before = self.record.entry(study.name) or {}
                 with suppress(OSError):
                     self.record.note({**tell(error), "files": before.get("files", {})})
-        if error is not None and hopeless(error):
+        if error is not None and is_fatal(error):
             self.hopeless = _describe_error(error)
         kept = self.record.entry(study.name) or {"files": ()}
         ended = "failed" if error else "done", time.perf_counter() - clock, tuple(kept["files"])
@@ -301,7 +301,7 @@ class _Run:
             # Before the first chunk began.
             self.interrupted = True
             return
-        self.hopeless, self.interrupted, self.lost = sweeps.hopeless, sweeps.interrupted, sweeps.lost
+        self.hopeless, self.interrupted, self.lost = sweeps.fatal_error, sweeps.interrupted, sweeps.lost
         for study in (plan.study for plan in plans):
             sweep = sweeps.results[study.name]
             self.repaired += sweep.repaired

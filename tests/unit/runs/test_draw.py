@@ -222,7 +222,7 @@ def test_slices_that_do_not_exist_are_refused(folder, tmp_path, at, says):
 
 
 def test_a_folder_without_stores_is_refused(tmp_path, capsys):
-    with pytest.raises(StoreError, match="holds no store of a sweep"):
+    with pytest.raises(StoreError, match="contains no store of a sweep"):
         draw_stores(tmp_path)
     assert main_of("figures", tmp_path) == 2
     assert main_of("figures", tmp_path, "--at", "delta") == 2

@@ -215,7 +215,7 @@ def test_a_strangers_store_of_the_same_name_is_never_replaced(both, tmp_path):
     store = tmp_path / "out" / "swept.zarr"
     zarr.create_group(store).create_array("mine", data=np.arange(3.0))
     for overwrite in (False, True):
-        with pytest.raises(StoreExistsError, match=r"swept\.zarr exists already"):
+        with pytest.raises(StoreExistsError, match=r"swept\.zarr already exists"):
             run(both, out=tmp_path / "out", overwrite=overwrite)
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name != ".locks"] == ["swept.zarr"]
     np.testing.assert_array_equal(zarr.open_array(store, path="mine")[:], [0, 1, 2])
