@@ -121,7 +121,7 @@ def test_a_run_of_an_earlier_release_is_replaced_but_not_resumed(finished, both)
     record = record_of(finished)
     record["format"] = 1
     (finished / "run.json").write_text(json.dumps(record), encoding="utf-8")
-    with pytest.raises(StoreError, match="kept no checksums to go on from; start again with --overwrite"):
+    with pytest.raises(StoreError, match="without checksums, which cannot be resumed; start again with --overwrite"):
         run(both, out=finished, resume=True)
     assert run(both, out=finished, overwrite=True).ok
 

@@ -94,4 +94,4 @@ def test_the_plan_says_how_radii_are_found_and_what_is_proved_of_them():
     assert "stable by crossover: stability limit of each line of constant B" in lines
     assert "polynomials of degree up to 74" in lines
     usual = make_plan(sweep_of(study(axes=HUGE, outputs=("margin",))))
-    assert "proved to 1e-09" in usual.methods["spectral_radius"][1]
+    assert "certified to 1e-09" in usual.methods["spectral_radius"][1]
