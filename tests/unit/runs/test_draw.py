@@ -157,7 +157,7 @@ def test_every_device_has_its_boundary(plane):
 def test_a_single_value_is_no_figure(plane, draw):
     with pytest.raises(InputError, match="'stable' varies over"):
         draw(plane.isel(beta=0, delta=0, d=0), "stable")
-    with pytest.raises(InputError, match="holds no boundaries of several devices"):
+    with pytest.raises(InputError, match="contains no boundaries of several devices"):
         draw_outlines(plane.isel(delta=0, d=0))
 
 
