@@ -20,7 +20,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.evaluate import Route, map_blocks
+from zwidth.arrays.blocks import map_blocks
+from zwidth.arrays.evaluate import Route
 from zwidth.loops.rigid.margins import margins_kernel
 from zwidth.loops.rigid.normalization import status_of_results
 from zwidth.loops.rigid.outermost_poles import area_poles, list_poles

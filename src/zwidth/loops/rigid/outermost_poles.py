@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import BLOCK, FEW, Route, compile_columns, map_blocks
+from zwidth.arrays.blocks import map_blocks
+from zwidth.arrays.evaluate import BLOCK, FEW, Route, compile_columns
 from zwidth.arrays.held_mass import classify_delays
 from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
