@@ -17,7 +17,7 @@ from zwidth.config.devices import (
     Rotary,
     find_second_device,
     find_second_period,
-    tell_rotary,
+    read_rotary,
 )
 from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, listing, members, problem
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
@@ -183,12 +183,12 @@ class SweepStudy(_Parts, Study):
     device: DeviceForm | None = None
     """A linear system or a measured response in place of mass and damping; the scene's where left out."""
 
-    rotary: Rotary = Field(default_factory=tell_rotary)
+    rotary: Rotary = Field(default_factory=read_rotary)
     """Whether its devices turn, as all of a file do where one quantity has a unit of rotation."""
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The units of its devices."""
+        """The unit system of the study's devices, also for a study that is read from a store."""
         return SYSTEMS[bool(self.rotary)]
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)

@@ -1,17 +1,17 @@
-"""Pictures of scenes, into an Axes of yours or pyplot's current one: each function returns its Axes.
+"""Figures of scenes, drawn into an existing Axes or pyplot's current one; each function returns its Axes.
 
-    region      stable walls, islands and holes, with the stiffest wall and the passive set
-    ridge       the stiffest stable wall over a parameter of the scene
-    step        the response to a step of force
-    bode        size and phase of the open loop over frequency, with its margins
-    nyquist     the open loop around -1, with its gain crossover
-    poles       in the unit circle
-    motion      a simulated motion: position and velocity over time
-    recommendation  the wall to set among the stable ones, and its response to a step of force
+    region          stable walls, islands and holes, with the stiffest wall and the passive set
+    ridge           maximum stiffness over a parameter of the scene
+    step            response to a step of force
+    bode            magnitude and phase of the open loop over frequency, with its margins
+    nyquist         open loop around -1, with its gain crossover
+    poles           poles and the unit circle
+    motion          position of a simulated motion over time
+    recommendation  recommended wall among the stable ones, and its response to a step of force
 
-Without an Axes they draw into ``matplotlib.pyplot.gca()``; those with two panels make a figure of pyplot's. The look is
-applied while drawing; matplotlib's settings stay as they are. ``zwidth.figures.save(ax, path)`` or
-``ax.figure.savefig(path)`` write it.
+Without an Axes they draw into ``matplotlib.pyplot.gca()``; functions with two panels create a pyplot figure. The house
+style applies while drawing; matplotlib's settings do not change. Use ``zwidth.figures.save(ax, path)`` or
+``ax.figure.savefig(path)`` to write the figure.
 """
 
 from __future__ import annotations
@@ -47,16 +47,15 @@ from zwidth.words.formatting import name_wall
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.types import ArrayLike
 
-_ANGLES = 181
-_FREQUENCIES = 2000
-_PERIODS, _MOST_PERIODS = 100, 20_000
-
+_ANGLES = 181  # points of the outline of the passive walls
+_FREQUENCIES = 2000  # frequencies of an open loop, on each of a logarithmic and a linear grid
+_PERIODS, _MOST_PERIODS = 100, 20_000  # smallest and largest number of periods of a step response
 
 __all__ = ["bode", "motion", "nyquist", "poles", "recommendation", "region", "ridge", "step"]
 
 
 def __dir__() -> list[str]:
-    """Its own names, and not those that it imports."""
+    """Return the public names without imported ones."""
     return sorted(__all__)
 
 
@@ -80,7 +79,7 @@ def _draws_scene(
 
 
 def _axes(ax: Axes | None) -> Axes:
-    """The Axes to draw into; pyplot is loaded where it is asked for its own, of a new figure if it has none."""
+    """Return the Axes to draw into: the given one, or pyplot's current one."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt
@@ -89,7 +88,7 @@ def _axes(ax: Axes | None) -> Axes:
 
 
 def _two(axes: style.AnyAxes | None, rows: int, columns: int, size: tuple[float, float] | None) -> np.ndarray:
-    """Two Axes to draw into, of a new figure of pyplot's where none are given."""
+    """Return two Axes to draw into: the given ones, or those of a new pyplot figure."""
     if axes is None:
         import matplotlib.pyplot as plt
 
@@ -98,7 +97,7 @@ def _two(axes: style.AnyAxes | None, rows: int, columns: int, size: tuple[float,
 
 
 def _complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: tuple[float, float]) -> Axes:
-    """Complex numbers in an Axes, with the unit circle."""
+    """Return an Axes with the complex plane and the unit circle."""
     ax = _axes(ax)
     ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.BLACK, linewidth=0.7))
     ax.set(xlim=real, ylim=imaginary, xlabel="real part", ylabel="imaginary part", aspect="equal")
@@ -109,19 +108,19 @@ def _complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: tuple[
 def region(
     scene: Scene | Mapping[str, Scene], ax: Axes | None = None, *, normalized: bool = False, passive: bool = False
 ) -> Axes:
-    """Draw the stable walls of a scene, or of several by their labels, with the stiffest of each.
+    """Draw the stable walls of one or several scenes, with the stiffest wall of each.
 
     Args:
-        scene: one, or a mapping from labels to scenes.
-        ax: an Axes of yours; pyplot's current one where left out.
-        normalized: over alpha and beta in place of K and B.
-        passive: also the walls that are passive, with stiffness > 0 (dash-dotted).
+        scene: a scene, or a mapping from labels to scenes.
+        ax: an existing Axes. Default: pyplot's current one.
+        normalized: use axes of alpha and beta in place of K and B.
+        passive: also draw the passive walls with stiffness > 0 (dash-dotted).
 
     Returns:
-        The Axes. Solid: the largest outline; dashed: islands; dotted: holes; what is stable is shaded.
+        The Axes. Solid: the largest outline; dashed: islands; dotted: holes; the stable walls are shaded.
 
     Raises:
-        InputError: one is no scene; or no passivity condition holds for it, with ``passive``.
+        InputError: if a value is no scene, or ``passive`` is set and a scene has no passivity condition.
     """
     scenes = scene if isinstance(scene, Mapping) else {"": scene}
     for each in scenes.values():
@@ -132,7 +131,7 @@ def region(
 
 
 def _trace_passive(scene: Scene, label: str = "") -> dict[str, Any]:
-    """The outline of the passive walls, as columns beside those of `tabulate_sets`."""
+    """Return the outline of the passive walls, with the columns of `tabulate_sets`."""
     edge = tabulate_walls(scene, *passive_edge(scene, _ANGLES))
     return {"label": label, "number": 0, "piece": "passive", **edge}
 
@@ -141,15 +140,15 @@ def _trace_passive(scene: Scene, label: str = "") -> dict[str, Any]:
 def recommendation(
     found: Recommendation, axes: style.AnyAxes | None = None, *, response: Table | None = None
 ) -> np.ndarray:
-    """Draw the wall that `zwidth.Scene.recommend` found among the stable ones, and its response to a step of 1 N.
+    """Draw a recommended wall among the stable ones, and its response to a step of 1 N.
 
     Args:
-        found: what it returned; without a wall the stable walls alone are drawn.
-        axes: an Axes of yours for the walls alone, or two; a figure of pyplot's where left out.
-        response: columns of a step study of this wall, in SI units; computed at the samples where left out.
+        found: result of `zwidth.Scene.recommend`; if it has no wall, only the stable walls are drawn.
+        axes: an existing Axes for the walls only, or two. Default: a pyplot figure.
+        response: columns of a step study of this wall, in SI units. Default: computed at the samples.
     """
     scene, verdict, told = found.scene, found.verdict, found.as_dict()["recommended"]
-    # Without a model there is no response.
+    # A measured device has no model to compute a response.
     moves = not isinstance(scene.device, MeasuredDevice)
     if axes is None:
         axes = _two(None, 1, 2, (style.WIDTH, 3.5)) if verdict is not None and moves else _axes(None)
@@ -168,7 +167,7 @@ def recommendation(
     look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
     panels[0].plot([K * spring] * 2, interval * damper, **look)
     if response is None and moves:
-        # As long as the slowest motion takes to decay, or so many periods.
+        # Cover one and a half times the decay of the dominant pole.
         periods = int(min(max(_PERIODS, 1.5 * (told["decay_time"] or 0.0) / scene.timing.period), _MOST_PERIODS))
         columns = _tabulate_step(scene, K, B, periods)
         if not scene.parts_beyond:
@@ -182,7 +181,7 @@ def recommendation(
 
 
 def _draw_response(ax: Axes, response: Table) -> None:
-    """Positions over time, and when they have settled."""
+    """Draw positions over time and mark the settling time."""
     clock, unit = draw_positions(ax, response)
     time = np.asarray(response["time_s"])
     ax.set(xlim=(0.0, float(time[-1] + time[1]) * clock), xlabel=f"time  $t$  in {unit}")
@@ -195,13 +194,13 @@ def _draw_response(ax: Axes, response: Table) -> None:
 
 @_draws_scene
 def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = None) -> Axes:
-    """Draw the stiffest stable wall over one parameter of a scene, all others as they are.
+    """Draw the maximum stiffness over one parameter of a scene.
 
     Args:
         scene: the scene.
-        parameter: its dotted path, as in `zwidth.Scene.replace`: "damping", "velocity.cutoff", ...
-        values: of it, in SI units.
-        ax: an Axes of yours; pyplot's current one where left out.
+        parameter: dotted path as in `zwidth.Scene.replace`, such as "damping" or "velocity.cutoff".
+        values: values of the parameter in SI units.
+        ax: an existing Axes. Default: pyplot's current one.
     """
     known = PARAMETERS.get(parameter)
     grid = as_float64("values", read_texts("values", values, scene.unit_system[known.unit]) if known else values)
@@ -236,14 +235,14 @@ def step(
     *,
     periods: int = 100,
 ) -> Axes:
-    """Draw the response of the device, in contact with a wall, to a force of 1 N on it, at the samples.
+    """Draw the response of the device in a wall to a step of 1 N, at the samples.
 
     Args:
         scene: the scene.
-        stiffness: K of the wall in N/m; the scene's own wall where neither is given.
-        virtual_damping: B in N s/m.
-        ax: an Axes of yours; pyplot's current one where left out.
-        periods: how many sampling periods.
+        stiffness: K of the wall in N/m. Default of K and B: the wall of the scene.
+        virtual_damping: B of the wall in N s/m.
+        ax: an existing Axes. Default: pyplot's current one.
+        periods: number of sampling periods.
     """
     K, B = map(float, resolve_wall(scene.wall, stiffness, virtual_damping, scene.unit_system))
     drawn = draw_step(stack([_tabulate_step(scene, K, B, periods)]), _axes(ax))[0]
@@ -252,7 +251,7 @@ def step(
 
 
 def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, periods: int) -> dict[str, Any]:
-    """The response to 1 N at the samples, as columns of a step study."""
+    """Return the response to a step of 1 N at the samples, as columns of a step study."""
     label = name_wall(stiffness, virtual_damping, scene.unit_system)
     columns = {**tabulate_walls(scene, stiffness, virtual_damping), "label": label}
     columns["time_s"] = np.arange(periods) * scene.timing.period
@@ -261,7 +260,7 @@ def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, perio
 
 
 def _frequencies(scene: Scene) -> np.ndarray:
-    """Frequencies in Hz that resolve an open loop, up to half the sampling rate."""
+    """Return frequencies in Hz that resolve an open loop, up to the Nyquist frequency."""
     if isinstance(scene.device, MeasuredDevice):
         return scene.device.frequency
     half = 0.5 / float(scene.timing.period)
@@ -276,16 +275,16 @@ def bode(
     virtual_damping: float | str | None = None,
     axes: style.AnyAxes | None = None,
 ) -> np.ndarray:
-    """Draw size and phase of the open loop of a wall over frequency, with its gain and phase margin.
+    """Draw magnitude and phase of the open loop of a wall over frequency, with its gain and phase margin.
 
     Args:
         scene: the scene.
-        stiffness: K of the wall in N/m; the scene's own wall where neither is given.
-        virtual_damping: B in N s/m.
-        axes: two Axes of yours; a figure of pyplot's where left out.
+        stiffness: K of the wall in N/m. Default of K and B: the wall of the scene.
+        virtual_damping: B of the wall in N s/m.
+        axes: two existing Axes. Default: a pyplot figure.
 
     Returns:
-        The Axes of size and phase; bars mark the margins where they are taken, as `zwidth.Scene.margins` has them.
+        The Axes of magnitude and phase; bars mark the margins of `zwidth.Scene.margins`.
     """
     hertz = _frequencies(scene)
     found = scene.frequency_response(stiffness, virtual_damping, hertz)
@@ -295,7 +294,7 @@ def bode(
     stable = bool(scene.is_stable(stiffness, virtual_damping))
     read = {name: round_margin(f"{name}_margin", known, stable, 3) for name in ("gain", "phase")}
     at_phase, at_gain = float(known.gain_crossover), float(known.phase_crossover)
-    # The turn that the margin is measured from, where the phase crosses -180 degrees.
+    # Shift the phase by full turns so that it starts between -360 and 0 degrees.
     angles = np.unwrap(np.angle(found))
     angles = np.degrees(angles - 2.0 * np.pi * np.round((angles[0] + np.pi) / (2.0 * np.pi)))
     upper.plot(hertz, np.abs(found), color=style.BLUE, label="$|L|$")
@@ -325,16 +324,16 @@ def nyquist(
     virtual_damping: float | str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the open loop of a wall over frequency, with the point -1 that it must leave on its left.
+    """Draw the Nyquist plot of the open loop of a wall, with the point -1, which a stable loop leaves on its left.
 
     Args:
         scene: the scene.
-        stiffness: K of the wall in N/m; the scene's own wall where neither is given.
-        virtual_damping: B in N s/m.
-        ax: an Axes of yours; pyplot's current one where left out.
+        stiffness: K of the wall in N/m. Default of K and B: the wall of the scene.
+        virtual_damping: B of the wall in N s/m.
+        ax: an existing Axes. Default: pyplot's current one.
 
     Returns:
-        The Axes; a dot marks each gain crossover, where the loop meets the unit circle.
+        The Axes; a dot marks each gain crossover, an intersection with the unit circle.
     """
     found = scene.frequency_response(stiffness, virtual_damping, _frequencies(scene))
     ax = _complex_plane(ax, (-2.6, 1.6), (-2.2, 2.0))
@@ -356,13 +355,13 @@ def poles(
     virtual_damping: float | str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the poles of the loop with a wall, in the unit circle.
+    """Draw the poles of the closed loop with a wall, and the unit circle.
 
     Args:
         scene: the scene.
-        stiffness: K of the wall in N/m; the scene's own wall where neither is given.
-        virtual_damping: B in N s/m.
-        ax: an Axes of yours; pyplot's current one where left out.
+        stiffness: K of the wall in N/m. Default of K and B: the wall of the scene.
+        virtual_damping: B of the wall in N s/m.
+        ax: an existing Axes. Default: pyplot's current one.
     """
     found: Any = np.asarray(scene.poles(stiffness, virtual_damping)).ravel()
     outside = np.abs(found) >= 1.0
@@ -378,12 +377,12 @@ def poles(
 
 @_draws
 def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
-    """Draw the position of one simulated motion, or of several, over time.
+    """Draw the position of one or several simulated motions over time.
 
     Args:
-        found: what `zwidth.simulate` returns, recorded.
-        ax: an Axes of yours; pyplot's current one where left out.
-        labels: a name for each of several, in their order.
+        found: result of `zwidth.simulate` with recorded positions.
+        ax: an existing Axes. Default: pyplot's current one.
+        labels: names of several motions, in their order.
     """
     if not hasattr(found, "wall_force"):
         raise InputError(f"found: got {type(found).__name__}; give what zwidth.simulate returns")

@@ -32,7 +32,7 @@ from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, member
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
-from zwidth.config.values import Quantity, find_system
+from zwidth.config.values import Quantity
 from zwidth.parts.wall import NoWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
@@ -142,18 +142,11 @@ class Config(Strict, what="a configuration"):
     studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""
 
-    _rotary: bool = PrivateAttr(default_factory=lambda: find_system().rotary)
-
     _place: _Place = PrivateAttr(default_factory=lambda: _Place(find_file("").absolute()))
 
     @property
-    def rotary(self) -> bool:
-        """True if its devices are rotary."""
-        return self._rotary
-
-    @property
     def folder(self) -> Path:
-        """Where the files are that it names."""
+        """The folder to which file names in the configuration are relative."""
         return self._place.folder
 
     @classmethod

@@ -224,7 +224,7 @@ def check_same(store: Store, study: SweepStudy) -> None:
 
 
 def refuse_changes(where: Path, name: str, noun: str, old: Any, new: Any) -> None:
-    """Raise a `StoreError` with all list_differences if results were computed from another study.
+    """Raise a `StoreError` with all differences if results were computed from another study.
 
     Args:
         where: File with the recorded study, for the message.

@@ -24,8 +24,9 @@ import numpy as np
 from matplotlib.colors import to_hex
 
 from zwidth.config.study import KINDS
+from zwidth.figures.color_scale import ColorScale, choose_scale
 from zwidth.figures.grid import choose_axes, in_order
-from zwidth.figures.plane import ColorScale, Edges, choose_scale
+from zwidth.figures.plane import Edges
 from zwidth.figures.style import pick_evenly, save, style_sheet, units, write_unit
 from zwidth.figures.table import is_of_rotary
 from zwidth.runs.draw import list_figures, make_edges
@@ -193,7 +194,7 @@ def _embed_figure(path: Path, study: str) -> str:
 def _draw_curves(data: xarray.Dataset, study: str) -> Iterator[str]:
     """Yield the outputs of a sweep over one parameter, as figures like those of `zwidth figures`."""
     data = data.reset_coords(drop=True)
-    with TemporaryDirectory() as folder, style_sheet():
+    with TemporaryDirectory() as folder:
         for name, draw in list_figures(data):
             if name in OUTPUTS and len(choose_axes(data, name)) == 1:
                 (file,) = save(draw(), Path(folder) / f"{study}_{name}", ("svg",))
