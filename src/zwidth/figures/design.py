@@ -16,7 +16,8 @@ from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, in_order, sele
 from zwidth.words.formatting import ENOUGH, count_digits_apart, header, round_safely, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS
 
-_STIFFNESS, _NOISE = SI_COLUMNS[0], "velocity_noise_m_per_s"
+_STIFFNESS = SI_COLUMNS[0]  # column of K_max
+_NOISE = "velocity_noise_m_per_s"  # column of the velocity noise
 # Column and axis label of the parameter of each kind of filter.
 _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),

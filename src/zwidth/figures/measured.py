@@ -20,7 +20,8 @@ from zwidth.words.formatting import round_safely
 _MAX_SAMPLES = 4000  # samples drawn per panel; of longer logs every n-th
 _TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder": 6}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}
-_LOW, _HIGH = "stiffness_low_N_per_m", "stiffness_high_N_per_m"
+_LOW = "stiffness_low_N_per_m"  # column of the lower end of the 95 % band
+_HIGH = "stiffness_high_N_per_m"  # column of its upper end
 _FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))  # line, band and dash per fit
 _ROWS = ("position", "residuals", "autocorrelation", "walls")
 

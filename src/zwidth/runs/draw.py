@@ -54,8 +54,10 @@ def make_edges(store: Store) -> Edges:
         indices = [_find_index(coordinates[dim][1], part[dim]) if dim in part.coords else 0 for dim in dims]
         order = sorted(walls, key=lambda dim: dim not in ("alpha", "stiffness"))
         factors = [part[dim].attrs["factor"] for dim in order]
-        found = outlines_of_device(tuple(indices))
-        return {name: [(points * factors, hole) for points, hole in outlines] for name, outlines in found.items()}
+        outlines_by_name = outlines_of_device(tuple(indices))
+        return {
+            name: [(points * factors, hole) for points, hole in outlines] for name, outlines in outlines_by_name.items()
+        }
 
     return edges
 

@@ -37,6 +37,7 @@ class CheckedStore(LocalStore):
 
     @property
     def complete(self) -> bool:
+        """True if all chunks were finished when the store was opened."""
         return not self._absent
 
     def get_sync(

@@ -96,6 +96,7 @@ def _submit_jobs(client: Client, jobs: list[Job], perform: Perform) -> Generator
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def submit_next() -> None:
+        """Submit the next waiting job, if any."""
         job = next(waiting, None)
         if job is not None:
             key = f"{os.path.basename(job.path)}-{job.task.family}-{job.task.index}-{os.urandom(4).hex()}"

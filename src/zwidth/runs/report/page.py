@@ -326,8 +326,8 @@ def _encode_edges(part: xarray.DataArray, x: str, edges: Edges) -> dict[str, lis
     for dim in map(str, part.coords):
         part[dim].attrs.setdefault("factor", 1.0)
     over = slice(None, None, 1 if x in ("alpha", "stiffness") else -1)
-    found = edges(part.to_dataset(name="values")).items()
-    return {name: [_encode(points[:, over]) for points, _ in outlines] for name, outlines in found}
+    outlines_by_name = edges(part.to_dataset(name="values")).items()
+    return {name: [_encode(points[:, over]) for points, _ in outlines] for name, outlines in outlines_by_name}
 
 
 def _encode(numbers: np.ndarray) -> str:
