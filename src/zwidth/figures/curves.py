@@ -132,7 +132,10 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
 
 
 def _list_looks(family: str, count: int) -> list[dict[str, Any]]:
-    """Return the looks of curves: colors ordered by value; for devices, which have no order, also line styles."""
+    """Return color and line style of each curve: colors ordered by value, and for devices also line styles.
+
+    ``family`` is the parameter with one curve per value. Devices have no order, so their line styles differ as well.
+    """
     if family == "device":
         return [style.look(k) for k in range(count)]
     return [{"color": color, "linestyle": style.SOLID} for color in style.ordered_colors(count)]
@@ -141,7 +144,7 @@ def _list_looks(family: str, count: int) -> list[dict[str, Any]]:
 def _add_legend(
     axes: np.ndarray, names: list[str], looks: list[dict[str, Any]], *, outside: bool, title: str | None = None
 ) -> None:
-    """Add a legend with the names and looks of curves, above the panels or in the first one."""
+    """Add a legend with name, color and line style of each curve, above the panels or in the first one."""
     longest = max(10 if "$" in name else len(name) for name in names)
     columns = max(1, min(len(names), 6, _LEGEND_LETTERS // max(longest, 1)))
     handles = [

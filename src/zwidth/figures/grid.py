@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 MISSING = "#D9D9D9"  # gray of panels at points without a value
 
-# Panels. Of larger grids, evenly spaced values are drawn.
+# Limits of panels. If there are more values, evenly spaced ones are drawn.
 _MAX_VALUES = 1000  # values drawn along an axis of a single panel
 _MAX_VALUES_OF_MANY = 500  # values drawn along an axis of one of several panels
-_MAX_COLUMNS = 3  # panels next to each other, and values of each of two panel parameters
-_MAX_PANELS = 9  # values of a single panel parameter
+_MAX_COLUMNS = 3  # columns of panels; also values of each parameter if two of them vary from panel to panel
+_MAX_PANELS = 9  # panels, if a single parameter varies from panel to panel
 _MAX_TITLE_VALUES = 3  # parameter values that fit into the title of one of several panels
 
 # Axes.

@@ -92,7 +92,7 @@ def draw_limit_cycles(
 
 
 def _find_beyond(arrays: Mapping[str, np.ndarray], bounds: tuple[float, float]) -> np.ndarray:
-    """Return which motions diverge or have an amplitude above the upper bound, or none."""
+    """Return which motions diverge, or have no amplitude or one above the upper bound."""
     return (arrays["outcome"] == MotionKind.DIVERGED) | ~(arrays["amplitude_m"] <= bounds[1])
 
 
@@ -189,7 +189,7 @@ def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest
 
 
 def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarray) -> list[dict[str, Any]]:
-    """Return look and label of each curve; the label states its value, and if all its walls are linearly unstable."""
+    """Return line properties and label of each curve; the label states its value, and if all its walls are unstable."""
     if not family:
         return [{**style.look(0), "label": "limit cycle"}]
     values, parameter = arrays[family], AXES[family]

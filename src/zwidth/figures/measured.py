@@ -163,7 +163,7 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
         K, low, up = (columns[name] * to_spring for name in (SI_COLUMNS[0], _LOW, _HIGH))
         B = columns[SI_COLUMNS[1]] * to_damper
         ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {source}")
-        # Draw the boundary up to one point beyond K > 0, where it meets K = 0.
+        # Draw the part of the boundary with K > 0, and one point beyond each of its ends, where it meets K = 0.
         ends = np.flatnonzero(K > 0)
         shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
         ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)

@@ -110,7 +110,7 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
 
 
 def _read_responses(table: Table) -> list[Any]:
-    """Return the step responses in a table, with their columns and looks as attributes.
+    """Return the step responses in a table, with their columns and line properties as attributes.
 
     The attribute ``settled`` states whether the response has settled by the end of its time; None if unknown.
     """
@@ -215,7 +215,7 @@ def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
 
 def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
-    """Return the motions in a table, with their columns and looks as attributes."""
+    """Return the motions in a table, with their columns and line properties (``look``) as attributes."""
     columns = {str(name): np.asarray(table[name]) for name in table}
     # Separate the motions by their start at time 0, because all other columns of two motions may be equal.
     motions = curves({**columns, "number": np.cumsum(columns[time] == 0.0)}, "number")

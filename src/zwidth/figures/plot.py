@@ -61,7 +61,7 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-def _draws(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+def _with_house_style(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Wrap a function to draw in the house style, in the units of its first argument."""
 
     @wraps(function)
@@ -73,11 +73,11 @@ def _draws(function: Callable[Parameters, Result]) -> Callable[Parameters, Resul
     return within
 
 
-def _draws_scene(
+def _with_checked_scene(
     function: Callable[Concatenate[Scene, Parameters], Result],
 ) -> Callable[Concatenate[Scene, Parameters], Result]:
-    """Wrap a function of a scene as `_draws` does, and check the scene."""
-    return of_scene(_draws(function))
+    """Wrap a function of a scene as `_with_house_style` does, and check the scene."""
+    return of_scene(_with_house_style(function))
 
 
 def _choose_axes(ax: Axes | None) -> Axes:
@@ -108,7 +108,7 @@ def _make_complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: t
     return ax
 
 
-@_draws
+@_with_house_style
 def region(
     scene: Scene | Mapping[str, Scene], ax: Axes | None = None, *, normalized: bool = False, passive: bool = False
 ) -> Axes:
@@ -140,7 +140,7 @@ def _trace_passive(scene: Scene, label: str = "") -> dict[str, Any]:
     return {"label": label, "number": 0, "piece": "passive", **edge}
 
 
-@_draws
+@_with_house_style
 def recommendation(
     found: Recommendation, axes: style.AnyAxes | None = None, *, response: Table | None = None
 ) -> np.ndarray:
@@ -206,7 +206,7 @@ def _draw_response(ax: Axes, response: Table) -> None:
         ax.legend([dot], [text], loc="lower right", handletextpad=0.2)
 
 
-@_draws_scene
+@_with_checked_scene
 def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = None) -> Axes:
     """Draw the maximum stiffness over one parameter of a scene.
 
@@ -240,7 +240,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     return ax
 
 
-@_draws_scene
+@_with_checked_scene
 def step(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -285,7 +285,7 @@ def _choose_frequencies(scene: Scene) -> np.ndarray:
     return np.concatenate([slow, fast[1:]])
 
 
-@_draws_scene
+@_with_checked_scene
 def bode(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -335,7 +335,7 @@ def bode(
     return np.array([upper, lower])
 
 
-@_draws_scene
+@_with_checked_scene
 def nyquist(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -366,7 +366,7 @@ def nyquist(
     return ax
 
 
-@_draws_scene
+@_with_checked_scene
 def poles(
     scene: Scene,
     stiffness: float | str | None = None,
@@ -393,7 +393,7 @@ def poles(
     return ax
 
 
-@_draws
+@_with_house_style
 def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
     """Draw the position of one or several simulated motions over time.
 

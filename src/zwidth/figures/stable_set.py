@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Outlines: TypeAlias = Sequence[tuple[np.ndarray, bool]]
 # Light colors, so that labels and curves drawn over them stay legible; printed in gray, passive is the darker one.
 SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
-_INTERPOLATION = 32  # points per step of an outline on a logarithmic axis, where straight steps become curves
+_INTERPOLATION = 32  # points per straight step of an outline, which is curved on a logarithmic axis
 # Marks of walls, in panels and legends.
 MARKS: dict[str, dict[str, Any]] = {
     "stiffest": {"marker": "o", "markersize": 4.5},

@@ -260,13 +260,13 @@ def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> N
 
 
 def use_whole(ax: Axes) -> None:
-    """Place ticks at integers only on a linear x axis of an integer quantity."""
+    """Place the ticks of the x axis of an integer quantity at integers, if the axis is linear."""
     if ax.get_xscale() == "linear":
         ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
 
 
 def label_ends(ax: Axes, curves: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:
-    """Write the delay of each curve to the right of its end; of two delay models only the exact one is labeled.
+    """Write the delay of each curve to the right of its end; with two delay models, label only the exact curves.
 
     Args:
         ax: Axes of the curves.

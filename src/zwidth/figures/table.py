@@ -57,7 +57,7 @@ def is_of_rotary(data: Any) -> bool:
 
 
 def name_as_linear(table: Any) -> Any:
-    """Return a table with the column names of linear devices; return such a table and other objects unchanged."""
+    """Rename the columns of a table of rotary devices to those of linear devices; return other objects unchanged."""
     names = {str(name): convert_header(str(name), LINEAR) for name in table} if hasattr(table, "keys") else {}
     return {linear: table[name] for name, linear in names.items()} if any(k != v for k, v in names.items()) else table
 

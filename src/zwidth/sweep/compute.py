@@ -131,9 +131,10 @@ def _decide_stability(block: Block, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _choose_route(count: int) -> Route:
-    """Return "numpy" or "jax" by the size of the whole grid, because results of the two may differ in the last digit.
+    """Return "numpy" for small grids and "jax" for large ones, given the number of points of the whole grid.
 
-    If the size of a chunk decided, values would depend on the division into chunks.
+    The size of a chunk must not decide: the results of both may differ in the last digit, so that the value of a point
+    would depend on the division into chunks.
     """
     return "numpy" if count <= MAX_NUMPY else "jax"
 

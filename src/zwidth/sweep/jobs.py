@@ -44,7 +44,7 @@ _STOP_TIMEOUT = 3.0  # s; a worker that has not ended by itself after this time 
 
 
 class LostSchedulerError(ZwidthError):
-    """Loss of the cluster during a run; the message is a predicate, to be placed after the scheduler's address."""
+    """Loss of the cluster during a run; the message continues a sentence that begins with the scheduler's address."""
 
 
 class Job(NamedTuple):
@@ -274,8 +274,8 @@ def _compute_walls(
     alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
     status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
     if "stable" in outputs:
-        # Transpose, because `decide` computes the stable intervals of K once per leading index, here per damping.
-        # Walls of a measured response may be undecided; the status then says so.
+        # Transpose, because `decide` computes the stable intervals of K once per row, here once per damping. Walls of
+        # a measured response may be undecided, which their status reports.
         labels = scene.loop.decide(alpha.T, beta.T, "auto", (stiffness.T, virtual_damping.T))
         results["stable"], status = np.asarray(labels.stable).T, np.asarray(labels.status).T
     unknown = np.zeros(status.shape, bool)

@@ -31,7 +31,7 @@ from zwidth.words.files import hidden_beside, remove_quietly, write_whole
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.words.status import Status
 
-SUFFIX = ".zarr"  # of the folder of a store
+SUFFIX = ".zarr"  # suffix of the name of a store, which is a folder
 FORMAT = 2  # format version of new stores
 OLD_FORMAT = 1  # format of earlier releases, whose checksums are kept in separate arrays and no longer read
 CHECKSUM = "attributes_sha256"  # attribute with the checksum of the description
