@@ -59,7 +59,7 @@ class SystemSection(PartSection, what="a linear system"):
     """Likewise; of a higher degree."""
 
     zeros: _Numbers | None = None
-    """Finite zeros in rad/s, or in z; complex ones as text, '-3+40j', with their conjugates. None where left out."""
+    """Finite zeros in rad/s, or in z; complex ones as text, '-3+40j', with their conjugates. Default: none."""
 
     poles: _Numbers | None = None
     """Poles, likewise."""
@@ -260,7 +260,7 @@ class SampledMass(OneKind):
         return super().prepare({**found, **{key: value for key, value in raw.items() if key != "device"}})
 
     device: DeviceForm | None = None
-    """Name of a published device, whose mass and damping are taken where none are written; or a device that is no mass
+    """Name of a published device, which supplies mass and damping if they are not given; or a device that is not a mass
     with damping: a linear system ('1 / 0.1 10 0' in s, or a mapping), or a measured response (FILE.csv)."""
 
     mass: Annotated[float | None, quantity_of("mass"), WrapValidator(_mass)] = Field(
@@ -269,7 +269,7 @@ class SampledMass(OneKind):
     damping: Annotated[float, quantity_of("damping")] = 0.0
 
     rotary: Rotary = Field(default_factory=read_rotary)
-    """Whether the device turns, as all of a file do where one quantity has a unit of rotation."""
+    """True for rotary devices. One quantity with a rotary unit makes all devices of a file rotary."""
 
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
     period: Annotated[float, quantity_of("period"), WrapValidator(read_period)] = Field(

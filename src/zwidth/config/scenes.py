@@ -124,7 +124,7 @@ class SimulatedDevice(PhysicalDevice):
     """A device in SI units whose velocity estimate need not be linear."""
 
     velocity: SimulatedVelocityField | None = None
-    """How the velocity is estimated; the difference of two samples where left out."""
+    """Velocity estimate. Default: the difference of two samples."""
 
 
 class LabeledDevice(_PhysicalPlant, what="a device"):
@@ -171,7 +171,7 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
 
     velocity: SimulatedVelocityField | None = None
-    """How the velocity is estimated; the difference of two samples where left out."""
+    """Velocity estimate. Default: the difference of two samples."""
 
     safe_limit: SafeLimitSection | None = None
     """Stiffest wall that measurements of the device support."""

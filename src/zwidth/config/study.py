@@ -73,7 +73,7 @@ class Study(Strict):
         own = handler.resolve_ref_schema(found)
         own["required"] = [name for name in own.get("required", []) if name not in cls.from_scene]
         for field in (own["properties"][name] for name in cls.from_scene):
-            field["description"] += " The scene's where left out."
+            field["description"] += " Default: that of the scene."
         return found
 
     @classmethod

@@ -105,7 +105,7 @@ class FigureLook(Strict, what="the look of figures"):
     """Width of every figure, as 85 mm of a journal's column; type is no smaller for it."""
 
     format: Literal["png", "svg", "pdf"] | None = None
-    """Kind of file; PNG and SVG where left out."""
+    """Format of the files. Default: PNG and SVG."""
 
     dpi: Annotated[float, Quantity(allowed=Range(10, 2400))] | None = None
     """Resolution in dots per inch of PNG files and of the maps in SVG and PDF files. Default: 180 for PNG."""
@@ -128,13 +128,13 @@ class Config(Strict, what="a configuration"):
     """Version of the format, 1."""
 
     name: Name
-    """Name of the configuration; results go to a folder of this name unless told otherwise."""
+    """Name of the configuration, and by default of the folder for the results."""
 
     description: str = ""
     """Free text."""
 
     scene: SceneField | None = None
-    """Device, timing and wall that supply what a study leaves out."""
+    """Device, timing and wall, the default values of the studies."""
 
     figure: FigureLook | None = None
     """Width, format and resolution of the studies' figures; for sweeps use the options of `zwidth figures`."""

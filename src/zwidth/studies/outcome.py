@@ -94,7 +94,7 @@ class WallsStudy(ComputedStudy):
     """What the studies of walls share that are a share of the maximum stiffness or given outright."""
 
     walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
-    """Walls, any number for one device; of several devices one for all, or one for each. The scene's where left out."""
+    """Walls: any number for one device; for several devices, one for all or one each. Default: that of the scene."""
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
