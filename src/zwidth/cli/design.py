@@ -17,7 +17,6 @@ from zwidth.cli.options import (
     flag_of,
     json_option,
     read_pairs,
-    read_share,
     scene_options,
 )
 from zwidth.pages.verdict import spell_device
@@ -34,6 +33,7 @@ from zwidth.words.formatting import (
 )
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.status import Status
+from zwidth.words.units import read_share
 
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}

@@ -25,7 +25,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.plausible import list_doubts
 from zwidth.words.quantities import ANY, CHOICES, OF_PARTS, PARAMETERS, Range
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
-from zwidth.words.units import DIMENSIONS, read_quantity, tell_kind
+from zwidth.words.units import DIMENSIONS, read_quantity, read_share, tell_kind
 
 if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
@@ -94,12 +94,6 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
         return read_quantity(number, dimension, allowed, counts=counts)[0]
 
     return Parsed("quantity", read)
-
-
-def read_share(text: str) -> float:
-    """A share: ``2%`` or ``0.02``."""
-    text = text.strip()
-    return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
 
 
 SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")

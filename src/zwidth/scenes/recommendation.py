@@ -202,8 +202,8 @@ class Recommendation:
 
     def spell_requirement(self) -> str:
         """Return, in words, the active requirement, which limits the stiffness."""
-        within = " within the safe limit" if self.limited_by != "safe_limit" and self.is_held_back else ""
-        return f"limited by {self.wanted.spell(self.limited_by)}{within}"
+        bounded = ", with B limited by the safe limit" if self.limited_by != "safe_limit" and self.is_held_back else ""
+        return f"limited by {self.wanted.spell(self.limited_by)}{bounded}"
 
     @property
     def is_held_back(self) -> bool:
