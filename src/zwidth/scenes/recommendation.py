@@ -305,7 +305,7 @@ class SceneAdvice(SceneOptima):
                 ``stiffness_fraction`` (default 0.75) of the limit's stiffness.
 
         If neither a fraction, a margin nor passivity is given, the defaults are a stiffness fraction of 0.75, a gain
-        margin of 2, a phase margin of 30 degrees and, unless the scene has an operator, ``grasps="soft"``. If one of
+        margin of 2, a phase margin of 30 degrees and, for a `Device` without an operator, ``grasps="soft"``. If one of
         them is given, it replaces all defaults. ``grasps`` leaves the other defaults unchanged.
 
         Returns:
@@ -334,7 +334,7 @@ class SceneAdvice(SceneOptima):
             raise InputError(f"passive: got True {obstacle}")
         if not isinstance(self.device, Device) and wanted.grasps != "none" and grasps is not None:
             raise InputError(f"grasps: got {grasps!r}, but the device is no Device with a mass; only 'none' is allowed")
-        if grasps is None and self.operator is not None:
+        if grasps is None and (self.operator is not None or not isinstance(self.device, Device)):
             wanted = wanted._replace(grasps="none")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)

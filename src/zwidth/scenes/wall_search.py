@@ -30,6 +30,7 @@ SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive onl
 NEAR = 5.0  # tolerance of the best B over the tolerance of K
 LEAST = 1e-9  # smallest stiffness tried, relative to the largest allowed one
 STEP_DOWN = 0.25  # factor by which K is lowered until a wall satisfies the requirements
+STEP_DOWN_UNSTABLE = 0.95  # the same for a device unstable without a wall, whose stable walls have a lower end in K
 HELD_GAIN = 1.1  # factor on K and B with which a wall is still stable in a required grasp, because grasps vary
 HELD = 0.95  # factor on K for the initial guess if a grasp destabilizes the wall
 FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
@@ -203,18 +204,21 @@ def find_stiffest(
         # Keep the sign, with a size that lets false_position continue: it ends at a value next to 0.
         return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
 
-    top = math.log(most)
+    top, softest = math.log(most), scene.loop.least_stiffness(-math.inf)
+    end, longest = top + math.log(LEAST), math.log(STEP_DOWN)
+    if softest is not None:
+        end, longest = math.log(softest * scene.units.stiffness), math.log(STEP_DOWN_UNSTABLE)
     low = high = top if near is None or not 0 < near < most else math.log(near)
     at_low = at_high = best_slack(low)
-    step = math.log(STEP_DOWN if low == top else FIRST_STEP)
+    step = longest if low == top else math.log(FIRST_STEP)
     while at_high > 0 and high < top:
         low, at_low = high, at_high
         high = min(high - step, top)
         at_high, step = best_slack(high), 2.0 * step
-    while at_low <= 0 and low > top + math.log(LEAST):
+    while at_low <= 0 and low > end:
         high, at_high = low, at_low
         low = low + step
-        at_low, step = best_slack(low), max(2.0 * step, math.log(STEP_DOWN))
+        at_low, step = best_slack(low), max(2.0 * step, longest)
     if at_low <= 0:
         return math.nan, math.nan
     if low < high and at_high <= 0:
