@@ -21,12 +21,12 @@ _HARDWARE = (
         "resolution",
         "m",
         POSITIVE,
-        "Step of the encoder, in m, or '2000 counts' per revolution.",
+        "Step of the encoder, in m (rotary: rad), or '2000 counts' per revolution.",
     ),
-    ("--friction", "coulomb", "N", NOT_NEGATIVE, "Coulomb friction of the device, in N."),
-    ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N. Default: --friction."),
-    ("--max-force", "max_force", "N", POSITIVE, "Largest force of the motor, in N."),
-    ("--max-rate", "max_rate", "N/s", POSITIVE, "Largest rate of change of the commanded force, in N/s."),
+    ("--friction", "coulomb", "N", NOT_NEGATIVE, "Coulomb friction of the device, in N (rotary: N m)."),
+    ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N (rotary: N m). Default: --friction."),
+    ("--max-force", "max_force", "N", POSITIVE, "Largest force of the motor, in N (rotary: torque in N m)."),
+    ("--max-rate", "max_rate", "N/s", POSITIVE, "Largest rate of change of the commanded force, in N/s (rotary: N m/s)."),
 )
 
 

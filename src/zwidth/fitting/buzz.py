@@ -64,8 +64,9 @@ def fit_buzz(
             two dampings. Texts with units, such as "0.4 N m/rad", are allowed.
         period: T in s.
         velocity: the velocity estimate; the backward difference by default.
-        noise: relative standard deviation of K and f, as 0.02 or "2%", or one for each. By default it is equal for both and
-            estimated from the residuals, which is inaccurate for two or three walls; identical walls then count once.
+        noise: relative standard deviation of K and f, as 0.02 or "2%", or one for each. By default it is equal for both
+            and estimated from the residuals, which is inaccurate for two or three walls; identical walls then count
+            once.
         rotary: True if K is in N m/rad and B in N m s/rad. By default, the units of the points decide; numbers without
             units are those of a linear device.
 

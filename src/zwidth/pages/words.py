@@ -150,10 +150,10 @@ def scene_notes(scene: Scene) -> list[str]:
     from zwidth.scenes.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
-    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *_compare_with_limit(scene)]
+    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *compare_with_limit(scene)]
 
 
-def _compare_with_limit(scene: Scene) -> list[str]:
+def compare_with_limit(scene: Scene) -> list[str]:
     """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
     limit = scene.safe_limit
     return [] if limit is None or isinstance(scene.wall, NoWall) else [*limit_cautions(scene), *limit.warnings]
