@@ -327,7 +327,11 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option("--stiffness-fraction", type=SHARE, help="Largest share of K_max.  [default: 75%]")
 @click.option("--gain-margin", type=_FACTOR, help="Smallest gain margin, a factor on K and B together.  [default: 2]")
 @click.option("--phase-margin", type=_DEGREES, help="Smallest phase margin, in degrees.  [default: 30]")
-@click.option("--passive", is_flag=True, help="Only passive walls: stable in any grasp, because no passive hand can destabilize them.")
+@click.option(
+    "--passive",
+    is_flag=True,
+    help="Only passive walls: stable in any grasp, because no passive hand can destabilize them.",
+)
 @click.option(
     "--grasps",
     type=click.Choice(("all", "soft", "none")),

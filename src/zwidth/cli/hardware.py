@@ -26,8 +26,21 @@ _HARDWARE = (
     ("--friction", "coulomb", "N", NOT_NEGATIVE, "Coulomb friction of the device, in N (rotary: N m)."),
     ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N (rotary: N m). Default: --friction."),
     ("--max-force", "max_force", "N", POSITIVE, "Largest force of the motor, in N (rotary: torque in N m)."),
-    ("--max-rate", "max_rate", "N/s", POSITIVE, "Largest rate of change of the commanded force, in N/s (rotary: N m/s)."),
+    (
+        "--max-rate",
+        "max_rate",
+        "N/s",
+        POSITIVE,
+        "Largest rate of change of the commanded force, in N/s (rotary: N m/s).",
+    ),
 )
+
+
+def add_option(command: Command, chosen: str) -> Command:
+    """Add the option of one hardware parameter, such as "max_force"."""
+    flag, name, unit, allowed, text = next(each for each in _HARDWARE if each[1] == chosen)
+    kind = quantity_type(unit, allowed, counts=name == "resolution")
+    return click.option(flag, name, type=kind, help=text)(command)
 
 
 def hardware_options(command: Command) -> Command:
@@ -46,9 +59,8 @@ def hardware_options(command: Command) -> Command:
         return command(hardware=known | hardware, **given)
 
     decorated: Callable[..., Any] = with_hardware
-    for flag, name, unit, allowed, text in reversed(_HARDWARE):
-        kind = quantity_type(unit, allowed, counts=name == "resolution")
-        decorated = click.option(flag, name, type=kind, help=text)(decorated)
+    for each in reversed(_HARDWARE):
+        decorated = add_option(decorated, each[1])
     return decorated
 
 

@@ -76,7 +76,9 @@ studies: [{{kind: recommend, name: wall}}]
 
 def test_k_max_beyond_the_safe_limit_of_a_file_has_a_caution(tmp_path):
     file = tmp_path / "fitted.yaml"
-    file.write_text(FITTED.format('{stiffness: 0, reason: "resolve the warnings first", warnings: ["the clock jumps"]}'))
+    file.write_text(
+        FITTED.format('{stiffness: 0, reason: "resolve the warnings first", warnings: ["the clock jumps"]}')
+    )
     text = " ".join(ridge(str(file)).split())
     caution = "the real device may be unstable. no wall is supported: resolve the warnings first"
     assert f"CAUTION this wall exceeds the safe limit: {caution} CAUTION the clock jumps next" in text
