@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from zwidth import __version__
-from zwidth.cli.hardware import diagnose_wall, hardware_options
+from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     SHARE,
@@ -88,7 +88,8 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
             result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
-        lines = check_lines(scene, verdict, limits, silent=find_silent(), diagnosis=diagnosis, verbose=verbose)
+        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
+        lines = check_lines(scene, verdict, limits, **told, diagnosis=diagnosis, verbose=verbose)
     words.tell(result, lines + words.note_lines(notes), as_json, words.LABEL)
 
 
@@ -385,7 +386,8 @@ def recommend(
         result["cautions"] += words.silent_cautions(scene, find_silent())
         result |= {} if diagnosis is None else {"diagnosis": diagnosis.as_dict()}
     else:
-        lines = recommend_lines(found, silent=find_silent(), diagnosis=diagnosis, verbose=verbose)
+        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
+        lines = recommend_lines(found, **told, diagnosis=diagnosis, verbose=verbose)
     words.tell(result, [*lines, *words.note_lines(notes), *wrote], as_json, words.LABEL)
     if found.status != Status.OK:
         raise SystemExit(EXIT_FAILED)

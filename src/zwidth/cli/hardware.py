@@ -64,6 +64,17 @@ def hardware_options(command: Command) -> Command:
     return decorated
 
 
+def spell_hardware_of_file(scene: Scene) -> str:
+    """Return encoder, friction and motor in words, as far as the scene file of the command supplies them; "" if not."""
+    from zwidth.scenes.trials import spell_hardware
+
+    given = click.get_current_context().params
+    values = {name: value for name, value in get_hardware().items() if given[name] is None}
+    if not values or isinstance(scene.device, MeasuredDevice):
+        return ""
+    return f"{spell_hardware(values, scene.unit_system)} (from {given['scene_file'].name})"
+
+
 def diagnose_wall(scene: Scene, hardware: dict[str, Any], *, remedies: bool) -> Any:
     """Return the `zwidth.diagnose` result of a wall with the given hardware; None without hardware.
 

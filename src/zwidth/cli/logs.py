@@ -187,11 +187,10 @@ def _diagnose(found: Any, motor: dict[str, float]) -> Any:
 def _list_lines(found: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
     """Return the printed lines of a fit, with the results in a hand and of a simulation as `zwidth recommend`."""
     from zwidth.fitting.words import detail_fit, summarize_fit
-    from zwidth.pages.verdict import spell_hands
 
     checks, more = [], "details: --verbose; scene for the other commands: --yaml"
     if found.recommended.status == Status.OK:
-        checks = [("in a hand", spell_hands(found.recommended))]
+        checks = [("in a hand", found.recommended.spell_hands())]
         more += "; program for the loop: --code c"
     checks += spell_diagnosis(diagnosis)
     details = [("", ""), *detail_fit(found, source)] if verbose else []

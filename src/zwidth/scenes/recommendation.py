@@ -13,6 +13,7 @@ from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_limit
 from zwidth.parts.device import Device
+from zwidth.parts.grasps import RADII
 from zwidth.parts.safe_limit import SafeLimit
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.assessment import (
@@ -186,8 +187,9 @@ class Recommendation:
         )
         room = f"B from {lower} to {upper} is stable at this K"
         margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
+        hands = [f"in a hand: {hands}"] if (hands := self.spell_hands()) else []
         cautions = (f"caution: {caution}" for caution in self.cautions)
-        return f"{self.spell_wall()}: {self.spell_limit()}", margins, *cautions
+        return f"{self.spell_wall()}: {self.spell_limit()}", margins, *hands, *cautions
 
     def spell_wall(self) -> str:
         """Return the recommended wall in words."""
@@ -221,6 +223,16 @@ class Recommendation:
         gain, phase, late = (round_margin(f"{name}_margin", verdict, True, 3) for name in ("gain", "phase", "delay"))
         delay = "not known" if math.isnan(late) else with_unit(late, "s", 3)
         return f"gain {plain(gain, 3)}, phase {plain(phase, 3)} deg, delay {delay}"
+
+    def spell_hands(self) -> str:
+        """Return the stability of the wall in the reference grasps in words; "" if there are none."""
+        labels = {name: stable for name, stable in self.grasps.items() if name != "released"}
+        if not labels:
+            return ""
+        radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if self.unit_system.rotary else ""
+        stable = sum(labels.values())
+        count = "all six" if stable == len(labels) else f"{stable} of {len(labels)}"
+        return f"stable in {count} reference grasps{radii}"
 
     def spell_passive(self) -> str:
         """Return the passivity of the wall in words."""
