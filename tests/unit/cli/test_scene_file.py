@@ -200,3 +200,18 @@ def test_an_encoder_simulated_without_friction_has_a_caution(tmp_path):
     assert "friction" not in CliRunner().invoke(cli, ["ridge", str(file)]).stdout
     run = CliRunner().invoke(cli, ["run", str(file), "--out", str(tmp_path / "run")]).stdout
     assert "simulated with encoder step 20.0 µm, without friction: " in " ".join(run.split())
+
+
+def test_a_filter_of_sections_is_that_of_python(tmp_path):
+    file = tmp_path / "filtered.yaml"
+    sections = {"numerator": [[1000, -1000], [0.2, 0.1]], "denominator": [[1, 0], [1, -0.7]]}
+    filtered = (
+        f", velocity: {{kind: filter, numerator: {sections['numerator']}, denominator: {sections['denominator']}}}"
+    )
+    file.write_text(WITH_HARDWARE.format(filtered))
+    found = json.loads(CliRunner().invoke(cli, ["ridge", str(file), "--json"]).stdout)["stiffness_max"]
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), velocity=zwidth.VelocityFilter(**sections))
+    assert found == float(scene.max_stiffness().stiffness)
+    file.write_text(file.read_text().replace("[0.2, 0.1]", "3"))
+    with pytest.raises(zwidth.ConfigError, match=r"numerator\[1\]: got 3; coefficients are a list"):
+        CliRunner().invoke(cli, ["ridge", str(file)], catch_exceptions=False)
