@@ -171,6 +171,9 @@ class SafeLimitSection(PartSection, what="a safe limit"):
     warnings: list[str] = Field(default=[])
     """Warnings about the measurements."""
 
+    damping_reserve: Annotated[float, Quantity("N s/m", NOT_NEGATIVE)] = 0.0
+    """Physical damping that passivity does not count, because its estimate is uncertain, in N s/m or with a unit."""
+
 
 def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Strict]:
     """A base of what has a section for each of the parts that a scene need not have."""

@@ -241,6 +241,8 @@ def _write_limit(fit: DeviceFit) -> list[str]:
         f"    virtual_damping: {float(limit.virtual_damping)!r} {unit_of('damping', fit.unit_system)}",
         f"    reason: {json.dumps(limit.reason, ensure_ascii=False)}",
     ]
+    reserve = f"    damping_reserve: {limit.damping_reserve!r} {unit_of('damping', fit.unit_system)}"
+    lines += [f"{reserve} # not counted for passivity: b minus its lower end"] if limit.damping_reserve else []
     warnings = [f"      - {json.dumps(text, ensure_ascii=False)}" for text in limit.warnings]
     return lines + (["    warnings:", *warnings] if warnings else [])
 

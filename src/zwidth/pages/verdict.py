@@ -23,6 +23,7 @@ from zwidth.pages.words import (
     word_of,
 )
 from zwidth.parts.device import Device
+from zwidth.parts.safe_limit import reserve_damping
 from zwidth.scenes.assessment import round_margin
 from zwidth.scenes.cautions import find_thin
 from zwidth.scenes.stabilization import stabilize
@@ -203,6 +204,9 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     if abs(margin) <= ROUNDED * dampings:
         return "on the limit: no physical damping to spare"
     size = with_unit(abs(round_safely(margin, "below")), scene.unit_system["N s/m"])
+    if verdict.passive and margin < (reserve := reserve_damping(scene)):
+        spread = with_unit(reserve, scene.unit_system["N s/m"])
+        return f"uncertain: {size} of physical damping to spare, but the fitted damping may be lower by {spread}"
     if verdict.passive:
         return f"yes: {size} of physical damping to spare"
     return f"{'no' if scene.device.coupling is None else 'not certified'}: {size} more physical damping needed"

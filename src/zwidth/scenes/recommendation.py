@@ -14,7 +14,7 @@ from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_limit
 from zwidth.parts.device import Device
 from zwidth.parts.grasps import RADII
-from zwidth.parts.safe_limit import SafeLimit
+from zwidth.parts.safe_limit import SafeLimit, reserve_damping
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.assessment import (
     Assessment,
@@ -237,6 +237,8 @@ class Recommendation:
     def spell_passive(self) -> str:
         """Return the passivity of the wall in words."""
         passive = None if self.verdict is None else self.verdict.passive
+        if passive and self.verdict is not None and self.verdict.passivity_margin < reserve_damping(self.scene):
+            return "uncertain, because the fitted damping is"
         obstacle = find_obstacle(**vars(self.scene.device)).partition(":")[0]
         return {True: "yes", False: "no", None: f"not known {obstacle}".rstrip()}[passive]
 

@@ -15,7 +15,7 @@ import numpy as np
 from zwidth.arrays.roots import false_position, find_lowest
 from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
-from zwidth.parts.safe_limit import SafeLimit
+from zwidth.parts.safe_limit import SafeLimit, reserve_damping
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, soft_dampings
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
@@ -133,6 +133,7 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, held: Sequence[SceneOptima
     wall, so that a search for the largest slack prefers well-damped walls.
     """
     device_damping = float(scene.device.damping)
+    reserve = 0.0 if wanted.beyond_safe else reserve_damping(scene)
     asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
     asked += ["modulus_margin"] if held else []
 
@@ -148,7 +149,7 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, held: Sequence[SceneOptima
             if wanted.phase_margin:
                 slacks["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
         if wanted.passive:
-            margin = np.asarray(scene.passivity_margin(stiffness, damping)) / (device_damping or 1.0)
+            margin = (np.asarray(scene.passivity_margin(stiffness, damping)) - reserve) / (device_damping or 1.0)
             # A margin of exactly 0 must yield a negative slack, because such a wall is not passive.
             slacks["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
         if held:
@@ -288,6 +289,10 @@ def _choose_free(
             reason = f"no wall satisfies {' and '.join(map(wanted.spell, spare))}; relax a requirement"
             if wanted.passive and scene.device.damping == 0:
                 reason = "no passive wall exists, because the device has no physical damping"
+            elif wanted.passive and safe is not None and scene.device.damping <= safe.damping_reserve:
+                reason = (
+                    "no wall is passive for certain, because the device may have no physical damping; record longer"
+                )
             return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
         spare = slack(stiffness, damping)
         limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else active
