@@ -76,7 +76,8 @@ def _read_coefficients(raw: Any) -> tuple[Any, ...]:
     if not isinstance(raw, list | tuple):
         raise problem(f"got {describe(raw)}", "coefficients are a list, highest power first", "write [1000, -1000]")
     sections = any(isinstance(each, list | tuple) for each in raw)
-    return read_entries(raw, _read_coefficients if sections else Quantity().read, distinct=False)
+    entry: Any = _read_coefficients if sections else Quantity().read
+    return read_entries(raw, entry, distinct=False)
 
 
 _NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 1}
