@@ -1,8 +1,14 @@
 """Compute the stability boundary of rigid devices: the curve, points at given beta or alpha, the outline and the area.
 
-The stable walls of a device fill one region of the (alpha, beta) plane. Its outline consists of the stability lobe of
-the boundary curve (`loops.rigid.curve`), of a line of walls with a pole at z = -1 for short delays and strong damping,
-and of alpha = 0, where a pole is at z = 1 (docs/theory/boundary.md, docs/theory/one-lobe.md).
+The stable walls of a device, with its normalized physical damping delta and its delay of d = n + f periods, fill one
+region of the (alpha, beta) plane. Its outline consists of
+
+- the *lobe*, the first part of the boundary curve (`loops.rigid.curve`), on which a pole pair is at e^(+-j omega);
+- for short delays and strong damping, a line alpha + 2 beta = const of walls with a pole at z = -1, which the lobe
+  meets in the *corner*;
+- the line alpha = 0, on which a pole is at z = 1 (docs/theory/boundary.md, docs/theory/one-lobe.md).
+
+The *ridge* is the point of the lobe with the largest alpha. The code parameterizes the lobe by x (`loops.rigid.curve`).
 """
 
 from __future__ import annotations
@@ -145,7 +151,7 @@ def boundary_point(
     line = side if beta is None else "row"
     arguments = {"delta": delta, "d": d, name: value}
     if method == "optimistix":
-        # Import on demand, because the solvers take a second to import.
+        # Import only if requested, because importing the solvers takes a second.
         from zwidth.loops.rigid.exact_points import point_kernel
 
         return BoundaryPoint(*evaluate(point_kernel, arguments, line, ridge_kernel, route="jax"))
@@ -153,7 +159,16 @@ def boundary_point(
 
 
 def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -> BoundaryPoint:
-    """Return the boundary point at the beta ("row") or alpha ("lower", "upper") that ``number`` contains."""
+    """Return the boundary point at a given beta or alpha.
+
+    Args:
+        delta: Normalized physical damping.
+        d: Delay in periods.
+        number: The given beta if ``line`` is "row"; the given alpha if it is "lower" or "upper".
+        line: "row" for the largest stable alpha at this beta; "lower" or "upper" for the smallest or the largest stable
+            beta at this alpha.
+        kind: `DelayClasses` of d.
+    """
     xp, is_row, zero = namespace(delta, d, number), line == "row", 0.0 * number
     input_status = wall_status(*((zero, number) if is_row else (number, zero)), delta, d)
     curve = build_lobe(delta, d, kind)
@@ -163,7 +178,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
         x, on_lobe, exists = limit.x, limit.meets_lobe, (limit.meets_lobe | limit.beyond) & (limit.alpha > 0)
         x = follow_root(lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta)
         point = evaluate_lobe(x, curve)
-        # Return the value that `zwidth.is_stable` compares alpha with, with the derivatives of the curve.
+        # Return exactly the alpha with which `zwidth.is_stable` compares, but with the derivatives of the lobe.
         alpha = limit.alpha if xp is np else frozen(limit.alpha, xp) + (point.alpha - frozen(point.alpha, xp))
         beta = number
     else:
@@ -176,11 +191,11 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
             lambda x, curve, alpha: evaluate_lobe(x, curve).alpha - alpha, x, lambda *_: True, curve, number
         )
         point = evaluate_lobe(x, curve)
-        # Take no further step, because near the ridge it would be a quotient of rounding errors.
+        # Take no further Newton step, because near the ridge the step would be a quotient of rounding errors.
         alpha, beta = number, point.b - delta
     omega = compute_frequency(x, curve)
     if curve.short_curve is not None and line != "lower":
-        # On the line with a pole at z = -1, alpha + 2 beta is constant.
+        # On the line of walls with a pole at z = -1, alpha + 2 beta is constant.
         line_value = compute_corner_line(curve) - (2.0 * number if is_row else number)
         alpha = xp.where(on_lobe, alpha, line_value) if is_row else alpha
         beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * line_value)
@@ -193,7 +208,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
 
 
 class Piece(IntEnum):
-    """The pole that crosses the unit circle on a part of the outline."""
+    """The pole that is on the unit circle along one part of the outline."""
 
     COMPLEX_PAIR = 0
     MINUS_ONE = 1
@@ -202,7 +217,7 @@ class Piece(IntEnum):
 
 @shown()
 class StableRegion(NamedTuple):
-    """A closed outline: vertex k lies on ``piece[k]``; alpha = 0 joins the last vertex to the first."""
+    """Closed outline of the stable set: vertex k lies on ``piece[k]``, and alpha = 0 joins the last to the first."""
 
     alpha: Vertices
     beta: Vertices
@@ -233,7 +248,7 @@ def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices,
         if first < last
         else last * half_grid
     )
-    # The rounding error of the last product may exceed the end.
+    # Limit omega to the end of the lobe, because the rounding error of the last product may exceed it.
     omega = np.minimum(omega, last)
     wall = boundary(omega, delta, d)
     return omega, np.asarray(wall.alpha), np.asarray(wall.beta)
@@ -265,7 +280,7 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     omega, alpha, beta = sample_lobe(delta, d, points=points)
     piece = np.full(omega.shape, Piece.COMPLEX_PAIR)
     if omega[-1] == np.pi and alpha[-1] > 0:
-        # From the corner along the line alpha + 2 beta = const to alpha = 0.
+        # Add the straight part from the corner along alpha + 2 beta = const to alpha = 0.
         omega, piece = np.append(omega, np.pi), np.append(piece, Piece.MINUS_ONE)
         beta = np.append(beta, beta[-1] + 0.5 * alpha[-1])
         alpha = np.append(alpha, 0.0)
@@ -273,8 +288,8 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     return StableRegion(alpha, beta, omega, piece)
 
 
-LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic
-LOBE_WEIGHT = 16  # time and memory of a point relative to a point of other kernels
+LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe; the integrand alpha d(beta) is analytic there
+LOBE_WEIGHT = 16  # computing time and memory per point of `stable_area`, relative to other kernels
 
 
 def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
@@ -310,15 +325,16 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
     curve = build_lobe(delta, d, kind)
     end = frozen(curve.end, xp)
-    # From a corner, the outline returns to alpha = 0 along alpha + 2 beta = const.
+    # If the lobe ends in the corner, the outline continues to alpha = 0 along alpha + 2 beta = const.
     point = evaluate_lobe(end, curve)
     corner_alpha = xp.where(curve.to_corner, point.alpha, 0.0)
     if xp is not np:
-        # Without a corner, the end is a zero of alpha; second derivatives of the area need its derivative.
+        # Without a corner, alpha is 0 at the end of the lobe. Add one Newton step, because second derivatives of the
+        # area need the derivative of this end.
         end = end - xp.where(
             curve.to_corner, 0.0, point.alpha / frozen(xp.where(curve.to_corner, 1.0, point.d_alpha), xp)
         )
-    # Add an axis for the nodes.
+    # Add an axis for the quadrature nodes.
     expanded = tree_map(lambda value: None if value is None else value[..., None], curve)
 
     def integrand(x: Array) -> Array:

@@ -1,11 +1,16 @@
 """Certify stability verdicts of rigid loops: by the closed form with a static error bound, then by ball arithmetic.
 
-Both steps evaluate the source code of `loops.rigid.crossover`, with other numbers:
+Both steps evaluate the source code of `loops.rigid.crossover`, with other number types:
 
-1. `Sized`: float64 values, each with the sum of the magnitudes of its terms. A comparison holds if the difference
-   exceeds `TOLERANCE` times that sum. This static bound covers all rounding errors (docs/theory/certified.md).
+1. `Sized`: float64 values, each with a *size*, the sum of the magnitudes of its terms. A comparison is true if the
+   difference exceeds `TOLERANCE` times its size. This static bound covers all rounding errors
+   (docs/theory/certified.md).
 2. Balls of python-flint (optional) around exact inputs, for walls that the first step leaves open. The precision is
    doubled until the verdict is certain.
+
+As in `loops.rigid.crossover`, the wall has the normalized stiffness alpha and damping beta, the device the normalized
+damping delta, the delay is d = n + f periods, c = e^-delta and phi1 = (1 - c)/delta. The gain crossover w determines
+u = 1 - cos w, the zero of a cubic. N(z) = a2 z^2 + a1 z + a0 is the numerator of the discretized device.
 
 A wall stays UNDECIDED if poles other than z = 1 lie exactly on the unit circle. For delta > 0 and alpha > 0 no such
 wall is known: c is then transcendental, but alpha, beta, delta and d are rational.
@@ -43,13 +48,13 @@ from zwidth.words.xp import horner, namespace, nan_beyond, roots, store_once
 if TYPE_CHECKING:
     import flint
 
-# Relative to the size of a number. Steps C1 to C6 of docs/theory/certified.md derive the three bounds.
+# Error bounds, relative to the size of a number. Steps C1 to C6 of docs/theory/certified.md derive them.
 TOLERANCE = 2.0**-35  # largest error of a number that depends on the gain crossover u
 CROSSOVER_WIDTH = 2.0**-39  # largest relative error of the gain crossover u = 1 - cos omega
 CUBIC_TOLERANCE = 2.0**-45  # largest error of the cubic H whose zero is u
 TINY = 2.0**-960  # added to each size; TOLERANCE * TINY exceeds what XLA flushes to zero
 
-# Codes of `compute_wall_codes`.
+# Codes of walls returned by `compute_wall_codes`.
 UNSTABLE = 0
 STABLE = 1
 OPEN = 2  # the error bound permits both verdicts
@@ -57,10 +62,10 @@ EDGE = 3  # alpha = 0, and all poles but z = 1 lie inside the unit circle
 
 
 class Sized:
-    """Float64 values with the sum of the magnitudes of their terms, elementwise.
+    """Float64 values, each with its size, the sum of the magnitudes of its terms, elementwise.
 
     The exact number differs from ``value`` by at most ``TOLERANCE * size``; without ``size``, ``value`` is exact. The
-    operators are those of ``flint.arb``.
+    class has the operators of ``flint.arb`` that `loops.rigid.crossover` uses.
     """
 
     __slots__ = ("exact", "size", "value")
@@ -74,7 +79,7 @@ class Sized:
     def __add__(self, other: Any) -> Sized:
         other = other if isinstance(other, Sized) else Sized(other)
         value = self.value + other.value
-        # The sum of two exact numbers has only its own rounding error.
+        # A sum of two exact numbers has no error but its own rounding error.
         return Sized(value, abs(value) + TINY if self.exact and other.exact else self.size + other.size)
 
     __radd__ = __add__
@@ -100,9 +105,9 @@ class Sized:
         return Sized(quotient, xp.where(least > 0, (self.size + abs(quotient) * other.size) / least, xp.inf))
 
     def sqrt(self) -> Sized:
-        """Return the square root; NaN if ``value`` is negative."""
+        """Return the square root, with NaN if ``value`` is negative."""
         root = roots(self.value)[0]
-        # |sqrt x - sqrt v| = |x - v|/(sqrt x + sqrt v)
+        # The size follows from |sqrt x - sqrt v| = |x - v|/(sqrt x + sqrt v), with v the value and x the exact number.
         return Sized(root, self.size / root)
 
     def __gt__(self, other: Any) -> Array:
@@ -114,7 +119,7 @@ class Sized:
 
 
 def compute_wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
-    """Return the code of each wall, elementwise."""
+    """Return UNSTABLE, STABLE, OPEN or EDGE for each wall, elementwise."""
     xp, plant = namespace(alpha, beta, delta), size_device(delta, d, kind)
     wall, verdicts = (Sized(alpha), Sized(beta)), []
     if kind.short:
@@ -122,8 +127,9 @@ def compute_wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: 
     if kind.long:
         verdicts.append(decide_long_delay(*wall, plant.whole, plant, enclose_root, size_phase))
     stable, unstable = (xp.where(plant.whole < 1, *pair) for pair in zip(verdicts[0], verdicts[-1], strict=True))
-    # At alpha = 0 the verdict is on the poles other than z = 1, for beta > delta (docs/theory, S15b). For alpha > 0 the
-    # lobe lies above beta = -delta (L16). P(1) = phi1 alpha < 0 implies a real pole above 1.
+    # At alpha = 0 the verdict applies to the poles other than z = 1 and requires beta > delta (docs/theory, S15b). For
+    # alpha > 0 the stable set lies above beta = -delta (L16). If alpha < 0, a real pole is above 1, because
+    # P(1) = phi1 alpha < 0.
     b, edge = wall[1] + plant.delta, alpha == 0
     valid = (edge & (beta > delta)) | ((alpha > 0) & (b > 0))
     code = xp.where(stable & valid, xp.where(edge, EDGE, STABLE), OPEN)
@@ -132,21 +138,21 @@ def compute_wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: 
 
 
 def size_device(delta: Array, d: Array, kind: DelayClasses) -> DeviceTerms:
-    """Return the `DeviceTerms` of exact delta and d, NaN if out of range."""
+    """Return the discretized device of exact delta and d as `Sized` numbers, NaN if out of range."""
     plant = discretize(delta, d, kind)
     if kind.fractional and kind.long:
         plant = store_once(plant, delta)  # because several loops of the compiled program use it
     sized = DeviceTerms(*(Sized(value, abs(value) + TINY) for value in plant))
     sized = sized._replace(delta=Sized(plant.delta), f=Sized(plant.f), whole=plant.whole, a0=None)
     if kind.fractional:
-        # The rounding error of f changes a0 by up to 2^-52 a1.
+        # Increase the size of a0, because the rounding error of f changes a0 by up to 2^-52 a1.
         a0 = Sized(plant.a0, plant.a0 + plant.a1 / 16.0 + TINY)
         return sized._replace(a0=a0, gap=sized.a2 - sized.a1 + a0)
     return sized
 
 
 def enclose_root(coefficients: tuple[Sized, ...]) -> tuple[Sized, Array]:
-    """Return the zero of the cubic, and whether sign changes certify it to `CROSSOVER_WIDTH`."""
+    """Return the zero u of the cubic, and whether sign changes of the cubic prove its error to be `CROSSOVER_WIDTH`."""
     u = find_first_root(tuple(h.value for h in coefficients))
     low, high = (horner(Sized(u * (1.0 + side)), coefficients) for side in (-CROSSOVER_WIDTH, CROSSOVER_WIDTH))
     changes_sign = (low.value > CUBIC_TOLERANCE * low.size) & (high.value < -CUBIC_TOLERANCE * high.size)
@@ -154,9 +160,9 @@ def enclose_root(coefficients: tuple[Sized, ...]) -> tuple[Sized, Array]:
 
 
 def size_phase(u: Sized, n: Array) -> DelayPhase:
-    """Return the delay phase at the crossover."""
+    """Return the phase lag (n + 1/2) w at the gain crossover u = 1 - cos w, with the sizes of its sine and cosine."""
     phase = evaluate_phase(u.value, n)
-    # The half angle h is at most pi/2, so that h <= pi/2 sin h.
+    # Half the phase lag, h, is at most pi/2, so h <= pi/2 sin h bounds the error of the sine.
     cosine, sine = Sized(phase.cosine, 1.0), Sized(phase.sine, 4.0 * roots(phase.half_sine_squared)[0] + TINY)
     return DelayPhase(
         cosine, sine, Sized(phase.half_sine_squared, 5.0 * phase.half_sine_squared + TINY), phase.within, phase.beyond
@@ -164,7 +170,7 @@ def size_phase(u: Sized, n: Array) -> DelayPhase:
 
 
 def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
-    """Return certified labels and their statuses; ON_BOUNDARY or UNDECIDED for walls without a label."""
+    """Return certified stability labels and statuses; the status is ON_BOUNDARY or UNDECIDED without a label."""
     columns = points.columns()
     code = filter_walls(*columns)
     stable, status = code == STABLE, np.zeros(code.shape, np.int32)
@@ -176,8 +182,8 @@ def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
 
 
 def filter_walls(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return the code of each wall; OPEN if out of range."""
-    # Find invalid numbers by NumPy, because XLA treats those below 2^-1022 as 0.
+    """Return the code of each wall (`compute_wall_codes`); OPEN if it is out of range."""
+    # Replace negative delta and d by NaN in NumPy, because XLA treats numbers below 2^-1022 as 0.
     device = (np.where(value < 0, np.nan, value) for value in (delta, d))
     return evaluate_columns(compute_wall_codes, [*nan_beyond(WALL_RANGE, alpha, beta), *device], classify_delays(d))
 
@@ -185,15 +191,15 @@ def filter_walls(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.n
 def _decide_rest(
     code: np.ndarray, alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return labels and statuses of walls that are at the edge alpha = 0, out of range, or left open by the filter."""
+    """Return labels and statuses of the walls that are at alpha = 0, out of range, or left open by `filter_walls`."""
     code, alpha, beta, delta, d = np.broadcast_arrays(code, alpha, beta, delta, d)
     status = wall_status(alpha, beta, delta, d)
     in_range, stable = status == Status.OK, np.zeros(code.shape, bool)
-    # For alpha = 0 and |beta| <= delta, |beta N| <= |beta| phi1 <= 1 - c <= |z - c| on the circle: apart from z = 1, no
-    # pole lies outside.
+    # For alpha = 0 and |beta| <= delta no pole other than z = 1 lies on or outside the unit circle, because there
+    # |beta N| <= |beta| phi1 <= 1 - c <= |z - c|.
     edge = (alpha == 0) & ((code == EDGE) | (np.abs(beta) <= delta))
     status[in_range & edge] = Status.ON_BOUNDARY
-    # Walls with beta <= -delta are unstable: P(1) = 0 and P'(1) = phi1 (delta + beta) < 0, or L16.
+    # Walls with beta <= -delta are unstable, because P(1) = 0 and P'(1) = phi1 (delta + beta) < 0, or by L16.
     open_walls = np.flatnonzero(in_range & ~edge & (beta > -delta))
     status[open_walls] = Status.UNDECIDED
     if open_walls.size and available():
@@ -203,7 +209,7 @@ def _decide_rest(
 
 
 def decide(alpha: float, beta: float, delta: float, d: float) -> tuple[bool, Status]:
-    """Return label and status of one wall by balls; alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
+    """Return label and status of one wall by ball arithmetic, for beta > -delta, or beta > delta if alpha = 0."""
     at_edge = alpha == 0
     for bits in BITS:
         stable, unstable = compute_verdict(alpha, beta, delta, d, bits)
@@ -213,7 +219,7 @@ def decide(alpha: float, beta: float, delta: float, d: float) -> tuple[bool, Sta
 
 
 def compute_verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Verdict:
-    """Return the verdict at one precision."""
+    """Return the stability verdict of one wall by ball arithmetic with a precision of ``bits``."""
     import flint
 
     with flint.ctx.workprec(bits):
@@ -227,7 +233,7 @@ def compute_verdict(alpha: float, beta: float, delta: float, d: float, bits: int
 
 @lru_cache(maxsize=64)
 def device(delta: float, d: float, bits: int) -> DeviceTerms:
-    """Return the device of exact delta and d in balls, cached because all walls of a grid share it."""
+    """Return the discretized device of exact delta and d in balls, cached because all walls of a grid share it."""
     import flint
 
     # Use 64 more bits, because the phi-functions amplify the rounding error of delta (1 - f).
@@ -240,7 +246,7 @@ def device(delta: float, d: float, bits: int) -> DeviceTerms:
 
 
 def _phi(x: flint.arb) -> PhiFunctions:
-    """Return the phi-functions of x >= 0; the working precision compensates the cancellation of the quotients."""
+    """Return the phi-functions of x >= 0, with more precision for small x, where their quotients cancel."""
     import flint
 
     if x == 0:
@@ -255,7 +261,7 @@ def _phi(x: flint.arb) -> PhiFunctions:
 
 
 def _enclose_root_in_balls(coefficients: tuple[flint.arb, ...]) -> tuple[flint.arb, bool]:
-    """Return a ball around the zero of the cubic, and whether sign changes certify it."""
+    """Return a ball around the zero of the cubic, and whether sign changes of the cubic certify it."""
     import flint
 
     midpoints = [h.mid() for h in coefficients]
@@ -273,7 +279,7 @@ def _enclose_root_in_balls(coefficients: tuple[flint.arb, ...]) -> tuple[flint.a
 
 
 def _evaluate_phase_in_balls(u: flint.arb, n: int) -> DelayPhase:
-    """Return the delay phase at the crossover, in balls."""
+    """Return the phase lag (n + 1/2) w at the gain crossover u = 1 - cos w, in balls."""
     import flint
 
     w = (u / 2).sqrt().asin() * 2

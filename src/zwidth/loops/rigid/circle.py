@@ -1,21 +1,20 @@
 """Count the poles outside a circle |z| = r by the argument principle, from the gain crossovers on that circle.
 
-P = T + B as in `loops.rigid.crossover`, with s = alpha + beta and d = n + f:
+P = T + B as in `loops.rigid.crossover`, with c = e^-delta, s = alpha + beta and the delay d = n + f:
 
-    T = z^(1+n) (z - 1)(z - c)                   device and delay
-    B = M(z) (s z - beta)                        wall,  M = (a2 z + h)(1 + q/z); its zeros are real and not positive
+    T = z^(1+n) (z - 1)(z - c)    device and delay
+    B = M(z) W(z)                 wall,  W = s z - beta,  M = (a2 z + h)(1 + q/z) with real zeros <= 0
 
-On ``z = r e^(j w)``, 0 < w < pi, with x = sin^2(w/2), a factor z - a with real a satisfies ``|z - a|^2 = (r - a)^2 +
-4 r a x``, and its imaginary part does not change sign. Therefore
+A *crossover* is a point of the circle with |T| = |B|. On ``z = r e^(j w)``, 0 < w < pi, with x = sin^2(w/2), a factor
+z - a with real a satisfies ``|z - a|^2 = (r - a)^2 + 4 r a x``, and its imaginary part does not change sign. Therefore
 
 - |T|^2 - |B|^2 is a quadratic in x for integer delays and a cubic for fractional ones; its zeros are the crossovers;
 - the principal values of all arguments are continuous in w, so that no phase has to be unwrapped.
 
 The number of poles inside follows from the phase difference arg T - arg B at each crossover
 (docs/theory/one-crossover.md, Theorem 4). The circle is given by log r, because r itself cannot distinguish circles
-very close to the unit circle. `count_poles_in_cell` counts for all walls of a rectangle in the (alpha, beta) plane at
-once (docs/theory/maps.md, C4).
-"""
+very close to the unit circle. `count_poles_in_cell` counts for all walls of a *cell*, a rectangle in the (alpha, beta)
+plane, at once (docs/theory/maps.md, C4).
 
 from __future__ import annotations
 
@@ -29,12 +28,12 @@ from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.types import Array
 from zwidth.words.xp import angle, apply_each, epsilon, find_turn, namespace, nan_unless, repeat
 
-# Steps of the bracketed iteration for the zeros of the cubic.
+# Maximum number of steps of the bracketed iteration for a zero of the cubic |T|^2 - |B|^2.
 CUBIC_STEPS = 6
-# Relative widening of the bounds of a cell, which covers their rounding errors.
+# Factor by which the bounds of a cell are widened, to cover their rounding errors.
 WIDENING = 1.0 + 1e-12
-# End points and midpoints, alternating, of the four pieces into which an interval between zeros is divided; each piece
-# has its own bound of the phase change.
+# Points at which the range of w of a crossover over all walls of a cell is divided, relative to this range: end points
+# and midpoints, alternating, of four pieces. The phase change is bounded on each piece separately.
 PIECE_POINTS = np.arange(9)[:, None, None] / 8.0
 
 
@@ -82,7 +81,7 @@ class _Circle(NamedTuple):
     terms: tuple[Array, ...]  # coefficients of |T|^2 and of an upper bound of |B|^2, for rounding errors
 
     def sum_magnitudes(self, x: Array) -> Array:
-        """Return the sum of |T|^2 and a bound of |B|^2 at x; their difference has a rounding error relative to it."""
+        """Return |T|^2 plus a bound of |B|^2 at x, which scales the rounding error of |T|^2 - |B|^2."""
         t0, t1, c0, c1, m0, w0, w1 = self.terms
         return (t0 + t1 * x) * (c0 + c1 * x) + m0 * (w0 + w1 * x)
 
@@ -101,7 +100,7 @@ def _evaluate_on_circle(log_r: Array, loop: LoopFactors, fractional: bool, xp: A
     r_minus_c, wall, numerator = r_minus_1 + loop.em, loop.alpha * r + loop.beta * r_minus_1, loop.a2 * r + loop.h
     power = loop.n_plus_1 * log_r
     smaller = xp.exp(-xp.abs(power))
-    # Divide by the larger of r^(1+n) and 1, so that nothing overflows.
+    # Divide T and B by the larger of r^(1+n) and 1 to avoid overflow.
     device_scale, wall_scale = xp.where(power < 0, smaller, 1.0), xp.where(power < 0, 1.0, smaller)
     t0, t1 = device_scale * r_minus_1 * (device_scale * r_minus_1), 4.0 * r * device_scale * device_scale
     c0, c1 = r_minus_c * r_minus_c, 4.0 * r * loop.c
@@ -127,14 +126,14 @@ def _find_quadratic_zeros(h0: Array, h1: Array, h2: Array, xp: Any) -> list[Arra
     root = xp.sqrt(h1 * h1 - 4.0 * h0 * h2)
     half = -0.5 * (h1 + xp.where(h1 < 0, -root, root))
     one, other = half / h2, h0 / half
-    # If the leading coefficient is 0, one zero is infinite; if the next one is 0 as well, both are.
+    # If h2 = 0, one zero is infinite; if h1 = 0 as well, both are.
     one = xp.where(h2 == 0, np.inf, one)
     other = xp.where(half == 0, one, other)
     return [xp.minimum(one, other), xp.maximum(one, other)]
 
 
 def _find_cubic_zeros(circle: _Circle, xp: Any) -> list[Array]:
-    """Return the zeros in (0, 1) in ascending order, at most one between two extrema; NaN if there is none."""
+    """Return the zeros of the cubic |T|^2 - |B|^2 in (0, 1), one per interval between its extrema; NaN if none."""
     h0, h1, h2, h3 = circle.h
     low, high = _find_quadratic_zeros(h1, 2.0 * h2, 3.0 * h3, xp)
     low, high = (xp.where(xp.isfinite(x), xp.clip(x, 0.0, 1.0), 0.0) for x in (low, high))
@@ -145,7 +144,7 @@ def _find_cubic_zeros(circle: _Circle, xp: Any) -> list[Array]:
 
 
 def _find_zero_between(piece: tuple[Array, ...], circle: _Circle, xp: Any) -> Array:
-    """Return the zero of the cubic on an interval on which it is monotone; NaN if it has none there.
+    """Return the zero of the cubic |T|^2 - |B|^2 on an interval on which it is monotone; NaN if it has none there.
 
     Each step solves for the zero of the parabola with the value, slope and second derivative of the cubic.
 
@@ -177,7 +176,7 @@ def _find_zero_between(piece: tuple[Array, ...], circle: _Circle, xp: Any) -> Ar
 
 
 def _find_only_zero(circle: _Circle, xp: Any) -> tuple[Array, Array]:
-    """Return the zero in (0, 1) of a cubic that has different signs at 0 and 1, and whether it is the only one."""
+    """Return a zero of |T|^2 - |B|^2 in (0, 1) if its signs at 0 and 1 differ, and whether it is the only one."""
     h0, h1, h2, h3 = circle.h
     sign = xp.where(h0 > 0, 1.0, -1.0)
     x = find_first_root(tuple([sign * h for h in circle.h]))
@@ -195,7 +194,7 @@ def _find_only_zero(circle: _Circle, xp: Any) -> tuple[Array, Array]:
 def _evaluate_phase_difference(
     x: Array, circle: _Circle, loop: LoopFactors, fractional: bool, xp: Any
 ) -> tuple[Array, Array, Array]:
-    """Return arg T - arg B at a crossover, and a bound of its derivative in w.
+    """Return arg T - arg B at a crossover x, the angle w of the crossover, and a bound of the derivative in w.
 
     Returns:
         ``arg T - arg B``, continuous from w = 0; w; and a bound of the derivative of the difference in w.
@@ -206,7 +205,8 @@ def _evaluate_phase_difference(
     sign = xp.where(loop.s < 0, -1.0, 1.0)
     wall_re, wall_im = sign * (circle.wall - loop.s * drop), sign * loop.s * im
     numerator_re, numerator_im = circle.numerator - loop.a2 * drop, loop.a2 * im
-    # (z - 1)/(a2 z + h) has an argument in (0, pi), (z - c)/W with the wall's factor W one in (-pi, pi).
+    # The argument of (z - 1)/(a2 z + h) is in (0, pi) and that of (z - c)/W in (-pi, pi), so the principal value of
+    # their sum may have to be increased by 2 pi.
     p_re, p_im = re_z_minus_1 * numerator_re + im * numerator_im, im * numerator_re - re_z_minus_1 * numerator_im
     q_re, q_im = re_z_minus_c * wall_re + im * wall_im, im * wall_re - re_z_minus_c * wall_im
     v_re, v_im = p_re * q_re - p_im * q_im, p_re * q_im + p_im * q_re
@@ -215,10 +215,10 @@ def _evaluate_phase_difference(
     w = find_turn(x, y, xp)
     theta = loop.n_plus_1 * w + phase + xp.where(loop.s < 0, np.pi, 0.0)
     if fractional:
-        # arg(1 + q/z) = arg(z + q) - w, in [-pi, 0]
+        # Subtract arg(1 + q/z) = arg(z + q) - w, which is in [-pi, 0].
         ratio = loop.q / circle.r
         theta = theta - angle(1.0 + ratio - 2.0 * ratio * x, -ratio * im / circle.r)
-    # The derivative of the argument of a factor z - a is the real part of z/(z - a) = 1 + a/(z - a).
+    # Bound the derivative. For the argument of a factor z - a it is the real part of z/(z - a) = 1 + a/(z - a).
     rate = loop.n_plus_1 + 0.0 * x
     parts = [
         (1.0, re_z_minus_1, im),
@@ -232,7 +232,7 @@ def _evaluate_phase_difference(
 
 
 class PoleCount(NamedTuple):
-    """The result of the count on one circle."""
+    """The number of poles that are not inside a circle, and whether it is certain."""
 
     outside: Array  # number of poles that are not inside
     certain: Array  # rounding errors cannot have changed the count
@@ -276,12 +276,12 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
 
     def evaluate_phase(x: Array) -> tuple[Array, Array, Array]:
         theta, w, rate = _evaluate_phase_difference(x, circle, loop, fractional, xp)
-        # Rounding errors shift x by more if |T| and |B| cross at a small angle; the last value is the resulting shift
-        # of theta, in rounding units.
+        # If |T| and |B| cross at a small angle, rounding errors shift the crossover x considerably. The last value
+        # returned is the resulting shift of theta = arg T - arg B, in rounding units.
         return theta, w, rate * circle.sum_magnitudes(x) / (xp.abs(circle.differentiate(x)) * xp.sqrt(x * (1.0 - x)))
 
-    # For three zeros, trace the function only once, which halves the compile time. For two zeros this would double
-    # the run time.
+    # For three zeros, trace the function only once, which halves the compile time. For two zeros a single trace would
+    # double the run time.
     phases = list(map(evaluate_phase, zeros)) if len(zeros) < 3 else apply_each(evaluate_phase, zeros, xp)
     for valid, (theta, w, shift) in zip(valid_masks, phases, strict=True):
         turns = theta / (2.0 * np.pi)
@@ -290,7 +290,7 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
         device_larger = device_larger != valid
         certain = certain & (~valid | (0.5 - xp.abs(turns - nearest) > tolerance + 4.0 * eps * shift))
         crossovers.append(w)
-    # The count is uncertain if rounding errors have changed the number of crossovers.
+    # The count is uncertain if T is larger than B at z = -r but not according to the crossovers, or vice versa.
     certain = certain & (device_larger == device_larger_at_end)
     return PoleCount(loop.n_plus_1 + 2.0 - (stop - start + 2.0 * full_turns), certain, crossovers)
 
@@ -312,8 +312,8 @@ def count_poles_in_cell(
     circle = _evaluate_on_circle(log_r, loop, fractional, np)
     a, b = half
     r, abs_r_minus_1, power = circle.r, np.abs(circle.r_minus_1), loop.n_plus_1 * log_r
-    # Bounds that hold for all walls of the cell: on the change of W = alpha z + beta (z - 1) at x = 0, and on the
-    # changes of the coefficients w0 and w1 of |W|^2 = w0 + w1 x.
+    # Bound the changes within the cell, for all its walls: that of W = alpha z + beta (z - 1) at x = 0, and those of
+    # the coefficients w0 and w1 of |W|^2 = w0 + w1 x.
     wall_change, w1 = a * r + b * abs_r_minus_1, 4.0 * r * loop.s * loop.beta
     e0 = (2.0 * np.abs(circle.wall) * wall_change + wall_change * wall_change) * WIDENING + 1e-14 * circle.wall**2
     e1 = 4.0 * r * (np.abs(loop.s) * b + (np.abs(loop.beta) + b) * (a + b)) * WIDENING + 1e-14 * np.abs(w1)
@@ -340,7 +340,7 @@ def count_poles_in_cell(
     (device_larger, device_larger_at_end, low), (other_larger, other_larger_at_end, high) = bounds
     certain = (device_larger == other_larger) & (device_larger_at_end == other_larger_at_end)
     start, stop, wall_at_end = _evaluate_end_arguments(circle, loop, device_larger, device_larger_at_end)
-    # Where B is the larger part at an end, its sign must be the same for all walls.
+    # If |B| > |T| at z = r or z = -r, W must have the same sign there for all walls of the cell.
     certain &= (device_larger | (np.abs(circle.wall) > wall_change)) & (
         device_larger_at_end | (np.abs(wall_at_end) > a * r + b * (1.0 + r))
     )
@@ -352,8 +352,8 @@ def count_poles_in_cell(
     first, x, second = cuts[:-1:2], cuts[1::2], cuts[2::2]
     turns = _evaluate_phase_difference(x, circle, loop, fractional, np)[0] / (2.0 * np.pi)
     nearest = np.round(turns[0])
-    # The derivative of arg(z - a) is the real part of z/(z - a) = 1 + a/(z - a). Evaluate each factor at that end of
-    # the piece at which |z - a| is smallest.
+    # Bound the derivative of arg(z - a), the real part of z/(z - a) = 1 + a/(z - a), on each piece, by evaluating it at
+    # that end of the piece at which |z - a| is smallest.
     least_wall = np.sqrt(np.maximum(circle.wall**2 + np.minimum(w1 * first, w1 * second), 0.0))
     rate = loop.n_plus_1 + 1.0 / np.sqrt(abs_r_minus_1**2 + 4.0 * r * first) + np.abs(loop.beta) / least_wall
     rate = rate + loop.c / np.sqrt(circle.r_minus_c**2 + 4.0 * r * loop.c * first)
@@ -365,7 +365,7 @@ def count_poles_in_cell(
         relative_change < 1.0, 0.5 * np.pi * relative_change, np.inf
     )
     certain &= (~valid | (2.0 * np.pi * np.abs(turns - nearest) + phase_change < np.pi - 1e-9)).all((0, 1))
-    # T and B alternate as the larger part.
+    # Between successive crossovers, |T| > |B| and |T| < |B| alternate.
     signs = np.where(device_larger, 1.0, -1.0) * (-1.0) ** np.arange(len(valid))[:, None]
     full_turns = np.where(valid, signs * nearest, 0.0).sum(0)
     return loop.n_plus_1 + 2.0 - (stop - start + 2.0 * full_turns), certain
@@ -374,7 +374,7 @@ def count_poles_in_cell(
 def _evaluate_end_arguments(
     circle: _Circle, loop: LoopFactors, device_larger: Array, device_larger_at_end: Array
 ) -> tuple[Array, Array, Array]:
-    """Return arg P/pi at z = r and z = -r, i.e. the argument of the larger of T and B; and the wall's factor at -r."""
+    """Return arg P/pi at z = r and z = -r, which is that of the larger of T and B; and W at z = -r."""
     xp = namespace(circle.r)
     half = xp.where(loop.s < 0, -1.0, 1.0)
     start = xp.where(

@@ -4,20 +4,24 @@ The inputs are the normalized stiffness alpha and damping beta of the wall, the 
 device, and its delay of d = n + f periods (n integer, 0 <= f < 1). The discretized plant (`arrays.held_mass`) yields
 the characteristic polynomial P = T + B and the open loop L = B/T with
 
-    T = z^(n+1) (z - 1)(z - c)                device and delay
-    B = M(z) ((alpha + beta) z - beta)        wall,  M = a2 z + a1 + a0/z
+    T = z^(n+1) (z - 1)(z - c)                device and delay, c = e^-delta
+    B = M(z) ((alpha + beta) z - beta)        wall, M = a2 z + a1 + a0/z
 
 On the unit circle, z = e^(jw) with 0 < w <= pi, the code uses
 
     y = sin^2(w/2)      u = 1 - cos w = 2 y      W = alpha + beta u + j beta sin w      V = |M|^2
+    em = 1 - c          p1 = phi1 = em/delta     phi2 = (1 - phi1)/delta                psi = (phi1 - c)/delta
 
-For alpha > 0, |L| decreases strictly with frequency (one-crossover.md, Theorem 1). So there is at most one gain
-crossover, and the phase of the loop at that frequency decides stability (Theorem 2). Two implementations:
+and gap = a2 - a1 + a0. For alpha > 0, |L| decreases strictly with frequency (one-crossover.md, Theorem 1). So there is
+at most one gain crossover, and the phase of the loop at that frequency decides stability (Theorem 2).
+
+A wall on the *boundary curve* (alpha_w, beta_w) has a pole at e^(jw). The *lobe*, the first part of this curve, bounds
+the stable set, together with the line of walls with a pole at z = -1 if the lobe ends on that line, in the *corner*.
 
 d >= 1: Compute the crossover as the root of the cubic |B|^2 - |T|^2 in u (a quadratic for integer d). The point
-    (alpha_w, beta_w) of the stability boundary at this frequency has the same |W| as the wall. The wall is stable if
-    and only if this point lies on the stability lobe and the wall has the larger arg W. The second condition is
-    equivalent to ``beta alpha_w > alpha beta_w`` and to ``beta > beta_w`` (S15a), so arg W itself is not computed.
+    (alpha_w, beta_w) of the boundary curve at this frequency has the same |W| as the wall. The wall is stable if
+    and only if this point lies on the lobe and the wall has the larger arg W. The second condition is equivalent to
+    ``beta alpha_w > alpha beta_w`` and to ``beta > beta_w`` (S15a), so arg W itself is not computed.
 
 d < 1: Eliminate the crossover. A line of constant beta meets the stability lobe at the root of a quadratic in y; the
     wall is stable if and only if alpha is below the boundary there, and below the line of poles at z = -1.
@@ -58,7 +62,7 @@ class Verdict(NamedTuple):
 
 
 class DelayPhase(NamedTuple):
-    """The phase lag (n + 1/2) w of the integer delay at the gain crossover w (Theorem 2), and certain bounds on w.
+    """The phase lag (n + 1/2) w of the integer delay n at the gain crossover w, with two guaranteed bounds on w.
 
     ``within`` and ``beyond`` are true only if the stated bound is certain.
     """
@@ -70,10 +74,10 @@ class DelayPhase(NamedTuple):
     beyond: Any  # w >= pi/(n + 1): above the frequencies of the stability lobe, hence unstable
 
 
-# Coefficients h0, h1, h2[, h3] of `expand_gain_difference` -> the root u, and whether it is certainly the only root in
-# (0, 2).
+# Type of functions that return the root u of the polynomial with the coefficients h0, h1, h2[, h3]
+# (`expand_gain_difference`), and whether it is provably the only root in (0, 2).
 RootFinder = Callable[[tuple[Any, ...]], tuple[Any, Any]]
-# u and n -> the phase lag at that frequency.
+# Type of functions of u and n that return the phase lag at the frequency of u.
 DelayPhaseFunction = Callable[[Any, Any], DelayPhase]
 
 
@@ -86,9 +90,9 @@ class ShortDelayCurve(NamedTuple):
 
 
 class LongDelayCurve(NamedTuple):
-    """The terms of the boundary curve for d >= 1, as polynomials in y with the lowest power first.
+    """The terms E and H of ``(z - c) conj M = E + j H sin w``, and V, as polynomials in y with the lowest power first.
 
-    E and H are those of ``(z - c) conj M = E + j H sin w`` (boundary.md, B1). They do not depend on n.
+    These terms determine the boundary curve for d >= 1 (boundary.md, B1). They do not depend on n.
     """
 
     E: tuple[Any, ...]
@@ -101,7 +105,7 @@ def expand_short_delay_curve(plant: Any) -> ShortDelayCurve:
     """Expand the boundary curve for d < 1 in powers of y, in any arithmetic."""
     p1, em, a2, a1, a0, f = plant.p1, plant.em, plant.a2, plant.a1, plant.a0, plant.f
     t = 1.0 - f
-    # Every term of this sum is nonnegative, and the next coefficient is a single product: nothing cancels.
+    # No digits cancel, because all terms of ``total`` are nonnegative and the other coefficient is a single product.
     total = f * (f * em + p1) + t * (f * plant.p1_t + t * plant.psi_t) + a0
     damping = p1 * total * 4.0, a0 * (f + t * plant.p1_t) * -16.0
     modulus = p1 * p1, (a1 * (a2 + a0) + a2 * a0 * 4.0) * -4.0, a2 * a0 * 16.0
@@ -110,7 +114,7 @@ def expand_short_delay_curve(plant: Any) -> ShortDelayCurve:
 
 
 def expand_long_delay_curve(plant: Any) -> LongDelayCurve:
-    """Expand the terms of the boundary curve for d >= 1 in powers of y, in any arithmetic; a0 is None for integer d."""
+    """Expand the terms of `LongDelayCurve` in powers of y, in any arithmetic; a0 is None for integer d."""
     p1, em, a2, a1, a0 = plant.p1, plant.em, plant.a2, plant.a1, plant.a0
     if a0 is None:
         E = em * p1, (plant.gap - em * a2) * 2.0
@@ -119,8 +123,7 @@ def expand_long_delay_curve(plant: Any) -> LongDelayCurve:
     E = em * p1, (p1 + total * em - difference * 2.0) * -2.0, a0 * 8.0
     H = p1 * (p1 + plant.f * em), a0 * -4.0
     V = p1 * p1, (a1 * total + product) * -4.0, product * 4.0
-    # The constant terms of delta V - E cancel exactly, because em = 1 - c = delta phi1 and p1 = phi1. The rest is
-    # divided by y.
+    # The constant terms of delta V - E cancel exactly, because em = delta phi1. Divide the other terms by y.
     excess0 = p1 * 2.0 - difference * 4.0 + plant.delta * (total * (total - a1) - product * 2.0) * 2.0
     excess1 = a0 * (1.0 - plant.delta * a2 * 2.0) * -8.0
     return LongDelayCurve(E, H, V, (excess0, excess1))
@@ -133,9 +136,10 @@ def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]
     positive at u = 0 and has at most one root in (0, 2), the gain crossover, beyond which it is negative.
     """
     p1_squared, cross, alpha_squared = plant.p1 * plant.p1, beta * (alpha + beta) * 2, alpha * alpha
-    # |W|^2 = alpha^2 + cross u. bend = cross/2 - delta^2 is factored, which avoids cancellation near beta = delta.
+    # Compute bend = cross/2 - delta^2 in factored form, which avoids cancellation near beta = delta. The code uses
+    # |W|^2 = alpha^2 + cross u.
     bend = (beta - plant.delta) * (beta + plant.delta) + alpha * beta
-    # V = phi1^2 - 2 m1 u + product u^2
+    # The expansion of V is phi1^2 - 2 m1 u + product u^2; for integer d, a0 = 0 and therefore product = 0.
     if plant.a0 is None:
         m1 = plant.a1 * plant.a2
         return p1_squared * alpha_squared, (p1_squared * bend - m1 * alpha_squared) * 2, m1 * cross * -2 - plant.c * 4
@@ -146,7 +150,7 @@ def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]
 
 
 def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
-    """Decide stability for d < 1, alpha > 0 and beta > -delta: compare alpha with the boundary at this beta."""
+    """Decide stability for d < 1, alpha > 0 and beta > -delta, by comparing alpha with the boundary at this beta."""
     # |L(-1)| < 1 is necessary: otherwise there is no gain crossover. On lines of constant beta that miss the lobe, this
     # condition alone limits alpha.
     wall_at_nyquist, device_at_nyquist = plant.gap * (alpha + beta * 2.0), (plant.c + 1.0) * 2.0
@@ -154,27 +158,29 @@ def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
     crosses_nowhere = (wall_at_nyquist > device_at_nyquist) | (wall_at_nyquist < -device_at_nyquist)
     b = beta + plant.delta
     if plant.a0 is None:
-        # d = 0: y has been eliminated. alpha_w = phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)), with a1 = psi, a2 = phi2.
+        # For d = 0, y can be eliminated: alpha_w = phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)), where p1 = phi1,
+        # a1 = psi, a2 = phi2 and b = beta + delta.
         left, right = alpha * plant.a1 * (plant.p1 + plant.a2 * b), plant.p1 * b * (1.0 - plant.a1 * beta)
         return Verdict(crosses & (left < right), crosses_nowhere | (left > right))
     (u0, u1), modulus, stiffness = expand_short_delay_curve(plant)
-    # The lobe has this beta where V b = y (u0 + u1 y), that is, quadratic y^2 - linear y + constant = 0: at the first
-    # positive root.
+    # The lobe has this beta where V b = y (u0 + u1 y), i.e. quadratic y^2 - linear y + constant = 0. Compute the first
+    # positive root y.
     constant, linear, quadratic = modulus[0] * b, u0 - b * modulus[1], b * modulus[2] - u1
     discriminant = linear * linear - constant * quadratic * 4.0
     y = constant * 2.0 / (linear + roots(discriminant)[0])
-    # alpha < alpha_w, both sides multiplied by V.
+    # Compare alpha with alpha_w, both multiplied by V.
     left, right = alpha * horner(y, modulus), y * horner(y, stiffness) * 4.0
     meets_curve, misses_lobe = discriminant > 0, (discriminant < 0) | (y > 1.0)
     meets_lobe = meets_curve & (y < 1.0)
-    # A line of constant beta may miss the lobe. If the lobe ends at z = -1 (y = 1) with alpha > 0, the walls on such a
-    # line are stable up to the line of poles at z = -1; if the lobe ends earlier, at alpha = 0, none is stable. It ends
-    # earlier if V alpha_w < 0 at y = 1, or if N(-1) < 0: the line of poles at z = -1 then lies below the stable set.
+    # A line of constant beta may miss the lobe. If the lobe ends in the corner (y = 1, alpha > 0), the walls on such a
+    # line are stable up to the line of poles at z = -1. If the lobe ends earlier, at alpha = 0, none of them is stable.
+    # The lobe ends earlier if V alpha_w < 0 at y = 1, or if gap < 0, because the line of poles at z = -1 then lies
+    # below the stable set.
     stiffness_at_nyquist = stiffness[0] + stiffness[1] + stiffness[2]
     ends_at_nyquist = (stiffness_at_nyquist > 0) & (plant.gap > 0)
     ends_earlier = (stiffness_at_nyquist < 0) | (plant.gap < 0)
-    # At the beta of the corner, where the lobe meets that line, y = 1; the sets of certified arithmetic then contain
-    # values on both sides of 1. For a lobe that ends at z = -1, ``left < right`` implies stability on either side.
+    # At the beta of the corner y is 1. In certified arithmetic y is then a set of numbers with values on both sides
+    # of 1; if the lobe ends in the corner, ``left < right`` implies stability for all of them.
     stable = crosses & (
         (meets_lobe & (left < right)) | (ends_at_nyquist & (misses_lobe | (meets_curve & (left < right))))
     )
@@ -211,7 +217,7 @@ def decide_long_delay(
     sin_half, cos_half = roots(y, 1.0 - y)  # of w/2
     phase = evaluate_phase(u, n)
     E_terms, H_terms, V_terms, excess = expand_long_delay_curve(plant)
-    # E + j F = (z - c) conj M
+    # Evaluate E and F = H sin w, the real and imaginary part of (z - c) conj M.
     E, F = horner(y, E_terms), sin_half * cos_half * horner(y, H_terms) * 2.0
     cos_full = phase.cosine * cos_half - phase.sine * sin_half  # cos((n + 1) w)
     # The boundary point, multiplied by V cos(w/2) > 0 (boundary.md, B1, second form):
@@ -222,25 +228,26 @@ def decide_long_delay(
     sine_F = phase.sine * F
     cosine_drop = phase.half_sine_squared * 2.0 - y / (cos_half + 1.0)  # cos(w/2) - cos((n + 1/2) w)
     boundary_offset = cos_half * y * horner(y, excess) + E * cosine_drop + sine_F
-    # The two equivalent criteria, beta alpha_w - alpha beta_w > 0 and beta - beta_w > 0.
+    # Evaluate the equivalent criteria beta alpha_w - alpha beta_w > 0 and beta - beta_w > 0, multiplied by V cos(w/2).
     cross_product = projection * beta * sin_half * 2.0 - (sine_F - phase.cosine * E) * alpha
     damping_margin = (beta + plant.delta) * cos_half * horner(y, V_terms) - boundary_offset
-    # The lobe ends where (n + 1) w + arg(E + j F) reaches pi. Neither angle is negative; ``projection`` has the sign of
-    # the sine of their sum, and the last condition excludes a sum of 2 pi or more.
+    # The lobe ends where (n + 1) w + arg(E + j F) reaches pi, where E + j F = (z - c) conj M. Neither angle is
+    # negative. ``projection`` has the sign of the sine of their sum; the last condition excludes sums of 2 pi or more.
     on_lobe = certain & phase.within & (projection > 0) & ((E > 0) | (cos_full > 0))
-    # Both criteria have the same sign but different rounding errors: the first is accurate near the end of the lobe,
-    # where alpha decreases, the second next to beta = -delta. ``steep`` separates the two parts approximately.
-    # (``^ True`` negates arrays as well as Python's bool.)
+    # Both criteria have the same sign but different rounding errors: cross_product is accurate near the end of the
+    # lobe, where alpha decreases, and damping_margin next to beta = -delta. ``steep`` separates the two parts
+    # approximately. (``^ True`` negates arrays as well as Python's bool.)
     steep = sin_half * cos_half * beta * 2.0 > alpha
     stable = on_lobe & ((steep & (cross_product > 0)) | ((steep ^ True) & (damping_margin > 0)))
-    # The gain difference is positive at u = 1: the crossover lies above w = pi/2 >= pi/(n + 1), or does not exist.
+    # If |B|^2 - |T|^2 is positive at u = 1, the crossover lies above w = pi/2 >= pi/(n + 1), or does not exist. The
+    # wall is unstable in both cases.
     too_fast = sum(gain_difference[1:], gain_difference[0]) > 0
     off_lobe = phase.beyond | (projection < 0)
     return Verdict(stable, too_fast | (certain & (off_lobe | (cross_product < 0) | (damping_margin < 0))))
 
 
 def find_first_root(coefficients: tuple[Array, ...]) -> Array:
-    """Find the root in (0, 1] of a cubic that changes sign from + to - there; of a quadratic, its first positive root.
+    """Find the root in (0, 1] at which a cubic changes its sign from + to -, or the first positive root of a quadratic.
 
     Args:
         coefficients: h0, h1, h2[, h3], the lowest power first.
@@ -263,7 +270,7 @@ def find_first_root(coefficients: tuple[Array, ...]) -> Array:
     h3 = rest[0]
     # If the start is outside (0, 1], the cubic term is not small; start from 1 instead.
     root = xp.where((root > 0) & (root < 1.0), root, 1.0)
-    # Unrolled, because XLA then fuses all steps into a single loop over the points.
+    # Unroll the iteration, because XLA then fuses all steps into a single loop over the points.
     for _ in range(NEWTON_STEPS):
         value, slope = h0 + root * (h1 + root * (h2 + root * h3)), h1 + root * (2.0 * h2 + 3.0 * root * h3)
         new = root - value / slope
@@ -272,20 +279,20 @@ def find_first_root(coefficients: tuple[Array, ...]) -> Array:
 
 
 def _find_crossover(gain_difference: tuple[Array, ...]) -> tuple[Array, Array]:
-    """Find the crossover in floating point, if it lies in (0, 1]: for d >= 1 no wall with u > 1 is stable."""
+    """Return the crossover u, and whether it lies in (0, 1]; for d >= 1 no wall with a larger u is stable."""
     u = find_first_root(gain_difference)
     return u, (sum(gain_difference[1:], gain_difference[0]) <= 0) & (u > 0) & (u <= 1.0)
 
 
 def evaluate_phase(u: Array, n: Array) -> DelayPhase:
-    """Evaluate the phase lag at the gain crossover ``u = 1 - cos w`` in floating point."""
+    """Evaluate the phase lag (n + 1/2) w at the gain crossover ``u = 1 - cos w``, in floating point."""
     xp = namespace(u, n)
-    # Compute the sine of the half angle, because 1 - cos((n + 1/2) w) must keep its relative accuracy for slow
-    # crossovers.
+    # Compute the sine of half the phase lag, because 1 - cos((n + 1/2) w) must keep its relative accuracy for low
+    # crossover frequencies.
     half = xp.minimum((n + 0.5) * xp.sqrt(0.5 * u) * horner(2.0 * u - 1.0, ARCSINE), 0.5 * np.pi)
     square = half * half
     sine, cosine = half * horner(square, SINE), horner(square, COSINE)
-    # The test implies (n + 1/2) w <= pi; its failure implies (n + 1) w >= pi, because u <= w^2/2
+    # If the comparison is true, (n + 1/2) w <= pi; otherwise (n + 1) w >= pi, because u <= w^2/2
     # (docs/theory/certified.md, C5).
     below_bound = u * (n + 1.0) * (n + 1.0) < 0.5 * np.pi * np.pi
     return DelayPhase(
@@ -308,11 +315,11 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[
     # Compute the smaller of u = 1 - cos w and v = 2 - u = 1 + cos w, to full relative accuracy.
     xp = namespace(alpha, plant.delta)
     in_u = expand_gain_difference(alpha, beta, plant)
-    # |T|^2 - |B|^2 in powers of v. It is positive at v = 0, that is at z = -1, if the crossover exists.
+    # Expand |T|^2 - |B|^2 in powers of v. It is positive at v = 0, i.e. at z = -1, if the crossover exists.
     device_at_nyquist, W_nyquist = 2.0 * (1.0 + plant.c), alpha + 2.0 * beta
     wall_at_nyquist, difference = plant.gap * W_nyquist, plant.a2 - plant.a0
     W_squared, cross, product = W_nyquist * W_nyquist, 2.0 * beta * (alpha + beta), 4.0 * plant.a2 * plant.a0
-    # V = gap^2 + g1 v + product v^2
+    # The expansion of V is gap^2 + g1 v + product v^2.
     g1 = 2.0 * (difference * difference - plant.gap * (plant.a2 + plant.a0))
     in_v = (
         (device_at_nyquist - wall_at_nyquist) * (device_at_nyquist + wall_at_nyquist),
@@ -320,7 +327,7 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[
         4.0 * plant.c - product * W_squared + g1 * cross,
         in_u[3],
     )
-    # Positive at u = 1: the crossover, if it exists, lies above w = pi/2.
+    # If the polynomial in u is positive at u = 1, the crossover can only lie above w = pi/2; solve for v there.
     above_half = sum(in_u[1:], in_u[0]) > 0
     coefficients = tuple(xp.where(above_half, *pair) for pair in zip(in_v, in_u, strict=True))
     root = follow_root(

@@ -2,13 +2,14 @@
 
 The boundary curve starts at omega = 0 in (alpha, beta) = (0, -delta). Its first part, the lobe, bounds the stable set.
 The lobe ends where alpha is 0 again or, for short delays and strong damping, at omega = pi in the *corner*, a wall with
-a double pole at z = -1. Along the lobe, ``b = beta + delta`` increases and alpha has a single maximum
+a double pole at z = -1. Along the lobe, ``b = beta + delta`` increases, and alpha has a single maximum, the *peak*
 (docs/theory/one-lobe.md, Theorems A and B). Therefore the stable walls on lines of constant beta (rows) and of constant
-alpha (columns) are intervals (Theorem C), and each root below is the only one in its bracket.
+alpha (columns) are intervals (Theorem C), and each root below is the only one in its bracket. If the lobe ends in the
+corner, some of these intervals end on the line of walls with a pole at z = -1, which passes through the corner.
 
-A parameter ``x`` selects a point of the lobe: ``x = y = sin^2(omega/2)`` for n = 0, where alpha and b are rational in
-y, and ``x = omega`` for n >= 1. Other notation as in `loops.rigid.row_limit`.
-"""
+The delay is d = n + f. A parameter ``x`` selects a point of the lobe: ``x = y = sin^2(omega/2)`` for n = 0, where alpha
+and b are rational in y with the denominator V, and ``x = omega`` for n >= 1. Other notation as in
+`loops.rigid.row_limit`.
 
 from __future__ import annotations
 
@@ -33,12 +34,12 @@ from zwidth.loops.rigid.row_limit import (
 from zwidth.words.types import Array
 from zwidth.words.xp import frozen, horner, namespace, repeat, store_once
 
-CUBIC_STEPS = 4  # steps for n = 0; the start is within 28 % of x
-COLUMN_STEPS = 3  # Newton steps for n >= 1; the start is within 0.3 % of x
+CUBIC_STEPS = 4  # steps to the point with a given alpha for n = 0; the start is within 28 % of x
+COLUMN_STEPS = 3  # Newton steps to the point with a given alpha for n >= 1; the start is within 0.3 % of x
 
 
 class Lobe(NamedTuple):
-    """The stability lobe of one device; fields for delays that do not occur are None."""
+    """The stability lobe of one device; fields that no delay of the batch needs are None."""
 
     plant: DeviceTerms
     d: Array
@@ -50,7 +51,7 @@ class Lobe(NamedTuple):
 
 
 class LobePoint(NamedTuple):
-    """A point of the curve and its derivatives in x."""
+    """A point of the lobe: alpha, b = beta + delta, and their derivatives in x."""
 
     alpha: Array
     b: Array
@@ -66,7 +67,7 @@ class Peak(NamedTuple):
 
 
 def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
-    """Return the lobe of one device, or of arrays of one shape, for the delays that `DelayClasses` allows."""
+    """Return the lobe of each device; ``kind`` states which classes of delays (short, long, fractional) occur."""
     xp = namespace(delta, d)
     plant = store_once(device(delta, d, kind), delta)
     is_short = plant.whole < 1
@@ -77,7 +78,7 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
         root, to_corner = _find_short_end(frozen(short_curve, xp))
         ends.append(root)
     if kind.long:
-        # Freeze the end and the fields after it, because they are only starting values of solvers.
+        # Remove the derivatives of the last five fields, because solvers only start from them.
         frozen_lobe = build_long_lobe(frozen(plant, xp))
         long_lobe = frozen_lobe if xp is np else LongLobe(*expand_long_lobe(plant)[:-5], *frozen_lobe[-5:])
         ends.append(long_lobe.end)
@@ -87,7 +88,7 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
 
 
 def _find_short_end(short_curve: Any) -> tuple[Array, Array]:
-    """Return y where alpha is 0 again, at most 1; and whether alpha stays positive up to y = 1."""
+    """Return y at the zero of alpha that ends the lobe for n = 0, at most 1; and whether alpha > 0 up to y = 1."""
     a, s, t = short_curve[2]
     xp = namespace(a)
     discriminant = s * s - 4.0 * a * t
@@ -103,7 +104,7 @@ def evaluate_lobe(x: Array, lobe: Lobe) -> LobePoint:
     if lobe.short_curve is None:
         return _evaluate_long(x, lobe.long_lobe)
     xp = namespace(x, lobe.d)
-    # Evaluate the form that is not selected at a valid x, because NaN would spoil the derivatives of the other one.
+    # Evaluate the form that is not selected at a valid x, because its NaN would spoil the derivatives of the other one.
     low = _evaluate_short(xp.where(lobe.is_short, x, 0.25), lobe.short_curve)
     high = _evaluate_long(xp.where(lobe.is_short, xp.minimum(1.0, 1.0 / lobe.long_lobe.k), x), lobe.long_lobe)
     return LobePoint(
@@ -151,7 +152,7 @@ def compute_corner_line(lobe: Lobe) -> Array:
 
 
 class RowLimit(NamedTuple):
-    """The largest stable alpha at one beta: on the lobe, or beyond the corner on the line of poles at z = -1."""
+    """The largest stable alpha at one beta: on the lobe or, beyond the corner, on the line of poles at z = -1."""
 
     x: Array  # the nearer end of the lobe if no point of the lobe has this beta
     meets_lobe: Array  # a point of the lobe has this beta
@@ -193,13 +194,16 @@ def find_peak(lobe: Lobe, kind: DelayClasses) -> Peak:
 
 
 def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return x of the point with a given alpha, and whether this point is on the line of poles at z = -1 instead.
+    """Return x of the point of the lobe with a given alpha, and whether no such point exists because of the corner.
 
     Args:
         alpha: Normalized stiffness, 0 < alpha < ``top.alpha``.
         top: Point of largest alpha.
         lobe: The lobe.
         upper: Return the point with the larger beta, i.e. after the peak; otherwise the one before the peak.
+
+    Returns:
+        x; and whether the stable interval ends on the line of walls with a pole at z = -1 instead.
     """
     xp = namespace(alpha, lobe.d)
     never = alpha < 0
@@ -213,14 +217,17 @@ def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[A
 
 
 def _find_short_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return the first or second zero of ``(alpha(y) - alpha) V``, a cubic ``-c0 + c1 y + c2 y^2 + c3 y^3``."""
+    """Return y of the point with a given alpha before or after the peak, a zero of the cubic ``(alpha(y) - alpha) V``.
+
+    The cubic is ``-c0 + c1 y + c2 y^2 + c3 y^3``. The second value is that of `find_column_end`.
+    """
     xp = namespace(alpha, lobe.d)
     _, (v0, v1, v2), (a, s, t) = lobe.short_curve
     c0, c1, c2, c3 = alpha * v0, 4.0 * a - alpha * v1, 4.0 * s - alpha * v2, 4.0 * t
     y = 2.0 * c0 / (c1 + xp.sqrt(xp.maximum(c1 * c1 + 4.0 * c2 * c0, 0.0)))
     y = xp.minimum(y, top.x)
-    # Each step finds the zero of the quadratic with the cubic's value and first two derivatives, because near the peak
-    # two zeros are close together.
+    # In each step, find the zero of the quadratic that has the cubic's value and first two derivatives at y, because
+    # near the peak two zeros of the cubic are close together.
     for _ in range(CUBIC_STEPS):
         value, slope = -c0 + y * (c1 + y * (c2 + y * c3)), c1 + y * (2.0 * c2 + 3.0 * y * c3)
         curvature = 2.0 * c2 + 6.0 * y * c3
@@ -228,7 +235,7 @@ def _find_short_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> 
         y = xp.minimum(xp.maximum(y, 0.0), top.x)
     if not upper:
         return y, alpha < 0
-    # Divide the cubic by the first zero; the quadratic c3 y^2 + e y + k remains.
+    # Divide the cubic by its linear factor with the first zero; the quotient is c3 y^2 + e y + k.
     k, e = c0 / y, c2 + c3 * y
     discriminant = e * e - 4.0 * c3 * k
     second = 2.0 * k / (xp.sqrt(xp.maximum(discriminant, 0.0)) - e)
@@ -237,9 +244,9 @@ def _find_short_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> 
 
 
 def _find_long_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> Array:
-    """Find the point by Newton's method in variables in which alpha is nearly linear."""
-    # After the peak, ``S = sqrt(1 - alpha/top)`` as a function of omega; before it, ``G = sqrt(top/alpha - 1)`` as a
-    # function of 1/omega.
+    """Return omega of the point with a given alpha, by Newton's method in variables in which alpha is nearly linear."""
+    # After the peak, solve sqrt(1 - alpha(omega)/top.alpha) = S for omega. Before the peak, solve
+    # sqrt(top.alpha/alpha(omega) - 1) = G for 1/omega. The left sides are nearly linear in omega and in 1/omega.
     xp = namespace(alpha, lobe.d)
     share = alpha / top.alpha
     S = xp.sqrt(xp.maximum(1.0 - share, 0.0))
@@ -253,7 +260,7 @@ def _find_long_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> A
             return xp.minimum(xp.maximum(x - xp.where(point.d_alpha < 0, step, 0.0), top.x), lobe.end)
 
         return repeat(COLUMN_STEPS, outwards, x, xp)
-    # Near omega = 0, alpha = rate omega^2 + ...; the start interpolates between this parabola and the peak.
+    # Near omega = 0, alpha is alpha_rate omega^2 + .... The start interpolates between this parabola and the peak.
     long_lobe = lobe.long_lobe
     alpha_rate = ((long_lobe.k + 0.5) * long_lobe.E0 + long_lobe.H0) / long_lobe.V0
     start_ratio = 2.0 * top.alpha / (alpha_rate * top.x * top.x)

@@ -1,16 +1,17 @@
 """Compute points of the stability boundary by a general nonlinear solver, as an independent check of the closed forms.
 
-The unknowns are alpha, beta and omega, all real. Two equations state that the loop has a pole at e^(j omega); the
-third is a condition on the wall:
+The unknowns are alpha, beta and omega, all real. Two equations state that the loop has a pole at z = e^(j omega), i.e.
+that the wall lies on the boundary curve. The third equation is a condition on the wall:
 
-    Re P = 0,  Im P = 0,  and  alpha or beta has a given value (a column or a row)
-                          or   Im(conj(dP/dbeta) dP/domega) = 0 (the ridge)
+    Re P = 0,  Im P = 0,  and  alpha or beta has a given value (on a *column* or a *row* of walls)
+                          or   Im(conj(dP/dbeta) dP/domega) = 0 (at the *ridge*, the largest alpha)
 
 The last equation is the stationarity of the Lagrangian for the largest alpha subject to P(e^(j omega)) = 0, without the
 multipliers: along the curve, only beta changes there.
 
 The solver needs only the frequency response of the loop, which is affine in (alpha, beta), and the fact that a row
-meets the lobe once, and a column once on each side of the ridge. So it checks `loops.rigid.curve` independently.
+meets the *lobe*, the first part of the boundary curve, once, and a column once on each side of the ridge. So it checks
+`loops.rigid.curve` independently. The lobe ends at alpha = 0 or in the *corner*, a wall with a double pole at z = -1.
 jaxopt's bisection computes a bracketed start; optimistix's Newton method refines it and provides the implicit
 derivatives.
 """
@@ -35,12 +36,12 @@ from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.xp import nan_with_nan_slopes, store_once
 
-# Bisection steps; 52 leave one unit in the last place of a float64.
+# Number of bisections; 52 reduce a bracket to one unit in the last place of a float64.
 BISECTIONS = 52
 
 
 def bracket_root(function: Callable[..., Array], lower: Array, upper: Array, *args: Any) -> tuple[Array, Array]:
-    """Return a zero of ``function(x, *args)`` between two points by bisection, and whether its sign changes."""
+    """Return a zero of ``function(x, *args)`` between two points by bisection, and whether the signs there differ."""
     with warnings.catch_warnings():
         # Suppress the notice that jaxopt is no longer maintained, because a user of zwidth cannot act on it.
         warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
@@ -53,17 +54,17 @@ def bracket_root(function: Callable[..., Array], lower: Array, upper: Array, *ar
 
 
 def find_lobe_end(loop: FrequencyLoop, d: Array) -> Array:
-    """Return the frequency at which alpha is 0 again on the boundary curve; pi if the lobe ends in the corner."""
+    """Return the frequency omega at which the lobe ends with alpha = 0; pi if it ends in the corner."""
     limit = jnp.minimum(jnp.pi, jnp.pi / (d + 0.5))
     end, exists = bracket_root(lambda omega, loop: find_boundary_wall(omega, loop).alpha, 1e-6 * limit, limit, loop)
     return jnp.where(exists & ~find_corner(expand_curve(loop.plant), loop.n).reached, end, jnp.pi)
 
 
 def evaluate_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyLoop) -> Array:
-    """Return ``P(e^(j omega))/e^(j (2 + n) omega)`` as a pair of real numbers."""
+    """Return the real and imaginary part of ``P(e^(j omega))/e^(j (2 + n) omega)`` as one array."""
     plant, n = loop
     point, half_cosine = circle(omega), jnp.cos(0.5 * omega)
-    # (z - 1)(z - c) + z^-n M (alpha + beta (1 - 1/z))
+    # Evaluate (z - 1)(z - c) + z^-n M (alpha + beta (1 - 1/z)) with M = N(z)/z; ``point.before`` is z - 1.
     m = (
         2.0 * (plant.a2 + plant.a0) * half_cosine * half_cosine
         - plant.gap
@@ -76,7 +77,7 @@ def evaluate_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyLo
 
 
 def _evaluate_conditions(condition: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Array]) -> Array:
-    """Return the three equations, scaled to order 1, in the unknowns alpha, beta and omega divided by ``scales``."""
+    """Return the residuals of the three equations, scaled to order 1, for alpha, beta and omega over ``scales``."""
     loop, number, scales = args
     alpha, beta, omega = unknowns * scales
 
@@ -99,7 +100,7 @@ def _evaluate_conditions(condition: str, unknowns: Array, args: tuple[FrequencyL
 def _solve_conditions(
     condition: str, start: Array, bracketed: Array, number: Array, loop: FrequencyLoop
 ) -> tuple[Array, Wall]:
-    """Return the frequency near a start at which the three equations hold, and the wall there, differentiable."""
+    """Return the solution of the three equations near a starting frequency: omega and the wall, with derivatives."""
     wall = jax.lax.stop_gradient(store_once(find_boundary_wall(start, loop), start))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
@@ -112,11 +113,11 @@ def _solve_conditions(
 
 
 @jnp.vectorize
-def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
+    """Return the fields of `zwidth.alpha_max` for one point, from the equations of the ridge."""
     """Return the fields of `zwidth.alpha_max` for one point."""
     status = device_status(delta, d)
     ok, inputs = status == Status.OK, (delta, d)
-    # Replace NaN, because a solver may stop all batch entries at the NaN of one.
+    # Replace NaN by valid numbers, because a solver may stop all batch entries at the NaN of one.
     delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
     loop = store_once(build_frequency_loop(delta, d), delta)
     corner = find_corner(expand_curve(loop.plant), loop.n)
@@ -125,12 +126,12 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
         return jax.grad(lambda w: find_boundary_wall(w, loop).alpha)(omega)
 
     end = store_once(find_lobe_end(loop, d), d)
-    # Stay slightly below pi, because at pi the derivative of alpha is 0 by symmetry, also without a maximum.
+    # Stay slightly below pi, because the derivative of alpha is 0 at pi by symmetry, even without a maximum there.
     upper = jnp.where(end < jnp.pi, end, jnp.pi * (1.0 - 1e-7))
     start, bracketed = bracket_root(differentiate_alpha, 1e-6 * end, upper, loop)
     start = store_once(start, d)
     omega, smooth = _solve_conditions("ridge", start, bracketed, d, loop)
-    # Test the distance from the bracket, because rounding errors can keep Newton's method from its tolerance.
+    # Accept a solution close to its start, because rounding errors can keep Newton's method from its tolerance.
     converged = corner.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
     nan_if_invalid = nan_with_nan_slopes(ok & converged, *inputs)
     status = jnp.where(ok & ~converged, int(Status.NOT_CONVERGED), status)
@@ -167,13 +168,14 @@ def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: C
     )
     omega, wall = _solve_conditions(line, start, on_lobe, number, loop)
     tolerance = float(jnp.finfo(start.dtype).eps) ** 0.5
-    # Compare the values as well, because for very soft walls the bracket does not resolve the low frequency.
+    # Also compare the wall with the given alpha or beta, because for very small alpha the bisection does not resolve
+    # the low frequency.
     matches = jnp.abs(subtract(wall, number)) <= 0.1 * tolerance * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
     converged = matches & (jnp.abs(omega - start) <= 100.0 * tolerance)
     value = wall.alpha if is_row else wall.beta
     exists = on_lobe & (value > 0) if is_row else on_lobe
     if line != "lower":
-        # For d < 1 the limit may lie on the line of poles at z = -1, where alpha + 2 beta is constant.
+        # For d < 1 the point may lie on the line of walls with a pole at z = -1, where alpha + 2 beta is constant.
         has_line = (loop.n == 0) & (loop.plant.gap > 0)
         line_value = 2.0 * (1.0 + loop.plant.c) / jnp.where(has_line, loop.plant.gap, 1.0)
         line_value = line_value - 2.0 * number if is_row else 0.5 * (line_value - number)
@@ -182,7 +184,7 @@ def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: C
         omega, value = jnp.where(is_real, jnp.pi, omega), jnp.where(is_real, line_value, value)
         exists, converged = exists | is_real, converged | is_real
     if is_row:
-        # Require a stable wall below the limit.
+        # Accept the point only if the wall with half its alpha is stable.
         exists = exists & stable_kernel(0.5 * value, number, delta, d)
     else:
         exists = exists & (number > 0) & (number < ridge.alpha)
