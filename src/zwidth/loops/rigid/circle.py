@@ -15,6 +15,7 @@ The number of poles inside follows from the phase difference arg T - arg B at ea
 (docs/theory/one-crossover.md, Theorem 4). The circle is given by log r, because r itself cannot distinguish circles
 very close to the unit circle. `count_poles_in_cell` counts for all walls of a *cell*, a rectangle in the (alpha, beta)
 plane, at once (docs/theory/maps.md, C4).
+"""
 
 from __future__ import annotations
 

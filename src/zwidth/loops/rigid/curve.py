@@ -10,6 +10,7 @@ corner, some of these intervals end on the line of walls with a pole at z = -1, 
 The delay is d = n + f. A parameter ``x`` selects a point of the lobe: ``x = y = sin^2(omega/2)`` for n = 0, where alpha
 and b are rational in y with the denominator V, and ``x = omega`` for n >= 1. Other notation as in
 `loops.rigid.row_limit`.
+"""
 
 from __future__ import annotations
 

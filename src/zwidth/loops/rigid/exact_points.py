@@ -113,8 +113,8 @@ def _solve_conditions(
 
 
 @jnp.vectorize
+def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
     """Return the fields of `zwidth.alpha_max` for one point, from the equations of the ridge."""
-    """Return the fields of `zwidth.alpha_max` for one point."""
     status = device_status(delta, d)
     ok, inputs = status == Status.OK, (delta, d)
     # Replace NaN by valid numbers, because a solver may stop all batch entries at the NaN of one.
