@@ -1,9 +1,13 @@
-"""Arrange the four arguments of a function as compactly as they vary, and group points by the degree of P.
+"""Fold repeated values of the arguments alpha, beta, delta and d, and group points by the degree of P.
 
-On a grid over alpha and beta for one device, the device is computed once and each line of constant beta once. Callers
-recognize this from the shapes; therefore arguments keep their shape, and axes along which an argument is constant
-(broadcast views, `numpy.meshgrid`) are folded to length 1. For functions whose arrays have the length of the
-polynomial, points are grouped by its degree, so that no array is padded before the computation.
+A *point* is one combination of the four arguments: a wall (alpha, beta) on a device with damping delta and delay d. If
+an argument is constant along an axis (broadcast views, `numpy.meshgrid`), the axis is *folded*: the argument gets
+length 1 there. From these shapes callers recognize a grid over alpha and beta for one device, and compute the device
+once and each line of constant beta once.
+
+The characteristic polynomial P has a degree that depends on the delay. For functions whose results have the length of
+P, points are grouped by this degree, so that no array is padded before the computation. A *kernel* is a function of
+*columns*, one-dimensional arrays with one entry per point.
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ NAMES: tuple[str, ...] = ("alpha", "beta", "delta", "d")
 
 
 class Degree(NamedTuple):
-    """The delay class that determines the length of the polynomial."""
+    """The integer part of a delay, and whether it has a fractional part; both determine the degree of P."""
 
     n: int  # integer part of the delay
     fractional: bool  # the delay has a fractional part
@@ -45,7 +49,7 @@ class Degree(NamedTuple):
 
 
 def find_degree(d: float) -> Degree:
-    """Return the `Degree` of one concrete delay; that of d = 0 for an invalid delay."""
+    """Return the `Degree` for one delay (a plain number); for an invalid delay, that for d = 0."""
     if not (np.isfinite(d) and d >= 0):
         return Degree(0, False)
     n = int(np.floor(d))
@@ -55,7 +59,9 @@ def find_degree(d: float) -> Degree:
 def map_by_degree(
     kernel: Callable[..., Any], values: tuple[ArrayLike, ...], *static: Any, lead: bool = False, route: Route = "auto"
 ) -> Any:
-    """Return the vectors ``kernel(alpha, beta, delta, d, degree, *static)`` of all points as one array.
+    """Evaluate a kernel for all points, one degree of P after the other, and return its vectors as one array.
+
+    The kernel is called as ``kernel(alpha, beta, delta, d, degree, *static)``.
 
     Args:
         kernel: Function of columns of points of one degree; returns an array (points, length).
@@ -83,7 +89,7 @@ def map_by_degree(
         delays = arrays[-1]
     shape = np.shape(arrays[0])
     columns: list[Any] = [xp.reshape(array, -1) for array in arrays]
-    # Replace delays out of range by 0, because they must not determine the length of the result.
+    # Treat delays out of range as 0, because they must not determine the length of the result.
     defined = np.broadcast_to(np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0), shape).reshape(-1)
     vectors, indices = [], []
     for delay, group, index in group_by_value(tuple(columns), 0.5 * (np.floor(defined) + np.ceil(defined))):
@@ -92,7 +98,7 @@ def map_by_degree(
             with np.errstate(all="ignore"):
                 vectors.append(kernel(*group, degree, *static))
         else:
-            # Weight of a point relative to 16 coefficients, rounded to a power of two.
+            # Computing cost per point: an eighth of the number of poles, rounded down to a power of two, at least 1.
             weight = 1 << max(0, degree.poles.bit_length() - 4)
             vectors.append(evaluate_columns(kernel, group, degree, *static, weight=weight))
         indices.append(np.arange(columns[0].size)[index])
@@ -105,28 +111,30 @@ def map_by_degree(
 
 
 def _pad_vectors(part: Any, longest: int, lead: bool, xp: Any) -> Any:
-    """Pad vectors to the greatest length."""
+    """Pad the vectors of one degree to the length ``longest``: with leading zeros, or with NaN at the end."""
     missing = longest - part.shape[1]
     if not lead:
         return xp.pad(part, ((0, 0), (0, missing)), constant_values=xp.nan)
-    # Leading zeros before a valid polynomial, NaN before one of an invalid point.
+    # Insert leading zeros before the coefficients of a valid polynomial, and NaN if the point is invalid.
     front = xp.where(xp.isnan(part[:, :1]), xp.nan, 0.0)
     return xp.concatenate([xp.repeat(front, missing, axis=1), part], axis=1)
 
 
 def count_uncompiled_points(degree: Degree) -> int:
-    """Return the number of points of a degree up to which NumPy is faster than compiling."""
+    """Return the largest number of points of one degree for which NumPy is faster than compiling."""
     return max(1, FEW // max(8, degree.poles**2))
 
 
-# Arguments with fewer values are not compared for repetition, because that would not pay.
+# Smallest size of an argument whose values are compared to detect repetition; for fewer values a comparison takes
+# longer than folding saves.
 MIN_COMPARED_SIZE = 2048
-# Smaller grids are listed point by point, in padded batches that share one compiled program.
+# Smallest grid that is compiled in its own shape. Smaller grids are flattened into columns and padded to common sizes,
+# so that they share one compiled program.
 MIN_DENSE_SIZE = 1 << 16
 
 
 class Points(NamedTuple):
-    """Float64 arguments of equal rank; each has length 1 along axes on which it is constant."""
+    """Float64 arrays of alpha, beta, delta and d of equal rank, with length 1 along axes on which they are constant."""
 
     alpha: np.ndarray
     beta: np.ndarray
@@ -155,7 +163,7 @@ class Points(NamedTuple):
 
 
 def fold_arguments(values: tuple[Any, Any, Any, Any]) -> tuple[Points, tuple[int, ...]]:
-    """Check and fold concrete arguments; return them with the shape that they broadcast to."""
+    """Check plain (untraced) arguments and fold them; return the points and the shape to which they broadcast."""
     arrays = [as_float64(name, value) for name, value in zip(NAMES, values, strict=True)]
     shape = join_shapes(zip(NAMES, (array.shape for array in arrays), strict=True))
     aligned = [array.reshape((1,) * (len(shape) - array.ndim) + array.shape) for array in arrays]
@@ -169,7 +177,7 @@ def restore_shape(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def fold(array: np.ndarray) -> np.ndarray:
     """Return the array with every axis along which its values are constant reduced to length 1."""
-    # Decide by the size before folding, because folding one axis can make the array too small for a comparison.
+    # Decide by the size before folding whether values are compared, because folding one axis reduces the size.
     compare = array.size >= MIN_COMPARED_SIZE
     for axis in range(array.ndim):
         if array.shape[axis] > 1 and _is_constant(array, axis, compare):
@@ -191,7 +199,7 @@ def _is_constant(array: np.ndarray, axis: int, compare: bool) -> bool:
 def group_by_value(
     arrays: tuple[np.ndarray, ...], key: np.ndarray
 ) -> Iterator[tuple[Any, tuple[np.ndarray, ...], Any]]:
-    """Yield the distinct values of a key, with the arguments of each, and the index of their results.
+    """Yield each distinct value of a key, with the arguments of the points with this value and their index.
 
     Args:
         arrays: Arguments.
@@ -200,9 +208,9 @@ def group_by_value(
     Yields:
         The value; the arguments of its points; and the index of these points in the broadcast shape.
     """
-    # If the key varies along one axis, the groups keep their layout; if along several, the points are listed.
+    # If the key varies along one axis only, each group keeps its layout; otherwise its points are flattened.
     key = fold(key)
-    # A single value is the most frequent case; without any point, yield the value 0.
+    # Handle a single value separately, because it is the most frequent case; without any point, yield the value 0.
     values = np.unique(key) if key.size else np.zeros(1)
     varying = [axis for axis, length in enumerate(key.shape) if length > 1]
     if values.size == 1:

@@ -3,6 +3,11 @@
 The open loop L of `loops.rigid.crossover` has at most one gain crossover, and the phase at this frequency decides
 stability (docs/theory/one-crossover.md). Therefore each margin is the distance to a single point where the loop becomes
 unstable, and its sign agrees with the stability verdict.
+
+A wall has the normalized stiffness alpha and damping beta, its device the normalized damping delta; the delay is
+d = n + f periods (n integer, 0 <= f < 1), c = e^-delta and em = 1 - c. In the code the *phase* is arg L + pi in rad at
+the frequency w, so that the loop is stable if the phase at the gain crossover is positive. (alpha_w, beta_w) is the
+wall with a pole at e^(j w).
 """
 
 from __future__ import annotations
@@ -28,24 +33,24 @@ from zwidth.words.xp import along, apply_each, epsilon, frozen, horner, namespac
 
 # Maximum number of steps of false position; every sixth step bisects the bracket.
 FALSE_POSITION_STEPS = 240
-# Samples of the fractional part of the delay, for the delay margin.
+# Number of samples of the fractional part f of the delay, from which the delay margin is computed.
 N_FRACTIONS = 64
-# The samples next to an integer delay are closer to it than 1/delta by this factor, because the effect of the
-# fractional delay on a strongly damped device changes within 1/delta periods.
+# Grading of these samples: those next to an integer delay are closer to it than 1/delta by this factor, because for
+# strong damping the effect of a fractional delay changes within 1/delta periods.
 GRADING = 50.0
-# Below this delta the samples are practically evenly spaced.
+# Value of delta below which the samples are practically evenly spaced.
 LIGHT_DAMPING = 1e-3
 # Golden-section steps to the lowest point between samples.
 GOLDEN_SECTION_STEPS = 24
-# alpha, beta, delta, d and an arbitrary phase of a stable wall.
+# A stable wall (alpha, beta, delta, d and an arbitrary phase), which replaces unstable ones in the delay margin search.
 STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
-# Reported for a stable wall whose margin is 0 within rounding error.
+# Margin reported for a stable wall if the computed margin is 0 within rounding error.
 LEAST_MARGIN = float(np.finfo(np.float32).tiny)
-# Phase in rad below which its rounding error may matter.
+# Phase in rad below which its sign may be wrong because of rounding errors.
 SMALL_PHASE = 0.1
-# A damping whose square underflows in float64.
+# Value of delta whose square underflows in float64.
 NEGLIGIBLE_DAMPING = 1e-150
-# Phase assumed if |L| is above 1 at every frequency; negative, because the loop is then unstable.
+# Phase in rad assumed if |L| is above 1 at every frequency; negative, because the loop is then unstable.
 NO_CROSSOVER_PHASE = -1e-3
 
 
@@ -103,13 +108,13 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
 def margins_kernel(
     alpha: Array, beta: Array, delta: Array, d: Array, with_delay: bool = True, with_modulus: bool = True
 ) -> Margins:
-    """Return `margins` of arrays of one shape; the two margins that need a search are NaN if they are not requested."""
+    """Return `margins` of arrays of one shape; the delay and modulus margins are NaN if they are not requested."""
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d) & (alpha > 0)
     nan_if_invalid = nan_with_nan_slopes(ok, alpha, beta, delta, d)
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
-    # A damping whose square or inverse under- or overflows has no effect on the margins.
+    # Set delta to 0 if its square or its inverse under- or overflows, because it then has no effect on the margins.
     delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), NEGLIGIBLE_DAMPING)), 0.0, delta)
     plant = store_once(device(delta, d), delta)
     w, phase, crosses = evaluate_at_crossover(alpha, beta, plant)
@@ -117,7 +122,7 @@ def margins_kernel(
     gain, phase_crossover = _find_gain_margin(alpha, beta, plant, xp)
     delay = distance = closest = xp.nan * alpha
     if with_delay:
-        # Replace unstable walls by a stable one, so that the search is well defined; its result is not used for them.
+        # Replace unstable walls by `STABLE_WALL`, so that the search is well defined; its result is not used for them.
         pairs = zip((alpha, beta, delta, d, phase), STABLE_WALL, strict=True)
         *wall, delay0, phase0 = (xp.where(stable, value, substitute)[()] for value, substitute in pairs)
         delay = xp.where(stable, _find_delay_margin(tuple(wall), delay0, phase0, xp), 0.0)
@@ -140,25 +145,26 @@ def margins_kernel(
 
 
 def _place_by_verdict(margin: Array, edge: float, least: float, stable: Array, xp: Any) -> Array:
-    """Move a margin to the verdict's side of the edge, because rounding errors could make the two contradict."""
+    """Move a margin to the side of ``edge`` that agrees with the verdict, because rounding errors may contradict it."""
     nearest = xp.where(stable, edge + least, edge)
-    # The derivatives of the margin are kept.
+    # Add a difference that is 0, because it keeps the derivatives of the margin.
     return xp.where((margin < nearest) == stable, nearest + (margin - frozen(margin, xp)), margin)
 
 
 def _find_gain_margin(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> tuple[Array, Array]:
-    """Return the factor on the wall at which it becomes unstable, and the frequency there."""
-    # The phase of L does not depend on the factor, and the gain crossover increases with the factor. So the wall is
-    # stable up to the first zero of the phase; if there is none below z = -1, up to ``|L(-1)| = 1``.
+    """Return the factor on alpha and beta at which the loop becomes unstable, and the frequency of this onset."""
+    # The phase does not depend on a common factor of alpha and beta, and the gain crossover increases with it. So the
+    # loop is stable until the crossover reaches the first zero of the phase; if the phase has no zero below z = -1,
+    # until ``|L(-1)| = 1``.
 
     def evaluate_phase(log_w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> Array:
         # Multiply the phase by a positive factor that makes it of order 1 on both sides of w = sqrt(em), because for
-        # light damping the phase itself is below its rounding error long before its sign changes.
+        # light damping it is smaller than its rounding error long before its sign changes.
         w, n, em = xp.exp(log_w), plant.whole, plant.em
         (u0, u1), modulus_terms, stiffness_terms = expand_short_delay_curve(plant)
         phase_at_w = evaluate_gain_and_phase(w, alpha, beta, plant)[1]
-        # For d < 1 the phase vanishes at z = -1 in any case, and its other zero may be lost in rounding errors near
-        # there. Therefore use the sign of ``beta alpha_w - alpha beta_w``, which has only the other zero.
+        # For d < 1 the phase is 0 at z = -1 in any case, and near there rounding errors may hide its other zero.
+        # Therefore use the sign of ``beta alpha_w - alpha beta_w``, which has only the other zero.
         y = xp.sin(0.5 * w) ** 2
         terms = (
             4.0 * beta * y * horner(y, stiffness_terms),
@@ -170,8 +176,8 @@ def _find_gain_margin(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) ->
             (n == 0) & (xp.abs(phase_at_w) < SMALL_PHASE), normalized, phase_at_w * ((w + em) / (w * w + em))
         )
 
-    # At the lower end of the bracket, the phase of an undamped device is still linear in w; with damping it is above
-    # pi/2 - 1/2.
+    # Choose the lower end of the bracket so low that the phase of an undamped device is still linear in w; with damping
+    # the phase is above pi/2 - 1/2 there.
     n, em = plant.whole, plant.em
     slowness = 1.0 / xp.where(em > 0, em, 1e-9) + n + 2.0 + xp.abs(beta) / alpha
     wall, (low, high) = frozen(((alpha, beta, plant), (-xp.log(2.0 * slowness), xp.log(np.pi / (n + 1.0)))), xp)
@@ -183,21 +189,21 @@ def _find_gain_margin(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) ->
     gain_at_zero = 1.0 / evaluate_gain_and_phase(w, alpha, beta, plant)[0]
     wall_at_nyquist = xp.abs(plant.gap * (alpha + 2.0 * beta))
     gain_at_nyquist = 2.0 * (1.0 + plant.c) / xp.where(wall_at_nyquist > 0, wall_at_nyquist, 1.0)
-    # For d >= 1 the phase becomes 0 below z = -1, except for rounding errors.
+    # Require n = 0, because for d >= 1 the phase has a zero below w = pi, although rounding errors may hide it.
     ends_at_nyquist = (n == 0) & (wall_at_nyquist > 0) & (end > 0)
     gain = xp.where(never_stable, 0.0, xp.where(ends_at_nyquist, gain_at_nyquist, gain_at_zero))
     return gain, xp.where(ends_at_nyquist, np.pi, w) + nan_with_nan_slopes(~never_stable, alpha, beta, plant.em)
 
 
 def _is_falling(_: Array, slope: Array, step: Array) -> Array:
-    """Return whether the function falls through a zero; at an end of the range there is no zero to follow."""
+    """Return whether a function decreases at its computed zero; otherwise the zero is an end of the range."""
     return (slope < 0) & (abs(step) < 1e-3)
 
 
 def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> Array:
     """Return the additional delay, in periods, at which a stable wall first becomes unstable."""
-    # For a fixed fraction f, the wall is stable for integer parts n < nu(f), where nu(f) is the phase margin for n = 0
-    # divided by the gain crossover. The crossover does not depend on n, so the samples of nu serve all n.
+    # For a fixed fraction f, the wall is stable for integer delays n < nu(f), where nu(f) is the phase for n = 0 at the
+    # gain crossover, divided by its frequency. The crossover does not depend on n, so the samples of nu serve all n.
     frozen_wall = tuple(frozen(value, xp) for value in wall)
     n, fraction = split_delay(d)
     grid = _grade_fractions(frozen_wall[2], xp)
@@ -207,7 +213,8 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
     def sample(values: Array, index: Array) -> Array:
         return xp.take_along_axis(values, index, axis=-1)[..., 0][()]
 
-    # Just below an integer delay, a strongly damped device may have a lower limit; there is at most one such minimum.
+    # Refine the local minimum of nu(f) between the samples. For strong damping nu may have one just below an integer
+    # delay, but no second one.
     dips = (limits[..., 1:-1] <= limits[..., :-2]) & (limits[..., 1:-1] < limits[..., 2:])
     if xp is not np or dips.any():
         index = xp.argmax(dips, axis=-1)[..., None] + 1
@@ -222,7 +229,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
         )
         dips = xp.any(dips, axis=-1)[..., None] & (along(np.arange(N_FRACTIONS + 1), xp.asarray(d)) == index)
         grid, limits = xp.where(dips, f[..., None], grid), xp.where(dips, least[..., None], limits)
-    # f = 1 is f = 0 with n + 1; use this exact relation, independent of rounding errors.
+    # The delay n + f with f = 1 is the delay n + 1 with f = 0. Therefore set nu(1) = nu(0) - 1 without rounding errors.
     limits = xp.concatenate([limits[..., :-1], limits[..., :1] - 1.0], axis=-1)
     n_now, f_now = frozen((n, fraction), xp)
     later = (grid > f_now[..., None]) & (limits <= n_now[..., None])
@@ -241,7 +248,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
         return xp.where(exists, phase - n_lost * w, NO_CROSSOVER_PHASE)
 
     high, excess_high = sample(grid, index), xp.minimum(sample(excesses, index), 0.0)
-    # The tolerance is the rounding error of the total delay.
+    # Stop at the rounding error of the total delay.
     width = 4e-16 * (1.0 + n_lost)
     f = false_position(
         lambda f: excess(f, n_lost, *frozen_wall), low, high, excess_low, excess_high, FALSE_POSITION_STEPS, width
@@ -250,7 +257,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
 
 
 def _grade_fractions(delta: Array, xp: Any) -> Array:
-    """Return fractions from 0 to almost 1 along a last axis, denser at both ends; equidistant for light damping."""
+    """Return fractions f from 0 to almost 1 along a last axis, denser at both ends; evenly spaced for light damping."""
     share = along(np.arange(N_FRACTIONS + 1) / N_FRACTIONS, xp.asarray(delta))
     growth = xp.log1p(GRADING * xp.maximum(delta, LIGHT_DAMPING))[..., None]
     from_end = 0.5 * xp.expm1(2.0 * xp.minimum(share, 1.0 - share) * growth) / xp.expm1(growth)
@@ -258,11 +265,11 @@ def _grade_fractions(delta: Array, xp: Any) -> Array:
 
 
 def _limit_delay(w: Array, phase: Array, exists: Array) -> Array:
-    """Return nu of `_find_delay_margin`; -inf without a gain crossover, because the loop is then unstable for all n."""
+    """Return nu, such that integer delays n < nu are stable; -inf without a gain crossover, where no n is stable."""
     xp = namespace(w)
     return xp.where(exists, phase / w, -xp.inf)
 
 
 def _evaluate_fraction(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
-    """Return the gain crossover, the phase there, and whether it exists, for a delay f < 1."""
+    """Return the gain crossover, the phase there, and whether the crossover exists, for a delay f < 1."""
     return evaluate_at_crossover(alpha, beta, store_once(device(delta, f), f))

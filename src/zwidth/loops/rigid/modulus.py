@@ -1,8 +1,12 @@
 """Find the modulus margin of the rigid loop: the least distance ``|1 + L|`` of its Nyquist curve from -1.
 
-L = B/T is the open loop of `loops.rigid.crossover`. Its gain |L| decreases strictly with frequency
-(docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``. Both bound the range of frequencies in which
-the minimum can lie:
+L = B/T is the open loop of `loops.rigid.crossover`. With the wall (alpha, beta), the delay d = n + f, u = 1 - cos w,
+s = sin w, c = e^-delta, em = 1 - c and z = e^(j w), its factors at the frequency w are
+
+    W = alpha + beta u + j beta s      M = a2 z + a1 + a0/z      Z = s + j (em - u)
+
+Its gain |L| decreases strictly with frequency (docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``.
+Both bound the range of frequencies in which the minimum can lie:
 
 - If the distance is r at one frequency, the minimum lies where ``1 - r <= |L| <= 1 + r``.
 - Within one turn of the phase on either side of the gain crossover there is a frequency at which L is real and
@@ -28,7 +32,7 @@ from zwidth.words.xp import along, apply_each, frozen, namespace, store_once
 def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
     """Return the gain ``|L|`` and the phase of L plus pi, at w in (0, pi].
 
-    With ``u = 1 - cos w``, ``s = sin w``, ``W = alpha + beta u + j beta s``, M at e^(j w) and ``Z = s + j (em - u)``,
+    With the factors W, M and Z of L,
 
         |L|^2 = |W|^2 |M|^2 / (2 u (em^2 + 2 c u))
         phase = arg W + arg M + arg Z - (n + 1/2) w = pi + arg L
@@ -53,27 +57,28 @@ def _evaluate_factors(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -
 
 
 def evaluate_at_crossover(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array, Array]:
-    """Return the gain crossover, the phase there, and whether the crossover exists; otherwise both are arbitrary."""
+    """Return the gain crossover w, the phase of L plus pi there, and whether w exists; otherwise w is arbitrary."""
     xp = namespace(alpha, plant.delta)
     w, exists = find_gain_crossover(alpha, beta, plant)
     w, exists = store_once((xp.where(exists, w, 1.0), exists), alpha)
     return w, evaluate_gain_and_phase(w, alpha, beta, plant)[1], exists
 
 
-# Weight of a point for `evaluate`, because of its samples. Compilation would take many seconds and gain nothing.
+# Computing cost of a wall, relative to other kernels, because |1 + L| is sampled at many frequencies. The kernel is not
+# compiled, because compiling takes many seconds and the compiled kernel is not faster.
 SAMPLES_WEIGHT = 8
-# Sampled frequencies: evenly over the whole range, and logarithmically below and above the gain crossover.
+# Numbers of sampled frequencies: evenly spaced over the whole range, and logarithmically below and above the crossover.
 SAMPLES_PER_TURN = 48
 SAMPLES_BELOW = 32
 SAMPLES_ABOVE = 48
-# Local minima that are refined, the lowest ones first.
+# Number of local minima that are refined, the lowest ones first.
 MAX_DIPS = 5
-# Steps of the refinement.
+# Newton steps from each of these minima.
 NEWTON_STEPS = 8
 
 
 def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> Array:
-    """Return ``|1 + L|^2`` at w in (0, pi]: ``L = -W M Z e^(-j (n + 1/2) w)/(2 h |Z|^2)`` with h = sin(w/2)."""
+    """Return ``|1 + L|^2`` at w in (0, pi]: ``L = -W M Z e^(-j (n + 1/2) w)/(2 |Z|^2 sin(w/2))``."""
     xp = namespace(w, alpha)
     delay_phase = (2.0 * plant.whole + 1.0) * (0.5 * w)
     sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = _evaluate_factors(w, alpha, beta, plant)
@@ -90,14 +95,14 @@ def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DeviceT
 
 
 def _differentiate_distance(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
-    """Return half the first and half the second derivative of the squared distance, from the derivatives of log L."""
+    """Return half the first and half the second derivative of |1 + L|^2 in w, from the derivatives of log L."""
     xp = namespace(w, alpha)
     n_plus_half, c = plant.whole + 0.5, xp.cos(w)
     sine, cosine, u, s, wall, m = _evaluate_factors(w, alpha, beta, plant)
     z, delay = c + 1j * s, xp.cos(n_plus_half * w) - 1j * xp.sin(n_plus_half * w)
     wall, m, wall_slope = wall[0] + 1j * wall[1], m[0] + 1j * m[1], beta * (s + 1j * c)
     total, difference = plant.a2 + plant.a0, plant.a2 - plant.a0
-    # The conjugate of Z; its derivative with respect to w is z.
+    # The derivative of conj_Z, the conjugate of Z, with respect to w is z.
     conj_Z = s + 1j * (u - plant.em)
     wall_rate, m_rate, pole_rate = wall_slope / wall, (1j * difference * c - total * s) / m, z / conj_Z
     rate = wall_rate + m_rate - pole_rate - 1j * n_plus_half - 0.5 * cosine / sine
@@ -142,12 +147,12 @@ def _find_lowest(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> Arra
     plant = DeviceTerms(*(xp.asarray(field) for field in plant))
     wall = alpha[..., None], beta[..., None], DeviceTerms(*(field[..., None] for field in plant))
     center = find_frequency_of_gain(xp.ones_like(alpha))
-    # Increase the distance slightly, because rounding errors matter if both bounds nearly coincide.
+    # Increase the distance slightly, because rounding errors matter if the bounds of the range nearly coincide.
     distance = 1.0001 * xp.sqrt(compute_squared_distance(center, alpha, beta, plant))
     start, end = apply_each(find_frequency_of_gain, [1.0 + distance, xp.where(distance < 1.0, 1.0 - distance, 1.0)], xp)
     end = xp.where(distance < 1.0, end, np.pi)
-    # Three half turns of the delay phase contain one turn of the phase of L, because the phase of the wall may
-    # increase by a quarter turn meanwhile.
+    # Three half turns of the delay phase contain one turn of the phase of L, because meanwhile arg W may increase by a
+    # quarter turn.
     turn = 3.0 * np.pi / (plant.whole + 0.5)
     low = xp.minimum(xp.maximum(start, center - turn), center)
     high = xp.maximum(xp.minimum(end, center + turn), center)
@@ -167,7 +172,8 @@ def _find_lowest(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> Arra
         xp.concatenate([infinity, values[..., :-1]], -1),
         xp.concatenate([values[..., 1:], infinity], -1),
     )
-    # A duplicated node counts as a single minimum; the zero of the derivative may lie to the right of the second copy.
+    # If two samples coincide, count them as one minimum. Because the minimum may lie to the right of the second one,
+    # search between the second neighbors on both sides.
     dips = xp.where((values < previous) & (values <= following), values, np.inf)
     best = xp.argpartition(dips, MAX_DIPS - 1, axis=-1)[..., :MAX_DIPS]
 
@@ -178,7 +184,7 @@ def _find_lowest(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> Arra
     refined = newton(
         lambda w: _differentiate_distance(w, *wall), take_neighbor(-2), take_neighbor(2), middle, NEWTON_STEPS
     )[0]
-    # At an end of the range the minimum may be the end itself, therefore compare both candidates.
+    # Compare both candidates, because at an end of the range the minimum may be the end itself.
     candidates = xp.concatenate([refined, middle], axis=-1)
     lowest = xp.argmin(compute_squared_distance(candidates, *wall), axis=-1)[..., None]
     return xp.take_along_axis(candidates, lowest, axis=-1)[..., 0]

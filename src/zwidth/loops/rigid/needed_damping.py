@@ -6,12 +6,12 @@ kappa = 4 f (1 - f). At one frequency the wall needs the damping N, the larger r
     N^2 - A N - S/4 = 0,    S = kappa (a^2 + (b^2 - a^2) u/2)
 
 A is a times a stiffness term minus beta times a damping term; both contain cos(k w) and tau = sin(k w)/sin w. The
-maximum over frequency is at w = 0, at w = pi, or at a single peak in between, depending on the direction beta/alpha (P1
-to P3, for alpha >= 0). N is homogeneous in (alpha, beta). At the peak dN/du = 0, i.e.
+maximum of N over frequency is at w = 0, at w = pi, or at a single *peak* in between, depending on the *direction*
+beta/alpha (P1 to P3, for alpha >= 0). N is homogeneous in (alpha, beta). At the peak dN/du = 0, i.e.
 
     E = A' + kappa (b^2 - a^2)/(8 N) = 0
 
-A prime denotes d/du; in the code, a digit after a name is the order of this derivative.
+A prime denotes d/du; in the code, a digit after a name is the order of this derivative. E has the sign of dN/du.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from zwidth.arrays.roots import newton
 from zwidth.words.types import Array
 from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace
 
-# Newton steps to the peak, from a fitted start.
+# Newton steps to the peak, from a start that is within a few percent.
 PEAK_STEPS = 3
-# Newton steps to the direction beyond which a peak exists, from at most twice its beta.
+# Newton steps to the smallest direction beta/alpha with a peak; the start is at most twice the solution.
 DIRECTION_STEPS = 12
 
 
 class DelayTerms(NamedTuple):
-    """The terms of the condition that depend on the delay only."""
+    """The quantities f, k = n + 1 and kappa = 4 f (1 - f) of a delay d = n + f."""
 
     f: Array
     k: Array
@@ -40,16 +40,16 @@ class DelayTerms(NamedTuple):
 
 
 class PeakCondition(NamedTuple):
-    """The condition on the damping at one frequency."""
+    """The damping N that the wall needs at one frequency, and the condition E = 0 for its maximum."""
 
-    slope: Array  # E; it has the sign of dN/du
-    curvature: Array  # A''; it is dE/du if E = 0
+    slope: Array  # E, which has the sign of dN/du
+    curvature: Array  # A'', which is dE/du if E = 0
     root: Array  # 2 N - A
     needed: Array  # N
 
 
 def compute_delay_terms(d: Array) -> DelayTerms:
-    """Return the `DelayTerms` of d >= 0."""
+    """Return f, k and kappa of a delay d >= 0."""
     n, f = split_delay(d)
     return DelayTerms(f, n + 1.0, 4.0 * f * (1.0 - f))
 
@@ -63,11 +63,12 @@ def solve_larger_root(A: Array, S: Array, xp: Any) -> tuple[Array, Array]:
 
 
 def _evaluate_at_zero(a: Array, beta: Array, delay: DelayTerms) -> tuple[Array, Array, Array]:
-    """Return N, E and the derivative of E in beta at w = 0."""
+    """Return N, E and the derivative of E with respect to beta, all at w = 0."""
     f, k, kappa = delay
     xp = namespace(a, f)
     n = k - 1.0
-    # A' at u = 0, from the sums 1 + 2 sum cos(i w) and cos(k w), whose terms have the derivative -i^2 in u there.
+    # Compute A' at u = 0, where d cos(i w)/du = -i^2. The stiffness term combines the sums 1 + 2 cos w + ... +
+    # 2 cos(m w) for m = n and m = k, and the damping term combines cos(k w) and cos((k + 1) w).
     stiffness_slope = (1.0 - f) * n * k * (2.0 * n + 1.0) + f * k * (k + 1.0) * (2.0 * k + 1.0)
     damping_slope = (1.0 - f) * k * k + f * (k + 1.0) ** 2
     needed, root = solve_larger_root(a * (2.0 * (n + f) + 1.0) - beta, kappa * a * a, xp)
@@ -88,11 +89,11 @@ def evaluate_ends(a: Array, beta: Array, delay: DelayTerms) -> tuple[Array, Arra
 
 
 def evaluate_condition(u: Array, a: Array, beta: Array, delay: DelayTerms) -> PeakCondition:
-    """Evaluate the condition at ``u = 1 - cos w``, in (0, 2] for n = 0 and in (0, 1] for n >= 1."""
+    """Evaluate N, E and A'' at ``u = 1 - cos w``, in (0, 2] for n = 0 and in (0, 1] for n >= 1."""
     f, k, kappa = delay
     xp = namespace(u, a)
     cos_w, sin_squared = 1.0 - u, u * (2.0 - u)
-    # For n = 0 all terms are polynomials in u, up to w = pi.
+    # For n = 0 use that all terms are polynomials in u, up to w = pi, where tau = 1.
     undelayed = k == 1
     safe_sin_squared = xp.where(undelayed, 1.0, sin_squared)
     cosine, sine = _compute_cosine_and_sine(xp.minimum(u, 1.0), k, xp)
@@ -114,7 +115,8 @@ def evaluate_condition(u: Array, a: Array, beta: Array, delay: DelayTerms) -> Pe
         damping_term1 - f * ((k + 1.0) * next_tau + damping_term1),
     )
     damping_term2 = damping_term2 - f * ((k + 1.0) * next_tau1 + damping_term2)
-    # For n = 0 use these exact values, because the terms of order f would lose accuracy by 1 - 1.
+    # For n = 0 use exact derivatives, because the general formulas subtract nearly equal numbers and would spoil the
+    # terms of order f.
     stiffness_term1, stiffness_term2 = (
         xp.where(undelayed, -2.0 * f, stiffness_term1),
         xp.where(undelayed, 0.0, stiffness_term2),
@@ -128,7 +130,7 @@ def evaluate_condition(u: Array, a: Array, beta: Array, delay: DelayTerms) -> Pe
     )
     gain = beta * (beta + 2.0 * a)
     needed, root = solve_larger_root(A, kappa * (a * a + 0.5 * gain * u), xp)
-    # N is stationary if this E is 0; its derivative is then A''.
+    # E is 0 where N is stationary; its derivative there is A''.
     slope = A1 + 0.125 * kappa * gain / xp.where(needed > 0, needed, 1.0)
     return PeakCondition(slope, A2, root, needed)
 
@@ -145,23 +147,23 @@ def _compute_cosine_and_sine(u: Array, k: Array, xp: Any) -> tuple[Array, Array]
 
 
 def find_peak(a: Array, beta: Array, delay: DelayTerms, rise: Array) -> Array:
-    """Return u of the only peak between w = 0 and pi, if it exists; ``rise`` is E at u = 0."""
-    # The start is within a few percent, from ``(1 - x cot x)/x^2 = 2 sum 1/(i^2 pi^2 - x^2)``. The error of N is of
-    # second order in that of u.
+    """Return u of the only peak between w = 0 and pi, if a peak exists; ``rise`` is E at u = 0."""
+    # With x = (d + 1) w, the start follows from ``(1 - x cot x)/x^2 = 2 sum_i 1/(i^2 pi^2 - x^2)`` and is within a few
+    # percent of the peak. The error of N is of second order in that of u.
     f, k, _ = delay
     xp = namespace(a, f)
     periods = k + f
-    # Solve b/(2 a (d + 1)) = (1 - x cot x)/x^2, inverted because a may be 0.
+    # Solve b/(2 a (d + 1)) = (1 - x cot x)/x^2 for y = x^2, with both sides inverted because a may be 0.
     ratio = 2.0 * a * periods / (beta + a)
     y = np.pi**2 - 2.0 * ratio / xp.maximum(1.0 - 0.1307 * ratio, 0.5)
     y = np.pi**2 - 2.0 * ratio / xp.maximum(1.0 - (0.1307 + 0.00216 * y) * ratio, 0.5)
     largest_u = xp.where(k == 1, 2.0, 2.0 * xp.sin(0.5 * np.pi / k) ** 2)
-    # For smaller u the maximum equals N at w = 0 within rounding error.
+    # For smaller u the peak equals N at w = 0 within rounding error.
     floor = epsilon(a) ** 0.5 * largest_u
-    # The series of 1 - cos w, within 1e-3.
+    # Convert y = w^2 to u by the series of 1 - cos w, whose error is below 1e-3.
     y = xp.maximum(y, 0.0) / (periods * periods)
     u = xp.minimum(xp.maximum(0.5 * y * (1.0 - y * (1.0 / 12.0 - y * (1.0 / 360.0))), floor), largest_u)
-    # Unrolled, because XLA then fuses all steps into a single loop over the points.
+    # Unroll the iteration, because XLA then fuses all steps into a single loop over the points.
     for _ in range(PEAK_STEPS):
         point = evaluate_condition(u, a, beta, delay)
         # Near u = 0, E is nearly linear, and Newton's method may leave (0, largest_u]; then use the secant from u = 0.
@@ -173,7 +175,7 @@ def find_peak(a: Array, beta: Array, delay: DelayTerms, rise: Array) -> Array:
 
 
 def compute_needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
-    """Return the supremum over frequency of the damping needed, for alpha >= 0, elementwise, with its derivatives."""
+    """Return the supremum over frequency of the needed damping N, for alpha >= 0, elementwise, with derivatives."""
     xp = namespace(alpha, beta, d)
     if not (kind.long or kind.fractional):
         return 0.5 * alpha + xp.abs(beta)
@@ -184,7 +186,7 @@ def compute_needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClass
     at_zero, E, at_pi, reaches_pi = evaluate_ends(a, beta, delay)
     rises = E > 0
     has_peak = rises & ~reaches_pi
-    # If there is no peak, substitute values that have one; the result is not used.
+    # If there is no peak, substitute a wall and a delay that have one; the result is not used.
     safe_a, safe_beta = xp.where(has_peak, a, 0.0), xp.where(has_peak, beta, 1.0)
     safe_f = xp.where(has_peak, delay.f, 0.5)
     safe_delay = DelayTerms(safe_f, delay.k, 4.0 * safe_f * (1.0 - safe_f))
@@ -205,11 +207,11 @@ def find_directions(d: Array) -> tuple[Array, Array]:
     delay = compute_delay_terms(d)
     f, k, _ = delay
     half, zero = 0.5 + 0.0 * d, 0.0 * d
-    # E at w = 0 increases with beta. Without the term in S (f = 0) the first guess is the zero.
+    # E at w = 0 increases with beta. Start from the zero of E without its term in kappa, which vanishes for f = 0.
     _, E_without_S, E_by_beta = _evaluate_at_zero(half, zero, delay._replace(kappa=zero))
     largest = -E_without_S / E_by_beta
     lower, _ = newton(lambda beta: _evaluate_at_zero(half, beta, delay)[1:], zero, largest, largest, DIRECTION_STEPS)
-    # Solve (2 - 9 f) t^2 + (1 - 6 f) t = f.
+    # The upper direction t solves (2 - 9 f) t^2 + (1 - 6 f) t = f.
     has_upper = (k == 1) & (9.0 * f < 2.0)
     safe_f = xp.where(has_upper, f, 0.0)
     upper = 2.0 * safe_f / (1.0 - 6.0 * safe_f + xp.sqrt(1.0 - 4.0 * safe_f))

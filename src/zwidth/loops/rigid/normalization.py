@@ -49,7 +49,7 @@ class Physical(NamedTuple):
 
 
 def _find_magnitude_range(name: str) -> tuple[float, float]:
-    """Return the smallest and largest magnitude allowed, apart from 0."""
+    """Return the smallest and the largest allowed magnitude of a quantity, apart from 0."""
     return SIZES.get(name, SI_RANGE)
 
 
@@ -122,7 +122,7 @@ def status_of_results(
 
 
 def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
-    """Check the arguments, replace array entries out of range by NaN, and apply ``formula``."""
+    """Check the arguments, replace array entries out of range by NaN, and return the results of ``formula``."""
     checked = {name: _check_quantity(name, value) for name, value in values.items()}
     join_shapes((name, np.shape(value)) for name, value in checked.items())
     if any(map(is_jax, values.values())):
@@ -133,7 +133,7 @@ def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: Arr
 
 
 def _apply_formula(*arguments: Any) -> tuple[Array, ...]:
-    """Apply a formula with NaN for values out of range; the last two arguments are the formula and the names."""
+    """Apply a formula to quantities, with NaN if out of range; the last two arguments are the formula and the names."""
     *values, formula, names = arguments
     valid_masks = (
         _is_valid(name, value) & within(value, _find_magnitude_range(name))
@@ -143,7 +143,7 @@ def _apply_formula(*arguments: Any) -> tuple[Array, ...]:
 
 
 def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:
-    """Return the normalized parameters, eqs. (14), (16)."""
+    """Return alpha, beta, delta and d of SI quantities, by the paper's eqs. (14) and (16)."""
     return (
         stiffness * period * period / mass,
         virtual_damping * period / mass,
@@ -153,7 +153,7 @@ def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tupl
 
 
 def _denormalize(mass, period, alpha, beta, delta, d) -> tuple[Array, ...]:
-    """Return the SI quantities, in the order of `Physical`, from eqs. (14), (16)."""
+    """Return the SI quantities, in the order of `Physical`, by the paper's eqs. (14) and (16)."""
     rate = mass / period
     return mass, delta * rate, period, d * period, alpha * rate / period, beta * rate
 
