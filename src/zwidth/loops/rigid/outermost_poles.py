@@ -1,8 +1,12 @@
 """Compute the dominant pole of each wall of an array, certified: spectral radii and decay rates.
 
-Most walls are computed by one compiled kernel (`loops.rigid.pole_search`). Walls that it does not certify are computed
-again by slower methods in NumPy. On grids of alpha and beta, Taylor series serve whole cells of walls
-(`loops.rigid.pole_map`); walls that these leave open are computed one by one.
+The dominant pole e^(re + j im) is the pole of largest modulus. e^re is the spectral radius, -re the decay rate per
+period. A result is certified by counting the poles outside a circle (`loops.rigid.circle`).
+
+The walls are given by *columns*: one-dimensional arrays of alpha, beta, delta and d. Most walls are computed by one
+compiled kernel (`loops.rigid.pole_search`). Walls that it does not certify are computed again by slower methods in
+NumPy. On grids of alpha and beta, Taylor series serve whole *cells* of neighboring walls (`loops.rigid.pole_map`);
+walls that these leave open are computed one by one.
 """
 
 from __future__ import annotations
@@ -32,42 +36,42 @@ from zwidth.loops.rigid.pole_search import (
 )
 from zwidth.words.status import Status
 
-# If a count is uncertain at the required accuracy because of rounding errors, the error bound is increased by these
-# factors, up to `MAX_ERROR`.
+# Factors by which the error bound is increased if a count is uncertain at the required accuracy because of rounding
+# errors; bounds above `MAX_ERROR` are not tried.
 ERROR_FACTORS = 10.0 ** np.arange(12)
-MAX_ERROR = 0.1
-# Largest float64 below 1.
+MAX_ERROR = 0.1  # largest relative error of a radius that is certified
+# Largest float64 below 1, reported for stable walls whose radius rounds to 1.
 BELOW_ONE = 1.0 - 2.0**-53
-# Rounding error of a computed radius: without stiffness, a radius closer to 1 is exactly 1.
+# Rounding error of a computed radius: without stiffness, a radius that exceeds 1 by less than this is exactly 1.
 RADIUS_ROUNDING = 1e-13
-# A decay rate is NaN if its certified relative error exceeds this.
+# Largest certified relative error of a decay rate; with a larger error the rate is NaN.
 MAX_RATE_ERROR = 1e-3
-# Poles with smaller |sin(im)| are counted as real, i.e. without a conjugate.
+# Value of |sin(im)| below which a pole is counted as real, i.e. without a conjugate.
 REAL_AXIS_WIDTH = 1e-6
-# Smallest grid per device that is computed by cells; smaller ones are faster wall by wall.
+# Smallest number of walls per device for which a grid is computed by cells; smaller grids are faster wall by wall.
 SMALLEST_MAP = 1 << 11
-# Walls per batch without a compiler; smaller batches take longer per wall.
+# Walls per batch in NumPy; smaller batches take longer per wall.
 BATCH_SIZE = 1 << 13
-# Up to this number, single walls are faster than cells.
+# Largest number of walls that are computed one by one without testing whether they form a grid.
 FEW_FOR_CELLS = 1 << 13
 # Walls per compiled batch; all large batches have this size, so that they share one program.
 PIECE = BLOCK >> 3
 
-# Default relative error of radii and rates.
+# Default bound of the relative error of radii and rates.
 ACCURACY = 1e-9
 NO_RATE = np.empty(0)  # placeholder for rates that are not requested
 
 
 def compute_dominant_poles(columns: list[np.ndarray], accuracy: float, route: Route = "auto") -> DominantPoles:
-    """Return the dominant poles of columns of alpha, beta, delta and d of equal length.
+    """Return the dominant pole of each wall, given columns of alpha, beta, delta and d of equal length.
 
     With the routes "numpy" and "jax", the result of a wall does not depend on the other walls.
     """
     fractional = columns[3] != np.floor(columns[3])
     if not fractional.any() or fractional.all():
         return _compute_by_kind(columns, accuracy, bool(fractional.any()), route)
-    # Compute the walls with fractional and with integer delays separately, because the cubic is slower than the
-    # quadratic.
+    # Compute the walls with fractional and with integer delays separately, because counting poles requires the zeros of
+    # a cubic for fractional delays, and only those of a quadratic for integer delays.
     results = DominantPoles(*(np.empty(fractional.size) for _ in DominantPoles._fields))
     for index in (np.flatnonzero(fractional), np.flatnonzero(~fractional)):
         for leaf, values in zip(
@@ -95,7 +99,7 @@ def _compute_by_kind(columns: list[np.ndarray], accuracy: float, fractional: boo
             )
             results = [np.concatenate(leaves)[:size] for leaves in results]
         else:
-            # Pad to batches of one size, because other sizes may round differently.
+            # Pad all batches to one size, because programs compiled for other sizes may round differently.
             results = map_blocks(compile_columns(quick_kernel, (fractional,)), arguments, PIECE, exact=True)
     return _certify_open_walls(columns, DominantPoles(*(np.array(leaf) for leaf in results)), accuracy, fractional)
 
@@ -103,9 +107,9 @@ def _compute_by_kind(columns: list[np.ndarray], accuracy: float, fractional: boo
 def _certify_open_walls(
     columns: list[np.ndarray], poles: DominantPoles, accuracy: float, fractional: bool
 ) -> DominantPoles:
-    """Certify the remaining poles, in place: by other starting points, by bisection, then with larger error bounds."""
+    """Certify the poles without a certificate, in place: from other starts, by bisection, then with larger errors."""
     open_walls = np.flatnonzero(~poles.certified)
-    # Skip invalid walls, which have no certificate.
+    # Skip invalid walls, which cannot be certified.
     open_walls = open_walls[np.asarray(wall_status(*(column[open_walls] for column in columns))) == Status.OK]
     larger_errors = accuracy * ERROR_FACTORS
     attempts = [(method, accuracy) for method in (certify_again, certify_starts, bound_radius, bisect_radius)]
@@ -129,7 +133,7 @@ def _certify_open_walls(
 
 
 def _map_in_batches(function: Callable[[list[np.ndarray]], Any], columns: list[np.ndarray]) -> list[Any]:
-    """Return a function's results for batches of walls, one after another; a second thread would not save time."""
+    """Apply a function to batches of walls, one after another, because a second thread would not save time."""
     starts = range(0, max(columns[0].size, 1), BATCH_SIZE)
     with np.errstate(all="ignore"):
         return [function([column[start : start + BATCH_SIZE] for column in columns]) for start in starts]
@@ -146,7 +150,7 @@ def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, .
     shape, wall_axes = points.shape, []
     for name in ("beta", "alpha"):
         varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1] or [0]
-        # Compare by name, because the same array may be passed twice.
+        # Identify the other arguments by name, because the same array may be passed twice.
         others = [array for other, array in points._asdict().items() if other != name]
         if len(varying) > 1 or any(other.shape[varying[0]] > 1 for other in others):
             return None
@@ -170,12 +174,12 @@ class WallPoles(NamedTuple):
     rate: np.ndarray  # NaN if fewer than three digits are certified
 
     def map(self, function: Callable[[np.ndarray], np.ndarray]) -> WallPoles:
-        """Apply a function to each array, e.g. to change the layout."""
+        """Return the results with a function applied to each array, e.g. to change the layout."""
         return WallPoles(*(leaf if leaf is NO_RATE else function(leaf) for leaf in self))
 
 
 def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPoles:
-    """Compute the dominant poles of a grid by series, and wall by wall if the series fail.
+    """Compute the dominant poles of a grid by Taylor series in cells of walls, and one by one where these fail.
 
     Nothing is compiled, and the result of a wall does not depend on the window of the grid.
     """
@@ -193,7 +197,7 @@ def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPole
 
 
 def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = False, route: Route = "auto") -> WallPoles:
-    """Compute the dominant poles of columns of equal length, which may contain invalid walls."""
+    """Compute the dominant poles of columns of equal length one by one; the columns may include invalid walls."""
     size = columns[0].size
     if route != "auto":
         columns = [column[pad_to_16(np.arange(size))] for column in columns]
@@ -209,7 +213,7 @@ def find_dominant_pole(wall: tuple[float, float, float, float]) -> tuple[float, 
 def _find_listed(
     columns: list[np.ndarray], accuracy: float, with_rate: bool, route: Route
 ) -> tuple[WallPoles, DominantPoles]:
-    """Return the results for columns of walls: radii with rates, and the dominant poles."""
+    """Return the radii of columns of walls and, if requested, the rates; and the dominant poles."""
     dominant = compute_dominant_poles(columns, accuracy, route)
     rate = compute_rates(dominant, columns, accuracy) if with_rate else NO_RATE
     radius = np.exp(np.where(np.isinf(dominant.error), np.nan, dominant.re))
@@ -223,7 +227,7 @@ def _find_listed(
 def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = False) -> WallPoles:
     """Compute the dominant poles of arrays of equal shape, by cells if the arrays form a grid."""
     shape = arrays[0].shape
-    # Add an axis, because a line lacks one.
+    # Add a first axis of length 1, because a line of walls has only one axis.
     arranged = (
         arrange_as_area(Points(*(fold(array[None]) for array in arrays))) if arrays[0].size > FEW_FOR_CELLS else None
     )
@@ -240,11 +244,11 @@ def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = Fals
 
 
 def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: float) -> np.ndarray:
-    """Return the decay rates of dominant poles; NaN if their relative error is not certified to be small."""
+    """Return the decay rates of dominant poles; NaN if the certified relative error exceeds `MAX_RATE_ERROR`."""
     rate, allowed, width = 0.0 - poles.re, MAX_RATE_ERROR * np.abs(poles.re), certification_width(poles.re, accuracy)
-    # The count does not exclude other poles that are larger by up to the width.
+    # Allow for other poles that are larger by up to ``width``, because the count does not exclude them.
     error = np.minimum(poles.error, poles.pole_error + width)
-    # If both stiffness and total damping are 0, both poles near 1 are exactly 1.
+    # If both stiffness and total damping are 0, both poles near 1 are exactly 1, so the rate 0 has no error.
     error[(poles.re == 0) & (columns[0] == 0) & (columns[1] == -columns[2])] = 0.0
     is_fractional = columns[3] != np.floor(columns[3])
     with np.errstate(all="ignore"):
@@ -253,7 +257,8 @@ def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: flo
             if not index.size:
                 continue
             loop = factor_loop(*(column[index] for column in columns), fractional=fractional)
-            # Count on a smaller circle. If no other pole is nearly as large, the error of the rate is that of the pole.
+            # Count the poles outside a smaller circle. If no other pole is nearly as large, the error of the rate is
+            # that of the dominant pole.
             poles_outside = count_poles(poles.re[index] - width[index], loop, fractional)
             is_only = poles_outside.certain & (
                 poles_outside.outside == np.where(np.sin(poles.im[index]) < REAL_AXIS_WIDTH, 1, 2)
@@ -269,6 +274,6 @@ def _place_by_verdict(radius: np.ndarray, columns: list[np.ndarray]) -> np.ndarr
     alpha, beta, delta, d = columns
     with np.errstate(all="ignore"):
         stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
-    # Without stiffness one pole is exactly 1. For a stable wall, use the largest float64 below 1 at most.
+    # Without stiffness one pole is exactly 1. Limit the radius of a stable wall to the largest float64 below 1.
     outside = np.where((alpha == 0) & (radius < 1.0 + RADIUS_ROUNDING), 1.0, np.maximum(radius, 1.0))
     return np.where(stable, np.minimum(radius, BELOW_ONE), outside)

@@ -1,9 +1,10 @@
 """Test and measure the passivity of walls on rigid devices (Colgate's condition), for any delay.
 
-The wall is passive if the physical damping delta exceeds a bound at every frequency (docs/theory/passivity.md). The
-bound is convex and homogeneous in (alpha, beta), so the passive walls of all devices with the same delay are one convex
-set, scaled by delta. `loops.rigid.needed_damping` computes the maximum of the bound over frequency. On grids of one
-delay this maximum is evaluated from a polynomial in one variable that represents the direction beta/alpha.
+The wall with the normalized stiffness alpha and damping beta is passive if the physical damping delta exceeds a bound
+at every frequency (docs/theory/passivity.md). The *needed damping* is the maximum of this bound over frequency
+(`loops.rigid.needed_damping`). It is convex and homogeneous in (alpha, beta), so the passive walls of all devices with
+the same delay d form one convex set, scaled by delta. On grids of one delay, the needed damping is evaluated from a
+polynomial in one variable that represents the *direction* beta/alpha.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ NO_DELAY = DelayClasses(True, False, False)
 
 
 def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
-    """Return `passivity_margin`, elementwise."""
+    """Compute `passivity_margin` elementwise, for the classes of delays ``kind``."""
     xp = namespace(alpha, beta, delta, d)
     valid = valid_wall(alpha, beta, delta, d)
-    # Select by alpha >= 0 and not by the maximum with 0, because the latter would halve the derivative at alpha = 0.
+    # Select by alpha >= 0 and do not use the maximum of alpha and 0, because that would halve the derivative at 0.
     safe_alpha = xp.where(valid & (alpha >= 0), alpha, 0.0)
     safe_beta, safe_d = xp.where(valid, beta, 0.0), xp.where(valid, d, 0.0)
     margin = delta - compute_needed_damping(safe_alpha, safe_beta, safe_d, kind)
@@ -42,14 +43,14 @@ def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Dela
 
 
 def _limit_margin(margin: Array, alpha: Array) -> Array:
-    """Limit the margin for negative stiffness, which yields unbounded energy although the condition may hold."""
+    """Limit the margin to alpha for negative stiffness, which supplies unbounded energy even if the condition holds."""
     xp = namespace(margin, alpha)
     return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
 
 
 @lru_cache(maxsize=256)
 def fit_needed_damping(d: float) -> tuple[float, ...]:
-    """Fit the damping needed by all walls of one delay by a polynomial in the direction.
+    """Fit the needed damping at one delay by a polynomial in a variable that represents the direction beta/alpha.
 
     Between the directions ``lower`` and ``upper`` (`find_directions`), with x = beta - lower alpha,
     ``needed/(beta + (width - lower) alpha)`` is an analytic function of ``x/(x + width alpha)``, up to beta = infinity.
@@ -71,11 +72,11 @@ def fit_needed_damping(d: float) -> tuple[float, ...]:
     beta = lower * alpha + variable * width
     with np.errstate(all="ignore"):
         needed = compute_needed_damping(alpha, beta, np.full(N_TERMS, d))
-    # Divide by the width, because ``beta + (width - lower) alpha`` equals it at these walls.
+    # Divide by the width, because the scale ``beta + (width - lower) alpha`` equals the width at all nodes.
     terms = cosines @ needed * (2.0 / (N_TERMS * width))
     terms[0] *= 0.5
-    # Convert to powers, whose coefficients decrease as well, because Clenshaw's recurrence would lose two digits at the
-    # ends.
+    # Convert the Chebyshev series to powers, because Clenshaw's recurrence would lose two digits at the ends of the
+    # interval. The coefficients of the powers decrease as well.
     powers = np.polynomial.chebyshev.cheb2poly(terms)
     limit = float(end) if np.isfinite(span) else np.inf
     return d - np.floor(d), d + 0.5, float(lower), width, float(end), limit, *powers.tolist()
@@ -108,7 +109,7 @@ def _evaluate_fit(alpha: Array, beta: Array, delta: Array, *fit: Any) -> Array:
 
 
 def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: float) -> np.ndarray:
-    """Compute `passivity_margin` of arrays of one shape in NumPy; the values of the points are independent."""
+    """Compute `passivity_margin` at one delay in NumPy; the result at a point does not depend on the other points."""
     if not 0 <= d <= LONGEST_DELAY:
         return np.full(alpha.shape, np.nan)
     with np.errstate(all="ignore"):
@@ -207,7 +208,7 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
     delay = as_number("d", d, 0.0)
     period = delay + 1.0
     if period == np.floor(period):
-        # At the frequency with cos((d + 1) w) = 0, the virtual damping has no effect on the condition.
+        # Use the frequency with cos((d + 1) w) = 0, at which the virtual damping has no effect on the condition.
         angle = np.pi / (4.0 * period)
         slope = 2.0 * np.tan(angle)
         return float(slope), float(slope * (0.25 / (period * np.sin(angle) ** 2) - 0.5))
@@ -229,9 +230,10 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
     return float(alpha[0]), float(beta[0])
 
 
-# Gauss-Legendre nodes on each of the three analytic parts of the integrand.
+# Numbers of Gauss-Legendre nodes on the three parts of the range of directions, on each of which the integrand is
+# analytic.
 AREA_NODES = (64, 64, 32)
-# Weight of a point for `evaluate`, because of its nodes.
+# Computing cost of a point relative to other kernels, because the integrand is evaluated at all nodes.
 AREA_WEIGHT = 64
 
 
@@ -275,12 +277,12 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
     valid = valid_device(delta, d)
     safe_d = xp.where(valid, d, 1.0)
     unit = 1.0 / (safe_d + 0.5)
-    # Errors of the limits of the parts have no effect of first order.
+    # Compute the ends of the parts without derivatives, because errors of the ends have no effect of first order.
     lower, upper = (xp.arctan(t * frozen(unit, xp)) for t in find_directions(frozen(safe_d, xp)))
     end = 0.5 * np.pi + 0.0 * safe_d
 
     def integrand(theta: Array) -> Array:
-        # At the edge of the range alpha = 0; a rounding error must not make it negative.
+        # At theta = +-pi/2 alpha is 0, and a rounding error must not make it negative.
         alpha = xp.maximum(xp.cos(theta), 0.0) * unit[..., None]
         return compute_needed_damping(alpha, xp.sin(theta), safe_d[..., None] + 0.0 * theta) ** -2
 

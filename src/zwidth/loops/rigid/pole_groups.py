@@ -3,11 +3,14 @@
 A cell is a rectangle of walls, ``|alpha - alpha0| <= a``, ``|beta - beta0| <= b``. Around a center z0, with z = z0 (1 +
 u), alpha = alpha0 + a xi and beta = beta0 + b eta, the poles of the walls solve
 
-    A(u) = tau(u),   tau = a xi + b eta f(z),   f = 1 - 1/z          (docs/theory/maps.md)
+    A(u) = tau(u)      A = Q(z) - alpha0 - beta0 f(z)      tau = a xi + b eta f(z)
+    f = 1 - 1/z        Q = -z^n (z - 1)(z - c)/M(z)        M = (a2 z + h)(1 + q/z)
 
-A *group* is one pole, or two poles close to the real axis that may meet there. Two poles that meet are not analytic in
-xi and eta, but their sums are. Their coefficients are integrals along a circle around the group (C1). The circle is
-chosen such that ``|A| > R |tau|`` on it for all walls (C2); powers of 1/R bound the truncation error (C3).
+with c and M of the device and the integer delay n as in `loops.rigid.circle` (docs/theory/maps.md). A *group* is one
+pole, or two poles close to the real axis that may meet there. Two poles that meet are not analytic in xi and eta, but
+their sums are. The coefficients of these sums are integrals along a circle ``|u| = U`` around the group (C1). The
+circle is chosen such that ``|A| > R |tau|`` on it for all walls (C2); powers of 1/R bound the truncation error,
+relative to a bound G (C3). A pole is e^(re + j im); ``log |z|`` = re is called its log radius.
 """
 
 from __future__ import annotations
@@ -21,39 +24,38 @@ import numpy as np
 from zwidth.loops.rigid.circle import LoopFactors
 from zwidth.loops.rigid.pole_step import make_complex
 
-# Orders of the series in xi and eta; each group uses the lowest order that is accurate enough.
+# Orders of the series in xi and eta that are tried; each group uses the lowest order that is accurate enough.
 ORDERS = (2, 4, 8, 12, 20)
-# A radius is the exponential of a series, interpolated from Chebyshev nodes; along each axis there are this many more
-# nodes than the order of the series.
+# Number of Chebyshev nodes per axis in addition to the order of a series. The radius, the exponential of a series, is
+# interpolated between these nodes.
 EXTRA_NODES = 6
-# Terms of the Taylor series of A in u.
+# Order of the Taylor series of A in u.
 N_TERMS = 36
-# Points on the circle per pole, for the means.
+# Number of points per pole on the circle; the integrals are means over these points.
 POINTS_PER_POLE = 48
-# If the requested accuracy is coarser than this, poles whose radii agree within it need not be separated (C6).
+# Accuracy of radii above which poles whose radii agree within the accuracy need not be separated (C6).
 COARSE_ACCURACY = 1e-5
-# If |log radius| is smaller than this, the closed-form verdict decides on which side of the unit circle the pole is.
-# Reason: one in ten radii of walls with alpha >= 1e-18 rounds to 1, and one in ten of those within 1e-10 of the
-# stability boundary is on the wrong side.
+# Value of |log radius| below which the closed-form verdict, instead of the computed radius, decides on which side of
+# the unit circle a pole is. Within 1e-10 of the stability boundary, one in ten computed radii is on the wrong side.
 VERDICT_WIDTH = 1e-7
-# Factor on the errors allowed for the sums over two poles, because each pole depends on the square root of a difference
-# of these sums.
+# Factor by which the errors allowed for the sums over two poles are reduced, because each pole depends on the square
+# root of a difference of these sums.
 PAIR_FACTOR = 1e-3
-# Relative error of decay rates; walls with a larger error are computed one by one.
+# Largest relative error of decay rates from series; walls with a larger error are computed one by one.
 RATE_ACCURACY = 1e-6
-# Smallest |log radius| of a cell for which the order is chosen; the few walls closer to the unit circle may have to be
-# computed one by one.
+# Smallest |log radius| of a cell with which the order of its series is chosen; the few walls closer to the unit circle
+# may have to be computed one by one.
 MIN_LOG_RADIUS = 1e-5
-# Poles with smaller |sin(im)| are real.
+# Value of |sin(im)| below which a pole is real.
 REAL_AXIS_WIDTH = 1e-7
-# Newton steps to the center of a group of two.
+# Newton steps to the center of a group of two poles.
 NEWTON_STEPS = 4
-# Radii of the circles that are tried, relative to the largest one.
+# Radii of the circles that are tried, relative to the largest radius.
 CIRCLE_RADII = 2.0 ** (-0.5 * np.arange(14))
-# For groups of one and of two poles: distance, in indices of `CIRCLE_RADII`, of the neighboring circles that bound the
-# error of a mean over points.
+# Distance, in indices of `CIRCLE_RADII`, from a circle to the two neighboring circles on which the error of its means
+# is bounded, for groups of one and of two poles.
 CIRCLE_OFFSET = {1: 2, 2: 1}
-# R above this value gives no further advantage.
+# Ratio R above which the choice between circles does not depend on R, because the truncation error is negligible.
 AMPLE_RATIO = 100.0
 # Rounding error of the series, relative to the bound G of C3.
 ROUNDING = 1e-14
@@ -64,7 +66,7 @@ BINOMIAL_WEIGHTS = np.array(
 
 
 class AllowedErrors(NamedTuple):
-    """Largest errors allowed in logarithms of radii."""
+    """The accuracy required of radii and rates, and the errors of log radii that it allows."""
 
     accuracy: float  # relative error of radii
     with_rate: bool  # decay rates are requested, which need a relative error of the logarithm
@@ -76,16 +78,16 @@ class AllowedErrors(NamedTuple):
 
     @property
     def reserve(self) -> float:
-        """Part of the accuracy that is reserved for other poles, which may be slightly larger."""
+        """Part of the accuracy that is reserved for poles outside the groups, which may be slightly larger."""
         return 0.5 * self.accuracy if self.is_coarse else 0.0
 
     @property
     def uncertain_width(self) -> float:
-        """Largest |log radius| whose sign may be wrong."""
+        """Largest |log radius| at which the side of the unit circle may be wrong."""
         return VERDICT_WIDTH + min(self.accuracy, COARSE_ACCURACY)
 
     def limit(self, size: np.ndarray) -> Any:
-        """Return the error allowed in logarithms of the given magnitude."""
+        """Return the largest error allowed in log radii of the magnitude ``size``."""
         if self.with_rate:
             return np.minimum(self.accuracy, RATE_ACCURACY * size)
         return np.minimum(self.accuracy - self.reserve, np.maximum(size, COARSE_ACCURACY))
@@ -120,7 +122,7 @@ class Group(NamedTuple):
 
     @property
     def log_error(self) -> np.ndarray:
-        """Error of log |z| of a single pole; of the sums, times the disk, of two poles (orders, cells)."""
+        """Error of log |z| for one pole, or of the sums times U for two poles, by order and cell."""
         return (self.error + ROUNDING) * (self.disk / (1.0 - self.disk)) + ROUNDING * np.abs(self.re)
 
     def is_disjoint(self, other: Group) -> np.ndarray:
@@ -130,20 +132,20 @@ class Group(NamedTuple):
 
 
 def select_cells(tree: Any, index: Any) -> Any:
-    """Return the arrays of a tuple restricted to some cells, which are their last axis."""
+    """Return a nested tuple of arrays restricted to some cells; cells are the last axis of each array."""
     if isinstance(tree, tuple):
         return type(tree)(*(select_cells(leaf, index) for leaf in tree))
     return tree[..., index] if isinstance(tree, np.ndarray) else tree
 
 
 def _expand_taylor(re: np.ndarray, im: np.ndarray, loop: LoopFactors, fractional: bool, terms: int) -> tuple[Any, ...]:
-    """Return the Taylor coefficients of A around centers; f and 1/z there; and moduli of factors for a majorant."""
+    """Return the Taylor coefficients of A around centers, f and 1/z there, and the moduli of the factors of A there."""
     expm1_re, sine = np.expm1(re), np.sin(0.5 * im)
     r = 1.0 + expm1_re
     z_minus_1 = make_complex(expm1_re - 2.0 * r * sine * sine, 2.0 * r * sine * np.cos(0.5 * im))
     z, z_minus_c = z_minus_1 + 1.0, z_minus_1 + loop.em
     w, inverse_numerator = 1.0 / z, 1.0 / (loop.a2 * z + loop.h)
-    # Multiply out Q = -z^n (z - 1)(z - c)/((a2 z + h)(1 + q/z)), one factor in u after the other.
+    # Multiply the series in u of the factors of Q = -z^n (z - 1)(z - c)/((a2 z + h)(1 + q/z)), one after the other.
     n, modulus = loop.n_plus_1 - 1.0, np.exp((loop.n_plus_1 - 1.0) * re)
     q0, rho = (
         -make_complex(modulus * np.cos(n * im), modulus * np.sin(n * im)) * inverse_numerator,
@@ -228,18 +230,18 @@ def enclose_poles(
         majorant *= (1.0 + wider_disk) / (1.0 - abs_late * wider_disk)
     remainder = (majorant + np.abs(loop.beta) * abs_w / (1.0 - wider_disk)) * (disk / wider_disk) ** (N_TERMS + 1)
     total = ((sizes * largest ** orders[:, None]).T[:, None] @ CIRCLE_RADII ** orders[:, None])[:, 0].T
-    # Add the rounding error of evaluating P, bounded as in `pole_step`.
+    # Add the rounding error of evaluating P, bounded as in `loops.rigid.pole_step`.
     rounding = 2.0**-52 * (16.0 + loop.n_plus_1 * (np.abs(re) + im))
     remainder += rounding * (total + 2.0 * (np.abs(loop.alpha) + np.abs(loop.beta) * abs_f))
     main_term = sizes[poles] * disk**poles
     low = 2.0 * main_term - total - remainder
     ratio = low / (cells.a + cells.b * (abs_f + abs_w * disk / (1.0 - disk)))
     score = np.where(ratio > 1.02, ratio / (1.0 + 1e3 / errors.accuracy * remainder / low), 0.0)
-    # The error of a mean over points of the circle is bounded by its values on two neighboring circles, between which
-    # no pole may lie (C3).
+    # Bound the error of a mean over the points of a circle by the values of the integrand on two neighboring circles,
+    # between which no pole may lie (C3).
     offset, cell_index = CIRCLE_OFFSET[poles], np.arange(re.size)
-    # If the truncation error is negligible for every order, prefer a smaller circle, because it is farther from
-    # singularities outside.
+    # If R is so large that the truncation error is negligible for every order, prefer a smaller circle, because it is
+    # farther from singularities outside.
     rank = np.minimum(score, AMPLE_RATIO) * (1.0 + 0.01 * np.arange(CIRCLE_RADII.size)[:, None])
     best = (rank[offset:-offset] * (score[: -2 * offset] > 0) * (score[2 * offset :] > 0)).argmax(0) + offset
     chosen, spread, alias = (
@@ -250,25 +252,25 @@ def enclose_poles(
     for step in (offset, offset + 1):
         outer, inner = np.maximum(best - step, 0), np.minimum(best + step, CIRCLE_RADII.size - 1)
         between = (outer + inner == 2 * best) & (np.minimum(score[outer, cell_index], score[inner, cell_index]) > 0)
-        # Error of the means of the powers of tau/A; and of the mean for the poles at the center of the cell, which is
-        # larger by up to the number of points.
+        # Bound the error of the means of powers of tau/A. The error of the mean for the poles at the center of the cell
+        # may be larger by a factor up to the number of points.
         missed = 2.0 ** (-0.5 * step * points) * (1 + points)
         missed = missed * (4.5 * spread[outer, cell_index] + spread[inner, cell_index])
         alias = np.where(between, np.fmin(alias, missed), alias)
     is_enclosed = score[chosen] > 0
     if poles == 1:
-        # A single pole in a disk around a real center is real. Otherwise the disk must not reach the real axis.
+        # A single pole inside a circle around a real center is real. Otherwise the circle must not reach the real axis.
         is_enclosed &= (im == 0.0) | (im == np.pi) | (np.sin(im) > disk[chosen])
     inverse, power = 1.0 / ratio[chosen], np.array(ORDERS)[:, None] + 1
     remainder_share = remainder[chosen] / (low[chosen] * (1.0 - inverse))
     error = inverse**power / (power * (1.0 - inverse)) + remainder_share / (1.0 - remainder_share)
     if poles == 1:
-        # Add the interpolation error of the radii, bounded with the Lebesgue constant of the nodes.
+        # Add the error of interpolating the radii between nodes, bounded with the Lebesgue constant of the nodes.
         nodes = power + (EXTRA_NODES - 1)
         error = error + (1.0 + (1.0 + np.log(nodes) / 1.57) ** 2) * inverse**nodes / (1.0 - inverse) ** 2
     error = np.where(is_enclosed & (remainder_share < 0.5), error + alias, np.inf)
-    # Bound how far log |z| of the poles can be below log |z0|: two poles lie in the smallest disk that encloses them;
-    # the bound for a single pole is tighter.
+    # Bound the log radii of the poles from below, relative to re = log |z0|: both poles of a pair lie in the smallest
+    # circle that encloses them; for a single pole a tighter bound exists.
     if poles == 1:
         reach = 1.0 / ratio + sizes[0] / low
         farthest = np.where((ratio > 1.02) & (reach < 0.98), np.log1p(-reach) * disk / (1.0 - disk), -np.inf)
@@ -312,7 +314,7 @@ def _list_points(poles: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def expand_sums(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
-    """Return the series of C1 in eta and xi: log |1 + u| of one pole; for two, the sums of u/U and of (u/U)^2."""
+    """Return the series of C1 in eta and xi: log |1 + u| of one pole; for two poles, the sums of u/U and (u/U)^2."""
     poles, powers = group.poles, np.arange(N_TERMS + 1)
     count = POINTS_PER_POLE * poles
     points, weights = _list_points(poles)
@@ -327,7 +329,7 @@ def expand_sums(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
     for k in range(1, poles + 1):
         weight = weights * (u / (1.0 + u) if poles == 1 else k * points**k)
         series = _compute_powers(powers_eta, order + 1, weight) @ powers_xi * binomials
-        # The constant term, for the poles at the center of the cell.
+        # Replace the constant term by the value for the poles at the center of the cell.
         center_sum = (log_derivative * (weights * points**k)).sum(1)
         series[:, 0, 0] = np.log1p(group.disk * center_sum).real if poles == 1 else center_sum.real
         sums.append(series)
@@ -336,7 +338,7 @@ def expand_sums(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
 
 def compute_larger(first: np.ndarray, second: np.ndarray, disk: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return log |1 + u| of the larger of two poles, from the sums of u/U and (u/U)^2, and the discriminant D (C3)."""
-    # The poles are half +- sqrt(discriminant).
+    # The poles, in units of U, are half +- sqrt(discriminant).
     half = 0.5 * first
     discriminant = 0.5 * second - half * half
     real = disk * (half + np.sqrt(np.maximum(discriminant, 0.0)))
@@ -344,10 +346,10 @@ def compute_larger(first: np.ndarray, second: np.ndarray, disk: Any) -> tuple[np
 
 
 def is_larger_accurate(discriminant: np.ndarray, disk: Any, error: Any, limit: Any) -> np.ndarray:
-    """Return whether the larger pole is accurate enough if the errors of the two sums are ``error`` and twice that."""
+    """Return whether the larger pole is accurate to ``limit``, if the sums have the errors ``error`` and twice that."""
     discriminant_error = 2.01 * error
-    # The error of the square root is at most the root of the discriminant's error, and at most this error divided by
-    # the root of the discriminant.
+    # The error of the square root of D is at most the square root of the error of D, and at most the error of D divided
+    # by the square root of D.
     remaining = np.maximum(limit * ((1.0 - disk) ** 2 / disk) - 0.5 * error - discriminant_error, 0.0)
     return np.abs(discriminant) * remaining**2 >= np.where(
         discriminant_error <= remaining**2, -1.0, discriminant_error**2

@@ -1,12 +1,14 @@
 """Compute the dominant poles of a grid of walls: one power series and one certificate per cell of walls.
 
-In each cell, one or two groups of poles are expanded in the wall's position (`loops.rigid.pole_groups`). One count
-(`loops.rigid.circle.count_poles_in_cell`) certifies for all walls of the cell that no other pole is larger. The proofs,
-C1 to C6, are in docs/theory/maps.md. Cells that fail are divided in four; walls of the smallest cells that fail are
-left open, and `loops.rigid.outermost_poles` computes them one by one.
+In each cell, one or two *groups* of poles (one pole, or a pair near the real axis) are expanded in the wall's position
+(`loops.rigid.pole_groups`). One count (`loops.rigid.circle.count_poles_in_cell`) certifies for all walls of the cell
+that no other pole is larger. The proofs, C1 to C6, are in docs/theory/maps.md. Cells that fail are divided in four;
+walls of the smallest cells that fail are left *open*, and `loops.rigid.outermost_poles` computes them one by one. The
+*special* walls are those that are open or whose spectral radius is so close to 1 that its side of 1 is uncertain.
 
-Arrays of cells or walls have the axes device, row (beta) and column (alpha); a *position* is an index triple of these.
-xi and eta are the positions in alpha and beta relative to the center of the cell, from -1 to 1.
+A grid has the axes device, row (beta) and column (alpha); a *position* is an index triple of these, of a cell or of a
+wall. Only a *window* of the grid, a range of rows and columns, is computed. xi and eta are the positions in alpha and
+beta relative to the center of the cell, from -1 to 1. A *log radius* is log |z| of a pole z.
 """
 
 from __future__ import annotations
@@ -45,14 +47,14 @@ CELL_SIDES = (128, 64, 32, 16, 8)
 CELLS_PER_LIST = 1 << 9
 CELLS_PER_BATCH = 1 << 7  # cells whose sums are computed at once
 WALLS_PER_WRITE = 1 << 16
-# Halley steps from each starting point.
+# Number of Halley steps from each starting point.
 HALLEY_STEPS = 5
-# Relative to the distance between neighboring poles of a long delay: a sequence whose last step was shorter has
-# converged, and sequences that end closer together have found the same pole.
+# Distance relative to that between neighboring poles of a long delay. A sequence of Halley steps has converged if its
+# last step was shorter; two sequences that end closer together have found the same pole.
 SAME_POLE_DISTANCE = 1e-2
 # Longest axis for which powers and interpolation weights are cached, in walls.
 MAX_CACHED = 1 << 14
-# Distances of the counting circles from the poles of the groups, relative to how far the poles move in the cell.
+# Distances from the groups' poles to the circles on which poles are counted, relative to the poles' motion in the cell.
 COUNT_CIRCLES = (0.3, 1.5, 6.0)
 
 
@@ -88,7 +90,7 @@ def _list_chebyshev_nodes(order: int) -> np.ndarray:
 
 
 def _compute_interpolation_weights(positions: np.ndarray, order: int) -> np.ndarray:
-    """Return the weights of the values at the nodes in the interpolated value at each position: (..., nodes)."""
+    """Return the weights of the values at the nodes in the value interpolated at each position: (..., nodes)."""
     nodes = _list_chebyshev_nodes(order)
     polynomials = chebvander(nodes, nodes.size - 1).T * (2.0 / nodes.size)
     polynomials[0] *= 0.5
@@ -96,7 +98,7 @@ def _compute_interpolation_weights(positions: np.ndarray, order: int) -> np.ndar
 
 
 class _AxisPieces:
-    """An axis divided into pieces, with their centers and half widths (devices, pieces)."""
+    """The values along one axis of the grid, divided into pieces of one cell each: (devices, pieces)."""
 
     def __init__(self, values: np.ndarray, side: int) -> None:
         with np.errstate(all="ignore"):
@@ -109,7 +111,7 @@ class _AxisPieces:
         self._tables: dict[Any, np.ndarray] = {}
 
     def table(self, function: Callable[[np.ndarray, int], np.ndarray], order: int, pieces: Any) -> np.ndarray:
-        """Evaluate powers or interpolation weights (``function``) at the walls of pieces: (pieces, walls, ...)."""
+        """Return powers or interpolation weights (``function``) at the walls of some pieces: (pieces, walls, ...)."""
         if self._positions.size > MAX_CACHED:
             return function(self._positions[pieces], order)
         if (function, order) not in self._tables:
@@ -118,12 +120,12 @@ class _AxisPieces:
 
 
 def pad_to_16(index: np.ndarray) -> np.ndarray:
-    """Pad an index array to a multiple of 16 with its last entry, because NumPy may round remainders differently."""
+    """Pad an index array to a multiple of 16 with its last entry, because NumPy may round a remainder otherwise."""
     return np.concatenate([index, np.repeat(index[-1:], -index.size % 16)])
 
 
 def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return log radii minus and plus an error, both on the same side of the unit circle and not close to it."""
+    """Return log radii minus and plus an error, moved if needed to one side of the unit circle and away from it."""
     gap = 2.0 * VERDICT_WIDTH
     return (
         np.where(re > 0, np.maximum(re - error, gap), re - error),
@@ -132,7 +134,7 @@ def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.nda
 
 
 def _find_two_poles(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest pole that the starting points lead to, and the largest of the other ones: (2, cells)."""
+    """Return the largest pole reached from the starting points and the largest other pole reached: (2, cells)."""
     previous = re, im = list_starts(loop, fractional)
     distance = SAME_POLE_DISTANCE / loop.n_plus_1
     for _ in range(HALLEY_STEPS):
@@ -149,7 +151,7 @@ def _find_two_poles(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np
 
 
 class GridPoles(NamedTuple):
-    """Radii (devices, betas, alphas), and decay rates if requested; NaN for open walls."""
+    """Spectral radii (devices, betas, alphas), and decay rates if requested; NaN for open walls."""
 
     radius: np.ndarray
     rate: np.ndarray
@@ -166,7 +168,7 @@ class _ResultArrays:
         sizes = [-(-part.stop // side) * side - start for (part, side), start in zip(windows, starts, strict=True)]
         shape, self.first = (area.d.size, *sizes), np.array([[0], *([start] for start in starts)])
         self.radius, self.rate = np.empty(shape), np.empty(shape if with_rate else (0, 0, 0))
-        # Positions of walls whose radius is close to 1 or NaN.
+        # Positions of the special walls.
         self.special: list[np.ndarray] = []
 
     def cut_out(self, window: tuple[slice, slice]) -> GridPoles:
@@ -178,7 +180,7 @@ class _ResultArrays:
         radius, rate = (values[:, rows, columns] for values in (self.radius, self.rate))
         index = np.concatenate([np.empty((3, 0), int), *self.special], axis=1) - [[0], [rows.start], [columns.start]]
         is_inside = (index[1:] >= 0).all(0) & (index[1] < radius.shape[1]) & (index[2] < radius.shape[2])
-        # Walls at which two groups were compared may occur twice.
+        # Remove duplicates, because walls at which two groups were compared may occur twice.
         is_special = np.zeros(radius.shape, bool)
         is_special[tuple(index[:, is_inside])] = True
         return GridPoles(radius, rate, np.unravel_index(np.flatnonzero(is_special), radius.shape))
@@ -220,12 +222,12 @@ class _CellGrid:
         return positions[:, ((low < stop[:, None]) & (low + self.steps[1:] > start[:, None])).all(0)]
 
     def solve_all(self, positions: np.ndarray, fractional: bool) -> np.ndarray:
-        """Apply `solve` to lists of limited length."""
+        """Apply `solve` to all cells, in lists of limited length."""
         lists = (positions[:, start : start + CELLS_PER_LIST] for start in range(0, positions.shape[1], CELLS_PER_LIST))
         return np.concatenate([positions[:, :0], *(self.solve(some, fractional) for some in lists)], axis=1)
 
     def solve(self, positions: np.ndarray, fractional: bool) -> np.ndarray:
-        """Write the poles of all cells that can be certified; return the positions of the other cells."""
+        """Store the poles of all cells that can be certified; return the positions of the other cells."""
         count = positions.shape[1]
         positions = positions[:, pad_to_16(np.arange(count))]
         axis_indices = self._index_axes(positions)
@@ -243,7 +245,7 @@ class _CellGrid:
                     re[0, index], positions[:, index], select_cells(cells, index), fractional
                 )
         enclosed = (single.order < len(ORDERS)) | certified
-        # If another pole may become dominant in the cell, follow both; near a double pole, follow the pair.
+        # If another pole may become dominant in the cell, expand both as two groups; near a double pole, expand a pair.
         for mask, poles in ((enclosed & ~certified, 1), (~enclosed, 2)):
             index = pad_to_16(np.flatnonzero(mask))
             if not index.size:
@@ -261,11 +263,11 @@ class _CellGrid:
         return positions[:, :count][:, ~certified[:count]]
 
     def _evaluates_logarithms(self, k: int) -> bool:
-        """Return whether the series is evaluated at each wall: for rates, or if the nodes were as many as the walls."""
+        """Return whether a series is evaluated at each wall and not interpolated: for rates, and in small cells."""
         return self.errors.with_rate or min(self.sides) <= _list_chebyshev_nodes(ORDERS[k]).size
 
     def _index_axes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the indices of the cells on the alpha axis and on the beta axis."""
+        """Return the indices of the cells on the alpha axis and on the beta axis, each as (device, piece)."""
         device, row, column = positions
         return [
             (device if axis.center.shape[0] > 1 else 0 * device, position)
@@ -273,17 +275,7 @@ class _CellGrid:
         ]
 
     def _certify(self, groups: list[Group], positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Write the cells whose groups certainly contain the dominant pole of every wall (C4 to C6).
-
-        Args:
-            groups: One or two groups per cell.
-            positions: Positions of the cells.
-            cells: The cells.
-            fractional: Whether the delays are fractional.
-
-        Returns:
-            A mask of the cells that have been written.
-        """
+        """Store the cells whose groups provably include the dominant pole of every wall; return a mask (C4 to C6)."""
         enclosed = np.logical_and.reduce([group.order < len(ORDERS) for group in groups])
         if len(groups) == 2:
             enclosed &= groups[0].is_disjoint(groups[1])
@@ -294,12 +286,12 @@ class _CellGrid:
         ]
         counts = [sum(group.n_poles for group in groups)] * len(circles)
         if self.errors.is_coarse:
-            # Other poles may be larger by the reserve, on the same side of the unit circle.
+            # Other poles may be larger than the groups' by the reserve, on the same side of the unit circle.
             low = np.maximum.reduce([group.low for group in groups])
             circles.append(_bound_on_one_side(low, self.errors.reserve)[1])
             counts.append(0 * counts[0])
         loop, a, b = select_cells(cells, np.tile(index, len(circles)))
-        # Count on all circles in one call.
+        # Count the poles outside all circles in one call.
         outside, certain = count_poles_in_cell(np.concatenate(circles), loop, (a, b), fractional)
         shape = len(circles), index.size
         certified = np.zeros(positions.shape[1], bool)
@@ -310,7 +302,7 @@ class _CellGrid:
         return certified
 
     def _certify_uniform(self, re: np.ndarray, positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Write one value in the cells in which all spectral radii agree within the accuracy (C6)."""
+        """Store one value for all walls of each cell in which all spectral radii agree within the accuracy (C6)."""
         loop, a, b = select_cells(cells, np.tile(np.arange(re.size), 2))
         circles = np.concatenate(_bound_on_one_side(re, self.errors.accuracy))
         outside, certain = (part.reshape(2, -1) for part in count_poles_in_cell(circles, loop, (a, b), fractional))
@@ -322,7 +314,14 @@ class _CellGrid:
     def _write_group(
         self, group: Group, selected: np.ndarray, positions: np.ndarray, cells: Cells, merge: bool
     ) -> None:
-        """Write a group in the selected cells, in batches of one order."""
+        """Compute and store the poles of one group in the selected cells, in batches of equal series order.
+
+        Args:
+            group: The group of each cell.
+            selected: Indices of the selected cells.
+            positions: Positions of all ``cells``.
+            merge: Keep values of another group that are larger.
+        """
         for k, order in enumerate(ORDERS):
             index = selected[group.order[selected] == k]
             for start in range(0, index.size, CELLS_PER_BATCH):
@@ -335,7 +334,7 @@ class _CellGrid:
                     )
 
     def _write(self, positions: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
-        """Write the poles of all walls of some cells; with ``merge``, only if they are larger than those written."""
+        """Store the poles of all walls of some cells; with ``merge``, only those larger than the stored ones."""
         size, log_error = max(1, WALLS_PER_WRITE // (self.sides[0] * self.sides[1])), group.log_error[k]
         # Interpolate the differences from the radius at the center, because the rounding error of interpolation is
         # relative to the largest value.
@@ -351,7 +350,7 @@ class _CellGrid:
             # Lower bound of |log radius| in each cell: the constant term minus all other terms.
             sizes = np.abs(logarithms)
             least_log = np.maximum(2.0 * sizes[:, 0, 0] - sizes.sum((1, 2)), 0.0)
-            # In the other cells no wall is uncertain or too inaccurate.
+            # Find the cells in which some wall may be special or its error too large.
             is_close = (least_log < 2.0 * self.errors.uncertain_width) | (log_error > self.errors.limit(least_log))
         else:
             polynomials, is_close = [(x, polyvander) for x in sums], np.ones(log_error.size, bool)
@@ -381,7 +380,7 @@ class _CellGrid:
                 array[index] = choose(array[index], new) if merge else new
 
     def _select_larger(self, sums: list[np.ndarray], group: Group, k: int) -> list[np.ndarray]:
-        """Return radius and rate of the larger of two poles; NaN if it is not accurate enough."""
+        """Return radius and rate of the larger of two poles from their sums; NaN if they are not accurate enough."""
         re, disk, error = (x[:, None, None] for x in (group.re, group.disk, group.error[k] + ROUNDING))
         values, discriminant = compute_larger(sums[0], sums[1], disk)
         values += re
@@ -392,7 +391,7 @@ class _CellGrid:
     def _evaluate_at_walls(
         self, values: np.ndarray, basis: Any, k: int, positions: np.ndarray, buffer: np.ndarray
     ) -> np.ndarray:
-        """Evaluate a bilinear form at all walls of cells.
+        """Evaluate the series of each cell, or the interpolation between nodes, at all walls of the cell.
 
         Args:
             values: Coefficients in eta and xi, or values at the nodes, of each cell.
@@ -414,7 +413,7 @@ class _CellGrid:
         self.radius[tuple(positions - self.first)] = np.nan
 
     def _note_special(self, positions: np.ndarray, radius: np.ndarray) -> None:
-        """Note the walls that are NaN, or so close to the unit circle that their side is uncertain."""
+        """Add the walls whose radius is NaN or so close to 1 that its side is uncertain to the special walls."""
         index = np.flatnonzero(~(np.abs(radius - 1.0) > 1.01 * self.errors.uncertain_width))
         cell, *offset = np.unravel_index(index, radius.shape)
         corner = (self.steps * (positions - self.first))[1:, cell]

@@ -8,9 +8,10 @@ Certificate: let r be the modulus of the result and tol the tolerance. A count (
 poles lie inside ``|z| = r (1 + tol)``, and a pole lies within tol of the result. Then the spectral radius is r to
 within tol. If this fails, more starting points are tried, and finally the radius is bisected by counts.
 
-All positions are logarithms: a pole is ``e^(re + j im)`` with 0 <= im <= pi. There are two implementations: NumPy
-functions, which `loops.rigid.outermost_poles` applies to walls without a certificate, and one program for JAX
-transformations (`traced_kernel`).
+As in `loops.rigid.circle`, P = T + B with T = z^(1+n) (z - 1)(z - c) and B = M(z) W(z), W = s z - beta; a *crossover*
+is a point with |T| = |B| on a circle. All positions are logarithms: a pole is ``e^(re + j im)`` with 0 <= im <= pi.
+There are two implementations: NumPy functions, which `loops.rigid.outermost_poles` applies to walls without a
+certificate, and one program for JAX transformations (`traced_kernel`).
 """
 
 from __future__ import annotations
@@ -42,12 +43,12 @@ STEPS_ON_LARGER = 3  # then on the larger of the two
 STEPS_AGAIN = 6  # without a certificate: on the result, and on the starting point that is farther from it
 STEPS_ON_ALL = 10  # without a certificate again: on four starting points
 
-# A sequence has converged if a pole is within this distance of log z.
+# Distance in log z from a pole below which a sequence of steps has converged.
 CONVERGED_RADIUS = 1e-6
-# Largest factor by which a Newton step increases the bound of the distance to a pole. The bound before the step is
-# R = N |P/P'|, where N >= 3 is the degree, and the step has the length R/N.
+# Largest factor by which a Newton step increases the bound R of the distance to a pole. Before the step, R = N |P/P'|
+# with the degree N >= 3 of P, and the step has the length R/N.
 RADIUS_AFTER_STEP = 1.4
-# Distance between a pole and the circle of the count, see `certification_width`.
+# Distance in log r from a pole to the circle on which poles are counted, see `certification_width`.
 COUNT_ROUNDING = 4096.0  # rounding error of a count, in rounding units of log r
 RATE_WIDTH = 2e-11  # relative to |re|, for the accuracy of decay rates
 
@@ -58,14 +59,14 @@ BISECTIONS = 62
 POLISHING_STEPS = 6  # Halley steps after the bisection
 NEWTON_STEPS = 3  # Newton steps after those, in `_find_in_rounds`
 BISECTIONS_PER_COUNT = 3  # in NumPy, where counting on 7 circles at once takes as long as on one, for few walls
-# Circles tried by the last certificate, each ten times as far from the pole as the previous one, because the rounding
-# error of the count may be too large on a close circle.
+# Number of circles tried by the last certificate, each ten times as far from the pole as the previous one, because on a
+# close circle the rounding error of the count may be too large.
 MAX_TRIALS = 6
 
-# Inside a transformation, walls are divided into at most this many parts of at least this many walls.
+# Inside a JAX transformation, walls are divided into at most this many parts of at least this many walls.
 MAX_PARTS = 16
 MIN_PART_SIZE = 1 << 9
-# Angles of further starting points, relative to the angle of the first pair.
+# Angles of the third and fourth starting point, relative to the angle of the first pair.
 OFF_AXIS_RATIO = 0.1  # close to the real axis, but not on it
 BETWEEN_RATIO = 0.5  # a third pole of short delays lies near there
 
@@ -85,11 +86,11 @@ class DominantPoles(NamedTuple):
 
 
 def _bound_log_radius(loop: LoopFactors) -> Array:
-    """Return the logarithm of a radius above all poles: on larger circles |T| > |B|."""
+    """Return the logarithm of a radius larger than the moduli of all poles, because |T| > |B| on larger circles."""
     xp = namespace(loop.alpha)
     wall_bound = (loop.a2 + loop.h) * (1.0 + loop.q) * (xp.abs(loop.alpha) + 2.0 * xp.abs(loop.beta))
     bound_root = xp.sqrt(wall_bound)
-    # |T| >= r^(1+n) (r - 1)^2 and |B| <= wall_bound r^2 for r > 1.
+    # For r > 1 use |T| >= r^(1+n) (r - 1)^2 and |B| <= wall_bound r^2.
     bound = xp.log1p(xp.where(loop.n_plus_1 > 1, bound_root, bound_root + wall_bound))
     steep_bound = xp.maximum(np.log(2.0), xp.log(4.0 * wall_bound) / loop.n_plus_1)
     return 1e-9 + xp.where(loop.n_plus_1 > 1, xp.minimum(bound, steep_bound), bound)
@@ -122,11 +123,14 @@ def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
 
 
 def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
-    """Approximate the first pair: its angle from the delay, and its radius from |T| = |B|, by z^(1+n) alone."""
+    """Approximate the first pair: its angle from the delay, its radius from |T| = |B| with z^(1+n) as its only power.
+
+    All other factors of T and B are evaluated on the unit circle.
+    """
     xp = namespace(loop.alpha)
     im = np.pi / (loop.d_plus_1 + 1.0)
-    # If beta is negative enough that W is nearly a negative multiple of z - 1, arg T and arg B coincide half a turn
-    # later.
+    # If beta is so negative that W is nearly a negative multiple of z - 1, arg T and arg B agree half a turn later.
+    # Therefore double the angle.
     im = xp.where((loop.alpha < -loop.beta * im) & (loop.n_plus_1 > 1), 2.0 * im, im)
     x = xp.sin(0.5 * im) ** 2
     device_factors = [(1.0 - zero) * (1.0 - zero) + 4.0 * zero * x for zero in (1.0, loop.c)]
@@ -195,12 +199,12 @@ def certify_pole(
 def quick_kernel(
     alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool
 ) -> DominantPoles:
-    """Find and certify the dominant pole; succeeds for most walls."""
+    """Return the dominant pole of each wall from two starting points; for most walls it is certified."""
     loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
     return certify_pole(*find_candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
-# Attempts to certify the results of `quick_kernel` that have no certificate, in NumPy; ``loop`` has only those walls.
+# The following NumPy functions certify walls that `quick_kernel` does not certify; ``loop`` includes only these walls.
 
 
 def _certify_largest(
@@ -214,7 +218,7 @@ def _certify_largest(
 
 
 def certify_again(poles: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Continue from the result and from the starting point that is farther from it; certify the larger pole."""
+    """Take more steps from the result and from the starting point farther from it; certify the larger pole."""
     slow, pair = approximate_slow_pole(loop), approximate_first_pair(loop, fractional)
     farther = np.abs(poles.im - slow[1]) > np.abs(poles.im - pair[1])
     re, im = (np.stack([leaf, np.where(farther, *both)]) for leaf, *both in zip(poles[:2], slow, pair, strict=True))
@@ -222,7 +226,7 @@ def certify_again(poles: DominantPoles, tolerance: float, loop: LoopFactors, fra
 
 
 def bound_radius(poles: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Certify the radius, but not the pole, by two counts, on circles on both sides of it."""
+    """Certify the radius, but not the pole, by counts on a slightly larger and a slightly smaller circle."""
     above, below = (count_poles(poles.re + side, loop, fractional) for side in (tolerance, -tolerance))
     certified = above.all_inside & above.certain & ~below.all_inside & below.certain
     return poles._replace(
@@ -232,8 +236,8 @@ def bound_radius(poles: DominantPoles, tolerance: float, loop: LoopFactors, frac
 
 def list_starts(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return four starting points, of shape (4, loops): both approximations, and two at other angles."""
-    # The third is the slow pole moved onto the real axis if it is complex, and off the axis otherwise, because steps
-    # from the real axis never leave it and other steps rarely reach it.
+    # The third starting point is the slow pole moved onto the real axis if it is complex, and off the axis otherwise,
+    # because steps from the real axis never leave it and other steps rarely reach it.
     (slow, turn), pair = approximate_slow_pole(loop), approximate_first_pair(loop, fractional)
     other = np.where(turn > 0, 0.0, OFF_AXIS_RATIO * pair[1])
     return np.stack([slow, pair[0], slow, 0.0 * slow]), np.stack([turn, pair[1], other, BETWEEN_RATIO * pair[1]])
@@ -261,7 +265,8 @@ def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractio
     high = _bound_log_radius(loop)
     _, radius = repeat(-(-BISECTIONS // BISECTIONS_PER_COUNT), step, (0.0 * high + MIN_LOG_RADIUS, high), np)
     least_distance, im = np.inf, 0.0 * radius
-    # On that circle the pole is at a crossover or on the real axis.
+    # On the circle with the bisected radius, the pole is at a crossover or on the real axis. Choose the candidate that
+    # is nearest to a pole.
     for angle_guess in (0.0 * radius, 0.0 * radius + np.pi, *count_poles(radius, loop, fractional).crossovers):
         distance = newton_step(radius, angle_guess, loop, fractional).radius
         im, least_distance = np.where(distance < least_distance, angle_guess, im), np.minimum(distance, least_distance)
@@ -272,7 +277,7 @@ def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractio
 
 
 class _SearchState(NamedTuple):
-    """State of the search in `_find_in_rounds`."""
+    """The poles, certificates and bounds of the walls during the search in `_find_in_rounds`."""
 
     re: Array
     im: Array
@@ -355,7 +360,7 @@ def _find_in_rounds(begin: Any, end: Any, loop: LoopFactors, fractional: bool) -
 
         start = xp.where(round_index == 0, state.re, state.high), state.im, xp.full_like(high, np.inf)
         re, im, distance = fori_loop(steps[round_index, 0], steps[round_index, 1], step, start)
-        # Without stiffness one pole is exactly 1.
+        # Without stiffness one pole is exactly 1, so the logarithm of this pole is 0.
         at_one = (loop.alpha == 0) & ~(re > tolerance)
         re, im = xp.where(at_one, 0.0, re), xp.where(at_one, 0.0, im)
 

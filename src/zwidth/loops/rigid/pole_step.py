@@ -21,8 +21,8 @@ from zwidth.loops.rigid.circle import LoopFactors
 from zwidth.words.types import Array
 from zwidth.words.xp import COSINE, SINE, epsilon, horner, namespace, store_once
 
-# Rounding error of P from its factors, in rounding units of the sum of the moduli of its terms. The rounding error of
-# the angle p im is added.
+# Bound of the rounding error of P, in rounding units of the sum of the moduli of its terms. The rounding error of the
+# angle p im is added separately.
 FACTOR_ROUNDING = 16.0
 # Longest step of Halley's method, relative to the distance 1/(1 + n) between neighboring poles of a long delay; longer
 # steps would lead to other poles.
@@ -49,7 +49,7 @@ class Pair:
         return Pair(self.real * other, self.imag * other)
 
     def over(self, other: Pair) -> Pair:
-        """Return the quotient."""
+        """Return the quotient of this array and another one."""
         size = square(other)
         real = (self.real * other.real + self.imag * other.imag) / size
         return Pair(real, (self.imag * other.real - self.real * other.imag) / size)
@@ -84,15 +84,15 @@ class PolynomialValue(NamedTuple):
 def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
     """Return sine and cosine for |x| <= pi/2."""
     if xp is np:
-        # Return plain floats for a plain float, because they are faster than NumPy scalars.
+        # Convert single numbers to plain floats, because arithmetic with NumPy scalars is slower.
         return (float(np.sin(x)), float(np.cos(x))) if type(x) is float else (np.sin(x), np.cos(x))
     square = x * x
     return x * horner(square, SINE), horner(square, COSINE)
 
 
 def _store_pair(value: Any, witness: Array) -> Any:
-    """Return a pair that XLA computes once, although several of its loops use it."""
-    # Five loops use this pair and would each repeat its series; this reduces the time of a step to 70 %.
+    """Return a pair that XLA computes only once, although several of its loops use the pair."""
+    # Otherwise five loops would each repeat the series of this pair; computing it once saves 30 % of a step's time.
     return Pair(*store_once((value.real, value.imag), witness))
 
 
@@ -109,7 +109,7 @@ def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: boo
     sine, cosine = _sine_and_cosine(0.5 * im, xp)
     z_minus_1 = number(expm1_re - 2.0 * r * sine * sine, 2.0 * r * sine * cosine)
     log_power = power * re
-    # Do not use abs(), because its derivative at 0 is not that of the function.
+    # Select by the sign and do not use abs(), because its derivative at 0 belongs to neither of the two scales below.
     smaller = xp.exp(xp.where(log_power < 0, log_power, -log_power))
     device_scale, wall_scale = xp.where(log_power < 0, smaller, 1.0), xp.where(log_power < 0, 1.0, smaller)
     phase = power * im
@@ -166,7 +166,7 @@ def newton_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> Ne
     # A polynomial of degree N has a zero within N |P/P'| of every point.
     degree, slope = loop.n_plus_1 + (3.0 if fractional else 2.0), xp.sqrt(norm)
     rounding_error = value.rounding / slope
-    # The second derivative leaves an error after the step; near a double pole it is half the step.
+    # Estimate the error after the step from the second derivative; near a double pole the error is half the step.
     curvature_error = square(step) * xp.sqrt(square(value.second)) / slope
     return NewtonStep(
         step.real,
@@ -177,7 +177,7 @@ def newton_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> Ne
 
 
 def halley_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
-    """Take one Halley step, limited to `MAX_STEP`; return the new point, in the upper half plane."""
+    """Return the point after one Halley step, which is limited to `MAX_STEP`; the point is in the upper half plane."""
     xp = namespace(re, loop.alpha)
     value = evaluate_polynomial(re, im, loop, fractional)
     inverse_first = value.first.conjugate() * (1.0 / square(value.first))

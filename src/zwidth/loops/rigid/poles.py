@@ -41,13 +41,13 @@ from zwidth.words.xp import epsilon, is_traced, namespace, nan_with_nan_slopes, 
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 
-# Newton steps after the eigenvalues, whose errors are near eps^(1/k) for a k-fold pole; two steps suffice for a simple
-# pole.
+# Newton steps that refine the eigenvalues, whose errors are near eps^(1/k) for a k-fold pole; two steps suffice for a
+# simple pole.
 POLISHING_STEPS = 3
-# Aberth steps, in addition to half the number of poles; about 2 walls in 1,000 have not converged after these.
+# Aberth steps in addition to half the number of poles; after these, about 2 walls in 1,000 have not converged.
 MIN_ABERTH_STEPS = 9
-# Rounding error of the wall's part of P, in rounding units: of the coefficients of N(z), of their sum, and of the
-# products with them.
+# Rounding error of the wall's part of P, in rounding units. It covers the numerator N(z) of the plant (its coefficients
+# and their sum) and the products with it.
 NUMERATOR_ROUNDING = 32.0
 # Largest degree for Aberth's iteration. For more poles the number of steps and the compile time grow, and the product
 # of all distances between poles loses accuracy.
@@ -94,7 +94,7 @@ def _evaluate(z: Pair, loop: LoopFactors, degree: Degree) -> tuple[Pair, Pair]:
 def _bound_rounding(z: Pair, loop: LoopFactors, degree: Degree, unit: float) -> Array:
     """Return a bound of the rounding error of P(z)."""
     xp, power = namespace(z.real), degree.poles - 2
-    # |Re| + |Im| is an upper bound of the modulus that neither overflows nor underflows.
+    # Use |Re| + |Im| as an upper bound of the modulus, because it neither overflows nor underflows.
     abs_z, abs_z_minus_1, abs_z_minus_c = (xp.abs(z.real - zero) + xp.abs(z.imag) for zero in (0.0, 1.0, loop.c))
     device_part = abs_z**power * abs_z_minus_1 * ((3.0 * power + 8.0) * abs_z_minus_c + 2.0 * loop.c)
     numerator = (loop.a2 * abs_z + loop.h) * (abs_z + loop.q if degree.fractional else 1.0)
@@ -109,7 +109,7 @@ def _split(z: Array) -> Pair:
 
 
 def _subtract_pairwise(z: RootsFirst) -> list[Pair]:
-    """Return the differences z_i - z_(i+k), indices modulo the number of poles, for k = 1, 2, ..."""
+    """Return the differences z_i - z_(i+k) for k = 1, 2, ..., with indices modulo the number of poles."""
     twice, count = namespace(z).concatenate([z, z]), z.shape[0]
     return [_split(z - twice[k : k + count]) for k in range(1, count)]
 
@@ -128,9 +128,9 @@ def _take_aberth_step(z: RootsFirst, loop: LoopFactors, degree: Degree) -> Roots
 
 
 def _guess_poles(loop: LoopFactors, degree: Degree) -> RootsFirst:
-    """Return the starting points: two near the device's poles, the others on a circle where T and B are similar."""
+    """Return starting points: two near the device's poles, the others on a circle where both parts of P are similar."""
     xp, n_others, no_damping = namespace(loop.c), degree.poles - 2, loop.beta == 0
-    # Without virtual damping one pole is exactly 0; a step from there would not leave it.
+    # Without virtual damping one pole is exactly 0; one starting point is 0 and stays there.
     constant_term = loop.h * xp.where(no_damping, loop.alpha, loop.beta) * (loop.q if degree.fractional else 1.0)
     r = xp.clip(xp.abs(constant_term) ** (1.0 / xp.maximum(n_others - no_damping, 1)), 0.02, 3.0)
     # Choose a set that is not symmetric about the real axis. The iteration would preserve such a symmetry, and the
@@ -182,7 +182,7 @@ def aberth_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Deg
 
 
 def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
-    """Return all poles from eigenvalues, along a new last axis."""
+    """Return all poles along a new last axis, from the eigenvalues of companion matrices."""
     matrices = companion(compute_coefficients(alpha, beta, delta, d, degree))
     xp = namespace(matrices)
     z = _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices)
@@ -252,7 +252,7 @@ def _compute_by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, deg
         # Compile a single program, because JAX would otherwise compile every operation separately when it
         # differentiates outside `jit`.
         return _compile_by_degree(pole_kernel, degree)(*columns)
-    # Without compilation for few walls, and for large matrices, whose eigenvalues take most of the time.
+    # Do not compile for few walls, or for large matrices, whose eigenvalues take most of the time.
     few = alpha.size <= count_uncompiled_points(degree)
 
     def compute_block(*walls: Any) -> np.ndarray:
@@ -347,7 +347,7 @@ def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: 
     all_poles = map_by_degree(_compute_by_companion, values, route="numpy")
     xp = namespace(all_poles) if is_traced(*values) else np
     z: Any = xp.asarray(all_poles)
-    # NaN marks a missing pole if the wall has other poles.
+    # Ignore missing poles: NaN after the other poles of a wall with a lower degree.
     missing = xp.isnan(z.real) & ~xp.isnan(z[..., :1].real)
     radius = xp.max(xp.where(missing, 0.0, xp.abs(z)), axis=-1)
     # Without stiffness one pole is exactly 1, but the computed one has a rounding error.
