@@ -24,13 +24,13 @@ from zwidth.words.xp import namespace, nan_with_nan_slopes
 
 
 def expand_affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
-    """Return the coefficient vectors D, N1, N2 of devices of one degree, along a new last axis of degree.poles + 1."""
+    """Return the coefficients of D, N1, N2 of devices of one degree, along a new last axis of degree.poles + 1."""
     plant = held_plant(delta, d - degree.n if degree.fractional else None)
     xp = namespace(plant.a2)
     zero, one = 0.0 * plant.a2, 0.0 * plant.a2 + 1.0
     head = [one, -(1.0 + plant.c), plant.c]
-    # The coefficients of N(z) and of (z - 1) N(z). For an integer delay both are divided by the common factor z, and
-    # a2 - a1 is the gap.
+    # List the coefficients of N(z) and of (z - 1) N(z). For an integer delay both are divided by the common factor z,
+    # and ``plant.gap`` is a2 - a1.
     if degree.fractional:
         numerator = [plant.a2, plant.a1, plant.a0]
         differences = [plant.a1 - plant.a2, plant.a0 - plant.a1]
@@ -48,7 +48,7 @@ def expand_affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
 
 def compute_coefficients(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
     """Return the coefficients of the monic P, highest power first, along a new last axis of degree.poles + 1."""
-    # Replace arguments that are out of range by valid numbers; the caller sets these results to NaN.
+    # Replace arguments that are out of range by valid numbers; the caller sets their results to NaN.
     xp, ok = namespace(alpha, beta, delta, d), valid_wall(alpha, beta, delta, d)
     alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
     polynomials = expand_affine(delta, xp.where(ok, d, float(degree.n)), degree)
@@ -70,7 +70,7 @@ class FrequencyLoop(NamedTuple):
 
 
 def build_frequency_loop(delta: Array, d: Array) -> FrequencyLoop:
-    """Return the discretized plant and the integer delay of one (delta, d)."""
+    """Return the discretized plant and the integer part of the delay for one delta and d."""
     n, fraction = split_delay(d)
     return FrequencyLoop(held_plant(delta, fraction), n)
 

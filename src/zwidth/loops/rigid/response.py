@@ -4,7 +4,9 @@ Between two instants at which a force changes, the damped mass has the exact sol
 
     x(t) = x + t phi1(delta t) v + t^2 phi2(delta t) F        v(t) = e^(-delta t) v + t phi1(delta t) F
 
-(T = 1, m = 1). In each period the wall's force changes once, at the fraction f of a delay d = n + f.
+for the position x, the velocity v and the force F, in units in which the sampling period T and the mass m are 1. In
+each period the wall's force changes once, at the fraction f of a delay d = n + f. A response has settled when the
+position stays in the *band* of +-2 % around its final value.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ MOST_PERIODS = 1 << 21  # longest simulation for a settling time; takes some sec
 
 
 def advance(x: Array, v: Array, force: Array, t: Array, delta: float) -> tuple[Array, Array]:
-    """Return the exact state of the damped mass after time t under a constant force."""
+    """Return the exact position and velocity of the damped mass after time t under a constant force."""
     phi = phi_functions(delta * t)
     return x + t * phi.phi1 * v + t * t * phi.phi2 * force, np.exp(-delta * t) * v + t * phi.phi1 * force
 
@@ -40,7 +42,17 @@ def advance(x: Array, v: Array, force: Array, t: Array, delta: float) -> tuple[A
 def advance_period(
     x: Array, v: Array, older: Array, newer: Array, t: Array, delta: float, f: float
 ) -> tuple[Array, Array]:
-    """Return the state at the instant t of a period whose force changes at the fraction f."""
+    """Return position and velocity at the instant t of a period in which the force changes at the fraction f.
+
+    Args:
+        x: Position at the start of the period.
+        v: Velocity at the start of the period.
+        older: Force before the change.
+        newer: Force after the change.
+        t: Time from the start of the period, 0 to 1.
+        delta: Normalized physical damping.
+        f: Fraction of the period at which the force changes.
+    """
     x, v = advance(x, v, older, np.minimum(t, f), delta)
     return advance(x, v, newer, np.maximum(t - f, 0.0), delta)
 
@@ -65,7 +77,7 @@ def settling_time(alpha: float, beta: float, delta: float, d: float) -> float:
 
 
 def _find_last_outside(wall: tuple[float, float, float, float], periods: int) -> float:
-    """Return the last instant of a simulated step response at which it is outside the band; 0 if there is none."""
+    """Return the last instant, in periods, at which a step response is outside the band; 0 if there is none."""
     alpha, _, delta, d = wall
     f = d - math.floor(d)
     instants = np.unique([*np.arange(INSTANTS) / INSTANTS, f, 1.0])
@@ -109,16 +121,16 @@ class StepResponse(NamedTuple):
 
 def _simulate(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> np.ndarray:
     """Return x and v at the start of each period, from rest, and the wall's force before and after its change."""
-    # Use plain floats: a period takes one or two microseconds, so the import of a compiler would take longer.
+    # Use plain floats, because a period takes one or two microseconds and importing a compiler would take longer.
     n = find_degree(d).n
     f = d - n
-    # x and v after each part of a period are linear in x, v and the force: three coefficients per part.
+    # Compute three coefficients per part of a period, because x and v after a part are linear in x, v and the force.
     coefficients = []
     for t in (f, 1.0 - f):
         phi = phi_functions(np.float64(delta * t))
         coefficients.append((float(t * phi.phi1), float(t * t * phi.phi2), math.exp(-delta * t)))
     (xv0, xf0, c0), (xv1, xf1, c1) = coefficients
-    # The velocity changes by t phi1 F; t phi1 is also the factor of v in x.
+    # The coefficient of v in x and that of the force in v are both t phi1.
     x = v = previous = 0.0
     forces = [0.0] * (periods + n + 2)
     rows = []

@@ -1,9 +1,13 @@
-"""Return the maximum stiffness of rigid devices, alpha_max(delta, d), with derivatives in delta and d.
+"""Compute the maximum stiffness of rigid devices, alpha_max(delta, d), with derivatives in delta and d.
 
 The point of maximum stiffness is the *ridge* (docs/theory/boundary.md, B2): a smooth maximum of alpha on the stability
-lobe, or the corner, a wall with a double pole at z = -1. `loops.rigid.ridge_newton` solves for it. Its derivatives
-follow from the optimality condition, in closed form for NumPy and by a custom rule for JAX. For strong damping,
-alpha_max is proportional to delta; `stiffness_slope` returns the factor, the paper's eq. (22).
+lobe, or the *corner*, a wall with a double pole at z = -1. It is given by s = sin(omega/2), with its frequency omega.
+`loops.rigid.ridge_newton` solves the optimality condition T(s) = 0. The derivatives of the ridge follow from T, in
+closed form for NumPy and by a custom rule for JAX. For strong damping, alpha_max is proportional to delta;
+`stiffness_slope` returns the factor, the paper's eq. (22).
+
+The delay is d = n + f. The plant has the numerator N(z) = a2 z^2 + a1 z + a0 and the pole c = e^-delta; a0, a1 and a2
+consist of phi1(x) = (1 - e^-x)/x, phi2 = (1 - phi1)/x, psi = (phi1 - e^-x)/x and gap = phi2 - psi.
 """
 
 from __future__ import annotations
@@ -44,7 +48,7 @@ from zwidth.words.xp import epsilon, horner, namespace, nan_unless, push_forward
 
 
 def _compute_chi(x: Array, gap: Array) -> Array:
-    """Return chi = ``gap/x = -phi2'``, which is 1/6 at 0; ``psi' = chi - psi`` and ``phi1' = -psi``."""
+    """Return chi = ``gap/x = -phi2'``, which is 1/6 at x = 0; it also yields ``psi' = chi - psi``."""
     xp = namespace(x)
     is_small = x < 2.5
     half = xp.where(is_small, 0.5 * x, 0.0)
@@ -57,7 +61,7 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
     phi_t, phi_f = phi_functions(delta * t), phi_functions(delta * f)
     chi_t, chi_f = _compute_chi(delta * t, phi_t.gap), _compute_chi(delta * f, phi_f.gap)
-    # Each term of a1 decreases with delta, so the sum of their derivatives has no cancellation.
+    # Each term of a1 decreases with delta, so no digits cancel in the sum of their derivatives.
     a2 = -t * t * t * chi_t
     a1 = t * t * t * (phi_t.psi - chi_t) + f * f * f * chi_f
     a1 = -(
@@ -70,16 +74,16 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
 
 
 def recompute_ridge(s: Array, plant: Plant, n: Array, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
-    """Recompute alpha, beta, omega and s at a solved ridge, for correct derivatives in ``plant`` and n."""
+    """Recompute alpha, beta, omega and s at a ridge such that their derivatives in ``plant`` and n are correct."""
     # Differentiate one step of Newton's method, which has the derivative of the solution if it starts at the solution.
-    # A corner stays at s = 1. At a maximum the derivative of alpha in s is 0, so alpha is computed at the fixed s.
+    # A corner stays at s = 1. At a maximum the derivative of alpha in s is 0, so alpha is computed with a fixed s.
     xp = namespace(s, plant.a2, n)
     undelayed, curve, is_corner = not kind.long, expand_curve(plant), s >= 1.0
     s_inside = xp.where(is_corner, 0.5, s)
     T, T1 = evaluate_stationarity(s_inside, curve, n, undelayed)
     s_inside = xp.where(is_corner, 0.5, s_inside - T / xp.where(is_corner, 1.0, T1))
     s_moved = xp.where(is_corner, 1.0, s_inside)
-    # Do not use the series of `evaluate_wave`, because its derivative has fewer digits.
+    # Compute omega without the series of `evaluate_wave`, because the derivative of the series has fewer digits.
     omega = xp.where(is_corner, np.pi, 2.0 * xp.arctan(s_inside / xp.sqrt((1.0 - s_inside) * (1.0 + s_inside))))
     alpha, beta = (evaluate_wall(evaluate_wave(s_value, n, undelayed), curve) for s_value in (s, s_moved))
     return alpha[0], beta[1], omega, s_moved
@@ -118,7 +122,7 @@ def _jax_ridge() -> Any:
     function = jax.custom_jvp(solve_ridge, nondiff_argnums=(3,))
 
     def rule(kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
-        # The derivative of s follows from the same rule, so derivatives of every order are exact.
+        # Let the derivative of s follow from the same rule, so that derivatives of every order are exact.
         ridge = function(*primals, kind)
 
         def moving(plant: Plant, n: Array) -> Ridge:
@@ -180,14 +184,14 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
 
 
 def ridge_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgePoint:
-    """Return `alpha_max`, elementwise."""
+    """Compute `alpha_max` elementwise, for the classes of delays ``kind``."""
     return _make_point(*_solve_point(delta, d, kind)[:2])
 
 
 def differentiate_point(
     delta: Array, d: Array, kind: DelayClasses = ANY
 ) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
-    """Return `ridge_kernel` and its derivatives in delta and d."""
+    """Return `alpha_max` and its derivatives in delta and in d, elementwise."""
     ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
     point, has_converged = _make_point(ridge, status), converged(ridge)
 
@@ -210,7 +214,7 @@ class RidgeSlopes(NamedTuple):
 
 
 def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlopes:
-    """Return `alpha_max` and the derivatives of alpha, elementwise; in d those from the right at integer d."""
+    """Return `alpha_max` and the derivatives of its alpha, elementwise; those in d from the right at integer d."""
     ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
     xp, wave = namespace(ridge.s), evaluate_wave(ridge.s, n, not kind.long)
 
@@ -237,7 +241,7 @@ def stiffness_slopes(
 
 
 def _solve_point(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
-    """Return the ridge, its status, the plant, its integer delay, and delta and the fraction of the delay."""
+    """Return the ridge, its status, the plant, the integer delay n, and delta with the fraction f of the delay."""
     status = device_status(delta, d)
     delta, d = nan_unless(status == Status.OK, delta, d)
     n, f = split_delay(d)
@@ -302,11 +306,11 @@ def stiffness_slope(d: ArrayLike) -> Array:
 
 
 def slope_kernel(d: Array, kind: DelayClasses = ANY) -> Array:
-    """Return `stiffness_slope`, elementwise."""
+    """Compute `stiffness_slope` elementwise, for the classes of delays ``kind``."""
     (d,) = nan_unless(valid_device(0.0 * d, d), d)
     zero = 0.0 * d
     n, f = split_delay(d)
-    # The limit of delta N(z) for delta -> infinity: the velocity is proportional to the force, and e^-delta vanishes.
+    # Use the limit of delta N(z) for delta -> infinity, where the velocity is proportional to the force and c = 0.
     plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
     start = guess_start(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
     ridge = differentiable_ridge(plant, n, start, kind)

@@ -1,12 +1,17 @@
 """Find the ridge, the point of maximum stiffness, by Newton's method on its closed-form optimality condition.
 
-The boundary curve and the condition T = 0 are written in ``y = s^2``, ``s = sin(omega/2)``, with q = 1 - y, D = n + 1,
-n the integer part of the delay, and the letters of docs/theory/boundary.md, B1 and B2. A prime on that page is a
-trailing digit or a leading d in the code.
+The stability *lobe* is the first part of the boundary curve, on which the loop has a pole at z = e^(j omega). With the
+plant's numerator N(z) = a2 z^2 + a1 z + a0 and pole c, M = N(z)/z, and D = n + 1 for the integer part n of the delay,
 
-The stability lobe has a single maximum of alpha (docs/theory/one-lobe.md, Theorem B), so no search is needed: a fitted
-start and three Newton steps suffice. The maximum is smooth (T = 0), or it is the *corner* at y = 1, the wall with a
-double pole at z = -1. The number of steps is fixed, because in a batch all points take the same steps.
+    alpha = 4 y (tau E + kappa H)/V      E + j H sin omega = (z - c) conj(M)      V = |M|^2 = m^2 + (mu sin omega)^2
+    y = s^2    s = sin(omega/2)    q = 1 - y    tau = sin(D omega)/sin omega    kappa = cos(D omega)    mu = a2 - a0
+
+where m = Re M, sigma = a2 + a0 and gap = N(-1) (docs/theory/boundary.md, B1). T is the derivative of alpha in y, up to
+a positive factor (B2). A prime on that page is a trailing digit or a leading d in the code.
+
+The lobe has a single maximum of alpha (docs/theory/one-lobe.md, Theorem B), so no search is needed: a fitted start and
+three Newton steps suffice. The maximum is smooth (T = 0), or it is the *corner* at y = 1, the wall with a double pole
+at z = -1. The number of steps is fixed, because in a batch all points take the same steps.
 """
 
 from __future__ import annotations
@@ -21,7 +26,7 @@ from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, name
 
 
 class Curve(NamedTuple):
-    """Coefficients of the boundary curve of one device, as far as they do not depend on D."""
+    """The coefficients of E, H and V of one device; they do not depend on D."""
 
     E: tuple[Array, Array, Array]  # in powers of y
     H: tuple[Array, Array]  # in powers of y
@@ -32,7 +37,7 @@ class Curve(NamedTuple):
 
 
 def expand_curve(plant: Plant | DeviceTerms) -> Curve:
-    """Expand the curve of one plant; no coefficient has cancellation in the range of the ridge."""
+    """Return the coefficients of E, H and V of one plant; none of them cancels in the range of the ridge."""
     c, em, a2, a1, a0, gap = plant.c, plant.em, plant.a2, plant.a1, plant.a0, plant.gap
     sigma = a2 + a0
     at_one = sigma + a1
@@ -42,7 +47,7 @@ def expand_curve(plant: Plant | DeviceTerms) -> Curve:
 
 
 class Wave(NamedTuple):
-    """The terms of the curve that depend only on the frequency and on D; tau = sin(D w)/sin w, kappa = cos(D w)."""
+    """The terms of the boundary curve that depend only on the frequency and on D."""
 
     y: Array
     q: Array
@@ -55,11 +60,11 @@ class Wave(NamedTuple):
 
 
 def evaluate_wave(s: Array, n: Array, undelayed: bool) -> Wave:
-    """Return the terms at one s, with finite derivatives up to the corner; ``undelayed`` if D = 1 for all points."""
+    """Return the `Wave` at s, with finite derivatives up to the corner; ``undelayed`` if D = 1 for all points."""
     xp = namespace(s, n)
     y, q = s * s, (1.0 - s) * (1.0 + s)
     cos_w = q - y
-    # Replace the cosine at the corner (y = 1) to avoid a division by 0; there D = 1, and its factor is 0.
+    # At the corner (y = 1) replace cos(omega/2) by 1 to avoid a division by 0; D = 1 there, so no quotient is used.
     cos_half = xp.sqrt(xp.where(s < 1.0, q, 1.0))
     is_low = y < 0.5
     small = xp.where(is_low, s, cos_half)
@@ -68,25 +73,25 @@ def evaluate_wave(s: Array, n: Array, undelayed: bool) -> Wave:
     per_sin = 0.5 / (s * cos_half)
     if undelayed:
         return Wave(y, q, 1.0, cos_w, half_omega, per_sin, 0.0)
-    # Write D omega as omega + n omega, so that nothing cancels near pi, and D = 1 keeps its derivatives in D.
+    # Write D omega as omega + n omega, so that nothing cancels near pi and the derivatives in D at D = 1 are kept.
     D, x = n + 1.0, n * half_omega
     square = x * x
     sine, cosine = x * horner(square, SINE), horner(square, COSINE)
     sine_ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
     sin2 = 4.0 * y * q
     tau, kappa = cosine + cos_w * sine_ratio, cos_w * cosine - sin2 * sine_ratio
-    # For D = 1, kappa is cos omega and D kappa - tau cos omega is exactly 0.
+    # Write tau1 so that it is exactly 0 for D = 1, where kappa = cos omega and D kappa - tau cos omega = 0.
     tau1 = (n * cos_w * cosine - sine_ratio * (D * sin2 + cos_w * cos_w)) * (2.0 * per_sin * per_sin)
     return Wave(y, q, tau, kappa, half_omega, per_sin, tau1)
 
 
 def evaluate_wave_at(omega: Array, n: Array) -> Wave:
-    """Return the terms that `evaluate_wall` needs at a frequency from 0 to pi, for an integer delay n."""
+    """Return y, q, tau and kappa at a frequency from 0 to pi, for an integer delay n."""
     xp = namespace(omega, n)
     s, cos_half = xp.sin(0.5 * omega), xp.abs(xp.cos(0.5 * omega))
     y, q = s * s, cos_half * cos_half
     D = n + 1.0
-    # Above omega = 2 use pi - omega. pi is not a float64, so its low-order part is added separately.
+    # For omega > 2 use pi - omega. Add the low-order part of pi separately, because pi is not a float64.
     sign, near_pi = 1.0 - 2.0 * xp.mod(D, 2.0), omega > 2.0
     x = xp.where(near_pi, (np.pi - omega) + 1.2246467991473532e-16, omega)
     tau = xp.where(near_pi, -sign, 1.0) * D * _compute_cardinal_sine(D * x) / _compute_cardinal_sine(x)
@@ -102,7 +107,7 @@ def _compute_cardinal_sine(x: Array) -> Array:
 
 
 def _evaluate_polynomials(wave: Wave, curve: Curve) -> tuple[Array, Array, Array, Array]:
-    """Return E, H, m and V at one s."""
+    """Return E, H, m and V at one s, from the terms and coefficients of the curve."""
     xp = namespace(wave.y, curve.sigma)
     E = curve.E[0] + wave.y * (curve.E[1] + wave.y * curve.E[2])
     H = curve.H[0] + wave.y * curve.H[1]
@@ -112,7 +117,7 @@ def _evaluate_polynomials(wave: Wave, curve: Curve) -> tuple[Array, Array, Array
 
 
 def evaluate_wall(wave: Wave, curve: Curve) -> tuple[Array, Array]:
-    """Return alpha and beta of the curve at one s."""
+    """Return alpha and beta of the boundary curve at one s."""
     E, H, _, V = _evaluate_polynomials(wave, curve)
     per_V = 1.0 / V
     alpha = 4.0 * wave.y * (wave.tau * E + wave.kappa * H) * per_V
@@ -120,7 +125,7 @@ def evaluate_wall(wave: Wave, curve: Curve) -> tuple[Array, Array]:
 
 
 def evaluate_stationarity(s: Array, curve: Curve, n: Array, undelayed: bool = False) -> tuple[Array, Array]:
-    """Return T of B2 and dT/ds at one s."""
+    """Return T, which is 0 where alpha is stationary, and dT/ds, both at one s."""
     wave = evaluate_wave(s, n, undelayed)
     y, q, tau, kappa, tau1 = wave.y, wave.q, wave.tau, wave.kappa, wave.tau1
     E, H, m, V = _evaluate_polynomials(wave, curve)
@@ -146,8 +151,8 @@ class Corner(NamedTuple):
 
 
 def find_corner(curve: Curve, n: Array) -> Corner:
-    """Return the corner, where the lobe reaches y = 1 with alpha > 0; the ridge if alpha still increases there."""
-    # The first lobe reaches y = 1 only if D = 1 and arg M increases up to pi, i.e. N(-1) > 0 and mu > 0.
+    """Return the corner, in which the lobe may end; it is the ridge if alpha still increases there."""
+    # The lobe ends in the corner only if D = 1 and arg M increases up to pi, i.e. gap > 0 and mu > 0.
     xp = namespace(curve.sigma, n)
     E = sum(curve.E[1:], curve.E[0])
     H = curve.H[0] + curve.H[1]
@@ -155,7 +160,7 @@ def find_corner(curve: Curve, n: Array) -> Corner:
     V, dV = curve.gap**2, 4.0 * (curve.sigma * curve.gap - curve.mu**2)
     reached = (n <= 0.0) & (curve.gap > 0.0) & (curve.mu > 0.0) & (value > 0.0)
     is_ridge = reached & (V * (value + slope) - value * dV >= 0.0)
-    # For the other points avoid overflow, because its derivatives would be NaN and spoil the selected values.
+    # For other devices replace V by 1, because the derivatives of an overflow would be NaN and spoil those selected.
     V = xp.where(reached, V, 1.0)
     alpha = 4.0 * value / V
     return Corner(alpha, E / V - 0.5 * alpha, reached, is_ridge)
@@ -174,8 +179,9 @@ class Start(NamedTuple):
 # comparison is made with delta, because rounded coefficients of the curve would decide differently for its neighbors.
 CORNER_DELTA = 3.6593616274217835
 
-# Start s/u as a polynomial in t = r/(r + 3), with r = delta (d + 1), and u = 1/(d + 1), fitted over all devices. The
-# error is at most 0.8 % for d < 1 and 1.1 % for d >= 1. Each row is a polynomial in u, the coefficient of a power of t.
+# Start of Newton's method: s/u as a polynomial in t = r/(r + 3), with r = delta (d + 1), and u = 1/(d + 1), fitted over
+# all devices. The error is at most 0.8 % for d < 1 and 1.1 % for d >= 1. Each row is a polynomial in u, the coefficient
+# of a power of t.
 SHORT_START = (
     (0.3748, 0.6572, -0.7317, -0.01088, 0.2558),
     (-0.1878, 3.83, -4.872, 1.835),
@@ -184,21 +190,22 @@ SHORT_START = (
     (-0.4501,),
 )
 LONG_START = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
-# `Start.power` for d < 1, because T has a larger curvature there; the same form.
+# Exponent of s in T s^power, to which Newton's method is applied for d < 1, because T is more curved there. It is
+# fitted in the same form as the start.
 SHORT_POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
-# Two steps would leave an error of 5e-9.
+# Number of Newton steps; after two steps the error would be 5e-9.
 NEWTON_STEPS = 3
 
 
 def _evaluate_bivariate(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
-    """Evaluate a polynomial in t whose coefficients are polynomials in u."""
+    """Evaluate a polynomial in t whose coefficients are polynomials in u (``rows``), lowest powers first."""
     return horner(t, [horner(u, list(row)) for row in rows])
 
 
 def guess_start(
     delta: Array, d: Array, fraction: Array, kind: DelayClasses = ANY, strength: Array | None = None
 ) -> Start:
-    """Return the starting point for one (delta, d), from a fit; ``strength`` = 1 means delta -> infinity."""
+    """Return the starting point of Newton's method from a fit; ``strength`` = 1 replaces t for delta -> infinity."""
     xp = namespace(delta, d)
     delta, d, f = frozen((delta, d, fraction), xp)
     r = delta * (d + 1.0)
@@ -224,7 +231,7 @@ class Ridge(NamedTuple):
 
 
 def _find_stationary(curve: Curve, n: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
-    """Return s at the smooth maximum and the last step, by Newton's method in a bracket that contains every ridge."""
+    """Return s at the smooth maximum and the last step, by Newton's method in a bracket that encloses every ridge."""
     xp = namespace(curve.sigma, n)
     lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
     s = xp.minimum(xp.maximum(start.s, lower), upper)

@@ -1,11 +1,15 @@
 """Compute the stability limit of alpha for given beta, delta and d in closed form.
 
-For each (beta, delta, d) the stable walls are ``0 < alpha < limit`` (docs/theory/one-lobe.md, Theorem C). The limit is
-the point of the first lobe of the boundary curve with this beta, or a point of the line of poles at z = -1, which cuts
-the lobe off. All walls with one (beta, delta, d) form a *line of constant beta*, also called row.
+For each (beta, delta, d), d = n + f, the stable walls are ``0 < alpha < limit`` (docs/theory/one-lobe.md, Theorem C).
+The *limit* is the point with this beta on the *lobe*, the first part of the boundary curve, or a point of the line of
+walls with a pole at z = -1, which cuts the lobe off in the *corner*. All walls with one (beta, delta, d) form a *line
+of constant beta*, also called row.
 
-The boundary curve is used in its form with half angles (docs/theory/boundary.md, B1), with the letters of that page
-and k = n + 1/2. Lines of constant beta are parameterized by ``b = beta + delta``, which vanishes like w^2 at w = 0.
+A wall on the boundary curve has a pole at z = e^(j w). With M = N(z)/z of the discretized plant and its pole c,
+
+    E + j H sin w = (z - c) conj(M)      V = |M|^2      y = sin^2(w/2)      k = n + 1/2      b = beta + delta
+
+The curve is used in its form with half angles (docs/theory/boundary.md, B1). b vanishes like w^2 at w = 0. Therefore
 ``V b = delta V - cos(k w)/cos(w/2) E + ...`` is rearranged such that nothing cancels, for every delta.
 """
 
@@ -27,7 +31,7 @@ from zwidth.words.xp import COSINE, SINE, horner, namespace, nan_beyond, repeat
 END_STEPS = 6  # to the end of a lobe; the last one only confirms
 ROW_STEPS = 2  # to the frequency of a limit; they leave a relative error of 2e-9, which a last step in alpha squares
 
-# Abramowitz, Stegun 1964, eq. (4.4.47): arctan t on [0, 1] within 1e-5.
+# Coefficients of arctan(t)/t in powers of t^2; error 1e-5 on [0, 1] (Abramowitz, Stegun 1964, eq. (4.4.47)).
 ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
 
 
@@ -48,7 +52,7 @@ class LongLobe(NamedTuple):
     excess2: Array
     end: Any = None  # w at the end of the lobe
     end_b: Any = None  # b at the end of the lobe
-    # Start of Newton's method: sqrt(b/end_b) = sin(start_angle w/end)/start_sine, plus a correction.
+    # Newton's method starts from sqrt(b/end_b) = sin(start_angle w/end)/start_sine plus a correction.
     start_angle: Any = None
     start_sine: Any = None
     start_correction: Any = None
@@ -61,7 +65,7 @@ def _compute_sine_and_cosine(x: Array) -> tuple[Array, Array]:
 
 
 def find_on_short_lobe(b: Array, curve: Any) -> tuple[Array, Array]:
-    """Return y of the lobe (`expand_short_delay_curve`) at one b, the first root of a quadratic; and if it is real."""
+    """Return y of the lobe's point with a given b, the first root of a quadratic, and whether the root is real."""
     (u0, u1), (v0, v1, v2), _ = curve
     xp = namespace(b, u0)
     linear = u0 - b * v1
@@ -70,23 +74,23 @@ def find_on_short_lobe(b: Array, curve: Any) -> tuple[Array, Array]:
 
 
 def limit_short_delay(beta: Array, plant: DeviceTerms) -> Array:
-    """Return the limit for d < 1: on the lobe, or beyond the corner on the line of poles at z = -1.
+    """Return the limit of alpha for d < 1: on the lobe, or beyond the corner on the line of poles at z = -1.
 
     It is 0 if no alpha is stable, and NaN for invalid input.
     """
     p1, psi, tilt = plant.p1, plant.psi, plant.tilt
     xp = namespace(beta, plant.delta)
     b = beta + plant.delta
-    # For d = 0 the limit is phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
+    # Compute the limit for d = 0, phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)), with phi1, phi2 and psi of the plant.
     integer_limit = p1 * b * (1.0 - psi * beta) / (psi * (p1 + plant.p2 * b))
     (u0, u1), modulus_terms, stiffness_terms = curve = expand_short_delay_curve(plant)
     y, meets_curve = find_on_short_lobe(b, curve)
-    # V = |N|^2 is 0 where the curve goes to infinity; rounding errors must not change its sign there.
+    # Use |V|, because V is 0 where the curve goes to infinity, and rounding errors must not change its sign there.
     limit = 4.0 * y * horner(y, stiffness_terms) / xp.abs(horner(y, modulus_terms))
     corner_reached = (tilt > 0) & (stiffness_terms[0] + stiffness_terms[1] + stiffness_terms[2] > 0)
     beyond = xp.where(corner_reached, xp.inf, 0.0)
-    # Beyond the lobe the curve returns from infinity, with b < 0 at first. A line above the whole lobe may meet that
-    # part, but it is no stability limit.
+    # Beyond the lobe the curve returns from infinity, with b < 0 at first. A line of constant beta above the whole lobe
+    # may meet that part of the curve, but not at a stability limit.
     fractional = xp.where(meets_curve & (y <= 1) & (u0 + u1 * y > 0), limit, beyond)
     limit = xp.where(plant.f == 0, integer_limit, fractional)
     line_limit = 1.0 / xp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
@@ -95,19 +99,19 @@ def limit_short_delay(beta: Array, plant: DeviceTerms) -> Array:
 
 
 def _mask_limit(limit: Array, b: Array) -> Array:
-    """Return the limit, but 0 if no alpha is stable, and NaN if b is not finite."""
+    """Replace the limit of alpha by 0 if no alpha is stable, and by NaN if b is not finite."""
     xp = namespace(b)
     return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
 
 
 def expand_long_lobe(plant: DeviceTerms) -> LongLobe:
-    """Expand the curve of one device, without the end of the lobe."""
+    """Expand E, H and V of one device in powers of y; the end of the lobe and the starting values stay None."""
     E, H, V, excess = expand_long_delay_curve(plant)
     return LongLobe(plant.delta, plant.whole + 0.5, *E, *H, *V, *excess)
 
 
 def build_long_lobe(plant: DeviceTerms) -> LongLobe:
-    """Expand the curve of one device, and find the end of its lobe and the starting values."""
+    """Expand E, H and V of one device in powers of y; find the end of its lobe and the starting values of Newton."""
     lobe = expand_long_lobe(plant)
     em, p1, n, f = plant.em, plant.p1, plant.whole, plant.f
     xp = namespace(lobe.delta)
@@ -131,7 +135,7 @@ def build_long_lobe(plant: DeviceTerms) -> LongLobe:
 
 
 class LobeTerms:
-    """The terms of the curve at one frequency: with s, c of w/2, sin_k, cos_k of k w, and derivatives d... in w."""
+    """E, H, V and sines and cosines of w/2 (s, c) and k w (sin_k, cos_k) at one w; d... is a derivative in w."""
 
     def __init__(self, omega: Array, lobe: LongLobe):
         _, k, E0, E1, E2, H0, H1, V0, V1, V2, excess1, excess2, *_ = lobe
@@ -154,7 +158,7 @@ class LobeTerms:
 
 
 def evaluate_offset(terms: LobeTerms) -> tuple[Array, Array, Array, Array]:
-    """Return numerator and denominator of ``b = beta + delta`` on the curve, each with its derivative in w.
+    """Return numerator and denominator of b on the boundary curve, each with its derivative in w.
 
     Both are accurate relative to b.
 
@@ -190,7 +194,7 @@ class AlphaTerms(NamedTuple):
 
 
 def evaluate_alpha_terms(terms: LobeTerms) -> AlphaTerms:
-    """Evaluate the numerator of alpha at one frequency."""
+    """Evaluate the numerator of alpha on the boundary curve, and its derivative, at one frequency w."""
     # (n + 1) w = k w + w/2
     n_plus_1 = terms.k + 0.5
     sine = terms.sin_k * terms.c + terms.cos_k * terms.s
@@ -205,8 +209,8 @@ def evaluate_alpha_terms(terms: LobeTerms) -> AlphaTerms:
 
 def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
     """Return the first w at which alpha is 0 again: there the phase of ``e^(j (n+1) w) (E + j H sin w)`` reaches pi."""
-    # Newton's method on this phase, which is nearly linear in w. ``start_ratio`` = E/H at w = 0 selects the start
-    # between pi/(2 (n+1)), for an undamped device, and pi/(n+1).
+    # Solve for this phase by Newton's method, because the phase is nearly linear in w. ``start_ratio`` = E/H at w = 0
+    # selects a start between pi/(2 (n+1)), for an undamped device, and pi/(n+1).
     n_plus_1 = lobe.k + 0.5
     xp = namespace(n_plus_1)
     limit = np.pi / (d + 0.5)
@@ -215,7 +219,8 @@ def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
         terms = LobeTerms(omega, lobe)
         alpha_terms = evaluate_alpha_terms(terms)
         size = terms.E * terms.E + alpha_terms.F * alpha_terms.F
-        # If the remaining phase is less than a quarter turn, approximate it by sin cos; otherwise approach slowly.
+        # If the remaining phase is less than a quarter turn, approximate it by the product of its sine and cosine;
+        # otherwise limit the step.
         remaining = xp.where(alpha_terms.quadrature < 0, alpha_terms.projection * alpha_terms.quadrature, -0.2 * size)
         return xp.minimum(
             omega - remaining / (n_plus_1 * size + (terms.E * alpha_terms.dF - alpha_terms.F * terms.dE)), limit
@@ -228,13 +233,13 @@ def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
 
 
 def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
-    """Return the limit for d >= 1, and its frequency w if it exists.
+    """Return the limit of alpha for d >= 1, and the frequency w of the limit if it exists.
 
     The limit is 0 if no alpha is stable, and NaN for invalid input.
     """
-    # b increases with w along the lobe, so Newton's method on sqrt(b), which is nearly linear in w, needs no other
-    # bracket than the lobe. Clip to the lobe and do not bisect, because a midpoint near convergence would undo the last
-    # step.
+    # Apply Newton's method to sqrt(b), which is nearly linear in w. Because b increases with w along the lobe, no other
+    # bracket than the lobe is needed. Clip to the lobe and do not bisect, because a midpoint near convergence would
+    # undo the last step.
     delta, end, end_b, start_angle, start_sine, start_correction = lobe.delta, *lobe[-5:]
     xp = namespace(beta, delta)
     b = beta + delta
@@ -265,7 +270,10 @@ def _approximate_arcsine(x: Array) -> Array:
 
 
 def _compute_newton_step(target_b: Array, terms: LobeTerms) -> Array:
-    """Return ``2 (b - sqrt(target_b b))/b'``, with sqrt(r) approximated by (1 + 3 r)/(3 + r); a single division."""
+    """Return the Newton step in w from b to ``target_b``, computed with a single division.
+
+    The step is ``2 (b - sqrt(target_b b))/b'``, with sqrt(r) approximated by (1 + 3 r)/(3 + r).
+    """
     # XLA fuses a chain of such steps into one loop over the lines only if no quotient is used twice.
     numerator, d_numerator, denominator, d_denominator = evaluate_offset(terms)
     target_numerator = target_b * denominator
@@ -278,14 +286,15 @@ def _compute_newton_step(target_b: Array, terms: LobeTerms) -> Array:
     )
 
 
-# Smallest grid and number of lines for which labels are copied from a pattern; for others comparing is faster.
+# Smallest number of points, and of lines of constant beta, of a grid whose labels are copied from a pattern; for
+# smaller grids comparing is faster.
 MIN_PATTERN_SIZE = 1 << 16
 MIN_PATTERN_ROWS = 8
 
 
 def label_grid(points: Points) -> np.ndarray:
-    """Return whether each point is stable, i.e. ``0 < alpha < limit`` of its line; False if out of range."""
-    # The relative error of the limit is about 1e-15; near the end of the lobe, 1e-15 of the largest limit.
+    """Return whether each point of a grid is stable, i.e. ``0 < alpha < limit`` of its line; False if out of range."""
+    # The relative error of a limit is about 1e-15. Near the end of the lobe the error is 1e-15 of the largest limit.
     alpha, beta = nan_beyond(WALL_RANGE, points.alpha, points.beta)
     return _compare_with_limits(alpha, row_limits(beta, points.delta, points.d))
 
@@ -297,7 +306,7 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route 
     for long, points, index in group_by_value((beta, delta, d), d >= 1):
         kernel = _long_limit if long else _short_limit
         if route == "numpy" or (route == "auto" and limits.size <= FEW):
-            # Do not broadcast beta, so that each device is computed once.
+            # Keep the shape of beta, so that each device is computed only once.
             with np.errstate(all="ignore"):
                 limits[index] = kernel(points[0], *np.broadcast_arrays(*points[1:]))
         else:
@@ -308,17 +317,17 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route 
 
 
 def _short_limit(beta: Array, delta: Array, d: Array) -> Array:
-    """Return the limits for d < 1."""
+    """Return the limits of alpha for d < 1, elementwise."""
     return limit_short_delay(beta, device(delta, d))
 
 
 def _long_limit(beta: Array, delta: Array, d: Array) -> Array:
-    """Return the limits for d >= 1."""
+    """Return the limits of alpha for d >= 1, elementwise."""
     return find_limit_long_delay(beta, build_long_lobe(device(delta, d)))[0]
 
 
 def _compare_with_limits(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """Return ``0 < alpha < limit``, broadcast."""
+    """Return ``0 < alpha < limit`` for each point of a grid; large grids are filled from a pattern."""
     shape, values = np.broadcast_shapes(alpha.shape, limit.shape), alpha.reshape(-1)
     ascending = slice(None, None, -1 if values.size and values[0] > values[-1] else 1)
     values = values[ascending]
@@ -328,8 +337,8 @@ def _compare_with_limits(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
         stable = alpha < limit
         stable &= alpha > 0
         return stable
-    # The labels of a line are True up to its limit. Copy them at memory speed from a pattern that is True in its first
-    # half and False in the second.
+    # Along a line of constant beta, the labels are True up to the limit. Copy them at memory speed from a pattern that
+    # is True in its first half and False in the second.
     pattern = np.arange(2 * values.size) < values.size
     # Replace NaN by -inf, because searchsorted treats NaN as the largest value.
     count = np.searchsorted(values, np.where(np.isnan(limit), -np.inf, limit).reshape(-1))

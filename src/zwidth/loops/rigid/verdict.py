@@ -134,13 +134,13 @@ def decide_stability(
 
 
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
-    """Return labels, the method that decided them, and statuses unless all are OK."""
+    """Return labels, the method that decided them, and their statuses, or None if all statuses are OK."""
     if method == "companion":
         radius = np.asarray(radius_by_companion(*points))
         inconclusive = (np.abs(radius - 1.0) < DOUBLE_POLE_ERROR) & (np.asarray(points[0]) != 0)
         return radius < 1.0, Method.COMPANION, np.where(inconclusive, Status.UNDECIDED, Status.OK)
     if method == "certified":
-        # Import only on demand, because most programs never certify.
+        # Import only if requested, because most programs never certify.
         from zwidth.loops.rigid.certified import certify_labels
 
         stable, status = certify_labels(points)
