@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from methods.clock import time_calls
-from zwidth.arrays import evaluate
+from zwidth.arrays import blocks, evaluate
 from zwidth.arrays.held_mass import ANY
 from zwidth.loops.rigid import (
     circle,
@@ -139,7 +139,7 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
 
 def in_blocks(function: Callable[..., Any], size: int) -> Make:
     """A compiled function applied to blocks of one size, on one processor."""
-    return lambda: lambda *columns: evaluate.map_blocks(function, list(columns), size, 1)
+    return lambda: lambda *columns: blocks.map_blocks(function, list(columns), size, 1)
 
 
 def slopes() -> tuple[Callable[..., Any], Callable[..., Any]]:

@@ -3,7 +3,7 @@
     PYTHONPATH=src:tests/support:tests/oracles python tests/reference/make_islands.py
 
 Random scenes are drawn until enough have such a row (the library only points to them). Then nothing of the library is
-used: each end is bisected in balls of 80 digits, by poles of the polynomial in `any_loop.ball_parts` that are proved
+used: each end is bisected in balls of 80 digits, by poles of the polynomial in `proved_loop.ball_parts` that are proved
 outside the unit circle, and 300 further stiffnesses of the row are counted one by one: where their labels are not
 those of the intervals, nothing is written.
 """
@@ -17,6 +17,7 @@ from typing import Any
 import any_loop
 import flint
 import numpy as np
+import proved_loop
 
 COUNT, STEPS, DIGITS = 40, 70, 80
 PERIOD, MASS = 1e-3, 0.1
@@ -72,11 +73,11 @@ def widest_row(scene: Any) -> tuple[float, np.ndarray] | None:
 
 def bisect(scene: Any, damping: float, inside: flint.arb, outside: flint.arb) -> flint.arb:
     """The end of the stable interval between a stable and an unstable stiffness."""
-    device, spring, damper = any_loop.ball_parts(scene)
+    device, spring, damper = proved_loop.ball_parts(scene)
     fixed = device + damper * flint.arb(damping)
     for _ in range(STEPS):
         middle = ((inside + outside) / 2).mid()
-        roots = any_loop.nonzero(fixed + spring * middle).roots(tol=1e-40)
+        roots = proved_loop.nonzero(fixed + spring * middle).roots(tol=1e-40)
         if all(abs(root) < 1 for root in roots):
             inside = middle
         elif any(abs(root) > 1 for root in roots):
@@ -94,7 +95,7 @@ def labels_agree(scene: Any, damping: float, ends: np.ndarray) -> bool:
         if np.min(np.abs(ends - stiffness)) < 1e-6 * size:
             continue
         inside = bool(np.any((stiffness > ends[:, 0]) & (stiffness < ends[:, 1])))
-        if (any_loop.count_outside(scene, float(stiffness), damping) == 0) != inside:
+        if (proved_loop.count_outside(scene, float(stiffness), damping) == 0) != inside:
             return False
     return True
 

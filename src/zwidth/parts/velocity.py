@@ -1,8 +1,9 @@
-"""Velocity estimates: what a program makes of the sampled positions, and feeds to the wall's damper.
+"""Velocity estimates: transfer functions from the sampled position to the velocity that the wall's damper uses.
 
-Each is ``F(z)`` from position in m to velocity in m/s, and says what the loop is to know of it: `Estimate`, for T = 1.
-A filter's coded period is the one its formulas were written for. Where it is not the loop's, the difference is divided
-by the wrong time and the cut-off lies elsewhere: that is what the loop then does, and what is computed here.
+Each is ``F(z)`` from position in m to velocity in m/s. Its method ``estimate`` returns it normalized to T = 1, as
+`Estimate`. The coded period of an estimate is the sampling period that its formulas were written for. If the loop has
+another period, the program divides the difference by the wrong time and shifts the cut-off frequency. The loop is
+computed with these errors.
 """
 
 from __future__ import annotations
@@ -15,6 +16,14 @@ import numpy as np
 
 from zwidth.parts.checks import Part
 from zwidth.parts.circle import CirclePoints, Jet, lag_jet, product_jet
+from zwidth.parts.filter_sections import (
+    NEXT_TO_ONE,
+    ball_offsets,
+    count_trailing_zeros,
+    is_rounding,
+    offsets,
+    read_sections,
+)
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import Range
 from zwidth.words.xp import is_jax, namespace
@@ -35,7 +44,7 @@ class Estimate:
     poles: Any = field(default_factory=lambda: np.zeros(0, complex))
 
     def jet(self, at: CirclePoints) -> Jet:
-        """F and its derivative in w."""
+        """Return F and its derivative in w."""
         xp = namespace(at.w)
         parts = product_jet(at, self.zeros, self.gain)
         if self.poles.size:
@@ -59,12 +68,12 @@ class Estimate:
 
     @property
     def degree(self) -> int:
-        """By how much the estimate turns in all, a bound for how fast it varies."""
+        """The number of zeros, poles and delays; bounds the rate of change of the phase of F."""
         return self.window + abs(self.lag) + self.zeros.size + self.poles.size
 
 
 class _Checked(Part):
-    """Base of the estimates that are given by their numbers."""
+    """Base of the estimates whose fields have ranges."""
 
     _owner = "velocity"
 
@@ -74,7 +83,7 @@ class BackwardDifference(_Checked):
     """``v = (x_k - x_(k-1))/T``, the default and the paper's.
 
     Args:
-        coded_period: the period the difference is divided by, in s; the loop's where left out.
+        coded_period: period in s by which the difference is divided; the period of the loop if left out.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section II.
@@ -83,7 +92,7 @@ class BackwardDifference(_Checked):
     coded_period: Any = None
 
     def estimate(self, period: Any) -> Estimate:
-        """The estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop of this period, normalized."""
         return Estimate(window=1, gain=_ratio(period, self.coded_period))
 
 
@@ -93,7 +102,7 @@ class WindowedDifference(_Checked):
 
     Args:
         samples: n, from 1 (the backward difference) to 1000.
-        coded_period: the period in the formula, in s; the loop's where left out.
+        coded_period: period in s in the formula; the period of the loop if left out.
 
     References:
         chai3d/chai3d ``src/devices/CGenericHapticDevice.cpp`` (15 ms), Force Dimension SDK ``dhdc.h`` (20 ms).
@@ -103,21 +112,21 @@ class WindowedDifference(_Checked):
     coded_period: Any = None
 
     def estimate(self, period: Any) -> Estimate:
-        """The estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop of this period, normalized."""
         return Estimate(window=self.samples, gain=_ratio(period, self.coded_period))
 
 
 @dataclass(frozen=True, repr=False)
 class LowPass(_Checked):
-    """The backward difference behind one or two equal first-order low-passes: ``v <- p v + (1 - p) input`` each.
+    """The backward difference, followed by one or two equal first-order low-passes: ``v <- p v + (1 - p) input``.
 
     ``p = exp(-T/tau)``, ``tau = 1/(2 pi cutoff)``; ``F = (1 - 1/z)/T ((1 - p) z/(z - p))^order``.
 
     Args:
-        cutoff: in Hz, > 0 and at most half the sampling rate; or
+        cutoff: in Hz, > 0 and below half the sampling rate; or
         time_constant: tau in s, > 0.
         order: 1 or 2.
-        coded_period: the period that p and the difference were written for, in s; the loop's where left out.
+        coded_period: period in s for which p and the difference are computed; the period of the loop if left out.
 
     References:
         HannesRovina/HapticHumanRobotInterfaces-Lab ``Firmware/src/haptic_controller.c``;
@@ -138,7 +147,7 @@ class LowPass(_Checked):
         super().__post_init__()
 
     def estimate(self, period: Any) -> Estimate:
-        """The estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop of this period, normalized."""
         coded = period if self.coded_period is None else self.coded_period
         if self.time_constant is None:
             check_cutoff(self.cutoff, coded)
@@ -154,12 +163,12 @@ class LowPass(_Checked):
 
 @dataclass(frozen=True, repr=False)
 class Butterworth(_Checked):
-    """The backward difference behind a Butterworth low-pass, as `scipy.signal.butter` designs it.
+    """The backward difference, followed by a Butterworth low-pass, as `scipy.signal.butter` designs it.
 
     Args:
         cutoff: in Hz, > 0 and below half the sampling rate.
         order: 1 to 8.
-        coded_period: the period it was designed for, in s; the loop's where left out.
+        coded_period: period in s for which the filter was designed; the period of the loop if left out.
 
     References:
         mahilab/HapticPaddle ``src/main.cpp`` (order 4, 25 Hz at 1 kHz); Butterworth 1930, Wireless Engineer 7.
@@ -170,10 +179,10 @@ class Butterworth(_Checked):
     coded_period: Any = None
 
     def estimate(self, period: Any) -> Estimate:
-        """The estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop of this period, normalized."""
         coded = period if self.coded_period is None else self.coded_period
         check_cutoff(self.cutoff, coded)
-        # The bilinear transform, warped so that the cut-off stays: s = (z - 1)/(z + 1), poles on a circle.
+        # Bilinear transform s = (z - 1)/(z + 1), prewarped to keep the cut-off frequency; analog poles on a circle.
         xp = namespace(self.cutoff, coded)
         size = xp.tan(_pi(coded) * self.cutoff * coded)
         angles = _pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
@@ -208,7 +217,7 @@ class VelocityFilter(Part):
 
     def __post_init__(self) -> None:
         for name in ("numerator", "denominator"):
-            sections: tuple[Any, ...] = _read_sections(name, getattr(self, name))
+            sections: tuple[Any, ...] = read_sections(name, getattr(self, name))
             (first, *others) = sections
             object.__setattr__(self, name, sections if others else first)
         top, bottom = (sum(len(section) - 1 for section in part) for part in self._sections)
@@ -227,8 +236,8 @@ class VelocityFilter(Part):
             return
         got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
         # A single pole at z = 1 is an integrator. Rounding errors of the coefficients move several poles near z = 1.
-        slow = np.abs(poles) < _NEXT_TO_ONE
-        if np.sum(slow) != 1 and any(_is_rounding(section) for section in self._sections[1]):
+        slow = np.abs(poles) < NEXT_TO_ONE
+        if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
             cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"
         elif np.any(poles[slow] == 0):
             cause = "Integral action: model controller and sampled device in series as one LinearDevice (K = 1)"
@@ -245,16 +254,16 @@ class VelocityFilter(Part):
 
     @cached_property
     def _roots(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """Zeros and poles by their offsets from 1, and by how many powers of z the denominator exceeds both."""
+        """Zeros and poles as 1 - z, without those at z = 0, and the number of poles minus zeros at z = 0."""
         found, trailing = [], []
         for part in self._sections:
             sections = [np.array(section) for section in part]
-            trailing.append(sum(map(_trailing, sections)))
-            found.append(np.concatenate([_offsets(np.trim_zeros(section, "b")) for section in sections]))
+            trailing.append(sum(map(count_trailing_zeros, sections)))
+            found.append(np.concatenate([offsets(np.trim_zeros(section, "b")) for section in sections]))
         return found[0], found[1], trailing[1] - trailing[0]
 
     def estimate(self, period: Any) -> Estimate:
-        """The estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop of this period, normalized."""
         tops, bottoms = self._sections
         gain = period
         for section in tops:
@@ -264,7 +273,7 @@ class VelocityFilter(Part):
         if hasattr(period, "mid"):
             # Compute the roots as balls from the exact coefficients, because rounded roots would lose exact zeros at
             # z = 1.
-            exact = (np.concatenate([_ball_offsets(section) for section in part]) for part in (tops, bottoms))
+            exact = (np.concatenate([ball_offsets(section) for section in part]) for part in (tops, bottoms))
             return Estimate(0, gain, 0, *exact)
         zeros, poles, lag = self._roots
         return Estimate(0, gain, lag, zeros, poles)
@@ -272,14 +281,14 @@ class VelocityFilter(Part):
 
 @dataclass(frozen=True, repr=False)
 class FOAW(_Checked):
-    """First-order adaptive windowing, for simulations: it has no linear form and no answer to questions of stability.
+    """First-order adaptive windowing, for simulations only: the estimate is nonlinear, so the loop has no poles.
 
-    The slope over the longest window, up to ``samples`` periods, whose straight line from its oldest to its newest
-    position misses none between by more than ``noise``.
+    The estimate is the slope of the line from the oldest to the newest position of a window. The window is extended by
+    one period at a time, up to ``samples``, until a position in it deviates from this line by more than ``noise``.
 
     Args:
-        noise: the largest error of a measured position in m, > 0: one count of an encoder.
-        samples: the longest window in periods, 1 to 64.
+        noise: largest error of a measured position in m, > 0; one count of an encoder.
+        samples: longest window in periods, 1 to 64.
 
     References:
         Janabi-Sharifi, Hayward, Chen 2000, IEEE Trans. Control Systems Technology 8(6):1003-1009 (end-fit).
@@ -289,15 +298,14 @@ class FOAW(_Checked):
     samples: int = field(default=15, metadata={"allowed": Range(1, 64)})
 
     def estimate(self, period: Any) -> Estimate:
-        """Refused: what it answers hangs on the motion."""
+        """Raise `InputError`, because the estimate depends on the motion."""
         raise InputError(
-            "velocity: FOAW has no linear form, so that a wall with it has no poles and no boundary; simulate it, or "
-            "ask with a linear estimate such as zwidth.WindowedDifference"
+            "velocity: FOAW has no linear form, so the loop has no poles; simulate it, or use a linear estimate such "
+            "as zwidth.WindowedDifference"
         )
 
 
 Velocity: TypeAlias = BackwardDifference | WindowedDifference | LowPass | Butterworth | VelocityFilter | FOAW
-# By what configurations and the command line call them.
 ESTIMATES = {
     "backward_difference": BackwardDifference,
     "windowed_difference": WindowedDifference,
@@ -306,10 +314,11 @@ ESTIMATES = {
     "filter": VelocityFilter,
     "foaw": FOAW,
 }
+"""Velocity estimates by their names in configurations and on the command line."""
 
 
 def name_estimate(velocity: Velocity) -> str:
-    """What configurations call the kind of an estimate."""
+    """Return the name of the kind of an estimate in configurations."""
     for kind, part in ESTIMATES.items():
         if type(velocity) is part:
             return kind
@@ -328,17 +337,18 @@ def is_plain(velocity: Velocity, period: Any) -> bool:
 
 
 def check_cutoff(cutoff: Any, period: Any) -> None:
-    """Refuse a cut-off that a filter of this period cannot have."""
+    """Raise `InputError` if a cut-off frequency is not below the Nyquist frequency."""
     if is_jax(cutoff) or is_jax(period):
         return
     if cutoff * period >= 0.5:
         raise InputError(
-            f"velocity.cutoff: got {cutoff:g} Hz; it must lie below half the sampling rate, {0.5 / period:g} Hz here; "
-            "a filter that high does nothing, leave it out"
+            f"velocity.cutoff: got {cutoff:g} Hz; it must lie below half the sampling rate, {0.5 / period:g} Hz; "
+            "lower it, or remove the filter"
         )
 
 
 def _ratio(period: Any, coded: Any) -> Any:
+    """Return the period of the loop divided by the coded period; 1 if no coded period is given."""
     return 1.0 if coded is None else period / coded
 
 
@@ -363,72 +373,3 @@ def _unit_vectors(angles: np.ndarray) -> np.ndarray:
     import flint
 
     return np.array([flint.acb(angle.cos(), angle.sin()) for angle in angles])
-
-
-def _ball_offsets(coefficients: tuple[Any, ...]) -> np.ndarray:
-    """Return 1 - root for the roots of a polynomial with exact coefficients, as balls."""
-    import flint
-
-    exact = flint.fmpq_poly([flint.arb(value).fmpq() for value in reversed(coefficients)])
-    found: Any = exact(flint.fmpq_poly([1, -1])).numer().complex_roots()
-    return np.array([flint.acb(root) for root, times in found for _ in range(times)], object)
-
-
-_NEXT_TO_ONE = 1e-2  # largest distance from z = 1 of poles that rounding errors of the coefficients can move there
-
-
-def _read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
-    """Return the coefficients of the sections without leading zeros; raise `InputError` for other values.
-
-    Args:
-        name: "numerator" or "denominator", for messages.
-        given: coefficients of one polynomial, or a list of sections with their coefficients.
-    """
-    try:
-        rows = list(given) if np.ndim(given) or any(map(np.ndim, given)) else [given]
-    except ValueError:
-        # NumPy raises this error for sections of different lengths.
-        rows = list(given)
-    except TypeError:
-        rows = [given]
-    nested = any(np.ndim(row) for row in rows)
-    sections = []
-    for row in rows if nested else [rows]:
-        try:
-            values = np.atleast_1d(np.asarray(row, float))
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"velocity.{name}: got {given!r}; it must be a list of real coefficients") from error
-        values = np.trim_zeros(values, "f") if values.ndim == 1 else values
-        if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
-            raise InputError(
-                f"velocity.{name}: got {given!r}; it must be a list of finite coefficients, highest power first, not "
-                "all 0"
-            )
-        sections.append(tuple(values.tolist()))
-    return tuple(sections)
-
-
-def _is_rounding(coefficients: tuple[float, ...]) -> bool:
-    """Return whether rounding errors of the coefficients alone can explain the roots on or outside the unit circle."""
-    roots = 1.0 - _offsets(np.trim_zeros(np.array(coefficients), "b"))
-    on = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))
-    # If the polynomial is this small at a point of the circle, another one whose coefficients differ only by rounding
-    # errors has a root exactly there.
-    noise = 4.0 * len(coefficients) * np.finfo(float).eps * np.abs(coefficients).sum()
-    return bool(on.size and len(coefficients) > 2 and np.all(np.abs(np.polyval(coefficients, on)) <= noise))
-
-
-def _trailing(polynomial: np.ndarray) -> int:
-    return polynomial.size - int(np.flatnonzero(polynomial)[-1]) - 1
-
-
-def _offsets(polynomial: np.ndarray) -> np.ndarray:
-    """Roots by their offsets from 1, found in powers of z - 1: next to 1 they keep their digits."""
-    if polynomial.size < 2:
-        return np.zeros(0, complex)
-    shifted = np.polynomial.polynomial.Polynomial(polynomial[::-1])(
-        np.polynomial.polynomial.Polynomial([1.0, 1.0])
-    ).coef
-    scale = np.abs(polynomial).sum()
-    shifted = np.where(np.abs(shifted) <= 4 * polynomial.size * np.finfo(float).eps * scale, 0.0, shifted)
-    return -np.polynomial.polynomial.polyroots(shifted) + 0j

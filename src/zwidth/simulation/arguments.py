@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64, compute_concretely, join_shapes
+from zwidth.arrays.evaluate import as_float64, join_shapes
 from zwidth.arrays.threads import processors
 from zwidth.parts.checks import read_texts
 from zwidth.parts.linear_device import LinearDevice
@@ -19,9 +19,9 @@ from zwidth.simulation.parameters import Settings, TracedLaw
 from zwidth.words.errors import InputError, ResourceError, describe_choice
 from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
 from zwidth.words.unit_system import LINEAR, UnitSystem
-from zwidth.words.xp import is_traced
+from zwidth.words.xp import compute_concretely, is_traced
 
-RECORDED_BYTES = 2 * 14 * 8  # per recorded instant, including its conversion to SI units
+RECORDED_BYTES = 2 * 14 * 8  # per recorded instant: about 14 numbers, twice because of the conversion to SI units
 JITTER_BYTES = 20 * 8  # per instant of the running simulations
 DRAWN_BYTES = 4 * 8  # per period of the running simulations, for noise and for external forces
 MOST_BYTES = 4 << 30  # per call of `simulate`
@@ -32,14 +32,14 @@ ARGUMENTS = {
     for name in ("stiffness", "virtual_damping", *OF_MOTIONS)
 } | {"jitter": ("s", NOT_NEGATIVE)}
 """Unit and range of each numeric argument of `simulate`."""
-LIMITS = ("max_force", "max_rate")  # infinite if the motor has no limit
+LIMITS = ("max_force", "max_rate")  # may be infinite: the motor then has no such limit
 
 
 def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     """Return the distinct scenes, and the index of the scene of each batch entry."""
     listed = isinstance(scenes, Iterable) and not isinstance(scenes, np.ndarray)
     array = np.array(list(scenes) if listed else scenes, object)
-    known: dict[int, int] = {}
+    numbers: dict[int, int] = {}
     which = np.empty(array.shape, int)
     for index, scene in np.ndenumerate(array):
         if not (hasattr(scene, "device") and hasattr(scene, "timing")):
@@ -50,8 +50,8 @@ def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
             )
         if scene.traced_path is not None:
             raise InputError("scenes: got values traced by JAX; call simulate outside of jit, vmap and grad")
-        which[index] = known.setdefault(id(scene), len(known))
-    return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))], which
+        which[index] = numbers.setdefault(id(scene), len(numbers))
+    return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(numbers))], which
 
 
 def find_system(scenes: list[Any]) -> UnitSystem:
@@ -62,20 +62,20 @@ def find_system(scenes: list[Any]) -> UnitSystem:
 
 
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments with one initial value per body."""
+    """Return the arguments with initial values of every body; bodies without their own start with the device."""
     bodies = dict.fromkeys(["position", *(name for scene in scenes for name in name_bodies(scene))])
     for name in STARTS:
         start = given.pop(name)
         start = dict(start) if isinstance(start, Mapping) else {"position": start}
         for body in start.keys() - bodies.keys():
             raise InputError(f"{name}: {describe_choice(body, tuple(bodies))}")
-        own = start.get("position", 0.0)
-        given |= {f"{name}.{body}": start.get(body, own) for body in bodies}
+        of_device = start.get("position", 0.0)
+        given |= {f"{name}.{body}": start.get(body, of_device) for body in bodies}
     return given
 
 
 def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, periods: int) -> Any:
-    """Return the external force of operators with a moving far end, averaged over each period."""
+    """Return the mean external force on the device per period, including the force of the moving hand."""
     places = _read_history("hand_history", hand, periods + 1, find_system(scenes)["m"])
     for scene in scenes:
         if scene.operator is None or not scene.operator.rigid or scene.device.coupling is not None:
@@ -141,14 +141,14 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
 def read_arguments(
     scenes: list[Any], which: np.ndarray, given: dict[str, Any], seed: Any, history: Any, periods: int
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Return the numbers of all simulations by name, the scene index in the batch shape, and a mask of usable rows."""
+    """Return numbers by name, one per simulation; scene indices in the batch shape; and a mask of valid simulations."""
     if given["static"] is None:
         given = {**given, "static": given["coulomb"]}
     system = find_system(scenes)
     walls = [resolve_wall(scene.wall, given["stiffness"], given["virtual_damping"], system) for scene in scenes]
     if given["stiffness"] is None:
-        own = np.array(walls, float).reshape(-1, 2)[which]
-        given = {**given, "stiffness": own[..., 0], "virtual_damping": own[..., 1]}
+        pairs = np.array(walls, float).reshape(-1, 2)[which]
+        given = {**given, "stiffness": pairs[..., 0], "virtual_damping": pairs[..., 1]}
     elif given["virtual_damping"] is None:
         given = {**given, "virtual_damping": 0.0}
     arrays = {
@@ -236,6 +236,7 @@ def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: 
 
 
 def _read_seeds(seed: Any) -> np.ndarray:
+    """Return the seeds as an array of integers; raise `InputError` for other values."""
     if is_traced(seed):
         raise InputError("seed: got a value traced by JAX; use integers, outside of jit, vmap and grad")
     try:

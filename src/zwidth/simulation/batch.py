@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import compute_concretely
 from zwidth.arrays.threads import run_in_threads
 from zwidth.parts.chain import chain_of
 from zwidth.parts.device import Device
@@ -26,12 +25,13 @@ from zwidth.simulation.parameters import (
     spread_scenes,
 )
 from zwidth.simulation.result import OF_ENERGY, convert_to_si
+from zwidth.words.xp import compute_concretely
 
 GROUP = 1 << 10  # simulations per call: enough for vector units, few enough that a state stays in the cache
 
 
 def find_structure(scene: Parts) -> tuple[Any, ...]:
-    """Return the properties that scenes of one compiled program share."""
+    """Return the properties that must be equal for scenes to share a compiled program."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
     orders = len(scene.device.modes), 0 if scene.device.actuator is None else scene.device.actuator.order
     # Linear systems have no common structure, so each device and period has a program of its own.
@@ -41,7 +41,7 @@ def find_structure(scene: Parts) -> tuple[Any, ...]:
 
 
 def name_bodies(scene: Parts) -> tuple[str, ...]:
-    """Return the names in `Motion` of the positions of all bodies."""
+    """Return the fields of `Motion` with the positions of the bodies."""
     tip = ("tip_position",) if scene.device.coupling is not None else ()
     hand = ("hand_position",) if scene.operator is not None and not scene.operator.rigid else ()
     return "position", *tip, *hand
@@ -96,34 +96,35 @@ def run_scenes(
         record=settings.record,
         law=settings.law,
     )
-    # The minima avoid further compilations; a longer ring takes no more time.
+    # Lengths of the rings of positions and of commands. The minimum lengths save compilations; longer rings than needed
+    # take no more time.
     rings = (
         round_up(max(3, *(model.window for model in models)) + 1),
         round_up(max(5, *(model.late for model in models)) + 3),
     )
     names, count = name_bodies(scenes[0]), which.size
-    # The energies of a linear system are unknown, because its bodies are.
+    # The energies of a linear system are unknown, because its masses and springs are unknown.
     unknown = set() if isinstance(scenes[0].device, Device) else OF_ENERGY
 
     def run(rows: np.ndarray) -> dict[str, np.ndarray]:
         # Import JAX only here, because importing zwidth must not load it.
         from zwidth.simulation.engine import run_batch
 
-        own, scene_of = np.unique(which[rows], return_inverse=True)
-        members, group = [models[k] for k in own], {name: part[rows] for name, part in numbers.items()}
+        used, scene_of = np.unique(which[rows], return_inverse=True)
+        members, group = [models[k] for k in used], {name: part[rows] for name, part in numbers.items()}
         params, inputs = build_batch(members, scene_of, group, settings, options, names)
         with compute_concretely():
-            found = run_batch(params, options, settings, inputs, rings)
+            simulated = run_batch(params, options, settings, inputs, rings)
         memory = np.array([model.late + model.window for model in members])[scene_of]
-        columns = convert_to_si(found, inputs, params.motor.static > 0, memory, names, settings)
+        columns = convert_to_si(simulated, inputs, params.motor.static > 0, memory, names, settings)
         return columns | {name: np.full_like(columns[name], np.nan) for name in unknown & columns.keys()}
 
     size = min(GROUP, 1 << (count - 1).bit_length())
     # Repeat the last simulation to fill the last group, because each size needs a compilation.
     groups = [np.minimum(np.arange(first, first + size), count - 1) for first in range(0, count, size)]
     # Compile with the first group; threads run the others in parallel, because JAX releases the interpreter lock.
-    found = [run(groups[0]), *run_in_threads(run, groups[1:])]
-    return {name: np.concatenate([each[name] for each in found])[:count] for name in found[0]}
+    results = [run(groups[0]), *run_in_threads(run, groups[1:])]
+    return {name: np.concatenate([each[name] for each in results])[:count] for name in results[0]}
 
 
 def build_batch(

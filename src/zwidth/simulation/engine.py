@@ -22,9 +22,14 @@ from zwidth.words.xp import known_options
 
 BLOCK = 128  # periods per compiled call
 SEGMENTS = 6  # equal parts of the tail; an even number, because the trend compares the halves
-SLACK = 1.0 + 1e-9  # factor on the bound of FOAW; covers rounding errors, because positions are counts of an encoder
-# XLA's older loop emitters without splitting: half the compile time at the same speed.
-COMPILER_OPTIONS = ("xla_cpu_use_fusion_emitters", False), ("xla_cpu_parallel_codegen_split_count", 1)
+SLACK = 1.0 + 1e-9  # factor on the bound of FOAW; rounding errors must not exclude deviations of exactly one count
+# XLA's older loop emitters without splitting: half the compile time at the same speed. Full optimization even if
+# XLA_FLAGS asks for less, because a simulation runs for thousands of periods.
+COMPILER_OPTIONS = (
+    ("xla_cpu_use_fusion_emitters", False),
+    ("xla_cpu_parallel_codegen_split_count", 1),
+    ("xla_backend_optimization_level", 3),
+)
 
 
 class Controller(NamedTuple):
@@ -53,7 +58,7 @@ class Summary(NamedTuple):
     given: Array  # largest energy that the wall has supplied so far
     far: Array  # largest -x and x of the bodies, (1 + SEGMENTS, 2, bodies, batch); -inf without samples
     turns: Array  # number of times the velocity becomes positive, (1 + SEGMENTS, batch)
-    turned: Array  # first and last time in the tail at which it does, (2, batch)
+    turned: Array  # first and last instant of this kind in the tail, in periods, (2, batch)
 
 
 class State(NamedTuple):
@@ -75,6 +80,7 @@ class PeriodInputs(NamedTuple):
 
 
 def _write(rows: Array, row: Array, index: Array) -> Array:
+    """Return rows with one of them replaced."""
     return jax.lax.dynamic_update_index_in_dim(rows, row, index, 0, allow_negative_indices=False)
 
 
@@ -129,7 +135,10 @@ def control(
 
 
 def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, longest: int) -> Array:
-    """Return the FOAW velocity: the slope through both ends of the longest window before the first that misses."""
+    """Return the FOAW velocity: the slope between both ends of the longest window.
+
+    The window grows until a position within it deviates by more than ``bound`` from the line between both ends.
+    """
     past = ring[(k - np.arange(longest + 1)) & (len(ring) - 1)]
     back = np.arange(1, longest + 1)[:, None]
     slopes = (newest - past[1:]) / back
@@ -154,7 +163,7 @@ def propagate(
     indices: tuple[Array | int, Array | int],
     time: Array,
 ) -> tuple[BodyState, Array]:
-    """Propagate the bodies over one piece of a period, ``indices`` its substep and piece, and update the energies."""
+    """Propagate the bodies over one piece of a period and update the energies; ``indices``: substep and piece."""
     zero, direct = 0.0 * body.x[0], params.rate.shape[1] == params.rate.shape[0] + 1
     forces = jnp.stack([force + push + zero] if direct else [force + zero, push + zero])
     step = None if options.jitter else Flow(*(read(read(part, indices[0], 1), indices[1], 1) for part in params.pieces))
@@ -178,7 +187,7 @@ def propagate(
 
 
 def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, int]) -> State:
-    """Return the state before the first sample: uniform motion in the past, no command, modes at rest (T2)."""
+    """Return the state before the first sample: uniform motion until then, no commands, modes at rest (T2)."""
     count, size = params.place.shape[:2]
     body = np.zeros((size, inputs.positions.shape[1]))
     # Solve for the coordinates of the bodies only; links are then unstretched if all bodies start together.
@@ -197,7 +206,7 @@ def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, 
 
 
 def _settle(estimator: Any, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the filter state after a long uniform motion: its input is constant after a difference, else a ramp."""
+    """Return the filter state after a long uniform motion: a constant input after a difference, otherwise a ramp."""
     A, B, window = (np.asarray(part) for part in (estimator.A, estimator.B, estimator.window))
     level, slope = np.where(window > 0, v, x), np.where(window > 0, 0.0, v)
     left = np.eye(len(B)) - np.moveaxis(A, -1, 0)
@@ -210,7 +219,7 @@ def _simulate_period(
 ) -> tuple[State, Any]:
     """Simulate one period; ``ends``: periods at which the segments of the tail begin, and the end."""
     controller, reading = control(params, options, state.controller, inputs.k, state.body.x[0] + inputs.noise)
-    # Ages of the commands that act in turn until the next sample.
+    # Ages in samples of the commands that may act until the next sample, in the order of their start.
     ages = {1: (0,), 2: (1, 0), 4: (2, 1, 0, -1)}[options.pieces]
     forces = [look_back(controller.commands, inputs.k, params.late + age) for age in ages]
     durations = inputs.durations if options.jitter else params.durations
@@ -252,21 +261,21 @@ def _summarize(
     params: Parameters, state: State, reading: Reading, body: BodyState, work: Array, k: Array, ends: Array
 ) -> Summary:
     """Return the statistics after period k."""
-    known, before = state.summary, state.controller.touching
+    summary, before = state.summary, state.controller.touching
     places = jnp.stack([dot(row, state.body.x) for row in params.place])
     v, next_v = dot(params.motion[0], state.body.x), dot(params.motion[0], body.x)
-    hits = reading.touching & ~before & (k > 0) & jnp.isnan(known.impact)
+    hits = reading.touching & ~before & (k > 0) & jnp.isnan(summary.impact)
     turning = (v <= 0) & (next_v > 0)
     moment = k - v / jnp.where(next_v > v, next_v - v, 1.0)
-    segment, first = jnp.sum(k >= ends), known.turned[0]
+    segment, first = jnp.sum(k >= ends), summary.turned[0]
     turned = jnp.stack([jnp.where(jnp.isnan(first), moment, first), moment])
     return Summary(
-        known.exits + (before & ~reading.touching),
-        jnp.where(hits, v, known.impact),
-        jnp.fmax(known.given, work[0]),
-        _write(known.far, jnp.fmax(read(known.far, segment), jnp.stack([-places, places])), segment),
-        _write(known.turns, read(known.turns, segment) + turning, segment),
-        jnp.where(turning & (segment > 0), turned, known.turned),
+        summary.exits + (before & ~reading.touching),
+        jnp.where(hits, v, summary.impact),
+        jnp.fmax(summary.given, work[0]),
+        _write(summary.far, jnp.fmax(read(summary.far, segment), jnp.stack([-places, places])), segment),
+        _write(summary.turns, read(summary.turns, segment) + turning, segment),
+        jnp.where(turning & (segment > 0), turned, summary.turned),
     )
 
 
@@ -319,7 +328,7 @@ def run_batch(
 
 
 def _select_block(values: np.ndarray | None, first: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return one block of values along time, padded with 0; zeros for a batch of 1 if there are no values."""
+    """Return the values of one block of periods, zeros after the last; zeros of the given shape if there are none."""
     if values is None:
         return np.zeros((BLOCK, *shape))
     part = values[first : first + BLOCK]

@@ -18,7 +18,7 @@ from zwidth.parts.chain import Resonance, body_position
 from zwidth.parts.system import System
 from zwidth.words.errors import InputError
 
-TERMS = 15  # of the series; for a norm of 1/2 the truncation error is below 1e-19
+TERMS = 15  # of the series; for a norm of 1/2 its error is below 1e-18 in the motion and 5e-14 in the loss
 DIGITS = 53  # binary digits of a time below 2 periods: 1, 1/2, ... 2^-52
 
 
@@ -86,7 +86,7 @@ def build_mechanics(chains: Sequence[Any]) -> Mechanics:
 
 
 def _build_system(systems: Sequence[Any]) -> Mechanics:
-    """Return the matrices of one linear system with several delays; its only position is the output, without energy."""
+    """Return the matrices of one linear system with several delays: one position, the output; energies set to 0."""
     A, _, push = systems[0].realize()
     if systems[0].sampled:
         raise InputError(
@@ -101,11 +101,12 @@ def _build_system(systems: Sequence[Any]) -> Mechanics:
 
 
 def _stack(parts: Sequence[Any]) -> Any:
+    """Return named tuples of one type as a single one, with an array over the tuples in each field."""
     return type(parts[0])(*(np.array(column, float) for column in zip(*parts, strict=True)))
 
 
 def flow(rate: np.ndarray, drain: np.ndarray, times: np.ndarray) -> Flow:
-    """Return the flow of ``x' = rate @ (x, u)`` over given times, (scenes, ...)."""
+    """Return the flow of ``x' = rate @ (x, u)`` over times of shape (scenes, ...); ``drain``: power of the dampers."""
     count, size = rate.shape[-2:]
     inner = (rate.shape[0], *(1,) * (times.ndim - 1), size, size)
     whole = np.concatenate([rate, np.zeros((rate.shape[0], size - count, size))], 1).reshape(inner)

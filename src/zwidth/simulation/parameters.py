@@ -19,7 +19,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.types import Array
 
 LONGEST_ANGLE = 0.25  # rad of the fastest motion per step with friction; a longer step could hide two events (T5)
-MOST_STEPS = 256  # steps per period with friction, to limit the run time
+MOST_STEPS = 256  # largest number of steps per period with friction, to limit the run time
 
 
 Law: TypeAlias = Callable[[Any, Any, Any], Any]
@@ -118,7 +118,7 @@ class Parameters(NamedTuple):
 
 
 def spread_scenes(parts: Any, which: np.ndarray) -> Any:
-    """Return arrays with one row per scene as arrays with one last entry per simulation; length 1 for one scene."""
+    """Return arrays over the scenes (first axis) as arrays over the batch (last axis, of length 1 for one scene)."""
     if isinstance(parts, tuple):
         return type(parts)(*(spread_scenes(part, which) for part in parts))
     last = np.moveaxis(parts, 0, -1)
@@ -126,7 +126,7 @@ def spread_scenes(parts: Any, which: np.ndarray) -> Any:
 
 
 def round_up(size: int) -> int:
-    """Return 0 or the next power of 2, at least 2, so that few sizes are compiled."""
+    """Return 0 for 0, otherwise the next power of 2, at least 2, so that few sizes are compiled."""
     return 0 if size == 0 else max(2, 1 << (size - 1).bit_length())
 
 
@@ -169,7 +169,7 @@ def cut_period(lengths: np.ndarray, effective: Sequence[np.ndarray], substeps: i
 
 
 def find_longest_steps(machine: Mechanics) -> np.ndarray:
-    """Return the longest steps with friction: powers of 2; 2 if the velocity is monotone under a constant force."""
+    """Return the longest steps with friction, in periods: powers of 2, and 2 for a single body without spring (T5)."""
     size = machine.rate.shape[1]
     fastest = np.abs(np.linalg.eigvals(machine.rate[:, :, :size])).max(-1)
     steps = 0.5 ** np.maximum(0, np.ceil(np.log2(np.maximum(fastest, 1e-9) / LONGEST_ANGLE)))

@@ -1,8 +1,9 @@
 """Propagation over any duration by its binary digits, with the events of dry friction.
 
 Pure functions of JAX arrays whose last axis is the batch. The slip of the first body is -1 or 1 while it slips in that
-direction, 0 while friction holds it. The reserve is the distance from the next event: the speed while slipping, the
-force that static friction can still take while held. An event ends the reserve (docs/theory/simulation.md, T4 and T5).
+direction, 0 while friction holds it. Events start and end slip (docs/theory/simulation.md, T4 and T5). The reserve of
+the first body is positive between events and 0 at an event. While the body slips, it is the speed. While the body is
+held, it is the static friction minus the sum of the other forces, in the mean direction of this sum during the step.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from zwidth.words.types import Array
 
 MOST_EVENTS = 512  # events per piece; a simulation with more is NaN
 LAST_DIGIT = 0.5 ** (DIGITS - 1)  # shortest step, in sampling periods
-# An event costs a hundred times a piece without one, so simulations with events continue in groups of this fraction of
-# the batch.
+# Simulations with events continue in groups of 1/FRACTION of the batch, because a piece with an event takes a hundred
+# times as long as one without.
 FRACTION = 8
 
 
@@ -62,12 +63,12 @@ def advance(
 
     Args:
         digits: flows over the binary digits of time, slipping and held.
-        held: mask of held bodies.
+        held: mask of the batch entries whose first body is held.
         x: state of the bodies.
         forces: constant forces.
         limit: longest time, in sampling periods.
         keep: condition on the state; always true if left out.
-        which: batch entries that ``x`` holds; all if left out.
+        which: indices of the batch entries in ``x``; all if left out.
 
     Returns:
         State, time, and energy dissipated by the dampers.
@@ -100,6 +101,8 @@ def _take(part: Array, which: Array | None) -> Array:
 
 
 class _Slide(NamedTuple):
+    """State of a piece with friction."""
+
     body: BodyState
     left: Array  # remaining duration
     lost: Array  # energy dissipated by dampers
@@ -108,15 +111,18 @@ class _Slide(NamedTuple):
 
     @property
     def pending(self) -> Array:
+        """Mask of the batch entries whose piece is not finished."""
         return (self.left > 0) & (self.events < MOST_EVENTS)
 
 
 class _Trip(NamedTuple):
+    """State, time and loss at the end of a step, with and without an event."""
+
     x: Array
     time: Array
     lost: Array
     far: Array  # state at the end of the step if no event occurs
-    spent: Array  # energy dissipated by the dampers until then
+    spent: Array  # energy dissipated by the dampers if no event occurs
     over: Array  # an event ends the step
 
 
@@ -152,7 +158,7 @@ class _Joint(NamedTuple):
         return BodyState(x, jnp.where(stopped, jnp.where(jnp.abs(push) > self.static, jnp.sign(push), 0.0), slip))
 
     def reserve(self, x: Array, slip: Array, side: Array) -> Array:
-        """Return the reserve until the next event."""
+        """Return the reserve; ``side``: direction of the force on a held body."""
         return jnp.where(slip == 0, self.static - side * self.pressed(x), slip * self.speed(x))
 
     def slope(self, x: Array, slip: Array, side: Array) -> Array:
@@ -162,11 +168,11 @@ class _Joint(NamedTuple):
         return jnp.where(slip == 0, stuck, slip * (self.pressed(x) - slip * self.coulomb))
 
     def find_side(self, x: Array, far: Array) -> Array:
-        """Return the direction of the mean force on a held body during the step."""
+        """Return the direction of the mean force on a held body during a step that ends at ``far``."""
         return jnp.sign(self.pressed(x) + self.pressed(far))
 
     def dips(self, x: Array, slip: Array, far: Array, side: Array) -> Array:
-        """Return a mask of the steps within which the reserve has a minimum."""
+        """Return a mask of the steps at whose start the reserve decreases and at whose end it increases."""
         dips = (self.slope(x, slip, side) < 0) & (self.slope(far, slip, side) > 0)
         # Exclude a body just released, because its velocity is a rounding error.
         return (self.reserve(far, slip, side) > 0) & dips & ((slip == 0) | (self.speed(x) != 0))
@@ -207,10 +213,10 @@ class _Joint(NamedTuple):
         held, driven, limit = slip == 0, self.drive(slip), jnp.minimum(state.left, self.longest)
 
         def search(trip: _Trip, turn: Array) -> Any:
-            """Propagate by the whole step, then to the minimum of the reserve, then to the event; compiled once."""
+            """Propagate over the whole step (turn 0), to the minimum of the reserve (1), and to the event (2)."""
             side = self.find_side(x, trip.far)
             wanted = jnp.stack([self.dips(x, slip, trip.far, side), self.reserve(trip.x, slip, side) < 0])
-            # The first turn ignores the value that it reads.
+            # Turn 0 ignores the value that it reads.
             wanted = (turn == 0) | read(wanted, turn - 1)
 
             def keep(after: Array) -> Array:
@@ -263,8 +269,8 @@ def propagate_with_friction(
 
     def finish_few(state: _Slide) -> _Slide:
         which = jnp.sort(jnp.where(state.pending, np.arange(size), size))[:few]
-        own, part = jax.tree.map(lambda part: _take(part, which), (joint, state))
-        part = finish(own, part._replace(left=jnp.where(which < size, part.left, 0.0)), which)
+        few_joint, part = jax.tree.map(lambda part: _take(part, which), (joint, state))
+        part = finish(few_joint, part._replace(left=jnp.where(which < size, part.left, 0.0)), which)
         return jax.tree.map(lambda rows, part: rows.at[..., which].set(part, mode="drop"), state, part)
 
     if whole is None or few == size:

@@ -24,7 +24,7 @@ class MotionKind(IntEnum):
     """
 
     REST = 0
-    """No body moves in the second half of the tail by more than 1e-9 of the largest distance."""
+    """In the second half of the tail no body moves by more than 1e-9 of the largest magnitude of all positions."""
     DECAYING = 1
     """The width decreases from each segment to the next, or is below 1 % of the earlier motion and halves."""
     STEADY = 2
@@ -32,14 +32,14 @@ class MotionKind(IntEnum):
     GROWING = 3
     """The width increases from each segment to the next, or is twice that of the earlier motion and doubles."""
     DIVERGED = 4
-    """The position exceeds 1e100."""
+    """A body is farther than 1e100 m from the surface of the wall."""
     UNCLEAR = 5
     """None of these: the trend of the width is not clear, or the tail has too few oscillations."""
     INVALID = 6
     """The ``status`` of the simulation is not 0."""
 
 
-AT_REST = 1e-9  # largest width at rest, relative to the largest distance of a body from 0
+AT_REST = 1e-9  # largest width at rest, relative to the largest magnitude of all positions
 LEAST_REST = 3  # samples without motion that do not yet count as rest
 EQUAL = 1e-3  # largest relative difference of equal widths
 NO_TREND = 1.25  # ratio of the widths of both halves up to which fluctuations count as no trend
@@ -159,7 +159,7 @@ class Motion:
     status: Any
 
     def to_dataset(self, *dims: str) -> xarray.Dataset:
-        """Return an xarray Dataset (extra ``store``); each variable has a long name and a unit.
+        """Return the motion as an xarray Dataset with long names and units; needs ``pip install zwidth[store]``.
 
         Args:
             *dims: names of the batch axes, none for a single motion; default ``batch_0``, ``batch_1``, ...
@@ -192,7 +192,7 @@ class Motion:
 
 
 def _measure_width(summary: Any, start: int, stop: int) -> np.ndarray:
-    """Return the peak-to-peak positions in consecutive segments, (bodies, batch); NaN without samples."""
+    """Return the peak-to-peak position of each body in segments ``start`` to ``stop - 1``; NaN without samples."""
     width = summary.far[start:stop].max(0).sum(0)
     return np.where(width >= 0, width, np.nan)
 
@@ -204,17 +204,17 @@ def _measure_halves(summary: Any) -> list[np.ndarray]:
 
 
 def find_largest(summary: Any) -> np.ndarray:
-    """Return the largest distance of a body from 0."""
+    """Return the largest magnitude of the positions of all bodies at all samples."""
     return np.maximum(summary.far.max((0, 1, 2)), 0.0)
 
 
 def classify(summary: Any, memory: np.ndarray, tail: int) -> np.ndarray:
-    """Return the code of `MotionKind` of each motion; ``memory``: samples that decide the next command."""
+    """Return the code of `MotionKind` of each motion; ``memory``: samples that can affect the next command."""
     widest = find_largest(summary)
     width = np.stack([_measure_width(summary, k, k + 1)[0] for k in range(1, len(summary.turns))])
     before, (first, second) = _measure_width(summary, 0, 1), _measure_halves(summary)
     still = (second.max(0) <= AT_REST * widest) & (first.max(0) <= np.sqrt(AT_REST) * widest)
-    # A shorter rest is not a rest, because commands are still delayed.
+    # The rest must outlast the delay, because a command computed before it can still move the bodies.
     still &= tail // 2 > np.maximum(memory, LEAST_REST)
     before, trend, second = before[0], second[0] / first[0], second[0]
     oscillating = summary.turns[1:].min(0) >= 1
@@ -242,7 +242,7 @@ def convert_to_si(
         found: result of `run_batch`.
         inputs: external inputs, with the units.
         dry: mask of the simulations with friction.
-        memory: number of samples that decide the next command.
+        memory: number of samples that can affect the next command.
         bodies: names of the positions of all bodies.
         settings: settings of the batch.
     """
@@ -252,7 +252,7 @@ def convert_to_si(
     first, second = _measure_halves(summary)
     turns = summary.turns[1:].sum(0)
     frequency = (turns - 1) / (np.diff(summary.turned, axis=0)[0] * period)
-    # A motion that is not finite although it was small has too many friction events.
+    # A small motion that is not finite has too many friction events, or a force law without a finite force.
     lost = ~np.isfinite(state.body.x).all(0) & (find_largest(summary) < BEYOND)
     outcome = np.where(lost, MotionKind.INVALID, classify(summary, memory, settings.tail))
     columns = {

@@ -14,7 +14,8 @@ import xarray
 
 import zwidth
 from zwidth.arrays import evaluate as module
-from zwidth.arrays.evaluate import FEW, as_float64, check_scalars, evaluate, evaluate_columns, map_blocks
+from zwidth.arrays.blocks import map_blocks
+from zwidth.arrays.evaluate import FEW, as_float64, check_scalars, evaluate, evaluate_columns
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.xp import is_jax, is_traced, known_options, namespace
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import any_loop
 import jax
 import numpy as np
+import proved_loop
 import pytest
 
 import zwidth
@@ -74,7 +74,7 @@ def test_traced_slopes_are_the_same(scene, x64):
 def test_certified_verdicts_are_those_of_balls(scene):
     top = scene.max_stiffness()
     stiffness = np.array([0.5, 1.0 - 1e-10, 1.0 + 1e-10]) * top.stiffness
-    expected = [any_loop.count_outside(scene, each, float(top.virtual_damping)) == 0 for each in stiffness]
+    expected = [proved_loop.count_outside(scene, each, float(top.virtual_damping)) == 0 for each in stiffness]
     found = scene.is_stable(stiffness, top.virtual_damping, method="certified")
     assert found.tolist() == expected == [True, True, False]
 

@@ -7,6 +7,7 @@ from typing import Any
 import any_loop
 import control
 import numpy as np
+import proved_loop
 import pytest
 import scipy.signal
 
@@ -43,7 +44,7 @@ def test_every_form_of_a_rigid_mass_is_the_rigid_device(form):
 
 def same_matrices(scene: zwidth.Scene) -> Any:
     """The scene with its device, hand and all as one linear system."""
-    table, _, seen = any_loop._rates(scene)
+    table, _, seen = any_loop.rate_table(scene)
     own = np.array(table)[:-1]
     return zwidth.Scene(zwidth.LinearDevice((own[:, :-1], own[:, -1], seen)), scene.timing, velocity=scene.velocity)
 
@@ -122,7 +123,7 @@ def test_random_systems_are_judged_as_balls_do(seed):
         K, B = K[fine], B[fine]
         labels = np.atleast_1d(scene.is_stable(K, B))
         for place, (stiffness, damping) in enumerate(zip(K, B, strict=True)):
-            outside = any_loop.count_outside(scene, stiffness, damping, 250)
+            outside = proved_loop.count_outside(scene, stiffness, damping, 250)
             assert outside is None or (outside == 0) == labels[place], (device, periods, stiffness, damping)
             judged += outside is not None
         certified = scene.decide_stability(K[:2], B[:2], method="certified")

@@ -53,7 +53,11 @@ CASES = {
     "window too long": (lambda: zwidth.WindowedDifference(1001), "velocity.samples", "from 1 to 1000"),
     "half a sample": (lambda: zwidth.WindowedDifference(2.5), "velocity.samples", "whole number"),  # type: ignore[arg-type]
     "cut-off above half the rate": (lambda: scene(zwidth.LowPass(cutoff=501.0)), "velocity.cutoff", "500 Hz"),
-    "cut-off at half the rate": (lambda: scene(zwidth.Butterworth(cutoff=500.0)), "velocity.cutoff", "leave it out"),
+    "cut-off at half the rate": (
+        lambda: scene(zwidth.Butterworth(cutoff=500.0)),
+        "velocity.cutoff",
+        "remove the filter",
+    ),
     "cut-off of 0": (lambda: zwidth.LowPass(cutoff=0.0), "velocity.cutoff", "greater than 0"),
     "cut-off and time constant": (lambda: zwidth.LowPass(cutoff=10.0, time_constant=0.1), "velocity", "only one"),
     "order too high": (lambda: zwidth.Butterworth(cutoff=10.0, order=9), "velocity.order", "from 1 to 8"),

@@ -21,7 +21,7 @@ class Judge:
     """The bodies in SI units: positions and velocities, then modes and actuator; forces of command and of a hand."""
 
     def __init__(self, scene: zwidth.Scene, coulomb: float, static: float) -> None:
-        table, self.size, self.seen = any_loop._rates(scene)
+        table, self.size, self.seen = any_loop.rate_table(scene)
         self.matrix, self.bodies = np.array(table)[:-1, :-1], len(any_loop._masses_and_links(scene)[0])
         self.command = np.array(table)[:-1, -1]
         self.mass, self.coulomb, self.static = scene.device.mass, coulomb, static

@@ -1,7 +1,8 @@
-"""Rows of the boundary of any linear loop, and how many poles of each wall lie outside (docs/theory/scenes.md).
+"""The boundary of any linear loop at constant damping, and the number of poles outside the unit circle of each wall.
 
-A row meets each arc of `loops.linear.curve` once at most (V12). Along it a pole leaves the circle where
-``Im(q' - beta F') > 0``, which at z = 1 and z = -1 holds for the real poles as well. Hence
+A line of constant damping (a row) crosses each arc of `loops.linear.curve` at most once (docs/theory/scenes.md, V12).
+As alpha increases, poles leave the unit circle at a crossing if ``Im(q' - beta F') > 0``, also at z = 1 and z = -1.
+Hence
 
     poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
 
@@ -20,7 +21,7 @@ import numpy as np
 from zwidth.loops.linear.curve import (
     Arc,
     CrossingLine,
-    bands,
+    JoinedArcs,
     circle_zeros,
     curve_at,
     cut_arcs,
@@ -57,7 +58,7 @@ class Crossings(NamedTuple):
 
 @dataclass(frozen=True)
 class Boundary:
-    """The boundary of one loop, laid out for rows."""
+    """The boundary of one loop, prepared for lines of constant damping."""
 
     loop: LoopRoots
     w: np.ndarray
@@ -182,11 +183,12 @@ class Boundary:
         return self._look(self._steps.w)
 
     @cached_property
-    def _steps(self) -> _Steps:
-        return _Steps.join(self.arcs)
+    def _steps(self) -> JoinedArcs:
+        """The nodes of all arcs, in one sequence."""
+        return JoinedArcs.join(self.arcs)
 
     def arc_at(self, w: np.ndarray) -> np.ndarray:
-        """The arc that an angle lies on."""
+        """Return the index of the arc that contains each angle."""
         return np.searchsorted(self._steps.slowest, w, side="right") - 1
 
     @cached_property
@@ -335,51 +337,6 @@ class Boundary:
             bend = -(rest.slope / rest.value + 0.5j * times) * x * x / times
             leaving += int(np.sum(np.where(np.abs(x.imag) > _ALONG * np.abs(x), x.imag, bend.imag) < 0))
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
-
-
-class _Steps(NamedTuple):
-    """All arcs one after another: of each node, and of the step that leads to it from the one before."""
-
-    w: np.ndarray
-    beta: np.ndarray
-    alpha: np.ndarray
-    straight: np.ndarray  # of the step to each: whether alpha may be interpolated in beta, else both ends' mean counts
-    room: np.ndarray  # of the step to each: how far alpha may be from that
-    keys: np.ndarray  # of each node: its arc, then its place among the dampings of all
-    dampings: np.ndarray
-    first: np.ndarray  # of each arc: its first node in these
-    ends: np.ndarray  # (2, arcs): between which dampings it is
-    order: np.ndarray  # of the first ends, then of the last ones
-    sorted_ends: np.ndarray
-    leaving: np.ndarray
-    slowest: np.ndarray  # its lowest angle
-
-    @classmethod
-    def join(cls, arcs: tuple[Arc, ...]) -> _Steps:
-        """Lay the arcs of a boundary one after another."""
-        w, beta, *rest = map(np.concatenate, zip(*(arc[:6] for arc in arcs), strict=True))
-        sizes = [arc.w.size for arc in arcs]
-        dampings, keys = np.unique(beta, return_inverse=True)
-        keys = keys + np.repeat(np.arange(len(arcs)), sizes) * dampings.size
-        ends = np.array([arc.beta[[0, -1]] for arc in arcs]).T
-        order = np.argsort(ends, axis=None)
-        ends, first = (ends, order, ends.ravel()[order]), np.cumsum([0, *sizes[:-1]])
-        own = np.array([(arc.leaving, arc.first) for arc in arcs]).T
-        return cls(w, beta, rest[0], *bands(w, *rest), keys, dampings, first, *ends, *own)
-
-    def sum_met(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """The sum of weights of the arcs that rows meet; a row through an end of arcs as the row just above it."""
-        sums = np.cumsum(np.concatenate([[0.0], np.concatenate([weights, -weights])[self.order]]))
-        return sums[np.searchsorted(self.sorted_ends, beta, side="right")]
-
-    def meet(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The arcs that rows meet, the rows, and before which of the nodes."""
-        place, row = np.nonzero((beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None]))
-        return place, row, self.find(place, np.searchsorted(self.dampings, beta)[row])
-
-    def find(self, place: np.ndarray, among: np.ndarray) -> np.ndarray:
-        """The nodes of arcs before which rows meet them, by the rows' places among all dampings."""
-        return np.maximum(np.searchsorted(self.keys, place * self.dampings.size + among), self.first[place] + 1)
 
 
 class _Row(NamedTuple):

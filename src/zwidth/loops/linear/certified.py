@@ -101,7 +101,7 @@ def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_
 
 
 def _exact(part: Any) -> Any:
-    """Return a scene or one of its parts with exact balls for floats; bypass constructors: their checks need floats."""
+    """Return a scene or part with exact balls for floats; bypass constructors, because their checks need floats."""
     import flint
 
     if isinstance(part, tuple):

@@ -229,11 +229,14 @@ def level_arc(w: np.ndarray, here: CurvePoints, beta: float) -> Arc:
 def bands(
     w: np.ndarray, alpha: np.ndarray, alpha_slope: np.ndarray, beta_slope: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the steps to nodes whether alpha may be interpolated in beta, else both ends' mean counts; and within what."""
-    # Of arcs one after another: their ends have no alpha.
-    # Where the slope of beta hardly changes over a step, a straight line misses alpha by an eighth of the step times
-    # what alpha's slope changes, and by what beta bends; four times that is allowed. Elsewhere, more than both ends
-    # differ.
+    """Return a mask of the steps over which alpha may be interpolated linearly in beta, and bounds of its error.
+
+    The arguments are those of joined arcs; alpha is NaN at their ends. Use the mean alpha of both ends for the other
+    steps.
+    """
+    # If the slope of beta hardly changes over a step, linear interpolation misses alpha by at most an eighth of the
+    # step times the change of alpha's slope, plus the curvature of beta. Allow four times this error. For other steps
+    # allow more than the difference of both ends.
     with np.errstate(all="ignore"):
         bend = beta_slope / np.roll(beta_slope, 1)
         straight = (bend > 0.5) & (bend < 2.0)
@@ -241,3 +244,48 @@ def bands(
         largest = np.maximum(size, np.roll(size, 1))
         close = 0.5 * step * turn + np.abs(bend - 1.0) * rise + _ROUNDING * largest
         return straight, np.where(straight, close, 1.5 * rise + _ROOM * largest)
+
+
+class JoinedArcs(NamedTuple):
+    """The nodes of all arcs, one arc after another; a step leads to each node from the previous one."""
+
+    w: np.ndarray
+    beta: np.ndarray
+    alpha: np.ndarray
+    straight: np.ndarray  # of each step: alpha may be interpolated linearly in beta; else use the mean of both ends
+    room: np.ndarray  # of each step: bound of the error of this alpha
+    keys: np.ndarray  # of each node: index of its arc times the number of dampings, plus index of its damping
+    dampings: np.ndarray  # of all nodes, sorted
+    first: np.ndarray  # of each arc: its first node
+    ends: np.ndarray  # (2, arcs): smallest and largest damping
+    order: np.ndarray  # order of the flattened ends
+    sorted_ends: np.ndarray
+    leaving: np.ndarray  # of each arc: poles that leave the circle as alpha increases
+    slowest: np.ndarray  # of each arc: its lowest angle
+
+    @classmethod
+    def join(cls, arcs: tuple[Arc, ...]) -> JoinedArcs:
+        """Join the arcs of a boundary."""
+        w, beta, *rest = map(np.concatenate, zip(*(arc[:6] for arc in arcs), strict=True))
+        sizes = [arc.w.size for arc in arcs]
+        dampings, keys = np.unique(beta, return_inverse=True)
+        keys = keys + np.repeat(np.arange(len(arcs)), sizes) * dampings.size
+        ends = np.array([arc.beta[[0, -1]] for arc in arcs]).T
+        order = np.argsort(ends, axis=None)
+        ends, first = (ends, order, ends.ravel()[order]), np.cumsum([0, *sizes[:-1]])
+        own = np.array([(arc.leaving, arc.first) for arc in arcs]).T
+        return cls(w, beta, rest[0], *bands(w, *rest), keys, dampings, first, *ends, *own)
+
+    def sum_met(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """Return the sum of the weights of the arcs that contain each beta, without the larger end of each arc."""
+        sums = np.cumsum(np.concatenate([[0.0], np.concatenate([weights, -weights])[self.order]]))
+        return sums[np.searchsorted(self.sorted_ends, beta, side="right")]
+
+    def meet(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return for each crossing of an arc with a beta the indices of arc and beta, and the first node after it."""
+        place, row = np.nonzero((beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None]))
+        return place, row, self.find(place, np.searchsorted(self.dampings, beta)[row])
+
+    def find(self, place: np.ndarray, among: np.ndarray) -> np.ndarray:
+        """Return the first node of each arc after its crossing; ``among``: index of the beta in the sorted dampings."""
+        return np.maximum(np.searchsorted(self.keys, place * self.dampings.size + among), self.first[place] + 1)

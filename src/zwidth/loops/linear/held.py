@@ -106,7 +106,7 @@ def required_wall(chain: AnyChain, w: Any, parts: Sampled | Plant) -> Any:
 
 
 def find_roots(chain: AnyChain) -> LoopRoots:
-    """Return the loop of a chain by its roots."""
+    """Return the zeros, poles, gain and delay of the loop of a chain."""
     if isinstance(chain, Chain) and chain.rigid:
         return _rigid_loop(chain)
     chain.check()
@@ -118,7 +118,7 @@ def find_roots(chain: AnyChain) -> LoopRoots:
             lead, zeros = find_sampled_zeros(chain.device, float(chain.period), float(chain.d) - chain.whole)
             gain = lead * float(chain.mass) / float(chain.period) ** 2
             poles = -np.expm1(chain.device.poles * float(chain.period))
-        # Poles at z = 0 are periods of delay, which zeros there take away as far as there are any.
+        # Each pole at z = 0 is a delay of one period; zeros at z = 0 cancel such poles.
         lag, still = int(lag + np.sum(poles == 1)), int(np.sum(zeros == 1))
         zeros = np.append(zeros[zeros != 1], np.ones(max(still - lag, 0)))
         return LoopRoots(gain, max(lag - still, 0), zeros, poles[poles != 1], chain.estimate)

@@ -69,7 +69,7 @@ def trace_stiffest(scene: Any, negative: bool) -> RidgePoint:
 
 @partial(jax.jit, static_argnums=0)
 def compiled_ridge(structure: Structure, *values: Array) -> RidgePoint:
-    """The stiffest wall for values of the moving parameters."""
+    """Return the point of maximum stiffness for values of the traced parameters."""
     dtype = values[0].dtype
     # As bits: the thread of a callback may have JAX's default precision, which would halve the digits on the way.
     bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(jnp.stack(values)), jnp.int32)

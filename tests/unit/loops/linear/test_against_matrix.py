@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import any_loop
 import numpy as np
+import proved_loop
 import pytest
 from scipy.optimize import linear_sum_assignment
 
@@ -48,7 +49,7 @@ def test_poles_outside_are_those_of_the_matrix(kind):
             sizes = np.abs(np.linalg.eigvals(any_loop.closed_loop_matrix(scene, *wall)))
             expected: int | None = int(np.sum(sizes > 1))
             if expected != outside:
-                expected = any_loop.count_outside(scene, *wall)
+                expected = proved_loop.count_outside(scene, *wall)
             units_apart += expected is None
             judged += 1
             assert expected is None or outside == expected, (scene, wall)
@@ -64,7 +65,7 @@ def test_poles_are_proved_ones(kind):
         wall = alpha * scene.units.stiffness, beta * scene.units.virtual_damping
         found = poles_less_one(scene.loop.roots, np.array([alpha]), np.array([beta]))[0]
         try:
-            expected, missed = any_loop.proved_poles(scene, *wall, found)
+            expected, missed = proved_loop.proved_poles(scene, *wall, found)
         except ValueError:
             # A multiple pole, of a low-pass that a wall without damping leaves alone.
             continue
@@ -92,7 +93,7 @@ def test_zeros_beside_soft_modes_keep_their_digits(sensor, stiffness):
         held = zwidth.Operator(3.0, damping, spring * 1e-3, **behind)
         hand = held if generator.random() < 0.5 else None
         scene = zwidth.Scene(device, zwidth.Timing(period, generator.choice([0, 1, 0.4]) * period), operator=hand)
-        expected = any_loop.proved_zeros(scene)
+        expected = proved_loop.proved_zeros(scene)
         distance = np.abs(-scene.loop.roots.zeros[:, None] - expected) / np.abs(expected)
         own, other = linear_sum_assignment(distance)
         assert own.size == expected.size == scene.loop.roots.zeros.size

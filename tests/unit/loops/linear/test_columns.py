@@ -2,6 +2,7 @@
 
 import any_loop
 import numpy as np
+import proved_loop
 import pytest
 
 import zwidth
@@ -45,14 +46,14 @@ def test_an_end_near_0_of_a_soft_wall_keeps_its_digits():
     coupling = zwidth.Coupling(2.906851785633506, 205186.7108746703, 0.0, "tip")
     timing = zwidth.Timing(0.00038470647865914017, 0.00011541194359774204)
     scene = zwidth.Scene(zwidth.Device(2.9043679345862086, 0.0, coupling), timing)
-    exact, found = any_loop.proved_column(scene, 0.04824013422078757), scene.stable_damping(0.04824013422078757)
+    exact, found = proved_loop.proved_column(scene, 0.04824013422078757), scene.stable_damping(0.04824013422078757)
     assert exact is not None
     np.testing.assert_allclose(found, exact, rtol=1e-8)
 
 
 def check_column(scene, stiffness):
     """One column against balls; the share of each end by which it is off, of the larger one where it is nearly 0."""
-    exact = any_loop.proved_column(scene, stiffness)
+    exact = proved_loop.proved_column(scene, stiffness)
     if exact is None:
         return None
     found = stable_dampings(scene.loop.boundary, stiffness / scene.units.stiffness) * scene.units.virtual_damping

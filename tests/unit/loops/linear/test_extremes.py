@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import any_loop
 import flint
 import numpy as np
+import proved_loop
 import pytest
 
 import zwidth
@@ -90,7 +90,7 @@ def test_counts_are_those_of_proved_poles(name):
     decided = 0
     for a, b, outside in zip(alpha, beta, boundary.outside(alpha, beta), strict=True):
         wall = a * units.stiffness, b * units.virtual_damping
-        expected = any_loop.count_outside(loop, *wall)
+        expected = proved_loop.count_outside(loop, *wall)
         decided += expected is not None
         assert expected is None or outside == expected, (a, b)
     if not decided and flint.__version__ < "0.9":

@@ -1,15 +1,15 @@
 """StablePieces of the stable set: the stiffest wall is one that soft walls lead to, whatever islands stand beside them.
 
 The reference floods a grid of walls from K = 0 on; each is stable or not by Jury's table of the polynomial in
-`any_loop.ball_parts`, of which the library knows nothing.
+`proved_loop.ball_parts`, of which the library knows nothing.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-import any_loop
 import numpy as np
+import proved_loop
 import pytest
 import scipy.signal
 from scipy import ndimage
@@ -23,7 +23,7 @@ PHANTOM = Scene(Device(0.1, 10.0), TIMING)
 
 def is_stable(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """Whether Jury's table of each wall has no zero outside, for arrays of one shape."""
-    parts = any_loop.ball_parts(scene)
+    parts = proved_loop.ball_parts(scene)
     degree = max(part.degree() for part in parts)
     terms = [np.array([float(part[k].real.mid()) for k in range(degree, -1, -1)]) for part in parts]
     table = terms[0][:, None] + terms[1][:, None] * stiffness.ravel() + terms[2][:, None] * damping.ravel()
