@@ -387,8 +387,8 @@ class SceneOptima(SceneAnswers):
         @np.vectorize
         def margin(beta: float) -> float:
             loop = self.loop
-            wall = OpenLoop.lay_out(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
-            return wall.least_distance()[0]
+            wall = OpenLoop.tabulate(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
+            return wall.find_least_distance()[0]
 
         cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)
         columns = soft_dampings(self, stiffness, negative_damping)
