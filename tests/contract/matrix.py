@@ -36,6 +36,9 @@ ARRAYS = {
 TYPES = NUMBERS | ARRAYS
 # One of each way in which the other arguments are converted; each entry with derivatives compiles programs of its own.
 WAYS = ("int", "float", "int32", "JAX float32", "list of int", "float64 array")
+# One scalar and one array: in single precision the conversions are those of double precision, so fewer programs are
+# compiled.
+SINGLE_WAYS = ("int", "float64 array")
 DIFFERENTIATED = ("grad", "jit(grad)", "hessian")
 ALL = "all"  # in place of the name of an argument: every argument is traced
 EVERY_CASE = [*CASES, *SCENE_CASES]
@@ -62,9 +65,11 @@ def combinations(case: Case) -> Iterator[Combination]:
             coarse = case.one_number and kind in NUMBERS and kind.endswith(("float16", "float32"))
             if not kind.startswith("list") and not coarse and (x64 or kind in ARRAYS):
                 yield Combination(kind, "jit", ALL, x64)
-            for traced in dict.fromkeys((case.free[0], case.free[-1])) if kind in WAYS else case.free[:1]:
-                yield Combination(kind, "jit", traced, x64)
-            if kind not in WAYS:
+            ways = WAYS if x64 else SINGLE_WAYS
+            for traced in dict.fromkeys((case.free[0], case.free[-1])) if kind in ways else case.free[:1]:
+                if x64 or kind in WAYS:
+                    yield Combination(kind, "jit", traced, x64)
+            if kind not in ways:
                 continue
             # What is compiled depends on the argument, and the conversion of the others does not.
             first = case.free[0]

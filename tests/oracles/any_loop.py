@@ -100,7 +100,7 @@ def flow(a: np.ndarray, b: np.ndarray, time: float) -> tuple[np.ndarray, np.ndar
 
 
 def _companion(device: Any, number: Any) -> tuple[list[list[Any]], int, np.ndarray]:
-    """Return the same for a continuous linear device, in controllable canonical form and its own unit of time."""
+    """Return the result of `rate_table` for a continuous linear device, in controllable canonical form."""
     bottom, top = (
         [value / device.system.denominator[0] for value in part]
         for part in (device.system.denominator, device.system.numerator)
@@ -240,7 +240,7 @@ KINDS = ("device", "filter", "tip", "motor", "hand", "soft hand", "all", "driven
 
 
 def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np.ndarray, float]:
-    """Return all K that put a pole on the unit circle at one B, by a dense frequency grid; and their magnitude.
+    """Return all K that put a pole on the unit circle at one B, by a dense frequency grid, and their typical magnitude.
 
     The response of the device is computed from its state matrix at each frequency.
     """

@@ -11,7 +11,7 @@ KINDS = ("rigid", "filter", "tip", "motor", "hand", "coupled hand", "all")
 
 
 def random_velocity(rng, period):
-    """One of the velocity estimates."""
+    """Return a random velocity estimate."""
     kind = rng.integers(0, 6)
     if kind == 1:
         return zwidth.WindowedDifference(int(rng.integers(2, 15)))
@@ -27,7 +27,7 @@ def random_velocity(rng, period):
 
 
 def random_scene(kind, rng):
-    """A scene; its stable walls lie within some units of alpha and beta."""
+    """Return a random scene whose stable walls are within some units of alpha and beta."""
     mass, period = 10 ** rng.uniform(-1.5, 0.5), 10 ** rng.uniform(-4, -2.5)
     damping = rng.choice([0.0, 10 ** rng.uniform(-1, 1.5)])
     coupling = operator = None
@@ -53,7 +53,7 @@ def random_scene(kind, rng):
 
 
 def random_walls(scene, rng, count):
-    """Stiffness and virtual damping of walls around the stable ones."""
+    """Return stiffness and virtual damping of random walls around the stable set."""
     units = scene.units
     K = 10 ** rng.uniform(-4, 0.5, count) * units.stiffness
     B = rng.uniform(-0.2, 1, count) * 10 ** rng.uniform(-1.5, 0, count) * units.virtual_damping

@@ -68,6 +68,7 @@ def ball_parts(scene: Any) -> tuple[flint.acb_poly, flint.acb_poly, flint.acb_po
 
 
 def _top(block: flint.arb_mat, size: int) -> tuple[flint.arb_mat, flint.arb_mat]:
+    """Return the transition matrix and the response to a unit force from the exponential of a rate table."""
     a = flint.arb_mat(size, size, [block[i, j] for i in range(size) for j in range(size)])
     return a, flint.arb_mat(size, 1, [block[i, size] for i in range(size)])
 
@@ -129,6 +130,7 @@ def proved_zeros(scene: Any, digits: int = 90) -> np.ndarray:
 
 
 def _number(ball: flint.acb) -> complex:
+    """Return the midpoint of a ball."""
     return complex(float(ball.real.mid()), float(ball.imag.mid()))
 
 

@@ -1,4 +1,4 @@
-"""Functions applied to columns of points in blocks, on every processor."""
+"""Evaluation of functions on columns of points, block by block and on all processors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def map_blocks(
     within: Callable[[], Any] = compute_concretely,
     exact: bool = False,
 ) -> Any:
-    """Apply a function to columns block by block, on every processor.
+    """Apply a function to columns block by block, on all processors.
 
     Blocks keep the intermediate arrays in the cache: one array of a million points takes 2.5 times as long for the
     ridge (benchmarks/bench_xla.py).

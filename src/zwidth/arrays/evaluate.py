@@ -1,9 +1,9 @@
-"""The one way from a kernel to arrays.
+"""Evaluation of kernels on arrays.
 
-A kernel is a formula for one point whose text serves NumPy and JAX, elementwise. Few concrete points, and plain
-numbers above all, go through NumPy at once, in float64, whatever JAX's configuration says and without importing it;
-many are compiled by JAX, in pieces of one size; inside somebody's own transformation (`jit`, `grad`, ...) the compiled
-kernel is called and the ambient precision holds.
+A kernel is a formula for one point, applied elementwise, with the same source code for NumPy and JAX. Plain numbers and
+few concrete points are evaluated by NumPy in float64, regardless of JAX's configuration and without importing JAX. For
+many points JAX compiles the kernel and evaluates it in blocks of one size. Inside a transformation of the caller, as
+`jit` or `grad`, the compiled kernel uses the ambient precision.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
 from zwidth.words.xp import WIDE, compute_concretely, is_jax, is_traced, known_options, store_once, tree_map
 
-# The types whose conversion needs no check; bool and 0-d arrays take the long way.
+# Types whose conversion needs no check; bool and 0-d arrays are checked.
 _PLAIN = frozenset({float, int, np.float64})
 _NUMBERS = (int, float, np.floating, np.integer)
 
 
 def are_numbers(*values: ArrayLike) -> bool:
-    """Whether all values are plain numbers, whose conversion needs no check."""
+    """Return whether all values are plain numbers, whose conversion needs no check."""
     return _PLAIN.issuperset(map(type, values))
 
 
 def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
-    """Raise `InputError` for a plain number beyond the range of its name; NaN, negatives and arrays get a status."""
+    """Raise `InputError` for a plain number out of the range of its name; NaN, negatives and arrays get a status."""
     for name, value in arguments.items():
         if name not in SIZES or not isinstance(value, _NUMBERS):
             continue
-        # What is infinite gets a status, as what is negative.
+        # Infinite and negative values have a status instead of an error.
         least, most = SIZES[name]
-        # Of a float32 the limits would overflow.
+        # Convert to float64, because the limits would overflow in float32.
         number = value.item() if isinstance(value, np.generic) else value
         size = abs(number) if least else number
         if 0 < size < least or most < size < math.inf:
@@ -51,11 +51,11 @@ def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
 
 
 def as_float64(name: str, value: ArrayLike) -> np.ndarray:
-    """Convert one concrete argument to float64, or say what is wrong with it."""
-    # The module that defines masked arrays is loaded by those who make some.
+    """Convert one concrete argument to float64; raise `InputError` if it is not numeric."""
+    # Masked arrays exist only if their module is loaded.
     if isinstance(value, getattr(sys.modules.get("numpy.ma"), "MaskedArray", ())):
         raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
-    # By position axes of other names would meet.
+    # Broadcasting by position would combine axes of different names.
     if getattr(value, "dims", ()):
         raise InputError(
             f"{name}: got a DataArray, whose names of axes would be lost; call through xarray.apply_ufunc, or give its "
@@ -64,9 +64,9 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     if is_traced(value):
         raise InputError(f"{name}: got a value that JAX traces; give numbers, outside of jit, vmap and grad")
     try:
-        # NumPy makes an object of a whole number beyond its own.
+        # Convert integers first, because NumPy makes objects of large ones.
         array = np.asarray(float(value) if isinstance(value, int) else value)
-        # NumPy has no kind of its own for bfloat16 and its like.
+        # Types such as bfloat16 have the kind V of NumPy, but not the type void.
         if array.dtype.kind in "OSUcmM" or array.dtype.type is np.void:
             raise TypeError(array.dtype)
         return array.astype(np.float64, copy=False)
@@ -81,7 +81,7 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
 
 
 def as_number(name: str, value: Any, least: float = -math.inf) -> float:
-    """Convert one argument to a single finite number that is not below the least one, or say what is wrong with it."""
+    """Convert one argument to a single finite number; raise `InputError` if it is not one or below ``least``."""
     number = as_float64(name, value)
     if number.ndim or not (np.isfinite(number) and number >= least):
         raise InputError(
@@ -98,7 +98,7 @@ def broadcast(arguments: Mapping[str, ArrayLike]) -> list[np.ndarray]:
 
 
 def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shapes") -> tuple[int, ...]:
-    """The shape that arguments of these shapes broadcast to; an `InputError` with all of them where they do not."""
+    """Return the shape that all shapes broadcast to; raise `InputError` if they do not broadcast."""
     named = list(named)
     try:
         return np.broadcast_shapes(*(shape for _, shape in named))
@@ -108,11 +108,11 @@ def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shape
 
 
 def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
-    """Hand NumPy results to a caller who passed NumPy or plain numbers, JAX arrays to one who passed any."""
+    """Convert results to JAX arrays if an argument is a JAX array, otherwise to NumPy arrays or scalars."""
     if any(map(is_jax, values)):
         import jax.numpy as jnp
 
-        # Without this a caller with JAX's default precision would lose half of the digits on the way out.
+        # Convert in float64, because JAX's default precision would lose half of the digits.
         with compute_concretely():
             return tree_map(jnp.asarray, result)
     return tree_map(lambda leaf: np.asarray(leaf)[()], result)
@@ -148,7 +148,7 @@ _warned = threading.Event()
 
 
 def _warn_of_float32() -> None:
-    """Say once a process that half of the digits are missing: an optimizer would stop there and not tell."""
+    """Warn once per process that results have float32 precision, at which optimizers stop early without a message."""
     if not _warned.is_set():
         _warned.set()
         warnings.warn(
@@ -160,27 +160,25 @@ def _warn_of_float32() -> None:
 
 
 def _stack_level() -> int:
-    """How far up the first caller outside of zwidth and JAX is: the warning then names a line of the user's."""
+    """Return the stack level of the first caller outside zwidth and JAX, so that the warning shows the user's line."""
     frame, level = sys._getframe(1), 1
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("zwidth", "jax"):
         frame, level = frame.f_back, level + 1
     return level
 
 
-# "auto": NumPy for few points; "numpy": for all of them; "jax": compiled, however few they are, so that a point's value
-# does not depend on how many others came with it (the two routes may differ in the last place), or for lack of a text
-# for NumPy.
+# "auto": NumPy for few points; "numpy": NumPy for all points; "jax": always compiled, if the kernel has no NumPy code
+# or values must not depend on the number of points (both routes may differ in the last place).
 Route: TypeAlias = Literal["auto", "numpy", "jax"]
 
-# The values of a kernel at concrete points, and for each argument how every result moves with it.
+# Function that returns the values of a kernel at concrete points, and their derivatives in each argument.
 Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
 
-# Up to so many points NumPy is done before a compiler, which takes seconds: in some tenths of one. A compiler pays at
-# ten times as many; a second call takes two to five times as long as a compiled one.
+# Number of points up to which NumPy, with some tenths of a second, is faster than a compiler, which takes seconds. A
+# compiler pays off at ten times as many points; later calls of NumPy take two to five times as long as compiled ones.
 FEW = 1 << 18
-# At most so many points go at one time to NumPy, whose arrays then stay in caches, and to what is compiled: one
-# compilation, bounded memory, work for every processor.
-_AT_ONCE, BLOCK = 1 << 15, 1 << 16
+_AT_ONCE = 1 << 15  # points per NumPy call, so that arrays stay in caches
+BLOCK = 1 << 16  # points per compiled call: one compilation, bounded memory, work for every processor
 
 
 def evaluate(
@@ -191,11 +189,18 @@ def evaluate(
     route: Route = "auto",
     slopes: Slopes | None = None,
 ) -> Any:
-    """Apply ``kernel(*arrays, *static)`` to arguments that broadcast, and give results of their shape and type.
+    """Apply a kernel to arguments that broadcast.
 
-    Plain numbers beyond the range of their name are refused. ``weight`` says how many plain points one point counts
-    for, in time and memory: a kernel that makes samples of each point weighs more. ``slopes`` spares a gradient of few
-    points the compiler.
+    Args:
+        kernel: function of arrays and ``static``.
+        arguments: arguments by name; plain numbers out of the range of their name are an `InputError`.
+        *static: further arguments of the kernel, constants of the compilation.
+        weight: time and memory of a point relative to a simple kernel; larger for kernels that sample each point.
+        route: evaluation by NumPy or JAX.
+        slopes: derivatives of the kernel in NumPy, so that gradients of few points need no compilation.
+
+    Returns:
+        The results, with the broadcast shape and the array type of the arguments.
     """
     values = tuple(arguments.values())
     check_scalars(arguments)
@@ -203,7 +208,7 @@ def evaluate(
         try:
             numbers = list(map(np.float64, values))
         except OverflowError:
-            pass  # An integer beyond float64: the long way names it.
+            pass  # `broadcast` names the integer that overflows
         else:
             with np.errstate(all="ignore"):
                 found = kernel(*numbers, *static)
@@ -219,7 +224,7 @@ def evaluate(
 def evaluate_columns(
     kernel: Callable[..., Any], columns: Sequence[np.ndarray], *static: Any, weight: int = 1, route: Route = "auto"
 ) -> Any:
-    """`evaluate` of concrete columns of one length; one of a single value goes to the kernel as a number."""
+    """Evaluate a kernel on concrete columns of one length; pass a column of length 1 as a number."""
     count = count_points(columns)
     if route == "jax" or (route == "auto" and count > max(1, FEW // weight)):
         return map_blocks(compile_columns(kernel, static), columns, BLOCK // weight)
@@ -227,7 +232,7 @@ def evaluate_columns(
     def at_once(*parts: np.ndarray) -> Any:
         with np.errstate(all="ignore"):
             result = kernel(*(part[0] if part.size == 1 else part for part in parts), *static)
-        # A copy: a view of an argument, or of one value, could not be written to. One point has its axis first, too.
+        # Copy, because views of an argument or of a single value are read-only. Add the axis of a single point.
         shape = (count_points(parts),)
         if shape == (1,):
             return tree_map(lambda leaf: np.array(leaf)[None], result)
@@ -238,7 +243,7 @@ def evaluate_columns(
 
 
 def _plain(leaf: Any) -> Any:
-    """A NumPy scalar for the result at a single point."""
+    """Return the result at a single point as a NumPy scalar."""
     return leaf if isinstance(leaf, np.generic) else np.asarray(leaf)[()]
 
 
@@ -246,7 +251,7 @@ def _plain(leaf: Any) -> Any:
 def compile_traced(
     kernel: Callable[..., Any], static: tuple[Any, ...], slopes: Slopes | None = None
 ) -> Callable[..., Any]:
-    """A kernel compiled for traced values, with its derivatives as one product for each argument."""
+    """Return a kernel compiled for traced values, whose derivative is one product per argument."""
     # A point depends on itself alone: all there is to differentiate is a few numbers a point. Left to itself,
     # `jax.grad` outside `jit` would compile a program that hands out every intermediate result: for the ridge 1.2 to
     # 1.5 times as long (benchmarks/bench_xla.py). There the values are concrete: where ``slopes`` are known, nothing is
@@ -337,7 +342,7 @@ def _no_change(leaf: Any) -> Any:
 
 @cache
 def compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
-    """A kernel compiled for blocks of columns."""
+    """Return a kernel, compiled for blocks of columns."""
     import jax
 
     def whole(*columns: Any) -> Any:

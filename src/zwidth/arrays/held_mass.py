@@ -1,4 +1,4 @@
-"""A damped mass between two samples: its exact discretization under a delayed, held force.
+"""Exact discretization of a damped mass under a delayed force with zero-order hold.
 
 Normalized to T = 1 and m = 1. With d = n + f (n whole, 0 <= f < 1) the force computed at sample k acts from
 k + d on: in each period the older force holds during [0, f), the newer one during [f, 1). From computed
@@ -37,7 +37,7 @@ GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(_TERMS)]
 
 
 class PhiFunctions(NamedTuple):
-    """All of them at one argument: they share their exponential and their series."""
+    """The phi-functions at one argument, which share the exponential and the series."""
 
     c: Array
     phi1: Array
@@ -47,16 +47,16 @@ class PhiFunctions(NamedTuple):
 
 
 def phi_functions(x: Array) -> PhiFunctions:
-    """Return c, phi1, phi2, psi and gap at x >= 0, within 30 units of 2^-53 if ``xp.exp`` is within 8 of them."""
+    """Return c, phi1, phi2, psi and gap at x >= 0, accurate to 30 units of 2^-53 if ``xp.exp`` is to 8."""
     xp = namespace(x)
     small = x < _SERIES_BELOW
     factor = xp.exp(-0.5 * x)
     c = factor * factor
-    # Each branch gets an argument that is harmless where the other one holds.
+    # Use a valid argument in the branch that is not selected, because NaN would spoil the derivatives of the other.
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, _SERIES_BELOW, x)
     square = half * half
     low1, low_gap = factor * horner(square, _PHI1), factor * (2.0 * half) * horner(square, GAP)
-    # Above the switch 1 - c loses nothing, and unlike expm1 has a derivative that is relatively exact.
+    # Above the switch 1 - c has no cancellation. Unlike expm1 its derivative has a small relative error.
     inverse = 1.0 / high
     high1 = (1.0 - c) * inverse
     return PhiFunctions(
@@ -167,7 +167,7 @@ def device(delta: Array, d: Array, kind: DelayClasses = ANY) -> DeviceTerms:
     at = phi_functions(delta)
     late = phi_functions(delta * (1.0 - f)) if kind.fractional else at
     plant = held_plant(delta, f if kind.fractional else None, at=at, at_t=late)
-    # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1; 0 where N(-1) = 0.
+    # tilt is 0 if N(-1) = 0.
     tilt = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
     return DeviceTerms(
         *(delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi),

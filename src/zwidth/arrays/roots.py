@@ -1,6 +1,7 @@
-"""Zeros and integrals of functions of one unknown, elementwise, one text for NumPy and JAX; of several under JAX.
+"""Zeros and integrals of functions of one unknown, elementwise, for NumPy and JAX; of several unknowns for JAX only.
 
-The number of steps is fixed, so that no point of a batch waits for another, and none depends on those beside it.
+The number of steps is fixed, so that no point of a batch waits for another. The result of a point does not depend on
+the other points.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _NEWTON_STEPS = 16
 
 
 def bisect(holds: Function, low: Array, high: Array) -> Array:
-    """Return the point between ``low``, where a condition holds, and ``high``, from which it does not."""
+    """Return the point between ``low`` and ``high`` up to which a condition holds, by bisection."""
     xp = namespace(low, high)
 
     def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:

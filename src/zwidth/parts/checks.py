@@ -1,4 +1,4 @@
-"""Checks that the parts of a scene share: one message names the field, the value and what is allowed."""
+"""Checks of the parameters of scenes, with messages that contain field, value, allowed values and remedy."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from zwidth.words.xp import frozen, is_jax, is_traced, namespace
 
 
 def in_periods(delay: Array, period: Array) -> Array:
-    """``delay/period``, with a quotient within 4 rounding errors of a whole number taken as that number."""
+    """Return ``delay/period``; replace a quotient within 4 rounding errors of an integer by this integer."""
     # 1.1 ms over 0.1 ms is 11 periods, but its float64 quotient is 11.000000000000002, another polynomial.
     xp = namespace(delay, period)
     quotient = delay / period
     whole = xp.round(quotient)
     near = xp.abs(quotient - whole) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(whole, 1.0)
-    # Rounding is flat; the quotient it corrects is not.
+    # Keep the derivatives of the quotient, because those of the rounded one are 0.
     return quotient - frozen(xp.where(near & (whole > 0), quotient - whole, 0.0), xp)
 
 
@@ -40,11 +40,11 @@ class Span(NamedTuple):
     unit: Literal["s", "periods"]
 
     def seconds(self, period: float) -> float:
-        """The length in seconds for a sampling period in seconds."""
+        """Return the length in seconds for a sampling period in seconds."""
         return self.value if self.unit == "s" else self.value * period
 
     def periods(self, period: float) -> float:
-        """The length in sampling periods, whole where it is whole but for rounding."""
+        """Return the length in sampling periods, an exact integer if it differs from one by rounding errors only."""
         if self.unit == "periods":
             return self.value
         return float(in_periods(np.float64(self.value), np.float64(period)))
@@ -54,14 +54,14 @@ class Span(NamedTuple):
 
 
 def read_span(value: Any, allowed: Range) -> Span:
-    """A length of time."""
+    """Return a length of time as `Span`."""
     if isinstance(value, Span):
         return value
     amount, unit = read_quantity(value, TIME, allowed, periods=True)
     return Span(amount, "periods" if unit == "periods" else "s")
 
 
-# Of linear devices and of rotary ones, for messages.
+# Names and units of linear and of rotary devices, for messages.
 _KINDS, _UNITS = ("linear", "rotary"), ("kg, N s/m and N/m", "kg m^2, N m s/rad and N m/rad")
 
 Parameters = ParamSpec("Parameters")
@@ -93,7 +93,7 @@ def _has_text(value: Any) -> bool:
 
 
 def _map_texts(read: Callable[[str], Any], value: Any) -> Any:
-    """What is read of a text, or of those in lists, tuples and arrays; anything else as it is."""
+    """Apply ``read`` to a text or to all texts in a list, tuple or array; return other values unchanged."""
     if isinstance(value, np.ndarray) and value.dtype.kind == "U":
         value = value.tolist()
     if isinstance(value, str):
@@ -105,7 +105,7 @@ def _map_texts(read: Callable[[str], Any], value: Any) -> Any:
 
 
 def read_texts(field: str, value: Any, unit: str) -> Any:
-    """Texts with a unit, alone or in lists and arrays, as numbers in the SI unit; anything else as it is."""
+    """Convert texts with a unit, also in lists and arrays, to numbers in the SI unit; return other values unchanged."""
     return value if unit in ("", "1") else _map_texts(lambda text: check_number(field, text, unit, ANY), value)
 
 
@@ -129,12 +129,12 @@ def _in_si(name: str, value: Any, period: Any, system: UnitSystem) -> Any:
 
 
 class Part:
-    """Base of the dataclasses that a scene is made of: it checks their numbers, and their ``repr`` makes them again."""
+    """Base of the parts of a scene: checks their parameters; ``repr`` returns an expression that creates the part."""
 
-    _owner: ClassVar[str] = ""  # what begins the names of its quantities
+    _owner: ClassVar[str] = ""  # prefix of the paths of its parameters
 
     def __post_init__(self) -> None:
-        """Put every number in its SI unit, where `words.quantities` allows it; else raise `InputError`."""
+        """Convert every parameter to its SI unit; raise `InputError` if `words.quantities` does not allow the value."""
         # Values that are None by default may be omitted. A part with linear or rotary units stores the kind in
         # ``rotary``.
         own = {f"{self._owner}.{item.name}".lstrip("."): item for item in fields(self)}  # pyright: ignore[reportArgumentType]
@@ -159,12 +159,12 @@ class Part:
         return SYSTEMS[bool(getattr(self, "rotary", False))]
 
     def __repr__(self) -> str:
-        """A call, without what is as it is where left out."""
+        """Return an expression that creates the part, without arguments that have their default values."""
         parts = []
         for item in (item for item in fields(self) if item.repr):  # pyright: ignore[reportArgumentType]
             usual = item.default if item.default_factory is MISSING else item.default_factory()
             text = repr(getattr(self, item.name))
-            # A device that does not turn says so by None as well.
+            # False and None both mean a linear device.
             if text != repr(usual) and (text, usual) != ("False", None):
                 parts.append(f"{item.name}={text}")
         return f"{type(self).__name__}({', '.join(parts)})"
@@ -217,14 +217,22 @@ def check_kind(rotary: bool, given: dict[str, Any]) -> None:
 
 
 def find_range(item: Field[Any], path: str) -> Range:
-    """The admissible values of a field of a part: the quantity's, or fewer where the part says so."""
+    """Return the allowed range of a field: that of its metadata, otherwise that of its quantity."""
     return item.metadata.get("allowed", FIELDS[path].allowed)
 
 
 def check_number(field: str, value: Any, unit: str = "", allowed: Range | None = None) -> Any:
-    """Return one quantity in its SI unit, a float unless JAX traces or holds it; else raise `InputError`."""
-    # A text is a number with a unit, as in configuration files: "70 g". Unit and range are those that
-    # `words.quantities` has for the field where they are left out.
+    """Return one quantity in its SI unit as a float, or unchanged if JAX traces it.
+
+    Args:
+        field: path of the parameter.
+        value: a number, or a text with a unit, "70 g".
+        unit: SI unit; that of the parameter if left out.
+        allowed: range; that of the parameter if left out.
+
+    Raises:
+        InputError: the value is not a number, its unit is wrong, or it is out of range.
+    """
     if is_traced(value):
         return value
     if not unit:
@@ -242,30 +250,31 @@ def check_limit(name: str, value: Any, unit: str) -> float:
 
 
 def check_span(field: str, value: Any) -> Any:
-    """Return a length of time as `Span`, in s or in periods as it was given; what JAX holds stays as it is."""
+    """Return a length of time as `Span`, in its original unit, s or periods; unchanged if JAX traces it."""
     return value if is_traced(value) else _read(field, value, lambda known: read_span(known, NOT_NEGATIVE))
 
 
 def _read(field: str, value: Any, read: Callable[[Any], Any]) -> Any:
+    """Apply ``read`` to a single value; raise `InputError` with the name of the field if it is not usable."""
     if not isinstance(value, str | Span) and np.ndim(value) != 0:
         raise InputError(f"{field}: got an array of shape {np.shape(value)}; a scene holds single numbers")
     if isinstance(value, np.ndarray) or is_jax(value):
         value = np.asarray(value).item()
     if isinstance(value, Real) and not isinstance(value, bool):
-        # Also what NumPy holds.
+        # Scalars of NumPy are real numbers, too.
         value = to_float(value)  # pyright: ignore[reportArgumentType]  (anything that float takes)
     try:
         return read(value)
     except UnusableValueError as error:
         message = str(error)
         if not isinstance(value, str):
-            # As Python spells it.
+            # Show the value as Python spells it.
             message = message.replace(f"got {describe(value)};", f"got {value!r};", 1)
         raise InputError(f"{field}: {message}") from None
 
 
 def check_whole(field: str, value: Any, low: int, high: int) -> int:
-    """Return one whole number in range; else raise `InputError`."""
+    """Return an integer; raise `InputError` if the value is not an integer in range."""
     number = value if isinstance(value, int | np.integer) and not isinstance(value, bool) else None
     if number is None and isinstance(value, float | np.floating) and float(value).is_integer():
         number = int(value)

@@ -1,4 +1,4 @@
-"""The haptic device: a mass with viscous damping, rigid or with a compliance behind it, and what drives it."""
+"""The haptic device: a mass with viscous damping, and optionally a coupling, an actuator and modes."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from zwidth.words.formatting import with_unit
 
 @dataclass(frozen=True, repr=False)
 class Coupling(Part):
-    """The mass beyond a spring and a damper: a tendon's, a belt's, a gear's or a link's elasticity.
+    """A second mass, coupled by a spring and a damper: the elasticity of a tendon, belt, gear or link.
 
-    ``m x1'' = F - b x1' + k (x2 - x1) + c (x2' - x1')``, ``m2 x2'' = -k (x2 - x1) - c (x2' - x1')`` with the wall's
-    force F on the motor side.
+    ``m x1'' = F - b x1' + k (x2 - x1) + c (x2' - x1')``, ``m2 x2'' = -k (x2 - x1) - c (x2' - x1')``; the wall's
+    force F acts on the motor side.
 
     Args:
-        mass: m2, the mass on the tip's side, in kg, > 0.
-        stiffness: k of the spring between, in N/m, > 0.
-        damping: c of the damper between, in N s/m, >= 0.
-        sensor: where the position is measured, "motor" or "tip".
+        mass: m2, the mass on the tip side, in kg, > 0.
+        stiffness: k of the spring, in N/m, > 0.
+        damping: c of the damper, in N s/m, >= 0.
+        sensor: side on which the position is measured, "motor" or "tip".
 
     Example:
         >>> import zwidth
@@ -46,19 +46,20 @@ class Coupling(Part):
 
 @dataclass(frozen=True, repr=False)
 class Device(Part):
-    """The haptic device: a mass with viscous damping, or an inertia where it is rotary.
+    """The haptic device: a mass with viscous damping, or an inertia if the device is rotary.
 
-    A rotary device is the same mathematics in other units: kg m^2 in place of kg, N m s/rad of N s/m, N m/rad of N/m,
-    rad of m and N m of N. Every part and every wall of its scene is in these, and so is every answer.
+    The equations of a rotary device are the same in other units: kg m^2 instead of kg, N m s/rad instead of N s/m,
+    N m/rad instead of N/m, rad instead of m, and N m instead of N. All parts, walls and results of its scene have these
+    units.
 
     Args:
-        mass: m in kg, > 0; with a coupling, of the motor's side. Of a rotary device the inertia J in kg m^2.
-        damping: b in N s/m, >= 0; N m s/rad of a rotary device.
-        coupling: the mass beyond a spring and damper, None for a rigid device.
-        actuator: the lag of amplifier and motor, None where a command acts at once.
-        modes: resonances that a command excites and the sensor sees, in any number.
-        rotary: whether it turns; left out, the units of the other arguments say so, and plain numbers are of a linear
-            device.
+        mass: m in kg, > 0; with a coupling, that of the motor side. For a rotary device, the inertia J in kg m^2.
+        damping: b in N s/m, >= 0; in N m s/rad for a rotary device.
+        coupling: a second mass, coupled by a spring and a damper; None for a rigid device.
+        actuator: dynamics of amplifier and motor; None if commands act immediately.
+        modes: resonances that commands excite and the sensor measures, in any number.
+        rotary: True for a rotary device. If left out, the units of the other arguments decide; plain numbers are those
+            of a linear device.
 
     Example:
         >>> import zwidth
@@ -70,7 +71,7 @@ class Device(Part):
     damping: Any = 0.0
     coupling: Coupling | None = None
     actuator: Actuator | None = None
-    # A list is as good.
+    # A list is also accepted.
     modes: Any = ()
     rotary: bool | None = None
 

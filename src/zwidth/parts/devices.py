@@ -1,6 +1,6 @@
-"""Devices whose numbers somebody published, each number with its source; None where nothing is published.
+"""Devices with published parameters, each parameter with its source.
 
-A rotary device is the same mathematics as a linear one with other units: its ``mass`` is the inertia J in kg m^2, its
+The equations of a rotary device are those of a linear one in other units: its ``mass`` is the inertia J in kg m^2, its
 ``damping`` is in N m s/rad, and the walls of its loop are in N m/rad and N m s/rad.
 """
 
@@ -29,7 +29,7 @@ def __dir__() -> list[str]:
 
 
 class Published(NamedTuple):
-    """One number, its unit, where it was published, and what must be known to use it."""
+    """One parameter with its unit, its source, and a note on its use."""
 
     value: float
     unit: str
@@ -37,7 +37,7 @@ class Published(NamedTuple):
     note: str = ""
 
     def spell(self) -> str:
-        """It with its unit."""
+        """Return the value with its unit."""
         if self.unit in ("counts", "periods"):
             return f"{self.value:g} {self.unit.removesuffix('s') if self.value == 1 else self.unit}"
         return with_unit(self.value, self.unit, 3)
@@ -45,22 +45,22 @@ class Published(NamedTuple):
 
 @dataclass(frozen=True)
 class KnownDevice:
-    """What is published of one device; a field is None where nothing is.
+    """Published parameters of one device; unpublished ones are None.
 
     Attributes:
-        name: as `find_device` and the command line take it.
-        title: for people.
-        motion: "linear" or "rotary", which decides the units of everything else.
+        name: the name in `find_device` and on the command line.
+        title: the name in texts.
+        motion: "linear" or "rotary"; determines the units of all other fields.
         mass: in kg, or the inertia in kg m^2.
         damping: viscous, in N s/m or N m s/rad.
         friction: Coulomb friction in N or N m.
         resolution: one step of the position sensor, in m or rad.
-        counts: of the encoder on the motor's shaft; transmissions are not published with them.
-        period: of the loop it was measured or used in, in s.
-        delay: delay of that loop from a sample to the force that it causes, in s or in periods.
-        force: the largest, in N.
-        stiffness_limit: the largest in use, in N/m: what a library sets or notes name, no measured boundary.
-        damping_limit: likewise, in N s/m.
+        counts: counts of the encoder on the motor shaft; the transmission is not published with them.
+        period: sampling period in s of the loop in which the device was measured or used.
+        delay: delay of that loop from a sample to its force, in s or in periods.
+        force: largest force, in N.
+        stiffness_limit: largest stiffness in use, in N/m, from a library or notes; not a measured boundary.
+        damping_limit: largest virtual damping in use, in N s/m, likewise.
     """
 
     name: str
@@ -78,31 +78,32 @@ class KnownDevice:
     damping_limit: Published | None = None
 
     def __repr__(self) -> str:
-        """Its name and numbers, without their sources."""
+        """Return the name and the parameters, without sources."""
         numbers = [f"{name}={number.spell()}" for name, number in self.numbers.items()]
         return f"KnownDevice({', '.join([self.name, *numbers])})"
 
     @property
     def rotary(self) -> bool:
-        """Whether it turns."""
+        """True for a rotary device."""
         return self.motion == "rotary"
 
     @property
     def numbers(self) -> dict[str, Published]:
-        """Every number that is published, by its name."""
+        """The published parameters by name."""
         return {
             field.name: found for field in fields(self) if isinstance(found := getattr(self, field.name), Published)
         }
 
     def to_device(self, *, mass: Any = None, damping: Any = None) -> Device:
-        """A `zwidth.Device` with the published mass and damping.
+        """Return a `zwidth.Device` with the published mass and damping.
 
         For a rotary device ``Device.mass`` holds the inertia in kg m^2 and ``Device.damping`` N m s/rad, and every
         stiffness and virtual damping of such a scene is in N m/rad and N m s/rad.
 
         Args:
-            mass: yours, in place of the published one or where none is published.
-            damping: likewise; 0 is the cautious value, more damping was never seen to make a stable wall unstable.
+            mass: mass that replaces the published one; required if none is published.
+            damping: damping, likewise; 0 is the cautious value, because no stable wall was found that more physical
+                damping makes unstable.
 
         Raises:
             InputError: mass or damping is neither published nor given.
@@ -154,14 +155,14 @@ class KnownDevice:
         return found.value
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain JSON values; null where nothing is published."""
+        """Return JSON values; null for unpublished parameters."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value._asdict() if isinstance(value, Published) else value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
 class KnownHand:
-    """What was measured of one hand: kg, N s/m and N/m to ground."""
+    """Measured mass (kg), damping (N s/m) and stiffness (N/m) to ground of one hand."""
 
     name: str
     title: str
@@ -170,7 +171,7 @@ class KnownHand:
     stiffness: Published
 
     def to_operator(self) -> Operator:
-        """A `zwidth.Operator` who holds the device rigidly; `dataclasses.replace` puts a spring of yours between.
+        """Return a `zwidth.Operator` with a rigid grasp; add a spring by `dataclasses.replace`.
 
         Example:
             >>> import zwidth
@@ -181,11 +182,11 @@ class KnownHand:
 
 
 def _read_published() -> tuple[tuple[KnownDevice, ...], KnownHand]:
-    """The devices and the hand in the file beside this one."""
+    """Return the devices and the hand in ``published.json``."""
     known = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
 
     def spell_out(entry: dict[str, Any]) -> dict[str, Any]:
-        """Its numbers as `Published`, which name their sources by their keys in the file."""
+        """Return an entry with its parameters as `Published`, with the sources in place of their keys."""
         return {
             name: Published(value[0], value[1], known["sources"][value[2]], *value[3:])
             if isinstance(value, list)
@@ -197,20 +198,20 @@ def _read_published() -> tuple[tuple[KnownDevice, ...], KnownHand]:
 
 
 DEVICES, HAND = _read_published()
-"""Every device, those with measured numbers first; and a hand for `zwidth.Scene(..., operator=...)`."""
+"""All devices, those with measured parameters first; and a hand for `zwidth.Scene(..., operator=...)`."""
 
 
 def find_device(name: str) -> KnownDevice:
-    """Return the device of this name.
+    """Return the published device with a name.
 
     Args:
-        name: one of those that `zwidth.devices.DEVICES` holds and ``zwidth devices`` lists.
+        name: name of a device in `zwidth.devices.DEVICES`, as listed by ``zwidth devices``.
 
     Raises:
-        InputError: there is none.
+        InputError: no device has this name.
 
     References:
-        Each number names its own source.
+        Each parameter contains its source.
 
     Example:
         >>> import zwidth

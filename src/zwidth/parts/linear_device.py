@@ -1,4 +1,4 @@
-"""A device that is given as a linear system: what a force moves the sensed position by."""
+"""A device defined by a linear system from commanded force to sensed position."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FORMS = (
 
 
 class RationalResponse(NamedTuple):
-    """``numerator/denominator`` in s, or in z where it is sampled; exact, with the roots to float64."""
+    """``numerator/denominator`` in s, or in z for a sampled system, with exact coefficients."""
 
     numerator: Polynomial
     denominator: Polynomial
@@ -38,7 +38,7 @@ class RationalResponse(NamedTuple):
 
 
 class WholeDevice:
-    """Base of devices that are given as a whole: what a `Device` has beside its mass, and no body of these has."""
+    """Base of devices without bodies: defines the attributes of a `Device` that they do not have."""
 
     coupling: ClassVar[None] = None
     actuator: ClassVar[None] = None
@@ -55,21 +55,21 @@ class WholeDevice:
 
 @dataclass(frozen=True, repr=False)
 class LinearDevice(WholeDevice):
-    """A device as any strictly proper linear system from commanded force (N) to sensed position (m).
+    """A device defined by any strictly proper linear system from commanded force (N) to sensed position (m).
 
-    Every question about walls is answered of it; its numbers are taken as exact. Nothing is known of bodies: a hand,
-    friction, starts and energies of motions are for `Device`. The stiffest wall and recommendations are restricted to
+    All functions for walls accept it; its coefficients are taken as exact. Its bodies are unknown, so an operator,
+    friction, initial values and energies need a `Device`. The stiffest wall and recommendations are restricted to
     B >= 0, because B < 0 would cancel modeled damping that the real device may not have. Walls with B < 0 are included
     in `Scene.max_stiffness` with ``negative_damping=True``.
 
     Args:
         system: matrices ``(A, B, C)``, coefficients ``(numerator, denominator)`` with the highest power first, as text
             too, "1 / 0.1 10 0", or ``(zeros, poles, gain)``; or a model of scipy.signal (lti, dlti) or python-control
-            (TransferFunction, StateSpace). One that is sampled, with ``dt`` the period of the loop, has hold and delay
-            inside.
+            (TransferFunction, StateSpace). A sampled system, with ``dt`` equal to the period of the loop, includes hold
+            and delay.
 
     Raises:
-        InputError: the system is none of these, or the force would move the position at once.
+        InputError: the system is none of these, or it is not strictly proper.
 
     Example:
         >>> import zwidth
@@ -86,11 +86,11 @@ class LinearDevice(WholeDevice):
             object.__setattr__(self, "system", _read(self.system))
 
     def __repr__(self) -> str:
-        """As configurations have it."""
+        """Return an expression that creates the device."""
         return f"LinearDevice({self.spell_form()!r})"
 
     def spell_form(self) -> str | dict[str, Any]:
-        """What configurations have under ``device``: coefficients to float64."""
+        """Return the entry ``device`` of a configuration, with the coefficients in float64."""
         top, bottom = ([float(c) for c in part] for part in self.system[:2])
         if self.dt:
             return {"numerator": top, "denominator": bottom, "sampled": self.dt}
@@ -102,46 +102,46 @@ class LinearDevice(WholeDevice):
         return self.system.dt
 
     def spell(self) -> str:
-        """What it is, in words."""
+        """Return a one-line description of the system."""
         kind = "sampled" if self.dt else "continuous"
         return f"{kind} linear system of order {self.poles.size}, {self.zeros.size} finite zeros"
 
     @cached_property
     def zeros(self) -> np.ndarray:
-        """Its finite zeros, in rad/s or in z."""
+        """The finite zeros, in rad/s or in z."""
         return find_roots(self.system.numerator)
 
     @cached_property
     def poles(self) -> np.ndarray:
-        """Its poles, in rad/s or in z."""
+        """The poles, in rad/s or in z."""
         return find_roots(self.system.denominator)
 
     @cached_property
     def offsets(self) -> tuple[np.ndarray, np.ndarray]:
-        """``1 - z`` of the zeros and poles of a sampled system, which keeps the digits of slow ones."""
+        """``1 - z`` of the zeros and poles of a sampled system, with all digits of slow ones."""
         return find_roots(self.system.numerator, True), find_roots(self.system.denominator, True)
 
     @cached_property
     def gain(self) -> float:
-        """Of the highest powers."""
+        """Ratio of the leading coefficients of numerator and denominator."""
         return float(self.system.numerator[0] / self.system.denominator[0])
 
     @cached_property
     def mass(self) -> float:
-        """A mass of about the same answer, in kg, in which normalized numbers are counted."""
+        """A mass in kg with a response of similar magnitude, the unit of normalized parameters."""
         behind = self.poles.size - self.zeros.size
         if self.dt is None and behind == 2 and self.gain > 0:
             return 1.0 / self.gain
         moving = np.abs(self.poles)[np.abs(self.poles) > 0]
         w = float(np.exp(np.mean(np.log(moving)))) if moving.size else 1.0
-        # Beside the poles of undamped devices.
+        # Evaluate off the axis or circle on which undamped devices have poles.
         at, unit = (w * (0.3 + 1j), w) if self.dt is None else (0.3 + 1j, 1.0 / self.dt)
         size = abs(self.gain) * np.prod(np.abs(at - self.zeros)) / np.prod(np.abs(at - self.poles))
         return float(1.0 / (size * unit * unit))
 
 
 def split_fraction(text: str) -> tuple[list[float], list[float]]:
-    """The coefficients of ``NUMERATOR / DENOMINATOR``, each separated by blanks or commas, highest power first."""
+    """Return the coefficients of ``NUMERATOR / DENOMINATOR``, separated by blanks or commas, highest power first."""
     try:
         top, bottom = ([float(c) for c in side.replace(",", " ").split()] for side in text.split("/"))
     except ValueError:

@@ -1,7 +1,7 @@
-"""The hand that holds the device: part of its mass, or behind a spring and damper of its own.
+"""The operator's hand: attached to the device rigidly, or by a spring and a damper.
 
-A rigid grasp adds mass, damping and a spring to ground to the body that is held (the tip, where there is a coupling).
-Behind a spring and damper the hand is a further mass, with its own damper and spring to ground.
+A rigid grasp adds mass, damping and a spring to ground to the body that is held (the tip, if the device has a
+coupling). A hand attached by a spring and a damper is a separate mass, with its own damper and spring to ground.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.xp import is_jax
 
-# That of the reference below.
+# Values of the reference below.
 _HAND = {"mass": 0.554, "damping": 6.45, "stiffness": 135.0}
 
 
@@ -23,11 +23,11 @@ class Operator(Part):
     """The operator's hand.
 
     Args:
-        mass: in kg, >= 0; > 0 behind a spring.
+        mass: in kg, >= 0; > 0 unless the grasp is rigid.
         damping: to ground, in N s/m, >= 0.
         stiffness: to ground, in N/m, >= 0.
         coupling_stiffness: of the spring between hand and device, in N/m, > 0; None for a rigid grasp.
-        coupling_damping: of the damper beside it, in N s/m, >= 0.
+        coupling_damping: of the damper parallel to this spring, in N s/m, >= 0.
 
     References:
         A hand of 0.554 kg, 6.45 N s/m and 135 N/m: Sci. Rep. 5:18004 (2015), Fig. 3 (one trial).
@@ -56,7 +56,7 @@ class Operator(Part):
         if not self.rigid:
             # Check the mass after its conversion to SI.
             check_number("operator.mass", self.mass, self.unit_system["kg"], POSITIVE)
-        # Which number JAX holds, nobody can ask.
+        # Count any JAX value as nonzero, because a traced value cannot be compared.
         if self.rigid and (is_jax(self.coupling_damping) or self.coupling_damping):
             raise InputError(
                 f"operator.coupling_damping: got {self.coupling_damping!r} without a spring beside it; give "
@@ -65,5 +65,5 @@ class Operator(Part):
 
     @property
     def rigid(self) -> bool:
-        """Whether the grasp is rigid."""
+        """True if the grasp is rigid."""
         return self.coupling_stiffness is None

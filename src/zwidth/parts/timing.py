@@ -1,4 +1,4 @@
-"""When the wall's force is computed and when it acts."""
+"""Sampling period and delay of a loop."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from zwidth.words.xp import is_jax
 
 @dataclass(frozen=True, repr=False)
 class Timing(Part):
-    """When the wall's force is computed and when it acts.
+    """The sampling period of a loop and the delay of the wall's force.
 
     Args:
-        period: T in s, > 0; or give the rate.
-        delay: t_d, from a sample to the moment its force acts, in s, >= 0, whole periods or not; or exactly in
+        period: T in s, > 0; or pass ``rate``.
+        delay: t_d from a sample to the start of its force, in s, >= 0, integer or fractional periods; or exactly in
             periods, as "1.5 periods". If the period changes, a delay given in periods keeps its number of periods.
-        rate: 1/T in Hz, > 0, in place of the period.
+        rate: 1/T in Hz, > 0, instead of ``period``.
 
     Example:
         >>> import zwidth
@@ -72,7 +72,7 @@ class Timing(Part):
 
     @property
     def d(self) -> Any:
-        """The delay in periods: as given, or the quotient, whole where it is whole but for rounding."""
+        """The delay in periods: as given, or the quotient, an exact integer if it differs by rounding errors only."""
         if self._periods is not None:
             return np.float64(self._periods)
         return in_periods(*(value if is_jax(value) else np.float64(value) for value in (self.delay, self.period)))

@@ -123,7 +123,7 @@ class LowPass(_Checked):
     ``p = exp(-T/tau)``, ``tau = 1/(2 pi cutoff)``; ``F = (1 - 1/z)/T ((1 - p) z/(z - p))^order``.
 
     Args:
-        cutoff: in Hz, > 0 and at most half the sampling rate; or
+        cutoff: in Hz, > 0 and below half the sampling rate; or
         time_constant: tau in s, > 0.
         order: 1 or 2.
         coded_period: period in s for which p and the difference are computed; the period of the loop if left out.
@@ -283,8 +283,8 @@ class VelocityFilter(Part):
 class FOAW(_Checked):
     """First-order adaptive windowing, for simulations only: the estimate is nonlinear, so the loop has no poles.
 
-    The estimate is the slope of the line from the oldest to the newest position of a window. The window is the longest
-    one of up to ``samples`` periods in which no position deviates from this line by more than ``noise``.
+    The estimate is the slope of the line from the oldest to the newest position of a window. The window is extended by
+    one period at a time, up to ``samples``, until a position in it deviates from this line by more than ``noise``.
 
     Args:
         noise: largest error of a measured position in m, > 0; one count of an encoder.
@@ -348,6 +348,7 @@ def check_cutoff(cutoff: Any, period: Any) -> None:
 
 
 def _ratio(period: Any, coded: Any) -> Any:
+    """Return the period of the loop divided by the coded period; 1 if no coded period is given."""
     return 1.0 if coded is None else period / coded
 
 

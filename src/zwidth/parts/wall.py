@@ -1,4 +1,4 @@
-"""The wall that is rendered, and which wall a question means."""
+"""The virtual wall of a scene, and the wall that arguments select."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zwidth.words.units import to_float
 
 @dataclass(frozen=True, repr=False)
 class VirtualWall(Part):
-    """A spring and a damper, the damper acting on the velocity estimate.
+    """A spring and a damper; the damper acts on the velocity estimate.
 
     Args:
         stiffness: K in N/m.
@@ -26,7 +26,7 @@ class VirtualWall(Part):
 
 @dataclass(frozen=True, repr=False)
 class NoWall(VirtualWall):
-    """What a scene has in place of a wall where none was chosen: no force, and no wall that a question could mean."""
+    """Placeholder in scenes without a wall: no force, and no default for stiffness and damping."""
 
     stiffness: Any = field(default=0.0, init=False, repr=False)
     virtual_damping: Any = field(default=0.0, init=False, repr=False)
@@ -40,7 +40,7 @@ def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any, system
     # Integers that overflow float64 become infinite.
     both = stiffness, virtual_damping
     stiffness, virtual_damping = (to_float(v) if isinstance(v, int) and v.bit_length() > 1023 else v for v in both)
-    # Most questions are of numbers, in which there is no text to look for.
+    # Skip plain numbers, because most calls have no text to convert.
     if not (isinstance(stiffness, int | float) and isinstance(virtual_damping, int | float | None)):
         stiffness = read_texts("stiffness", stiffness, system["N/m"])
         virtual_damping = read_texts("virtual_damping", virtual_damping, system["N s/m"])
@@ -48,21 +48,20 @@ def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any, system
     if stiffness is None and virtual_damping is None:
         if not chosen:
             raise InputError(
-                "stiffness: none is given, and the scene has no wall; give stiffness (and virtual_damping), or the "
-                "scene wall=zwidth.VirtualWall(stiffness=...)"
+                "stiffness: none is given, and the scene has no wall; pass stiffness (and virtual_damping), or build "
+                "the scene with wall=zwidth.VirtualWall(stiffness=...)"
             )
         return wall.stiffness, wall.virtual_damping
     if stiffness is None:
         raise InputError(
-            "stiffness: none is given beside virtual_damping; give both, or none and the scene the wall that is meant: "
+            "stiffness: none is given with virtual_damping; pass both, or replace the scene's wall: "
             "scene.replace(stiffness=..., virtual_damping=...)"
         )
     if virtual_damping is None:
         if chosen:
             raise InputError(
-                f"virtual_damping: none is given beside stiffness, and the scene's own wall has {wall.virtual_damping} "
-                f"{system['N s/m']}; say which, 0 for a spring alone, or replace the wall: "
-                "scene.replace(stiffness=...)"
+                f"virtual_damping: none is given with stiffness, and the scene's wall has {wall.virtual_damping} "
+                f"{system['N s/m']}; pass it, 0 for a spring only, or replace the wall: scene.replace(stiffness=...)"
             )
         return stiffness, 0.0
     return stiffness, virtual_damping

@@ -21,7 +21,7 @@ from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
 from zwidth.words.unit_system import LINEAR, UnitSystem
 from zwidth.words.xp import compute_concretely, is_traced
 
-RECORDED_BYTES = 2 * 14 * 8  # per recorded instant, including its conversion to SI units
+RECORDED_BYTES = 2 * 14 * 8  # per recorded instant: about 14 numbers, twice because of the conversion to SI units
 JITTER_BYTES = 20 * 8  # per instant of the running simulations
 DRAWN_BYTES = 4 * 8  # per period of the running simulations, for noise and for external forces
 MOST_BYTES = 4 << 30  # per call of `simulate`
@@ -39,7 +39,7 @@ def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     """Return the distinct scenes, and the index of the scene of each batch entry."""
     listed = isinstance(scenes, Iterable) and not isinstance(scenes, np.ndarray)
     array = np.array(list(scenes) if listed else scenes, object)
-    known: dict[int, int] = {}
+    numbers: dict[int, int] = {}
     which = np.empty(array.shape, int)
     for index, scene in np.ndenumerate(array):
         if not (hasattr(scene, "device") and hasattr(scene, "timing")):
@@ -50,8 +50,8 @@ def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
             )
         if scene.traced_path is not None:
             raise InputError("scenes: got values traced by JAX; call simulate outside of jit, vmap and grad")
-        which[index] = known.setdefault(id(scene), len(known))
-    return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))], which
+        which[index] = numbers.setdefault(id(scene), len(numbers))
+    return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(numbers))], which
 
 
 def find_system(scenes: list[Any]) -> UnitSystem:
@@ -69,8 +69,8 @@ def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
         start = dict(start) if isinstance(start, Mapping) else {"position": start}
         for body in start.keys() - bodies.keys():
             raise InputError(f"{name}: {describe_choice(body, tuple(bodies))}")
-        own = start.get("position", 0.0)
-        given |= {f"{name}.{body}": start.get(body, own) for body in bodies}
+        of_device = start.get("position", 0.0)
+        given |= {f"{name}.{body}": start.get(body, of_device) for body in bodies}
     return given
 
 
@@ -147,8 +147,8 @@ def read_arguments(
     system = find_system(scenes)
     walls = [resolve_wall(scene.wall, given["stiffness"], given["virtual_damping"], system) for scene in scenes]
     if given["stiffness"] is None:
-        own = np.array(walls, float).reshape(-1, 2)[which]
-        given = {**given, "stiffness": own[..., 0], "virtual_damping": own[..., 1]}
+        pairs = np.array(walls, float).reshape(-1, 2)[which]
+        given = {**given, "stiffness": pairs[..., 0], "virtual_damping": pairs[..., 1]}
     elif given["virtual_damping"] is None:
         given = {**given, "virtual_damping": 0.0}
     arrays = {
@@ -236,6 +236,7 @@ def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: 
 
 
 def _read_seeds(seed: Any) -> np.ndarray:
+    """Return the seeds as an array of integers; raise `InputError` for other values."""
     if is_traced(seed):
         raise InputError("seed: got a value traced by JAX; use integers, outside of jit, vmap and grad")
     try:

@@ -110,21 +110,21 @@ def run_scenes(
         # Import JAX only here, because importing zwidth must not load it.
         from zwidth.simulation.engine import run_batch
 
-        own, scene_of = np.unique(which[rows], return_inverse=True)
-        members, group = [models[k] for k in own], {name: part[rows] for name, part in numbers.items()}
+        used, scene_of = np.unique(which[rows], return_inverse=True)
+        members, group = [models[k] for k in used], {name: part[rows] for name, part in numbers.items()}
         params, inputs = build_batch(members, scene_of, group, settings, options, names)
         with compute_concretely():
-            found = run_batch(params, options, settings, inputs, rings)
+            simulated = run_batch(params, options, settings, inputs, rings)
         memory = np.array([model.late + model.window for model in members])[scene_of]
-        columns = convert_to_si(found, inputs, params.motor.static > 0, memory, names, settings)
+        columns = convert_to_si(simulated, inputs, params.motor.static > 0, memory, names, settings)
         return columns | {name: np.full_like(columns[name], np.nan) for name in unknown & columns.keys()}
 
     size = min(GROUP, 1 << (count - 1).bit_length())
     # Repeat the last simulation to fill the last group, because each size needs a compilation.
     groups = [np.minimum(np.arange(first, first + size), count - 1) for first in range(0, count, size)]
     # Compile with the first group; threads run the others in parallel, because JAX releases the interpreter lock.
-    found = [run(groups[0]), *run_in_threads(run, groups[1:])]
-    return {name: np.concatenate([each[name] for each in found])[:count] for name in found[0]}
+    results = [run(groups[0]), *run_in_threads(run, groups[1:])]
+    return {name: np.concatenate([each[name] for each in results])[:count] for name in results[0]}
 
 
 def build_batch(

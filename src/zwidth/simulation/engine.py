@@ -23,8 +23,13 @@ from zwidth.words.xp import known_options
 BLOCK = 128  # periods per compiled call
 SEGMENTS = 6  # equal parts of the tail; an even number, because the trend compares the halves
 SLACK = 1.0 + 1e-9  # factor on the bound of FOAW; rounding errors must not exclude deviations of exactly one count
-# XLA's older loop emitters without splitting: half the compile time at the same speed.
-COMPILER_OPTIONS = ("xla_cpu_use_fusion_emitters", False), ("xla_cpu_parallel_codegen_split_count", 1)
+# XLA's older loop emitters without splitting: half the compile time at the same speed. Full optimization even if
+# XLA_FLAGS asks for less, because a simulation runs for thousands of periods.
+COMPILER_OPTIONS = (
+    ("xla_cpu_use_fusion_emitters", False),
+    ("xla_cpu_parallel_codegen_split_count", 1),
+    ("xla_backend_optimization_level", 3),
+)
 
 
 class Controller(NamedTuple):
@@ -53,7 +58,7 @@ class Summary(NamedTuple):
     given: Array  # largest energy that the wall has supplied so far
     far: Array  # largest -x and x of the bodies, (1 + SEGMENTS, 2, bodies, batch); -inf without samples
     turns: Array  # number of times the velocity becomes positive, (1 + SEGMENTS, batch)
-    turned: Array  # first and last time in the tail at which it does, (2, batch)
+    turned: Array  # first and last instant of this kind in the tail, in periods, (2, batch)
 
 
 class State(NamedTuple):
@@ -214,7 +219,7 @@ def _simulate_period(
 ) -> tuple[State, Any]:
     """Simulate one period; ``ends``: periods at which the segments of the tail begin, and the end."""
     controller, reading = control(params, options, state.controller, inputs.k, state.body.x[0] + inputs.noise)
-    # Ages of the commands that act in turn until the next sample.
+    # Ages in samples of the commands that may act until the next sample, in the order of their start.
     ages = {1: (0,), 2: (1, 0), 4: (2, 1, 0, -1)}[options.pieces]
     forces = [look_back(controller.commands, inputs.k, params.late + age) for age in ages]
     durations = inputs.durations if options.jitter else params.durations
@@ -256,21 +261,21 @@ def _summarize(
     params: Parameters, state: State, reading: Reading, body: BodyState, work: Array, k: Array, ends: Array
 ) -> Summary:
     """Return the statistics after period k."""
-    known, before = state.summary, state.controller.touching
+    summary, before = state.summary, state.controller.touching
     places = jnp.stack([dot(row, state.body.x) for row in params.place])
     v, next_v = dot(params.motion[0], state.body.x), dot(params.motion[0], body.x)
-    hits = reading.touching & ~before & (k > 0) & jnp.isnan(known.impact)
+    hits = reading.touching & ~before & (k > 0) & jnp.isnan(summary.impact)
     turning = (v <= 0) & (next_v > 0)
     moment = k - v / jnp.where(next_v > v, next_v - v, 1.0)
-    segment, first = jnp.sum(k >= ends), known.turned[0]
+    segment, first = jnp.sum(k >= ends), summary.turned[0]
     turned = jnp.stack([jnp.where(jnp.isnan(first), moment, first), moment])
     return Summary(
-        known.exits + (before & ~reading.touching),
-        jnp.where(hits, v, known.impact),
-        jnp.fmax(known.given, work[0]),
-        _write(known.far, jnp.fmax(read(known.far, segment), jnp.stack([-places, places])), segment),
-        _write(known.turns, read(known.turns, segment) + turning, segment),
-        jnp.where(turning & (segment > 0), turned, known.turned),
+        summary.exits + (before & ~reading.touching),
+        jnp.where(hits, v, summary.impact),
+        jnp.fmax(summary.given, work[0]),
+        _write(summary.far, jnp.fmax(read(summary.far, segment), jnp.stack([-places, places])), segment),
+        _write(summary.turns, read(summary.turns, segment) + turning, segment),
+        jnp.where(turning & (segment > 0), turned, summary.turned),
     )
 
 

@@ -269,8 +269,8 @@ def propagate_with_friction(
 
     def finish_few(state: _Slide) -> _Slide:
         which = jnp.sort(jnp.where(state.pending, np.arange(size), size))[:few]
-        own, part = jax.tree.map(lambda part: _take(part, which), (joint, state))
-        part = finish(own, part._replace(left=jnp.where(which < size, part.left, 0.0)), which)
+        few_joint, part = jax.tree.map(lambda part: _take(part, which), (joint, state))
+        part = finish(few_joint, part._replace(left=jnp.where(which < size, part.left, 0.0)), which)
         return jax.tree.map(lambda rows, part: rows.at[..., which].set(part, mode="drop"), state, part)
 
     if whole is None or few == size:

@@ -127,45 +127,45 @@ def simulate(
     substeps = check_whole("substeps", substeps, 1, 10_000)
     tail = max(periods // 4, 1) if tail is None else check_whole("tail", tail, 1, periods)
     settings = Settings(periods, substeps, tail, contact, record)
-    known, which = list_scenes(scenes)
+    distinct, which = list_scenes(scenes)
     if force is not None:
         settings = settings._replace(law=trace_law(force, stiffness, virtual_damping))
         given |= {"stiffness": 0.0, "virtual_damping": 0.0}
     if hand_history is not None:
-        push_history = convert_hand(known, which, hand_history, push_history, periods)
-    numbers, which, good = read_arguments(known, which, spread_starts(known, given), seed, push_history, periods)
-    refuse_bodies(known, which, numbers)
+        push_history = convert_hand(distinct, which, hand_history, push_history, periods)
+    numbers, which, good = read_arguments(distinct, which, spread_starts(distinct, given), seed, push_history, periods)
+    refuse_bodies(distinct, which, numbers)
     check_memory(numbers, settings)
     shape, which = which.shape, which.ravel()
-    found: dict[str, np.ndarray] = {}
+    results: dict[str, np.ndarray] = {}
     groups: dict[tuple[Any, ...], list[int]] = {}
-    for index, scene in enumerate(known):
+    for index, scene in enumerate(distinct):
         groups.setdefault(find_structure(scene), []).append(index)
     for members in groups.values():
-        own = np.flatnonzero(np.isin(which, members))
-        rows = {name: column[own] for name, column in numbers.items()}
-        part = run_scenes([known[k] for k in members], np.searchsorted(members, which[own]), rows, settings)
+        indices = np.flatnonzero(np.isin(which, members))
+        rows = {name: column[indices] for name, column in numbers.items()}
+        part = run_scenes([distinct[k] for k in members], np.searchsorted(members, which[indices]), rows, settings)
         for name, column in part.items():
-            if name not in found:
-                found[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
-            found[name][own] = column
-    for column in found.values():
-        # Discard the motions that were simulated with a replaced bad number.
+            if name not in results:
+                results[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
+            results[name][indices] = column
+    for column in results.values():
+        # Discard the motions of invalid arguments, which were replaced by 0 for the simulation.
         column[~good] = _missing(column.dtype)
-    found["status"][~good] = Status.INVALID_INPUT
-    found["outcome"][~good] = MotionKind.INVALID
+    results["status"][~good] = Status.INVALID_INPUT
+    results["outcome"][~good] = MotionKind.INVALID
     if record:
-        found["time"] = _build_time(known, which, np.arange(periods * substeps) / substeps, found.get("time"))
+        results["time"] = _build_time(distinct, which, np.arange(periods * substeps) / substeps, results.get("time"))
     shaped = {
         name: column if name == "time" and column.ndim == 1 else column.reshape((*shape, *column.shape[1:]))[()]
-        for name, column in found.items()
+        for name, column in results.items()
     }
-    return with_units(Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped)), known[0].unit_system)
+    return with_units(Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped)), distinct[0].unit_system)
 
 
-def _build_time(known: list[Any], which: np.ndarray, steps: np.ndarray, drawn: np.ndarray | None) -> np.ndarray:
+def _build_time(distinct: list[Any], which: np.ndarray, steps: np.ndarray, drawn: np.ndarray | None) -> np.ndarray:
     """Return the instants, on one axis if all simulations share them; ``drawn``: instants with jitter, else NaN."""
-    clock = np.array([float(scene.timing.period) for scene in known])
+    clock = np.array([float(scene.timing.period) for scene in distinct])
     if drawn is None and len(set(clock.tolist())) == 1:
         return steps * clock[0]
     even = steps * clock[which][:, None]
@@ -173,5 +173,5 @@ def _build_time(known: list[Any], which: np.ndarray, steps: np.ndarray, drawn: n
 
 
 def _missing(dtype: np.dtype) -> Any:
-    """Return the value of a result that does not exist."""
+    """Return the value of a missing result: NaN, or 0 for integers."""
     return np.nan if dtype.kind == "f" else 0

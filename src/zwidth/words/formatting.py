@@ -1,4 +1,4 @@
-"""Values for people: numbers with SI prefixes and few digits, what was received, and the cells of CSV files."""
+"""Formatting of values in output and messages: numbers with SI prefixes, received values, and cells of CSV files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LONGEST_VALUE = 60
 
 
 def plain(value: float, digits: int = 4) -> str:
-    """A number with a fixed count of significant digits, without an exponent where it stays short."""
+    """Return a number with a fixed number of significant digits, without exponent between 1e-4 and 1e6."""
     if not math.isfinite(value):
         return "none" if math.isnan(value) else ("infinite" if value > 0 else "-infinite")
     # A zero has no sign.
@@ -40,7 +40,7 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     if not math.isfinite(value) or value == 0:
         return f"{plain(value)} {unit}" if value == 0 else plain(value)
     power = min(9, max(-9, 3 * math.floor(math.log10(abs(value)) / 3)))
-    # 999.96 with four digits reads 1000: the next prefix is meant.
+    # Use the next prefix if rounding yields 1000, as for 999.96 with four digits.
     if abs(float(f"{value / 10**power:.{digits - 1}e}")) >= 1000 and power < 9:
         power += 3
     return f"{plain(value / 10**power, digits)} {PREFIXES[power]}{unit}"
@@ -64,27 +64,27 @@ def name_wall(stiffness: Any, virtual_damping: Any, system: UnitSystem) -> str:
     return f"K = {K}, B = {with_unit(float(virtual_damping), system['N s/m'])}"
 
 
-# Words behind a number, by the side of it on which there is enough.
+# Words after a limit, by the side on which values are sufficient.
 ENOUGH = {"above": "or more", "below": "or less"}
 
 
 def round_safely(value: float, enough: str, digits: int = 4) -> float:
-    """A number to few digits, rounded to the side on which there is enough."""
+    """Round a limit to a few digits, toward the side on which values are sufficient."""
     if not (value and math.isfinite(value) and enough in ENOUGH):
         return value
     step = 10.0 ** (math.floor(math.log10(abs(value))) + 1 - digits)
-    # A value that has so few digits stays, whatever the rounding of the quotient.
+    # Keep a value that has few digits, in spite of the rounding error of the quotient.
     steps = math.ceil(value / step - 1e-9) if enough == "above" else math.floor(value / step + 1e-9)
     return steps * step
 
 
 def count_digits(holds: Callable[[int], Any], least: int = 4) -> int:
-    """The fewest digits of a printed number, from 4 or so on, with which something holds."""
+    """Return the smallest number of digits, at least ``least``, for which ``holds`` returns True."""
     return next((digits for digits in range(least, 17) if holds(digits)), 17)
 
 
 def count_digits_apart(values: list[float], least: int = 4) -> int:
-    """The fewest digits, from 4 or so on, that tell different numbers apart."""
+    """Return the smallest number of digits, at least ``least``, that distinguishes different numbers."""
     return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)), least)
 
 
@@ -96,7 +96,7 @@ def spell_stiffness(value: float, system: UnitSystem, digits: int = 4) -> str:
 
 
 def tell_apart(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
-    """Two ends with a unit or plain, rounded into what lies between, with as many digits as it takes to leave some."""
+    """Return both ends of an interval with unit, rounded inward, with enough digits that they stay different."""
     for digits in range(least, 18):
         ends = round_safely(low, "above", digits), round_safely(high, "below", digits)
         if ends[0] < ends[1]:
@@ -105,7 +105,7 @@ def tell_apart(low: float, high: float, unit: str = "", least: int = 4) -> tuple
 
 
 def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, digits: int = 4) -> str:
-    """Of which values there is enough: on one side of a value, or up to the first of others there."""
+    """Return the sufficient values as text: on one side of a limit, up to the next of ``others`` if there is one."""
     side = 1.0 if enough == "above" else -1.0
     beyond = [side * other for other in others if side * other > side * value]
     if beyond:
@@ -116,7 +116,7 @@ def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, 
 
 
 def header(name: str, unit: str) -> str:
-    """The name of a column with its unit, as ``stiffness_N_per_m``; a number without unit has its name alone."""
+    """Return the name of a column with its unit, as ``stiffness_N_per_m``; only the name if it has no unit."""
     if unit in ("", "1", "sampling periods"):
         return name
     return f"{name}_{unit.replace('/', '_per_').replace(' ', '_').replace('^', '')}"
@@ -136,7 +136,7 @@ def convert_header(name: str, system: UnitSystem) -> str:
 
 
 def to_json(value: Any) -> Any:
-    """A value as JSON has it: None in place of NaN and infinities, lists in place of tuples."""
+    """Convert a value for JSON: None replaces NaN and infinities, lists replace tuples."""
     if isinstance(value, Mapping):
         return {name: to_json(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -145,12 +145,12 @@ def to_json(value: Any) -> Any:
 
 
 def to_cell(value: Any) -> Any:
-    """A value as a cell of CSV: a text that a spreadsheet would run as a formula has an apostrophe before it."""
+    """Convert a value to a cell of CSV; an apostrophe precedes a text that a spreadsheet would run as a formula."""
     return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) else value
 
 
 def from_cell(cell: str) -> str:
-    """The text that `to_cell` made a cell of."""
+    """Return the text that `to_cell` converted."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
@@ -159,7 +159,7 @@ _FORMULA = re.compile(r"'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20\t\r\n]")
 
 
 def describe(value: Any) -> str:
-    """The value received, as YAML spells it, on one line."""
+    """Return a received value as YAML spells it, on one line."""
     if value is None:
         return "nothing"
     if isinstance(value, bool):
@@ -181,7 +181,7 @@ def _count(number: int, noun: str) -> str:
 
 
 def resembling(name: Any, known: Iterable[str]) -> str | None:
-    """The known name that looks most like ``name``, if any does."""
+    """Return the known name that is most similar to ``name``; None if none is."""
     if not isinstance(name, str):
         return None
     by_lower = {candidate.lower(): candidate for candidate in known}
@@ -190,12 +190,12 @@ def resembling(name: Any, known: Iterable[str]) -> str | None:
 
 
 def suggestion(name: Any, known: Iterable[str], otherwise: str) -> str:
-    """A remedy: a question for the known name that ``name`` may stand for, else what is given."""
+    """Return a question that suggests the most similar known name; ``otherwise`` if none is similar."""
     found = resembling(name, known)
     return f"did you mean {found!r}?" if found else otherwise
 
 
 def short(value: float) -> str:
-    """The shortest text of a number, without ``.0`` where it is whole."""
+    """Return the shortest text of a number, without ``.0`` for integers."""
     text = f"{value:g}"
     return text if float(text) == value else repr(value)

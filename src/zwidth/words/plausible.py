@@ -1,4 +1,4 @@
-"""Doubts of values that no device has: slips of a unit, or of a period for a rate. They are taken all the same."""
+"""Warnings about implausible values, such as a wrong unit or a period in place of a rate; the values are accepted."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from zwidth.words.formatting import short
 from zwidth.words.quantities import FIELDS
 from zwidth.words.unit_system import UnitSystem
 
-# What devices have, by what kind of quantity it is, from and up to in its SI unit. An inertia of a rotary device, in
-# kg m^2, is far below any mass.
+# Smallest and largest plausible values by kind of quantity, in SI units. The smallest mass is also that of inertias of
+# rotary devices, in kg m^2.
 _PLAUSIBLE = {
     "mass": (1e-9, 20.0),
     "damping": (0.0, 1e4),
@@ -27,7 +27,7 @@ _PLAUSIBLE = {
 _STEP_ANGLE = (1e-9, 1.1)
 # Kinds of quantities with another name.
 _OF_UNIT = {"N s/m": "damping", "N/m": "spring", "s": "period", "kg": "mass"}
-# The slips: the same number of another unit and how much that is, here or as another quantity; or in words.
+# Likely mistakes: another unit for the same number, its size, and the quantity if another one is meant; or a text.
 _SLIPS = {
     "mass": (("", "g", 1e-3, ""),),
     "damping": (("", "mN s/m", 1e-3, ""),),
@@ -70,5 +70,6 @@ def list_doubts(given: Mapping[str, Any], spell: Callable[[str, str], str], syst
 
 
 def _is_plausible(kind: str, value: float, system: UnitSystem) -> bool:
+    """Return whether a value in SI units is 0 or in the plausible range of its kind of quantity."""
     low, high = _STEP_ANGLE if kind == "resolution" and system.rotary else _PLAUSIBLE[kind]
     return value == 0 or low <= abs(value) <= high

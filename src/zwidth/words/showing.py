@@ -1,4 +1,4 @@
-"""Results at the prompt and in notebooks: short, with units, with names for codes, and with the reason for a NaN."""
+"""Display of results at the prompt and in notebooks: short, with units, names of codes, and reasons for NaN."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ Result = TypeVar("Result")
 # A unit, or the names of codes.
 Unit = str | type[IntEnum]
 
-# What these names mean wherever they stand.
+# Default units of fields, by name.
 _USUAL: dict[str, Unit] = {"stiffness": "N/m", "virtual_damping": "N s/m", "status": Status}
-# Units that take no prefix; entries of an array that are written out; characters of a line, and rows of a table.
-_BARE = ("", "1", "degrees", "periods")
-_FEW, _LINE, _ROWS = 4, 120, 40
+_BARE = ("", "1", "degrees", "periods")  # units without prefixes
+_FEW = 4  # largest number of entries of an array that are shown
+_LINE = 120  # characters per line
+_ROWS = 40  # rows per table
 
 
 def shown(
@@ -49,7 +50,7 @@ def shown(
         shown_kind: Any = kind
         base: Any = kind
         if issubclass(kind, tuple):
-            # Named tuples have no place for an attribute, but their subclasses have. To JAX both are the same tuple.
+            # Use a subclass, because named tuples cannot have further attributes. JAX treats it as a named tuple, too.
             names = ("__module__", "__qualname__", "__doc__")
             shown_kind = type(kind.__name__, (kind,), {name: getattr(kind, name) for name in names})
             shown_kind._replace = lambda self, **changes: with_units(base._replace(self, **changes), self.unit_system)
@@ -114,7 +115,7 @@ def with_units(result: Result, system: UnitSystem | None) -> Result:
 
 
 def spell_value(value: Any, unit: Unit = "") -> str:
-    """A value in few characters; of an array its shape, its range and how much of it is NaN."""
+    """Return a short text for a value; for an array its shape, range and number of NaN."""
     if isinstance(value, str):
         return value or "''"
     if isinstance(value, bool | np.bool_) or value is None:
@@ -125,7 +126,7 @@ def spell_value(value: Any, unit: Unit = "") -> str:
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
-        # What JAX traces, and ragged lists.
+        # The value is traced by JAX or a ragged list.
         return repr(value)
     if array.dtype.kind not in "biufc":
         text = repr(value)
@@ -140,7 +141,7 @@ def spell_value(value: Any, unit: Unit = "") -> str:
 
 
 def _spell_number(value: Any, unit: Unit) -> str:
-    """One number with its unit, or the name of a code."""
+    """Return one number with its unit, or the name of a code."""
     if isinstance(unit, type):
         return unit(int(value)).name
     if isinstance(value, np.bool_ | np.integer):
@@ -152,7 +153,7 @@ def _spell_number(value: Any, unit: Unit) -> str:
     if unit in _BARE or not (value == 0 or 1e-12 < abs(value) < 1e12):
         # A zero has no sign.
         return f"{float(value) + 0.0:.6g} {'' if unit == '1' else unit}".strip()
-    # Most stiffnesses are the largest of which something holds.
+    # Round stiffnesses down, because most are upper limits.
     value = round_safely(float(value), "below" if unit == "N/m" else "", 6)
     number, _, rest = with_unit(value, unit, 6).partition(" ")
     return f"{float(number):.6g} {rest}"

@@ -98,7 +98,7 @@ COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
 
 
 def find_other(dimension: Dimension) -> Dimension | None:
-    """The same quantity of the other kind of device, linear or rotary; None where both have one unit."""
+    """Return the dimension of the same quantity of the other kind of device, linear or rotary; None if it has none."""
     return DIMENSIONS.get(_OTHER_KIND.get(dimension.base, ""))
 
 
@@ -130,7 +130,7 @@ def spell_exactly(value: float, unit: str) -> str:
 
 
 def looks_like_number(text: str) -> bool:
-    """Whether a text would be a number without its quotes."""
+    """Return whether a text would be a number without its quotes."""
     return _NUMBER_TEXT.fullmatch(text) is not None
 
 
@@ -149,7 +149,7 @@ def check_range(value: float, allowed: Range, unit: str = "", remedy: str = "") 
 
 
 def to_float(value: Any) -> float:
-    """A whole number beyond float64 becomes infinite, which `check_range` then refuses."""
+    """Return a float; infinity for an integer that overflows, which `check_range` refuses."""
     try:
         return float(value)
     except OverflowError:
@@ -157,7 +157,7 @@ def to_float(value: Any) -> float:
 
 
 def _canonical(unit: str) -> str:
-    """One spelling of a unit for the many of them: ``N*s/m``, ``N·s / m`` and ``Ns/m`` are ``N s/m``."""
+    """Return the standard spelling of a unit: ``N s/m`` for ``N*s/m``, ``N·s / m`` and ``Ns/m``."""
     unit = normalize_symbols(unit)
     unit = re.sub(r"\s*/\s*", "/", unit)
     unit = re.sub(r"([kmµu]?g)[\s*·⋅.]*([cm]?m)\^?2$", r"\1 \2^2", unit)

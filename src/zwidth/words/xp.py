@@ -1,9 +1,9 @@
-"""One text of a formula for NumPy and for JAX: which of the two, and the few operations they spell differently.
+"""Support for kernels with the same source code for NumPy and JAX.
 
-A kernel asks its arguments for their namespace, computes elementwise, iterates a fixed number of steps and chooses
-with ``xp.where``. What is written the way it is for the compiler's sake (XLA on a processor) stands behind, each trick
-with its reason and its gain: times without over times with by `benchmarks/bench_xla.py`, to compile and to run, on 2
-cores with AVX-512. Importing this imports no JAX.
+A kernel selects the namespace of its arguments, computes elementwise, iterates a fixed number of steps and selects by
+``xp.where``. Comments give the reason and the gain of code that is written for the compiler (XLA on a CPU): ratios of
+times to compile and to run without and with it, by `benchmarks/bench_xla.py` on 2 cores with AVX-512. Importing this
+module does not import JAX.
 """
 
 from __future__ import annotations
@@ -20,29 +20,28 @@ import numpy as np
 from zwidth.words.types import Array
 
 State = TypeVar("State")
-# Its square is nothing beside any derivative.
-_STEP = 1e-100
+_STEP = 1e-100  # complex step of numerical derivatives; its square is negligible
 _HOST_TYPES = (float, int, np.ndarray, np.generic, bool, list, tuple, str, type(None))
 
 
 def is_jax(value: Any) -> bool:
-    """Whether a value is a JAX array, traced or not. Where JAX was never imported, none can exist."""
+    """Return whether a value is a JAX array, traced or not; False if JAX was never imported."""
     if isinstance(value, _HOST_TYPES):
         return False
     kind = getattr(sys.modules.get("jax"), "Array", None)
-    # None also while another thread is about to import JAX.
+    # The attribute is missing while another thread imports JAX.
     return kind is not None and isinstance(value, kind)
 
 
 def is_traced(*values: Any) -> bool:
-    """Whether any argument is inside a JAX transformation."""
+    """Return whether any argument is traced by a JAX transformation."""
     kind = getattr(getattr(sys.modules.get("jax"), "core", None), "Tracer", None)
     return kind is not None and any(isinstance(value, kind) for value in values)
 
 
 @contextmanager
 def compute_concretely() -> Iterator[None]:
-    """Compute in float64 without tracing in this thread, also inside a JAX transformation of other values."""
+    """Compute in float64 without tracing inside the context, also during a JAX transformation of other values."""
     import jax
 
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
@@ -50,8 +49,8 @@ def compute_concretely() -> Iterator[None]:
 
 
 def namespace(*values: Any) -> Any:
-    """`jax.numpy` where any argument is a JAX array, NumPy otherwise."""
-    # As `is_jax`, which a call for each argument would take half of the time of a single wall.
+    """Return `jax.numpy` if any argument is a JAX array, otherwise NumPy."""
+    # Repeat the code of `is_jax`, because its calls would take half of the time of a single wall.
     kind = getattr(sys.modules.get("jax"), "Array", None)
     if kind is not None:
         for value in values:
@@ -69,8 +68,8 @@ def repeat(
     xp: Any,
     arrived: Callable[[State, State], bool] = lambda old, new: False,
 ) -> State:
-    """Apply ``step`` so many times; in NumPy until ``arrived(old, new)`` says that more would change nothing."""
-    # For JAX a loop of the compiler, whose length does not add to the time to compile.
+    """Apply ``step`` a number of times; in NumPy only until ``arrived(old, new)`` returns True."""
+    # Use a loop of the compiler for JAX, because its length does not increase the time to compile.
     if xp is np:
         for _ in range(steps):
             old, state = state, step(state)
@@ -83,7 +82,7 @@ def repeat(
 
 
 def apply_each(function: Callable[[Any], State], values: Sequence[Any], xp: Any) -> list[State]:
-    """A function of each value: JAX traces and compiles it once for all of them."""
+    """Apply a function to each value; JAX traces and compiles it only once."""
     if xp is np:
         return [function(value) for value in values]
     import jax
@@ -93,7 +92,7 @@ def apply_each(function: Callable[[Any], State], values: Sequence[Any], xp: Any)
 
 
 def frozen(values: State, xp: Any) -> State:
-    """The same values, through which no derivative passes."""
+    """Return the values as constants for differentiation."""
     if xp is np:
         return values
     from jax.lax import stop_gradient
@@ -110,7 +109,7 @@ def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
 
 
 def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes: tuple[Any, ...], xp: Any) -> Any:
-    """How the results, trees of (named) tuples, of an analytic function move when its arguments do."""
+    """Return the derivative of an analytic function along changes of its arguments, as a tree of (named) tuples."""
     if xp is not np:
         from jax import jvp
 
@@ -120,18 +119,18 @@ def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes:
 
 
 def along(values: np.ndarray, like: Any) -> Any:
-    """Values along a new last axis behind those of ``like``, and of its type."""
+    """Return values along a new last axis after those of ``like``, with the type of ``like``."""
     return namespace(like).asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))
 
 
 def epsilon(value: Any) -> float:
-    """The rounding unit of a value's type; that of float64 for plain numbers."""
+    """Return the machine epsilon of the type of a value; that of float64 for plain numbers."""
     return float(np.finfo(getattr(value, "dtype", np.float64)).eps)
 
 
 def horner(x: Any, coefficients: Sequence[Any]) -> Any:
-    """A polynomial, lowest power first, by Horner's rule."""
-    # The type is asked here first: a single wall passes here often, and each time would be one call more.
+    """Evaluate a polynomial, lowest power first, by Horner's rule."""
+    # Test the type before `is_jax`, because single walls evaluate many polynomials and a call costs time.
     if not isinstance(x, _HOST_TYPES) and is_jax(x) and all(isinstance(each, float) for each in coefficients):
         return _polynomial(tuple(coefficients))(x)
     total = coefficients[-1]
@@ -142,7 +141,7 @@ def horner(x: Any, coefficients: Sequence[Any]) -> Any:
 
 @cache
 def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
-    """A fixed polynomial for JAX, which reads it once; its slope is a polynomial too, however many derivatives ask."""
+    """Return a fixed polynomial as a JAX function, traced once; derivatives of all orders are polynomials, too."""
     import jax
 
     if len(coefficients) == 1:
@@ -154,56 +153,56 @@ def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
 
 
 def roots(*values: Any) -> tuple[Any, ...]:
-    """The square roots of arrays, or of numbers of another arithmetic."""
+    """Return the square roots of arrays, or of numbers with a method ``sqrt``."""
     if hasattr(values[0], "sqrt"):
         return tuple([value.sqrt() for value in values])
     return tuple(map(namespace(*values).sqrt, values))
 
 
 def within(value: Array, limits: tuple[float, float]) -> Array:
-    """Whether a value is 0 or of a magnitude within ``limits``."""
+    """Return whether a value is 0 or has a magnitude within ``limits``."""
     size = abs(value)
-    # In single precision the limits lie outside of what there is.
+    # In single precision the limits would overflow.
     kind = getattr(size, "dtype", np.float64)
     most = limits[1] if kind == np.float64 else min(limits[1], float(np.finfo(kind).max))
     return (size <= most) & ((size >= limits[0]) | (size == 0)) if limits[0] else size <= most
 
 
 def nan_beyond(limits: tuple[float, float], *values: Array) -> list[np.ndarray]:
-    """The values, NaN where one is not `within` the limits."""
+    """Return the values, with NaN for each value that is not `within` the limits."""
     return [np.where(within(value, limits), value, np.nan) for value in values]
 
 
-# A bad point is NaN, and so are its derivatives: `where(ok, value, nan)` alone would give it the derivative 0, a finite
-# number that means nothing. What may compute with NaN is voided before; what may not (a solver, a search, an
-# exponent) gets harmless numbers, and its results are poisoned behind.
+# The values and derivatives of an invalid point are NaN. `where(ok, value, nan)` would have the derivative 0 instead.
+# Apply `nan_unless` to the arguments if the kernel can compute with NaN. For solvers, searches and exponents, replace
+# invalid arguments by valid ones and add `nan_with_nan_slopes` to the results.
 
 
 def nan_unless(ok: Array, *values: Array) -> tuple[Array, ...]:
-    """The values where ``ok``, else NaN: so is what is computed with them, derivatives included."""
+    """Return the values where ``ok``, otherwise NaN, so that results and derivatives computed from them are NaN."""
     xp = namespace(ok, *values)
     factor = xp.where(ok, 1.0, np.nan)
     return tuple([value * factor for value in values])
 
 
 def nan_with_nan_slopes(ok: Array, *inputs: Array) -> Array:
-    """Something to add to a result: 0 where ``ok``, else NaN with NaN first and second derivatives in every input."""
+    """Return a term to add to a result: 0 where ``ok``, otherwise NaN with NaN first and second derivatives."""
     xp = namespace(ok, *inputs)
-    # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.
+    # Select twice, because the square of a large valid input overflows and would turn 0 into NaN.
     total = sum(xp.where(ok, 0.0, value) for value in inputs)
     return xp.where(ok, 0.0, np.nan) * total * (1.0 + total)
 
 
 Values = TypeVar("Values")
 
-# Registers twice as wide as what XLA takes by itself, where the processor has them; without effect elsewhere. Runs 1.2
-# times as fast for radii and 1.04 times for verdicts.
+# Vector registers twice as wide as XLA's default, on processors that have them; no effect on others. Radii run 1.2 and
+# verdicts 1.04 times as fast.
 WIDE = ("xla_cpu_prefer_vector_width", 512)
 
 
 @cache
 def known_options(*options: tuple[str, int]) -> dict[str, int]:
-    """Those of XLA's options that the installed XLA knows: releases drop some, and one of them would stop every run."""
+    """Return the options that the installed XLA accepts, because an unknown option would stop every run."""
     import jax
 
     def are_known(wanted: dict[str, int]) -> bool:
@@ -213,15 +212,15 @@ def known_options(*options: tuple[str, int]) -> dict[str, int]:
             return False
         return True
 
-    # Most often all are.
+    # Test all options together first, because usually all are accepted.
     return wanted if are_known(wanted := dict(options)) else {k: v for k, v in options if are_known({k: v})}
 
 
 def store_once(values: Values, witness: Array) -> Values:
-    """``values``, computed once: for a kernel in which many later steps use them."""
-    # XLA repeats a chain of cheap operations in every loop it makes out of the operations behind it, but never a
-    # division. The divisor here is 1, or NaN where ``witness`` (anything known at run time) is, so that the compiler
-    # cannot see it. The rigid loop's ridge compiles 1.3 and runs 1.3 to 1.5 times as fast.
+    """Return ``values`` such that XLA computes them once for all later steps that use them."""
+    # XLA repeats a chain of cheap operations in every loop that uses its result, but never a division. The divisor is
+    # 1, or NaN where ``witness`` (any run-time value) is NaN, so the compiler cannot remove it. The ridge of the rigid
+    # loop compiles 1.3 times and runs 1.3 to 1.5 times as fast.
     if not is_jax(witness):
         return values
     import jax
@@ -232,15 +231,16 @@ def store_once(values: Values, witness: Array) -> Values:
 
 
 def fit_arcsine(terms: int) -> list[float]:
-    """``asin(sqrt y)/sqrt y`` on [0, 1/2] by powers of 4 y - 1: to 2e-16 with 19 terms, to 6e-15 with 16."""
+    """Fit ``asin(sqrt y)/sqrt y`` on [0, 1/2] by powers of 4 y - 1; error 2e-16 with 19 terms, 6e-15 with 16."""
     node = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
     y = 0.25 * (node + 1.0)
     fit = np.polynomial.chebyshev.chebfit(node, np.arcsin(np.sqrt(y)) / np.sqrt(y), terms - 1)
     return np.polynomial.chebyshev.cheb2poly(fit).tolist()
 
 
-# Polynomials in place of calls, which serve every argument: radii run 2.9 times as fast by the series of the sine, an
-# `angle` by itself 2.1 times, and radii 1.06 times by `angle` and `find_turn`, whose compilation takes 0.7 of the time.
+# Polynomials replace library calls, which have to handle every argument. With the series of the sine, radii run 2.9
+# times as fast, and `angle` alone 2.1 times. With `angle` and `find_turn`, radii run 1.06 times as fast and compile in
+# 0.7 of the time.
 ARCSINE = fit_arcsine(19)
 # Taylor series of sin(x)/x and cos(x) by x^2; on [0, pi/2] the first term left out is below 1e-17.
 SINE = [(-1.0) ** k / factorial(2 * k + 1) for k in range(11)]
@@ -248,7 +248,7 @@ COSINE = [(-1.0) ** k / factorial(2 * k) for k in range(12)]
 
 
 def angle(re: Array, im: Array) -> Array:
-    """The argument in (-pi, pi]."""
+    """Return the argument of a complex number, in (-pi, pi]."""
     xp = namespace(re, im)
     if xp is np:
         return np.arctan2(im, re)
@@ -261,10 +261,10 @@ def angle(re: Array, im: Array) -> Array:
 
 
 def find_turn(x: Array, y: Array, xp: Any) -> Array:
-    """The w of ``x = sin^2(w/2)`` and y = 1 - x."""
+    """Return the w in [0, pi] for which ``x = sin^2(w/2)``; y = 1 - x."""
     if xp is np:
         return 2.0 * np.arctan2(np.sqrt(x), np.sqrt(y))
-    # Not by the minimum, which has half of two derivatives where both are equal.
+    # Do not use the minimum, because its derivative at x = y is the mean of both derivatives.
     beyond = x > y
     low = xp.where(beyond, y, x)
     value = 2.0 * xp.sqrt(low) * horner(4.0 * low - 1.0, ARCSINE)

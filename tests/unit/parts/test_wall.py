@@ -63,8 +63,8 @@ def test_one_rule_for_the_wall(name, question):
             np.testing.assert_array_equal(one, other)
     for one, other in zip(as_arrays(ask(bare, 1e3)), as_arrays(ask(bare, 1e3, 0.0)), strict=True):
         np.testing.assert_array_equal(one, other)
-    refused = {(scene, 10e3): "40.0 N s/m; say which", (scene, None, 5.0): "beside virtual_damping"}
-    refused |= {(bare,): "the scene has no wall", (bare, None, 5.0): "beside virtual_damping"}
+    refused = {(scene, 10e3): "40.0 N s/m; pass it", (scene, None, 5.0): "with virtual_damping"}
+    refused |= {(bare,): "the scene has no wall", (bare, None, 5.0): "with virtual_damping"}
     for arguments, words in refused.items():
         with pytest.raises(InputError, match=words) as error:
             ask(*arguments)

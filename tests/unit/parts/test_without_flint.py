@@ -50,7 +50,7 @@ def test_a_core_install_finds_the_same_walls():
 
 
 def response(zeros, poles, gain, period, fraction, z):
-    """The sampled response z^1 G(z) of a strictly proper system with simple poles, by partial fractions."""
+    """Return G(z), times z for a fractional delay, of a sampled system with simple poles, by partial fractions."""
     total = mp.mpc(0)
     for k, p in enumerate(poles):
         residue = mp.mpf(gain) * mp.fprod(p - q for q in zeros)

@@ -116,7 +116,7 @@ def test_counts_per_revolution_or_length_are_the_step_of_an_encoder():
         assert read_quantity(text, ANGLE)[0] == pytest.approx(step, rel=1e-15)
     assert read_quantity("2000 counts", ANGLE, counts=True)[0] == pytest.approx(step, rel=1e-15)
     assert read_quantity("14 bit", ANGLE)[0] == 2 * math.pi / 2**14
-    # Elsewhere counts are no angle: how many make a turn is open.
+    # Elsewhere counts are not an angle, because the number of counts per turn is not known.
     with pytest.raises(UnusableValueError, match="units allowed are rad"):
         read_quantity("20 counts", ANGLE)
     assert read_quantity("50 counts/mm", LENGTH)[0] == pytest.approx(2e-5, rel=1e-15)

@@ -264,10 +264,10 @@ def build_level_arc(w: np.ndarray, curve: CurvePoints, beta: float) -> Arc:
 def bound_interpolation(
     w: np.ndarray, alpha: np.ndarray, alpha_slope: np.ndarray, beta_slope: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each step if alpha may be interpolated linearly in beta, and a bound of the error of this alpha.
+    """Return a mask of the steps over which alpha may be interpolated linearly in beta, and bounds of its error.
 
-    The arguments are those of joined arcs; alpha is NaN at their ends. A step that may not be interpolated is
-    represented by the mean alpha of both ends.
+    The arguments are those of joined arcs; alpha is NaN at their ends. Use the mean alpha of both ends for the other
+    steps.
     """
     # If the slope of beta hardly changes over a step, linear interpolation misses alpha by at most an eighth of the
     # step times the change of alpha's slope, plus the curvature of beta. Allow four times this error. For other steps

@@ -1,4 +1,4 @@
-"""The stability boundary of the rigid loop: closed form, exact points on a row or column, outline of the stable set."""
+"""The stability boundary of the rigid loop: closed form, points at one damping or stiffness, outline, area."""
 
 from __future__ import annotations
 
@@ -29,21 +29,22 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Wall:
 
     With ``q = -z^n (z - 1)(z - c)/(n0(z) + n1(z)/z)`` on ``z = e^(j omega)``: ``beta = Im q / sin omega``,
     ``alpha = Re q - tan(omega/2) Im q``. The curve starts at (0, -delta), eq. (19). Its first lobe bounds the stable
-    set, see `zwidth.stable_region`; behind it the curve only lists walls with a pole on the circle.
+    set, see `zwidth.stable_region`. Walls on later parts of the curve have a pole on the unit circle, too, but do not
+    bound the stable set.
 
     Args:
-        omega: frequency in radians a period, 0 <= omega <= pi.
+        omega: frequency in rad per sample, 0 <= omega <= pi.
         delta: normalized physical damping b T/m, 0 to 1e12.
-        d: delay in periods, 0 to 1e5, whole or not. All three broadcast.
+        d: delay in periods, 0 to 1e5, integer or fractional. All three broadcast.
 
     Returns:
         Wall with ``alpha`` and ``beta`` of the broadcast shape; NaN out of range. At omega = 0 and pi the
-        values are the limits. They are finite unless N(-1) = 0, as for delta = 0 and integer d (for other d, N(-1)
-        vanishes at one damping, if at all); the curve then runs to infinity at pi.
+        values are the limits. The limit at pi is infinite if N(-1) = 0, as for delta = 0 and integer d (for other d,
+        N(-1) = 0 at one delta at most); otherwise both limits are finite.
 
     Numerics:
-        A few units in the last place, at a cost that does not grow with d. Traceable, also in d (derivatives at whole
-        d are those from the right). Float64 when called directly; the ambient precision inside `jit`.
+        Accurate to a few units in the last place, at a cost independent of d. JAX can trace and differentiate it, also
+        in d (from the right at integer d). Float64 when called directly; the ambient precision inside `jit`.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V; D-decomposition.
@@ -67,7 +68,7 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
 
 @shown()
 class BoundaryPoint(NamedTuple):
-    """A wall on the edge of stability, or an array of them."""
+    """A wall on the stability boundary, or arrays of such walls."""
 
     alpha: Array
     beta: Array
@@ -84,33 +85,34 @@ def boundary_point(
     side: str = "lower",
     method: PointMethod = "auto",
 ) -> BoundaryPoint:
-    """Find the exact boundary point of a row or column: ``P(e^(j omega)) = 0`` on the edge of the stable set.
+    """Return the point of the stability boundary at a given virtual damping or at a given stiffness.
 
-    Exactly one of ``beta`` and ``alpha`` is given: the stiffest stable wall of that damping; or the smallest
-    (``side="lower"``) or largest (``"upper"``) stable damping of that stiffness.
+    At a given ``beta`` it is the stiffest stable wall. At a given ``alpha`` it is the wall with the smallest
+    (``side="lower"``) or the largest (``"upper"``) stable damping. The point satisfies ``P(e^(j omega)) = 0``.
 
     Args:
         delta: normalized physical damping b T/m, 0 to 1e12.
-        d: delay in periods, 0 to 1e5, whole or not.
-        beta: normalized virtual damping of a row.
-        alpha: normalized stiffness of a column, > 0.
-        side: end of the column, "lower" or "upper". All arguments broadcast.
-        method: "auto" solves the functions of the lobe, which are monotone by theorem; "optimistix" solves the
-            frequency response in real unknowns from a bracket by jaxopt: an independent route, which compiles.
+        d: delay in periods, 0 to 1e5, integer or fractional.
+        beta: normalized virtual damping B T/m; or
+        alpha: normalized stiffness K T^2/m, > 0.
+        side: "lower" or "upper", for a given ``alpha``. All arguments broadcast.
+        method: "auto" inverts the closed form of the lobe; "optimistix" solves ``P(e^(j omega)) = 0`` in real unknowns,
+            from a bracket by jaxopt. The second method is independent of the first one; JAX compiles it.
 
     Returns:
         BoundaryPoint: ``alpha``, ``beta``; ``omega`` of the pole on the circle (pi: a real one); ``status``, see
-        `zwidth.Status`: NO_BOUNDARY if the row or column contains no stable wall. The values are NaN unless it is OK.
+        `zwidth.Status`: NO_BOUNDARY if no wall of this damping or stiffness is stable. The values are NaN unless the
+        status is OK.
 
     Raises:
         InputError: none or both of ``beta`` and ``alpha`` are given, an argument is no real number or a scalar out of
             range, shapes do not broadcast, or a name is unknown.
 
     Numerics:
-        alpha and ``beta + delta`` to about 1e-15 relative, times the condition of the line: close to the ridge a column
-        determines beta to half the digits only. The same in NumPy, compiled and traced; a scalar takes a fraction of a
-        millisecond and compiles nothing. Traceable with first and second derivatives, also in d (at whole d from the
-        right). Rows and columns are intervals by proof (docs/theory/one-lobe.md).
+        alpha and ``beta + delta`` to about 1e-15 relative, times their condition number: near the ridge, alpha
+        determines only half of the digits of beta. NumPy, compiled and traced calls return the same; a scalar takes a
+        fraction of a millisecond and compiles nothing. JAX can differentiate it twice, also in d (from the right at
+        integer d). The stable walls of one damping or stiffness form an interval (docs/theory/one-lobe.md).
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V.
@@ -137,7 +139,7 @@ def boundary_point(
 
 
 def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -> BoundaryPoint:
-    """Return the end of the row of damping ``number``, or one end of the column of that stiffness."""
+    """Return the boundary point at the beta ("row") or alpha ("lower", "upper") that ``number`` contains."""
     xp, is_row, zero = namespace(delta, d, number), line == "row", 0.0 * number
     given = wall_status(*((zero, number) if is_row else (number, zero)), delta, d)
     curve = lobe(delta, d, kind)
@@ -147,7 +149,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
         x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
         x = follow_root(lambda x, curve, b: wall(x, curve).b - b, x, lambda *_: True, curve, number + delta)
         at = wall(x, curve)
-        # The number that `zwidth.is_stable` compares with, with the derivatives of the curve.
+        # Return the value that `zwidth.is_stable` compares alpha with, with the derivatives of the curve.
         alpha = row.alpha if xp is np else frozen(row.alpha, xp) + (at.alpha - frozen(at.alpha, xp))
         beta = number
     else:
@@ -158,24 +160,24 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
         on_lobe = ~cut
         x = follow_root(lambda x, curve, alpha: wall(x, curve).alpha - alpha, x, lambda *_: True, curve, number)
         at = wall(x, curve)
-        # Beside the ridge a step more would be rounding over rounding.
+        # Take no further step, because near the ridge it would be a quotient of rounding errors.
         alpha, beta = number, at.b - delta
     omega = frequency(x, curve)
     if curve.short is not None and line != "lower":
-        # On the line of z = -1, alpha + 2 beta is known.
+        # On the line with a pole at z = -1, alpha + 2 beta is constant.
         rest = on_line(curve) - (2.0 * number if is_row else number)
         alpha = xp.where(on_lobe, alpha, rest) if is_row else alpha
         beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * rest)
         omega = xp.where(on_lobe, omega, np.pi)
     status = xp.where(exists, int(Status.OK), int(Status.NO_BOUNDARY))
     status = xp.where(given == int(Status.OK), status, given)
-    # NaN, derivatives included, where there is no point.
+    # Values and derivatives are NaN if the point does not exist.
     spoiled = nan_with_nan_slopes(status == int(Status.OK), delta, d, number)
     return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
 
 
 class Piece(IntEnum):
-    """Which pole crosses the unit circle on a part of the outline."""
+    """The pole that crosses the unit circle on a part of the outline."""
 
     COMPLEX_PAIR = 0
     MINUS_ONE = 1
@@ -184,7 +186,7 @@ class Piece(IntEnum):
 
 @shown()
 class StableRegion(NamedTuple):
-    """A closed outline: vertex k belongs to ``piece[k]``, and the last vertex joins the first along alpha = 0."""
+    """A closed outline: vertex k lies on ``piece[k]``; alpha = 0 joins the last vertex to the first."""
 
     alpha: Vertices
     beta: Vertices
@@ -199,7 +201,7 @@ class StableRegion(NamedTuple):
 
 
 def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices, Vertices, Vertices]:
-    """Return frequencies along the first lobe of the boundary curve, with its alpha and beta at these."""
+    """Return frequencies along the first lobe of the boundary curve, and alpha and beta at these frequencies."""
     known = {"delta": as_number("delta", delta, 0.0), "d": as_number("d", d, 0.0)}
     check_scalars(known)
     points = check_whole("points", points, 8, 10**7)
@@ -208,10 +210,10 @@ def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices,
         whole = lobe(np.float64(known["delta"]), np.float64(known["d"]), kind)
         top = peak(whole, kind).x
         first, last = (float(frequency(x, whole)) for x in (top, whole.end))
-    # Closer together at both ends and round the ridge, where the outline bends most.
+    # Space the points more closely at both ends and at the ridge, where the curvature is largest.
     half = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))
     omega = np.concatenate([first * half, first + (last - first) * half[1:]]) if first < last else last * half
-    # The last product may round past its end.
+    # The rounding error of the last product may exceed the end.
     omega = np.minimum(omega, last)
     wall = boundary(omega, delta, d)
     return omega, np.asarray(wall.alpha), np.asarray(wall.beta)
@@ -220,8 +222,8 @@ def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices,
 def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     """Return the outline of the stable set in the (alpha, beta) plane.
 
-    The lobe of the boundary curve from (0, -delta) to its return to alpha = 0, cut by the line on which a real pole
-    crosses at z = -1, and closed along alpha = 0, where one crosses at z = 1.
+    The outline is the lobe of the boundary curve, from (0, -delta) to its return to alpha = 0 or to the line on which a
+    real pole is at z = -1. It is closed along this line and along alpha = 0, where a real pole is at z = 1.
 
     Args:
         delta: normalized physical damping b T/m, >= 0, a single number.
@@ -251,26 +253,26 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     return StableRegion(alpha, beta, omega, piece)
 
 
-# Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic, and what a point weighs for them.
-_LOBE_NODES, _LOBE_WEIGHT = 48, 16
+_LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic
+_LOBE_WEIGHT = 16  # time and memory of a point relative to a point of other kernels
 
 
 def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
     """Return the area of the stable set in the (alpha, beta) plane.
 
-    ``A = integral of alpha d(beta)`` along the lobe of `zwidth.boundary`, closed by the line on which a real pole
-    crosses at z = -1, where that line cuts it, and by alpha = 0. In SI units the area over K and B is ``A m^2/T^3``.
+    ``A = integral of alpha d(beta)`` along the outline of `zwidth.stable_region`. In SI units, the area over K and B is
+    ``A m^2/T^3``.
 
     Args:
         delta: normalized physical damping b T/m, 0 to 1e12.
-        d: delay in periods, 0 to 1e5, whole or not (held). Both broadcast.
+        d: delay in periods, 0 to 1e5, integer or fractional. Both broadcast.
 
     Returns:
         Array of the broadcast shape; NaN out of range.
 
     Numerics:
-        Gauss-Legendre quadrature of the closed form, about 1e-13. Traceable, with first and second derivatives; at
-        whole d those in d are from the right.
+        Gauss-Legendre quadrature of the closed form, accurate to about 1e-13. JAX can differentiate it twice, in d from
+        the right at integer d.
 
     References:
         Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, section V.
@@ -287,13 +289,13 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
     curve = lobe(delta, d, kind)
     end = frozen(curve.end, xp)
-    # From a corner, which stays, back to alpha = 0 along alpha + 2 beta = const.
+    # From a corner, the outline returns to alpha = 0 along alpha + 2 beta = const.
     at = wall(end, curve)
     last = xp.where(curve.to_corner, at.alpha, 0.0)
     if xp is not np:
-        # Another end moves as the zero of alpha does, which the second derivatives of the area ask for.
+        # Without a corner, the end is a zero of alpha; second derivatives of the area need its derivative.
         end = end - xp.where(curve.to_corner, 0.0, at.alpha / frozen(xp.where(curve.to_corner, 1.0, at.d_alpha), xp))
-    # For many places of each lobe.
+    # Add an axis for the nodes.
     at_places = tree_map(lambda value: None if value is None else value[..., None], curve)
 
     def rise(x: Array) -> Array:

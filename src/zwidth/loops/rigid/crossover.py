@@ -1,15 +1,15 @@
-"""Stable or not in closed form: the loop has one gain crossover, and the lobe of stable walls is compared with there.
+"""Stability of the rigid loop in closed form, decided at its only gain crossover.
 
 Notation, on ``z = e^(j w)`` with ``u = 1 - cos w``, ``y = u/2``, and the plant of `arrays.held_mass`: P = T + B with
 
     T = z^(1+n) (z - 1)(z - c)                device and delay, d = n + f
     B = M(z) ((alpha + beta) z - beta)        wall;  M = a2 z + a1 + a0/z
 
-Their sizes are equal where a cubic in u vanishes (a quadratic for whole d). It has one zero in (0, 2) or none
-(docs/theory/one-crossover.md, Theorem 1). There ``W = alpha + beta u + j beta sin w`` of the wall is as large as that
-of the boundary curve at this w, and the wall is stable exactly if its argument is larger (S15a):
-``beta alpha_w > alpha beta_w``, or ``beta > beta_w``, where (alpha_w, beta_w) is the curve in the form of
-`loops.rigid.row_limit`. Below one period the crossover is eliminated: the end of each row is in closed form.
+The gain crossover, |T| = |B|, is the zero of a cubic in u (a quadratic for integer d), which has one zero in (0, 2) or
+none (docs/theory/one-crossover.md, Theorem 1). There the wall and the point (alpha_w, beta_w) of the boundary curve at
+this w have ``W = alpha + beta u + j beta sin w`` of equal magnitude. The wall is stable if and only if its W has the
+larger argument (S15a): ``beta alpha_w > alpha beta_w``, or ``beta > beta_w``. The curve is computed as in
+`loops.rigid.row_limit`. For d < 1 the crossover is eliminated: the largest stable alpha at each beta has a closed form.
 
 The same source code serves arrays of NumPy and JAX, float64 numbers with an error bound, and balls of python-flint
 (`loops.rigid.certified`). With bounds or balls, a comparison is true only if it is certain.
@@ -63,11 +63,11 @@ class Verdict(NamedTuple):
 
 
 class Lag(NamedTuple):
-    """The delay phase ``(n + 1/2) w`` at the crossover, and certain bounds of w."""
+    """The delay phase ``(n + 1/2) w`` at the crossover; a bound of w that is not certain is False."""
 
-    cosine: Any
+    cosine: Any  # of the delay phase
     sine: Any
-    rise: Any  # the square of the sine of its half
+    rise: Any  # square of the sine of half the delay phase
     within: Any  # (n + 1/2) w <= pi
     beyond: Any  # w >= pi/(n + 1)
 
@@ -166,7 +166,7 @@ def first_zero(cubic: tuple[Array, ...]) -> Array:
 
 
 def _solve(cubic: tuple[Array, ...]) -> tuple[Array, Array]:
-    """A zero behind u = 1 is not sought: what the steps towards it end with means nothing."""
+    """Return the zero u of the cubic and a mask of the points with a zero in (0, 1]; other u have no meaning."""
     u = first_zero(cubic)
     return u, (sum(cubic[1:], cubic[0]) <= 0) & (u > 0) & (u <= 1.0)
 
@@ -210,19 +210,19 @@ def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array,
 
 
 def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
-    """Whether each wall is stable, elementwise; False for what is NaN."""
+    """Return whether each wall is stable, elementwise; False for NaN."""
     here = device(delta, d, kind)
     return stable_at(alpha, beta, here, kind)
 
 
 def stable_at(alpha: Array, beta: Array, here: DeviceTerms, kind: DelayClasses) -> Array:
-    """The same on a discretized device."""
+    """Return whether each wall is stable on a discretized device."""
     plain = here._replace(a0=None)
     if not kind.fractional:
         here = plain
     early = short_verdict(alpha, beta, here).stable if kind.short else None
     if early is not None and kind.fractional:
-        # At its corner the lobe of d = 0 is better known by its own formula.
+        # Use the formula for d = 0, because it is more accurate at the corner.
         early = namespace(here.f).where(here.f == 0, short_verdict(alpha, beta, plain).stable, early)
     late = long_verdict(alpha, beta, here.whole, here, _solve, compute_lag).stable if kind.long else early
     stable = late if early is None else namespace(here.whole).where(here.whole < 1, early, late)

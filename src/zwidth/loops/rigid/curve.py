@@ -1,4 +1,4 @@
-"""The lobe of the boundary curve of the rigid loop: its points, its end, its peak, where a row or a column meets it.
+"""The lobe of the boundary curve of the rigid loop: its points, end and peak, and its points at one beta or alpha.
 
 The curve starts at (0, -delta), omega = 0, and bounds the stable set until it returns to alpha = 0 or, for short
 delays and strong damping, until omega = pi, where a double pole sits at z = -1 (the corner). ``b = beta + delta`` grows
@@ -32,24 +32,24 @@ from zwidth.loops.rigid.row_limit import (
 from zwidth.words.types import Array
 from zwidth.words.xp import frozen, horner, namespace, repeat, store_once
 
-# From starts within 28 % (the cubic for n = 0) and 0.3 % of x.
-_CUBIC_STEPS, _COLUMN_STEPS = 4, 3
+_CUBIC_STEPS = 4  # steps for n = 0; the start is within 28 % of x
+_COLUMN_STEPS = 3  # Newton steps for n >= 1; the start is within 0.3 % of x
 
 
 class Lobe(NamedTuple):
-    """The curve of one device; what does not occur among the delays of a kernel is None."""
+    """The boundary curve of one device; fields for delays that do not occur are None."""
 
     here: DeviceTerms
     d: Array
-    is_short: Array | None  # where both forms occur
+    is_short: Array | None  # d < 1; None unless both forms occur
     short: Any  # `short_curve`
     long: Any  # `LongLobe`
     end: Array  # the last x
-    to_corner: Array  # whether it ends at omega = pi with alpha > 0
+    to_corner: Array  # the lobe ends at omega = pi with alpha > 0
 
 
 class LobePoint(NamedTuple):
-    """A point of the curve, and how it moves with x."""
+    """A point of the curve and its derivatives in x."""
 
     alpha: Array
     b: Array
@@ -58,7 +58,7 @@ class LobePoint(NamedTuple):
 
 
 class Peak(NamedTuple):
-    """Where alpha is largest on the lobe: the ridge."""
+    """The point of the lobe with the largest alpha: the ridge."""
 
     x: Array
     alpha: Array
@@ -76,7 +76,7 @@ def lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
         root, to_corner = _short_end(frozen(short, xp))
         ends.append(root)
     if kind.long:
-        # The end and what follows it only start solvers: no derivative passes through them.
+        # Freeze the end and the fields after it, because they are only starting values of solvers.
         still = long_lobe(frozen(here, xp))
         long = still if xp is np else LongLobe(*open_lobe(here)[:-5], *still[-5:])
         ends.append(long.end)
@@ -96,13 +96,13 @@ def _short_end(short: Any) -> tuple[Array, Array]:
 
 
 def wall(x: Array, lobe: Lobe) -> LobePoint:
-    """The point of the curve at one place."""
+    """Return the point of the curve at x."""
     if lobe.long is None:
         return _short_wall(x, lobe.short)
     if lobe.short is None:
         return _long_wall(x, lobe.long)
     xp = namespace(x, lobe.d)
-    # Each form gets a place that is harmless where the other one holds.
+    # Evaluate the form that is not selected at a valid x, because NaN would spoil the derivatives of the other one.
     low = _short_wall(xp.where(lobe.is_short, x, 0.25), lobe.short)
     high = _long_wall(xp.where(lobe.is_short, xp.minimum(1.0, 1.0 / lobe.long.k), x), lobe.long)
     return LobePoint(*(xp.where(lobe.is_short, mine, other) for mine, other in zip(low, high, strict=True)))
@@ -144,16 +144,16 @@ def on_line(lobe: Lobe) -> Array:
 
 
 class RowEnd(NamedTuple):
-    """Where a row ends: on the lobe, or beyond the corner on the line of z = -1, or nowhere."""
+    """The largest stable alpha at one beta: on the lobe, or after the corner on the line with a pole at z = -1."""
 
-    x: Array  # where it does not meet the lobe, the nearer end of it
-    meets: Array
-    beyond: Array
-    alpha: Array  # the maximum stable alpha, with which `zwidth.is_stable` compares
+    x: Array  # the nearer end of the lobe if no point of the lobe has this beta
+    meets: Array  # a point of the lobe has this beta
+    beyond: Array  # the limit is on the line with a pole at z = -1
+    alpha: Array  # the value that `zwidth.is_stable` compares alpha with
 
 
 def row_end(beta: Array, lobe: Lobe) -> RowEnd:
-    """Return the end of a row: the only zero of ``b - beta - delta``."""
+    """Return the largest stable alpha at one beta, from the only zero of ``b - beta - delta`` on the lobe."""
     xp = namespace(beta, lobe.d)
     b = beta + lobe.here.delta
     ends = []
@@ -184,7 +184,7 @@ def peak(lobe: Lobe, kind: DelayClasses) -> Peak:
 
 
 def column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return x where a column of 0 < alpha < ``top.alpha`` meets the lobe, and if the line z = -1 ends it instead."""
+    """Return x where the lobe has 0 < alpha < ``top.alpha``, and a mask of ends on the line z = -1 instead."""
     xp = namespace(alpha, lobe.d)
     nowhere = alpha < 0
     if lobe.long is None:

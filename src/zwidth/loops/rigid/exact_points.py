@@ -103,7 +103,7 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
     """Return the fields of `zwidth.alpha_max` for one point."""
     status = device_status(delta, d)
     ok, inputs = status == Status.OK, (delta, d)
-    # A solver that sees NaN in one lane may stop the others.
+    # Replace NaN, because a solver may stop all batch entries at the NaN of one.
     delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
     loop = store_once(frequency_loop(delta, d), delta)
     summit = corner(expand_curve(loop.plant), loop.lag)
@@ -117,7 +117,7 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
     start, bracketed = bisect(slope, 1e-6 * end, upper, loop)
     start = store_once(start, d)
     omega, smooth = _solve("ridge", start, bracketed, d, loop)
-    # Rounding can keep Newton from its last tolerance; what counts is that it stayed where the bracket put it.
+    # Test the distance from the bracket, because rounding errors can keep Newton's method from its tolerance.
     converged = summit.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
     spoiled = nan_with_nan_slopes(ok & converged, *inputs)
     status = jnp.where(ok & ~converged, int(Status.NOT_CONVERGED), status)
@@ -134,7 +134,7 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
 
 @partial(jnp.vectorize, excluded=(3, 4))
 def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: Callable[..., Any]) -> tuple[Array, ...]:
-    """Return the fields of `zwidth.boundary_point` for one point; ``find_ridge`` separates its lower and upper side."""
+    """Return the fields of `zwidth.boundary_point` for one point; ``find_ridge`` computes `alpha_max`."""
     inputs, is_row = (delta, d, number), line == "row"
     given = wall_status(*((0.0 * number, number) if is_row else (number, 0.0 * number)), delta, d)
     ok = given == Status.OK
@@ -154,7 +154,7 @@ def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: C
     )
     omega, wall = _solve(line, start, on_lobe, number, loop)
     near = float(jnp.finfo(start.dtype).eps) ** 0.5
-    # Of a very soft wall the frequency is below what a bracket resolves.
+    # Compare values, too, because the bracket does not resolve the low frequency of a very soft wall.
     hit = jnp.abs(offset(wall, number)) <= 0.1 * near * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
     converged = hit & (jnp.abs(omega - start) <= 100.0 * near)
     found = wall.alpha if is_row else wall.beta
@@ -169,7 +169,7 @@ def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: C
         omega, found = jnp.where(is_real, jnp.pi, omega), jnp.where(is_real, rest, found)
         exists, converged = exists | is_real, converged | is_real
     if is_row:
-        # A stable wall before the end.
+        # Require a stable wall below the limit.
         exists = exists & stable_kernel(0.5 * found, number, delta, d)
     else:
         exists = exists & (number > 0) & (number < ridge.alpha)

@@ -196,7 +196,7 @@ def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, d
 
 
 def check_degree(d: ArrayLike) -> None:
-    """Refuse to begin what would take minutes a point and gigabytes."""
+    """Raise `InputError` for delays with so many poles that a point takes minutes and gigabytes."""
     if is_traced(d):
         return
     delays = as_float64("d", d)
@@ -211,6 +211,7 @@ def check_degree(d: ArrayLike) -> None:
 
 
 def _check(values: tuple[ArrayLike, ...], method: str = "companion") -> None:
+    """Raise `InputError` for an unknown method or too many poles."""
     check_choice("method", method, get_args(PoleMethod))
     check_degree(values[3])
 
@@ -244,20 +245,21 @@ def _compile_by_degree(kernel: Callable[..., Any], degree: Degree) -> Any:
 def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, method: PoleMethod = "auto") -> Roots:
     """Return the poles of the closed loop.
 
-    ``P(z) = 0``, see `zwidth.char_poly`; the loop is stable when every ``|z| < 1``. In no particular order.
+    The poles are the zeros of ``P(z)``, see `zwidth.char_poly`. The loop is stable if ``|z| < 1`` for all of them.
 
     Args:
         alpha: normalized stiffness K T^2/m.
         beta: normalized virtual damping B T/m.
         delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not; concrete also inside `jit`. All four broadcast.
-        method: "companion" computes eigenvalues; "aberth" all poles at one time by the iteration of Aberth and Ehrlich,
-            and eigenvalues where it has no proof that each pole was found; "auto" takes that for many walls with up to
-            24 poles, and eigenvalues otherwise and inside `jit`.
+        d: delay in periods, >= 0, integer or fractional; concrete also inside `jit`. All four broadcast.
+        method: "companion" computes eigenvalues; "aberth" iterates on all poles at once (Aberth and Ehrlich), and
+            computes eigenvalues for walls without a proof that each pole was found; "auto" is "aberth" for many walls
+            with up to 24 poles, otherwise and inside `jit` "companion".
 
     Returns:
-        Complex array of the broadcast shape with one more axis at the end: 3 + d poles for whole d, 4 + n for
-        d = n + f. Where degrees are mixed, the missing poles are NaN, at the end. A point out of range is NaN.
+        Complex array of the broadcast shape with one more axis at the end, in no particular order: 3 + d poles for
+        integer d, 4 + n for d = n + f. If degrees are mixed, missing poles are NaN, at the end. A point out of range is
+        NaN.
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, a name is unknown,
@@ -266,9 +268,9 @@ def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, 
         TracedDelayError: d is traced.
 
     Numerics:
-        A simple pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k).
-        Eigenvalues by LAPACK, O(degree^3) a point, then Newton steps on the factored polynomial. Aberth's iteration
-        works on that polynomial too, O(degree^2) a step. Few points need no JAX; many are compiled once for every
+        The error of a simple pole is about 1e-15 times its condition number, that of a k-fold pole about 1e-16^(1/k).
+        Eigenvalues by LAPACK, O(degree^3) per point, then Newton steps on the factored polynomial. Aberth's iteration
+        uses the same polynomial, O(degree^2) per step. Few points need no JAX; for many, one program is compiled per
         degree.
 
     References:
@@ -308,15 +310,15 @@ def _find_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degre
 
 
 def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Reals:
-    """The spectral radius at every point, from the poles; NaN where the input is out of range."""
+    """Return the spectral radius of each wall, from all poles; NaN for input out of range."""
     values = (alpha, beta, delta, d)
     _check(values)
     found = map_by_degree(_by_companion, values, route="numpy")
     xp = namespace(found) if is_traced(*values) else np
     z: Any = xp.asarray(found)
-    # Of a wall that has fewer poles than others.
+    # NaN marks a missing pole if the wall has other poles.
     missing = xp.isnan(z.real) & ~xp.isnan(z[..., :1].real)
     radius = xp.max(xp.where(missing, 0.0, xp.abs(z)), axis=-1)
-    # Without stiffness a pole is at 1, whatever rounding makes of it.
+    # Without stiffness a pole is exactly at 1, but the computed one has a rounding error.
     radius = xp.where(xp.asarray(alpha) == 0, xp.maximum(radius, 1.0), radius)
     return radius if xp is not np else to_caller(radius, values)

@@ -4,7 +4,7 @@ Held delay d = n + f, with N(z) = a2 z^2 + a1 z + a0 of `arrays.held_mass`:
 
     P(z) = z^(2+n) (z - 1)(z - c) + N(z) (alpha z + beta (z - 1))
 
-For whole d, a0 = 0 and one factor z cancels; that is the paper's polynomial (17) over -delta^2, monic and
+For integer d, a0 = 0 and one factor z cancels; that is the paper's polynomial (17) over -delta^2, monic and
 factored. Pole methods use the coefficients `coefficients`, frequency methods `frequency_boundary`.
 """
 
@@ -56,7 +56,7 @@ class Wall(NamedTuple):
 
 
 class FrequencyLoop(NamedTuple):
-    """The parameters of one loop for the frequency methods: computed once, then evaluated at many frequencies."""
+    """Parameters of one loop that do not depend on the frequency."""
 
     plant: Plant
     lag: Array  # integer periods of delay
@@ -69,7 +69,7 @@ def frequency_loop(delta: Array, d: Array) -> FrequencyLoop:
 
 
 def frequency_boundary(omega: Reals, loop: FrequencyLoop) -> Wall:
-    """The wall (alpha, beta) that puts a pole at z = e^(j omega), 0 <= omega <= pi, in closed form, for one point."""
+    """Return the wall that puts a pole at z = e^(j omega), 0 <= omega <= pi, in closed form."""
     return Wall(*wall(wave_at(omega, loop.lag), expand_curve(loop.plant)))
 
 
@@ -77,25 +77,26 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike)
     """Return the coefficients of the monic characteristic polynomial, highest power first.
 
     ``P(z) = z^(2+n) (z - 1)(z - c) + (z n0(z) + n1(z)) (alpha z + beta (z - 1))``, d = n + f, ``c = e^-delta``; for
-    whole d the paper's (17) over ``-delta^2``, delta = 0 included. Stable means: all zeros inside the unit circle.
+    integer d the paper's (17) over ``-delta^2``, also for delta = 0. The loop is stable if all zeros lie inside the
+    unit circle.
 
     Args:
         alpha: normalized stiffness K T^2/m.
         beta: normalized virtual damping B T/m.
         delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not; concrete also inside `jit`, because it decides the degree.
+        d: delay in periods, >= 0, integer or fractional; concrete also inside `jit`, because it determines the degree.
             All four broadcast.
 
     Returns:
-        Array of the broadcast shape with one more axis at the end: 4 + d coefficients for whole d, 5 + n
-        otherwise. Where degrees are mixed, shorter polynomials have zeros in front. A point out of range is NaN.
+        Array of the broadcast shape with one more axis at the end: 4 + d coefficients for integer d, 5 + n otherwise.
+        If degrees are mixed, shorter polynomials have leading zeros. A point out of range is NaN.
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
         TracedDelayError: d is traced.
 
     Numerics:
-        Every coefficient is accurate to a few rounding errors of the terms it is the sum of, for every delta.
+        Each coefficient is a sum; its error is a few rounding errors of the terms of this sum, for all delta.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eqs. (15), (17).

@@ -43,26 +43,26 @@ def move(x: Array, v: Array, older: Array, newer: Array, t: Array, delta: float,
     return advance(x, v, newer, np.maximum(t - f, 0.0), delta)
 
 
-def settling_time(alpha: float, beta: float, delta: float, d: float, band: float = SETTLING_BAND) -> float:
+def settling_time(alpha: float, beta: float, delta: float, d: float) -> float:
     """Return the last instant, in periods, at which a step response is outside the band; NaN if unstable or too slow.
 
-    The response is simulated for at least twice the time in which its dominant pole decays to the band, and doubled
-    until the second half of the simulation stays inside the band.
+    The simulation is at least twice as long as its dominant pole takes to decay to `SETTLING_BAND`. Its length is
+    doubled until the response stays inside the band throughout the second half.
     """
     wall = alpha, beta, delta, d
     with np.errstate(all="ignore"):
         stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
         rate = slowest_pole(wall)[1] if stable else math.nan
-    periods = 2.0 * (d + 2.0 - math.log(band) / rate) if rate > 0 else math.inf
+    periods = 2.0 * (d + 2.0 - math.log(SETTLING_BAND) / rate) if rate > 0 else math.inf
     while periods < MOST_PERIODS:
-        last = _last_outside(wall, math.ceil(periods), band)
+        last = _last_outside(wall, math.ceil(periods))
         if last < 0.5 * periods:
             return last
         periods *= 2.0
     return math.nan
 
 
-def _last_outside(wall: tuple[float, float, float, float], periods: int, band: float) -> float:
+def _last_outside(wall: tuple[float, float, float, float], periods: int) -> float:
     """Return the last instant of a simulated step response at which it is outside the band; 0 if there is none."""
     alpha, _, delta, d = wall
     f = d - math.floor(d)
@@ -70,7 +70,7 @@ def _last_outside(wall: tuple[float, float, float, float], periods: int, band: f
     x, v, older, newer = _run(*wall, 1.0, periods)[:, :, None]
 
     def is_outside(k: slice, t: np.ndarray) -> np.ndarray:
-        return np.abs(alpha * move(x[k], v[k], 1.0 + older[k], 1.0 + newer[k], t, delta, f)[0] - 1.0) > band
+        return np.abs(alpha * move(x[k], v[k], 1.0 + older[k], 1.0 + newer[k], t, delta, f)[0] - 1.0) > SETTLING_BAND
 
     rows = BLOCK // instants.size
     for stop in range(periods, 0, -rows):
@@ -92,19 +92,19 @@ def decay_time(rate: Array) -> Array:
 
 @shown()
 class StepResponse(NamedTuple):
-    """The response to a constant force from time 0 on; arrays over one time axis."""
+    """Response of the device, at rest in contact with the wall, to a constant external force that begins at time 0."""
 
-    time: Samples
+    time: Samples  # in periods; the next three fields are at these instants
     position: Samples
     velocity: Samples
     wall_force: Samples
     final_position: float
-    settling_time: float
+    settling_time: float  # in periods
 
 
 def _run(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> np.ndarray:
-    """Simulate the loop from rest; return x, v and the wall's force before and after its change, for each period."""
-    # Use plain floats, because a period then takes a microsecond or two; importing a compiler takes longer.
+    """Return x and v at the start of each period, from rest, and the wall's force before and after its change."""
+    # Use plain floats: a period takes one or two microseconds, so the import of a compiler would take longer.
     lag = find_degree(d).whole
     f = d - lag
     # x and v after each part of a period are linear in x, v and the force: three coefficients per part.
@@ -131,29 +131,29 @@ def _run(alpha: float, beta: float, delta: float, d: float, applied: float, peri
 def step_response(
     alpha: float, beta: float, delta: float, d: float, *, periods: int = 100, substeps: int = 10, force: float = 1.0
 ) -> StepResponse:
-    """Return the response, from force to position, of the device that rests in contact with the wall.
+    """Return the response to a constant external force of the device at rest in contact with the wall.
 
-    The force pushes on the mass itself from time 0 on; the wall answers with
-    ``-(alpha x_k + beta (x_k - x_(k-1)))``, computed at sample k and acting from k + d to k + d + 1 (held).
+    The force acts on the mass and begins at time 0. The force of the wall, ``-(alpha x_k + beta (x_k - x_(k-1)))``, is
+    computed at sample k and acts from k + d to k + d + 1 (zero-order hold).
 
     Args:
         alpha: normalized stiffness K T^2/m.
         beta: normalized virtual damping B T/m.
         delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not. All four single numbers.
-        periods: how many sampling periods to simulate, 1 to 10,000,000.
-        substeps: instants in each period, 1 to 10,000; 1 gives the samples alone.
-        force: the constant force in units of m/T^2 times a length unit.
+        d: delay in periods, >= 0, integer or fractional. All four are single numbers.
+        periods: number of simulated sampling periods, 1 to 10,000,000.
+        substeps: number of instants per period, 1 to 10,000; 1 returns the samples only.
+        force: external force, in units of m/T^2 times the unit of the position.
 
     Returns:
         StepResponse: ``time`` in periods; ``position``; ``velocity`` in position per period; ``wall_force``, the force
         of the wall; all (periods * substeps,). ``final_position`` is force/alpha, NaN for alpha = 0. ``settling_time``
         in periods is the last instant at which the position deviates by more than 2 % from it, also if that instant is
-        after the returned periods. NaN if the wall is not stable or needs more than some 500,000 periods to settle.
+        after the returned periods. NaN if the wall is not stable or needs more than about 500,000 periods to settle.
 
     Numerics:
-        Exact between force changes up to rounding; float64, by NumPy. An unstable response that outgrows it ends as
-        inf or NaN.
+        Exact between force changes except for rounding errors; float64, by NumPy. An unstable response that overflows
+        ends with infinities or NaN.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VIII, Fig. 11, eqs. (2), (6).

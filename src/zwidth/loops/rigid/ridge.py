@@ -1,4 +1,4 @@
-"""The stiffest stable wall of the rigid loop, alpha_max(delta, d), and its slope over strong damping, eq. (22)."""
+"""The maximum stiffness of the rigid loop, alpha_max(delta, d), and its derivative for strong damping, eq. (22)."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def _chi(x: Array, gap: Array) -> Array:
 
 
 def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
-    """The derivatives of `arrays.held_mass.held_plant` in delta and in the fraction."""
+    """Return the derivatives of `arrays.held_mass.held_plant` in delta and in the fraction of the delay."""
     f, t = fraction, 1.0 - fraction
     c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
     at_t, at_f = phi_functions(delta * t), phi_functions(delta * f)
     chi_t, chi_f = _chi(delta * t, at_t.gap), _chi(delta * f, at_f.gap)
-    # Every term of a1 falls.
+    # Each term of a1 decreases with delta, so the sum of their derivatives has no cancellation.
     a2 = -t * t * t * chi_t
     a1 = t * t * t * (at_t.psi - chi_t) + f * f * f * chi_f
     a1 = -(a1 + t * f * (e_t * (t * at_f.phi1 + f * at_f.psi) + t * at_t.psi * at_f.phi1 + f * at_t.phi1 * at_f.psi))
@@ -62,30 +62,33 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
 
 
 def follow(s: Array, plant: Plant, lag: Array, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
-    """Return alpha, beta, omega and s of the solved ridge, differentiable in plant and integer delay (``lag``)."""
-    # One step of Newton's method, through which derivatives pass: it is exact to the first order. A corner stays at 1,
-    # and at a maximum alpha moves as if s stood still.
+    """Recompute alpha, beta, omega and s at a solved ridge, for correct derivatives in ``plant`` and ``lag``."""
+    # Differentiate a single step of Newton's method, because its derivative at the solution is that of the solution. A
+    # corner stays at s = 1. At a maximum the derivative of alpha in s is 0, so alpha is computed at the fixed s.
     xp = namespace(s, plant.a2, lag)
     undelayed, curve, corner = not kind.long, expand_curve(plant), s >= 1.0
     inside = xp.where(corner, 0.5, s)
     first, second = stationarity(inside, curve, lag, undelayed)
     inside = xp.where(corner, 0.5, inside - first / xp.where(corner, 1.0, second))
     moved = xp.where(corner, 1.0, inside)
-    # Not by the series of `wave`, whose derivative has fewer digits.
+    # Do not use the series of `wave`, because its derivative has fewer digits.
     omega = xp.where(corner, np.pi, 2.0 * xp.arctan(inside / xp.sqrt((1.0 - inside) * (1.0 + inside))))
     alpha, beta = (wall(wave(place, lag, undelayed), curve) for place in (s, moved))
     return alpha[0], beta[1], omega, moved
 
 
 def differentiable_ridge(plant: Plant, lag: Array, start: Start, kind: DelayClasses) -> Ridge:
-    """Solve for the ridge; JAX can differentiate the result in plant and integer delay (``lag``) to any order."""
+    """Return the ridge of one plant with an integer delay of ``lag`` periods.
+
+    For JAX arrays, the derivatives in ``plant`` and ``lag`` are those of `follow`, which are exact to any order.
+    """
     ridge = solve if namespace(plant.a2, lag) is np else _jax_ridge()
     return ridge(plant, lag, start, kind)
 
 
 @cache
 def _jax_plant() -> Any:
-    """`arrays.held_mass.held_plant` with its derivatives in closed form."""
+    """Return `arrays.held_mass.held_plant` as a JAX function with derivatives in closed form."""
     import jax
 
     function = jax.custom_jvp(lambda delta, fraction: held_plant(delta, fraction))
@@ -101,6 +104,7 @@ def _jax_plant() -> Any:
 
 @cache
 def _jax_ridge() -> Any:
+    """Return `solve` as a JAX function with the derivatives of `follow`."""
     import jax
 
     function = jax.custom_jvp(solve, nondiff_argnums=(3,))
@@ -139,12 +143,12 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
         `zwidth.Status`. If the status is not 0, ``alpha``, ``beta`` and ``omega`` are NaN and ``kind`` is 3 (NONE).
 
     Numerics:
-        alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable in delta and d, also
-        twice. The first derivatives of alpha are continuous, also at the transition to the corner (d = 0:
-        delta = 3.65936162742...) and at integer d > 0. The second derivatives of alpha and the first ones of beta and
-        omega jump there; at integer d they are those from the right. For strong damping the second derivative in delta
-        falls like delta^-3, below its rounding error of 1e-15 (d = 0) to 1e-12 (d = 500) times alpha/delta^2: at
-        delta = 1e6 none of its digits is reliable.
+        alpha to about 1e-15 relative, because at a maximum the error of alpha is of second order in that of omega. JAX
+        can trace the function in delta and d and differentiate it twice. The first derivatives of alpha are continuous,
+        also at the transition to the corner (d = 0: delta = 3.65936162742...) and at integer d > 0. The second
+        derivatives of alpha and the first ones of beta and omega jump there; at integer d they are those from the
+        right. For strong damping the second derivative in delta decreases as delta^-3. Its rounding error is 1e-15
+        (d = 0) to 1e-12 (d = 500) times alpha/delta^2, so none of its digits is reliable at delta = 1e6.
 
         Float64 when called directly. Inside a transformation, also `jax.grad`, JAX's default precision applies: float32
         unless ``jax.config.update("jax_enable_x64", True)`` was called; a `zwidth.PrecisionWarning` reports it once.
@@ -160,7 +164,7 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
     check_choice("method", method, get_args(RidgeMethod))
     arguments = {"delta": delta, "d": d}
     if method == "kkt":
-        # The general route iterates over long formulas; its solvers take a second to import.
+        # Import on demand, because the solvers take a second to import. Compile, because they iterate long formulas.
         from zwidth.loops.rigid.exact_points import kkt_kernel
 
         return RidgePoint(*evaluate(kkt_kernel, arguments, route="jax"))
@@ -186,7 +190,7 @@ def move_point(delta: Array, d: Array, kind: DelayClasses = ANY) -> tuple[RidgeP
 
 
 class RidgeSlopes(NamedTuple):
-    """The stiffest wall with its derivatives."""
+    """The point of maximum stiffness, and the derivatives of its alpha in delta and d."""
 
     point: RidgePoint
     by_delta: Array
@@ -209,7 +213,7 @@ def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlop
 def stiffness_slopes(
     found: RidgeSlopes, mass: Array, period: Array, delta: Array, d: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """K_max and its derivatives in mass, damping, period and delay: see `zwidth.sensitivities`."""
+    """Return K_max and its derivatives in mass, damping, period and delay; see `zwidth.sensitivities`."""
     alpha, rate, change = found.point.alpha, 1.0 / period, delta * found.by_delta
     return (
         alpha * mass * rate * rate,
@@ -235,8 +239,8 @@ def _solve_ridge(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Arr
 
 
 def converged(ridge: Ridge) -> Array:
-    """Whether the solver has arrived."""
-    # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
+    """Return a mask of the points at which the solver has converged."""
+    # Convergence is quadratic, so only rounding errors are left after a step of sqrt(eps).
     return namespace(ridge.s).abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s
 
 
@@ -265,8 +269,8 @@ def stiffness_slope(d: ArrayLike) -> Array:
         d: delay in periods, 0 to 1e5, integer or fractional; any shape.
 
     Returns:
-        Array of d's shape: 4, 1, 0.631130, 0.465011, 0.369041 for d = 0, 1, 2, 3, 4. NaN where d is NaN, negative,
-        infinite or too long.
+        Array of d's shape: 4, 1, 0.631130, 0.465011, 0.369041 for d = 0, 1, 2, 3, 4. NaN if d is NaN, negative,
+        infinite or above 1e5.
 
     Numerics:
         About 1e-15 relative. Traceable, with derivatives of every order in d. g is ``4 (1 - 3 d)/(1 - 2 d)^2``
@@ -290,7 +294,7 @@ def slope_kernel(d: Array, kind: DelayClasses = ANY) -> Array:
     (d,) = nan_unless(valid_device(0.0 * d, d), d)
     zero = 0.0 * d
     lag, f = split_delay(d)
-    # delta N(z) for delta -> infinity: the velocity follows the force at once, e^-delta and its like vanish.
+    # The limit of delta N(z) for delta -> infinity: the velocity is proportional to the force, and e^-delta vanishes.
     plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
     start = guess_start(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
     ridge = differentiable_ridge(plant, lag, start, kind)

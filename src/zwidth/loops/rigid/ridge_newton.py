@@ -1,10 +1,10 @@
 """The ridge of the rigid loop by Newton's method on its closed-form optimality condition.
 
 Curve and condition are written in ``y = s^2``, ``s = sin(omega/2)``, with D = lag + 1, lag = n, and the letters of
-docs/theory/boundary.md, B1 and B2. A prime there is a trailing digit or a leading d here.
+docs/theory/boundary.md, B1 and B2. A prime on that page is a trailing digit or a leading d in the code.
 
-The lobe has one maximum (docs/theory/one-lobe.md, Theorem B), so nothing is searched. The number of steps is fixed:
-no point waits for another.
+The lobe has one maximum (docs/theory/one-lobe.md, Theorem B), so no search is needed. The number of steps is fixed, so
+that no point of a batch waits for another.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def wave_at(omega: Array, lag: Array) -> Wave:
     s, cos_half = xp.sin(0.5 * omega), xp.abs(xp.cos(0.5 * omega))
     y, q = s * s, cos_half * cos_half
     D = lag + 1.0
-    # Above 2 the phase is counted from pi, whose second float64 keeps the last digits.
+    # Above 2 use pi - omega; the second part of pi, added separately, keeps its last digits.
     sign, beyond = 1.0 - 2.0 * xp.mod(D, 2.0), omega > 2.0
     x = xp.where(beyond, (np.pi - omega) + 1.2246467991473532e-16, omega)
     tau = xp.where(beyond, -sign, 1.0) * D * _cardinal_sine(D * x) / _cardinal_sine(x)
@@ -173,7 +173,7 @@ class Start(NamedTuple):
 _TAKE_OVER = 3.6593616274217835
 
 # s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 0.8 % below one
-# period, 1.1 % beyond. Two steps then leave 5e-9, the third nothing but rounding.
+# period, 1.1 % beyond.
 _SHORT = (
     (0.3748, 0.6572, -0.7317, -0.01088, 0.2558),
     (-0.1878, 3.83, -4.872, 1.835),
@@ -182,9 +182,9 @@ _SHORT = (
     (-0.4501,),
 )
 _LONG = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
-# Below one period T bends more; so much that the power matters.
+# Power of s in `Start` below one period, where T has a larger curvature.
 _POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
-_STEPS = 3
+_STEPS = 3  # Newton steps; two leave an error of 5e-9
 
 
 def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
@@ -241,7 +241,7 @@ def solve(plant: Plant | DeviceTerms, lag: Array, start: Start, kind: DelayClass
     undelayed = not kind.long
     curve = expand_curve(store_once(plant, start.scale))
     s, last = _find_stationary(curve, lag, start, undelayed)
-    # Just before the take-over a smooth optimum may round to the corner's place.
+    # Keep s below 1, because a smooth maximum near the corner may round to 1.
     s = xp.minimum(s, 1.0 - 0.5 * epsilon(s))
     at = wave(s, lag, undelayed)
     ridge = Ridge(*wall(at, curve), 2.0 * at.half, s, last)

@@ -1,4 +1,4 @@
-"""The outermost pole of arrays of walls: the spectral radius, and how fast a loop settles."""
+"""The dominant pole of arrays of walls: spectral radius and decay rate."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def spectral_radius(
 
 
 def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
-    """Return how fast the slowest motion of the loop decays: ``-ln(rho)`` per period, rho the spectral radius.
+    """Return the decay rate of the dominant pole: ``-ln(rho)`` per period, with the spectral radius rho.
 
     After k periods a disturbance has decayed to about ``exp(-decay_rate k)``. The time constant is ``1/decay_rate``
     periods, the stability margin ``1 - rho = -expm1(-decay_rate)``.
@@ -96,22 +96,22 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         alpha: normalized stiffness K T^2/m.
         beta: normalized virtual damping B T/m.
         delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not (held). All four broadcast.
+        d: delay in periods, >= 0, integer or fractional. All four broadcast.
 
     Returns:
-        Array of the broadcast shape, per period: positive exactly where `zwidth.is_stable` says so, 0 with a pole at 1,
-        negative where the motion grows. NaN for a point out of range and where less than three digits of the rate are
-        known: on the boundary but for some 1e-12 of alpha or beta, and next to multiple poles that are nearly as slow.
+        Array of the broadcast shape, per period: positive if and only if `zwidth.is_stable` returns True, 0 with a pole
+        at 1, negative for growing responses. NaN for a point out of range, and if fewer than three digits of the rate
+        are certain: within about 1e-12 of the boundary in alpha or beta, and near (almost) dominant multiple poles.
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
 
     Numerics:
-        The logarithm of the outermost pole as for `zwidth.spectral_radius`, found from z - 1: the motion of a soft wall
-        keeps 11 digits or more however slow it is, that of a pair of poles near the circle has an absolute error of
-        some 1e-16. A proved bound of either is below a thousandth of the rate, or the rate is NaN. Where poles are
-        not told from each other (within 1e-12 in size), any of them is meant. Inside `jit` the same in the ambient
-        precision, without a bound.
+        The logarithm of the dominant pole of `zwidth.spectral_radius`, computed from z - 1. For soft walls the rate has
+        at least 11 digits, however small it is; for a pole pair near the unit circle its absolute error is about 1e-16.
+        A proved error bound is below a thousandth of the rate, otherwise the rate is NaN. If the magnitudes of several
+        poles agree within 1e-12, the rate is that of any of them. Inside `jit` it has the ambient precision and no
+        error bound.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
@@ -130,6 +130,7 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
 
 
 def _check_radius(method: str, accuracy: float | None) -> float:
+    """Return the accuracy; raise `InputError` for an unknown method or an accuracy out of range."""
     check_choice("method", method, get_args(RadiusMethod))
     if accuracy is None:
         return ACCURACY

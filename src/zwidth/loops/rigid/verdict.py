@@ -1,4 +1,4 @@
-"""Stable or not, for whole arrays of walls."""
+"""Stability verdicts for arrays of walls."""
 
 from __future__ import annotations
 
@@ -22,9 +22,7 @@ from zwidth.words.xp import is_traced
 StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
 STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
 
-
-# How far eigenvalues may be off where two poles are one: the root of the rounding unit.
-_ROUGH = 2e-8
+_ROUGH = 2e-8  # error of the eigenvalues at a double pole: about the square root of the rounding unit
 
 
 def is_stable(
@@ -56,9 +54,9 @@ def is_stable(
         TracedDelayError: d is traced with method "companion".
 
     Numerics:
-        At a cost that does not depend on d. Float64 when called directly, the ambient precision inside `jit`. The label
-        of the closed form is right where alpha is more than some rounding errors away from the boundary; there is no
-        faster, rougher method. What a point costs: benchmarks/results/bench.md.
+        The cost does not depend on d. Float64 when called directly, the ambient precision inside `jit`. The label of
+        the closed form is right if alpha is more than some rounding errors away from the boundary; no faster, less
+        accurate method exists. Times per point: benchmarks/results/bench.md.
 
     References:
         docs/theory/one-crossover.md; Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
@@ -96,9 +94,9 @@ def decide_stability(
 
     Returns:
         Stability: ``stable``, boolean; ``status``, see `zwidth.Status`: INVALID_INPUT or OUT_OF_RANGE for a point that
-        is not computed, with method "certified" UNDECIDED or ON_BOUNDARY where no label is given (``stable`` is
-        False there), and with "companion" UNDECIDED where the radius is 1 within what eigenvalues tell of a double
-        pole; ``method``, the `Method` that decided. Arrays may be read-only.
+        is not computed; with "certified" UNDECIDED or ON_BOUNDARY for a wall without a label (``stable`` is then
+        False); with "companion" UNDECIDED if the radius differs from 1 by less than the error of the eigenvalues at a
+        double pole; ``method``, the `Method` that decided. Arrays may be read-only.
 
     Raises:
         InputError: as for `zwidth.is_stable`, and for traced values.

@@ -23,12 +23,12 @@ DELAYS = [1.0, 2.0, 7.0, 500.0, 1.5, 3.25, 60.7, np.nextafter(2.0, 1.0), 1.0 + 1
 
 
 def pick(value, index):
-    """One entry of an array, or of a number that stands for all entries."""
+    """Return one entry of an array; a number stands for all entries."""
     return float(np.broadcast_to(value, index + 1 if np.ndim(value) == 0 else value.shape)[index])
 
 
 def errors(computed, exact, index, precision=BITS):
-    """Errors relative to the sizes of numbers, of one entry."""
+    """Return the errors of one entry relative to its sizes."""
     with flint.ctx.workprec(precision):
         return [
             float(abs(truth - pick(number.value, index)).upper() / flint.arb(pick(number.size, index)))
@@ -37,7 +37,7 @@ def errors(computed, exact, index, precision=BITS):
 
 
 def numbers(plant, exact):
-    """The numbers of a device and of its curve, with their exact values."""
+    """Return the terms of a device and the coefficients of its curve, with their exact values."""
     names = [name for name, value in plant._asdict().items() if isinstance(value, Sized) and name not in ("p2", "tilt")]
     pairs = [(getattr(plant, name), getattr(exact, name)) for name in names]
     for curve in (long_curve, short_curve) if exact.a0 is not None else (long_curve,):
@@ -47,7 +47,7 @@ def numbers(plant, exact):
 
 
 def walls(count, seed, d):
-    """Walls in and around the stable set of many devices."""
+    """Return walls in and around the stable sets of many devices."""
     rng = np.random.default_rng(seed)
     delta = np.where(rng.random(count) < 0.5, rng.exponential(1.0, count), 10.0 ** rng.uniform(-9, 9, count))
     d = np.full(count, float(d)) if np.ndim(d) == 0 else rng.choice(d, count)
@@ -96,7 +96,7 @@ class Exact:
 
 
 def exact_differences(verdict, wall, plant, *more):
-    """The differences whose signs a verdict tests, in balls."""
+    """Return the differences whose signs a verdict tests, in balls."""
     differences = []
     terms = plant._replace(**{k: Exact(v, differences) for k, v in plant._asdict().items() if isinstance(v, flint.arb)})
     verdict(*(Exact(value, differences) for value in wall), *more, terms)
@@ -104,7 +104,7 @@ def exact_differences(verdict, wall, plant, *more):
 
 
 def computed_differences(monkeypatch, operation):
-    """The differences whose signs ``operation`` tests, with their sizes."""
+    """Return the differences whose signs ``operation`` tests, with their sizes."""
     differences = []
 
     def record(self, other):
@@ -179,7 +179,7 @@ def test_bounds_of_a_short_verdict_hold(d, monkeypatch):
             wall, exact = (flint.arb(alpha[index]), flint.arb(beta[index])), certified.device(delta[index], d, BITS)
             true = exact_differences(short_verdict, wall, exact)
             assert len(true) == len(differences)
-            # Behind the end of the lobe there is no root, and no bound.
+            # Skip differences without a finite value, because beyond the end of the lobe the root does not exist.
             kept = [k for k, value in enumerate(true) if value.is_finite()]
             compared += len(kept) == len(true)
             assert max(errors([differences[k] for k in kept], [true[k] for k in kept], index)) < TOLERANCE / 2

@@ -198,7 +198,7 @@ def test_every_device_is_answered():
     np.testing.assert_array_equal(got.status, Status.OK)
     limit = np.minimum(np.pi, np.pi / (d + 0.5))
     lobe = np.full(4000, True)
-    # Up to the first return to alpha = 0 the scan sees nothing stiffer.
+    # The scan finds no larger alpha before the first return to alpha = 0.
     for fraction in np.linspace(0, 1, 120)[1:-1]:
         scanned = zwidth.boundary(fraction * limit, delta, d).alpha
         lobe &= scanned > 0
