@@ -153,7 +153,9 @@ def test_walls_of_a_row_that_contradicts_itself_are_told_by_their_poles(monkeypa
     stiffness, damping = np.linspace(1e3, 3e5, 12), np.array([[0.0], [50.0], [300.0]])
     expected = loop.is_stable(stiffness, damping)
     assert 0 < expected.sum() < expected.size
-    monkeypatch.setattr(type(loop.loop.boundary), "shift_ambiguous", lambda self, beta: (beta, np.zeros(beta.shape, bool)))
+    monkeypatch.setattr(
+        type(loop.loop.boundary), "shift_ambiguous", lambda self, beta: (beta, np.zeros(beta.shape, bool))
+    )
     np.testing.assert_array_equal(loop.is_stable(stiffness, damping), expected)
 
 

@@ -319,7 +319,9 @@ def test_no_stable_wall_is_no_number():
 def test_a_ridge_without_its_rows_is_refused(monkeypatch):
     scene = PAPER.replace(velocity=LowPass(cutoff=100.0))
     low = wanted(scene, False)
-    monkeypatch.setattr("zwidth.loops.linear.ridge._identify_conditions", lambda *_: low._replace(alpha=0.9 * low.alpha))
+    monkeypatch.setattr(
+        "zwidth.loops.linear.ridge._identify_conditions", lambda *_: low._replace(alpha=0.9 * low.alpha)
+    )
     wall = scene.max_stiffness()
     assert np.isnan(wall.stiffness)
     assert wall.status == Status.NOT_CONVERGED
