@@ -266,8 +266,17 @@ def bound_interpolation(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a mask of the steps over which alpha may be interpolated linearly in beta, and bounds of its error.
 
-    The arguments are those of joined arcs; alpha is NaN at their ends. Use the mean alpha of both ends for the other
-    steps.
+    On the other steps alpha is approximated by the mean of both ends, with the returned bound of the error.
+
+    Args:
+        w: angles of the nodes of all arcs, joined, shape (nodes,).
+        alpha: alpha at the nodes; NaN at the ends of the arcs.
+        alpha_slope: d alpha/dw.
+        beta_slope: d beta/dw.
+        size: as in `CurvePoints`.
+
+    Returns:
+        Two arrays of shape (nodes,); an entry describes the step from the previous node.
     """
     # If the slope of beta hardly changes over a step, linear interpolation misses alpha by at most an eighth of the
     # step times the change of alpha's slope, plus the curvature of beta. Allow four times this error. For other steps
