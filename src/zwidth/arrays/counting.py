@@ -204,7 +204,7 @@ def _count(columns: list[Array], xp: Any) -> Array:
 
 
 def _pad_roots(roots: Array, missing: int, xp: Any) -> Array:
-    """Append roots at z = 0."""
+    """Append ``missing`` roots at z = 0."""
     return xp.concatenate([roots, xp.zeros((*roots.shape[:-1], missing), roots.dtype)], axis=-1)
 
 
@@ -276,7 +276,7 @@ def _evaluate_difference(loop: _CircleParts, t: Array, eps: float, xp: Any) -> t
 
 
 def _get_smallest(xp: Any, like: Array) -> float:
-    """Return a number far below all others whose quotients stay finite."""
+    """Return a positive number, negligible next to all others, that avoids 0/0 in quotients."""
     return math.sqrt(xp.finfo(like.dtype).tiny)
 
 

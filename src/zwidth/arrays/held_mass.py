@@ -61,7 +61,7 @@ def phi_functions(x: Array) -> PhiFunctions:
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, SERIES_BELOW, x)
     half_squared = half * half
     low1, low_gap = factor * horner(half_squared, PHI1), factor * (2.0 * half) * horner(half_squared, GAP)
-    # Above the switch 1 - c has no cancellation. Unlike expm1 its derivative has a small relative error.
+    # Above `SERIES_BELOW`, 1 - c does not cancel. Its derivative has a small relative error, unlike that of expm1.
     inverse = 1.0 / high
     high1 = (1.0 - c) * inverse
     return PhiFunctions(
@@ -89,7 +89,7 @@ class Plant(NamedTuple):
 
 
 def held_plant(
-    delta: Any, fraction: Any = None, functions: Functions = phi_functions, at: Any = None, at_t: Any = None
+    delta: Any, fraction: Any = None, functions: Functions = phi_functions, phi: Any = None, phi_t: Any = None
 ) -> Plant:
     """Discretize a mass with damping and a fractional delay, in any arithmetic.
 
@@ -97,23 +97,25 @@ def held_plant(
         delta: normalized damping.
         fraction: fractional part f of the delay, in [0, 1); None for an integer delay, with a0 = 0.
         functions: evaluates the phi-functions in this arithmetic.
-        at: phi-functions at delta, if already computed.
-        at_t: phi-functions at delta (1 - f), if already computed.
+        phi: phi-functions at delta, if already computed.
+        phi_t: phi-functions at delta (1 - f), if already computed.
     """
-    at = functions(delta) if at is None else at
+    phi = functions(delta) if phi is None else phi
     if fraction is None:
-        return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
+        return Plant(phi.c, delta * phi.phi1, phi.phi2, phi.psi, 0.0 * phi.gap, phi.gap)
     f = fraction
     t = 1.0 - f
-    at_t, at_f = functions(delta * t) if at_t is None else at_t, functions(delta * f)
-    e_t = at_t.c
-    a2 = t * t * at_t.phi2
-    a1 = t * t * at_t.psi + t * f * e_t * at_f.phi1 + f * f * at_f.phi2 + t * f * at_t.phi1 * at_f.phi1
-    a0 = e_t * f * f * at_f.psi
+    phi_t, phi_f = functions(delta * t) if phi_t is None else phi_t, functions(delta * f)
+    e_t = phi_t.c
+    a2 = t * t * phi_t.phi2
+    a1 = t * t * phi_t.psi + t * f * e_t * phi_f.phi1 + f * f * phi_f.phi2 + t * f * phi_t.phi1 * phi_f.phi1
+    a0 = e_t * f * f * phi_f.psi
     gap = (
-        t * t * at_t.gap - t * f * at_f.phi1 * (e_t + at_t.phi1) - f * f * (at_f.gap + delta * t * at_t.phi1 * at_f.psi)
+        t * t * phi_t.gap
+        - t * f * phi_f.phi1 * (e_t + phi_t.phi1)
+        - f * f * (phi_f.gap + delta * t * phi_t.phi1 * phi_f.psi)
     )
-    return Plant(at.c, delta * at.phi1, a2, a1, a0, gap)
+    return Plant(phi.c, delta * phi.phi1, a2, a1, a0, gap)
 
 
 def factor_numerator(plant: Plant) -> tuple[Array, Array]:
@@ -182,13 +184,13 @@ def device(delta: Array, d: Array, kind: DelayClasses = ANY) -> DeviceTerms:
     """
     delta, d = nan_unless(valid_device(delta, d), delta, d)
     whole, f = split_delay(d)
-    at = phi_functions(delta)
-    late = phi_functions(delta * (1.0 - f)) if kind.fractional else at
-    plant = held_plant(delta, f if kind.fractional else None, at=at, at_t=late)
+    phi = phi_functions(delta)
+    phi_t = phi_functions(delta * (1.0 - f)) if kind.fractional else phi
+    plant = held_plant(delta, f if kind.fractional else None, phi=phi, phi_t=phi_t)
     # (-1)^n P(-1) = 2 (1 + c) - (-1)^n N(-1) (alpha + 2 beta) is positive if the loop is stable.
     tilt = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
     return DeviceTerms(
-        *(delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi),
+        *(delta, whole, f, plant.c, plant.em, phi.phi1, phi.phi2, phi.psi, phi_t.phi1, phi_t.psi),
         *(plant.a2, plant.a1, plant.a0, plant.gap, tilt),
     )
 

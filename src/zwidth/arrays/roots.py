@@ -281,9 +281,11 @@ def follow_root(
 
     @jax.custom_jvp
     def attach(root: Array, *parameters: Any) -> Array:
+        """Return the root; its derivatives follow from ``rule``."""
         return root
 
     def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+        """Return the root and its tangent, by implicit differentiation."""
         x, parameters = attach(*primals), primals[1:]
         leaves, tree = jax.tree.flatten(parameters)
         changes = jax.tree.leaves(tangents[1:])

@@ -28,12 +28,12 @@ N_ACROSS = 65  # equidistant lines across the stable set
 BEYOND = 0.05  # distance of the first and last of them from the stable nodes, relative to the range of dampings
 
 # Refinement near meetings
-# Offsets of the lines of constant B near a meeting, relative to the gap between the lines that enclosed it.
+# Offsets in beta of new lines of constant B near a meeting, relative to the gap between the lines that enclose it.
 MEETING_OFFSETS = np.array([-1e-3, -1e-7, 1e-7, 1e-3])
-# Gap, relative to the previous one, at which a meeting counts as enclosed; the two nearest offsets are closer.
+# Largest final gap between two lines that enclose a meeting, relative to the gap before refinement.
 ENCLOSED_GAP = 3e-7
-MAX_ROUNDS = 60  # of adding lines
-MAX_CORNER_STEPS = 60  # of false position
+MAX_ROUNDS = 60  # rounds in which lines are added
+MAX_CORNER_STEPS = 60  # steps of false position for a corner
 DAMPING_TOLERANCE = 1e-13  # relative accuracy of the damping of a corner
 
 # Edges
@@ -93,7 +93,10 @@ class StableSet:
         return self.boundary.lossless if len(self.boundary.lines) == 2 else np.nan
 
     def _place_rows(self) -> np.ndarray:
-        """Return initial dampings: across the stable set, and on both sides of each change along the nodes."""
+        """Return the dampings of the initial lines of constant B.
+
+        They are equidistant across the stable set, and close to each point of the curve where an edge starts or ends.
+        """
         b, (w, _, beta) = self.boundary, self._nodes
         arc, is_edge = b.find_arc(w), b.are_stable_edges(w)
         changes = np.pad((is_edge[1:] != is_edge[:-1]) | (is_edge[1:] & (arc[1:] != arc[:-1])), 1, constant_values=True)
@@ -107,7 +110,7 @@ class StableSet:
         # If no node is on an edge, the set may still contain walls without damping: the softest walls of a device that
         # comes to rest are stable.
         across = across if is_edge.any() else np.union1d(across, 0.0)
-        # Ignore the other nodes outside this range, which may be next to an asymptote of the curve.
+        # Drop nodes outside this range, because they may lie next to an asymptote of the curve.
         return np.union1d(across, near[(near > across[0]) & (near < across[-1])])
 
     def _scan_rows(self, beta: np.ndarray) -> _Rows:
@@ -166,7 +169,7 @@ class StableSet:
             Dampings of further lines near these meetings, and the located corners as in `_pair_ends`.
         """
         b, columns, beta = self.boundary, meetings.columns[left], rows.beta
-        # The set may extend beyond the first and the last line.
+        # Extend the range, because the set may extend beyond the first and the last line of constant B.
         size = np.ptp(beta[np.isfinite(rows.alpha).any(1)]) + np.spacing(np.abs(beta).max())
         low, high = np.concatenate([[beta[0] - size], beta, [beta[-1] + size]])[
             meetings.gap[left] + np.array([[0], [1]])

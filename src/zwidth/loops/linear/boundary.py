@@ -43,7 +43,7 @@ CONVERGED_STEP = 1e-10  # relative to w; the error after it is of the order of i
 
 # Relative changes of beta, tried in this order, for lines whose crossings are ambiguous by rounding errors (V15).
 SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
-# Distance of the probe near an angle at which the curve is undefined, relative to the distance of the next node.
+# Distance of a probe of the curve from an angle at which it is undefined, relative to the distance of the next node.
 PROBE_DISTANCE = 1e-6
 # Relative imaginary part of x below which a pole leaves a zero of G along the unit circle (V14).
 TANGENT_TOLERANCE = 1e-9
@@ -157,8 +157,8 @@ class Boundary:
         Returns:
             Angle and alpha of each crossing.
         """
-        # The function is Im(q - beta F), divided by its zeros that all lines share (`_LoopValues`). It increases with w
-        # if a pair leaves the circle. Converged crossings are removed from the iteration.
+        # Solve ``ratio(w) = 0``. Im(q - beta F) increases with w where a pair leaves the circle (V11); ``signs`` are
+        # those of the factors by which ``ratio`` divides it. Converged crossings leave the iteration.
         joined, nodes = self._joined, self._node_values
         lower = np.where(joined.w[k - 1] < joined.w[k], k - 1, k)
         upper = 2 * k - 1 - lower
@@ -183,7 +183,7 @@ class Boundary:
             new = x + move
             # Bisect if the step leaves the bracket or is longer than half the previous step.
             good = (new >= below[active]) & (new <= above[active]) & (np.abs(move) <= 0.5 * before)
-            # A converged step may leave the bracket by rounding errors.
+            # Accept a converged step even if rounding errors put it outside the bracket.
             good |= np.abs(new - x) <= CONVERGED_STEP * x
             new = np.where(good, np.clip(new, below[active], above[active]), 0.5 * (below[active] + above[active]))
             # After the last step the error is of the order of its square. Extrapolate alpha by the exact step, because
@@ -207,10 +207,12 @@ class Boundary:
 
     @cached_property
     def _node_values(self) -> _LoopValues:
+        """The values of the loop at the nodes of all arcs."""
         return self._evaluate_loop(self._joined.w)
 
     @cached_property
     def _joined(self) -> JoinedArcs:
+        """The arcs in one sequence of nodes."""
         return JoinedArcs.join(self.arcs)
 
     def find_arc(self, w: np.ndarray) -> np.ndarray:
@@ -231,7 +233,7 @@ class Boundary:
         for a, b in pairwise(sorted(self.limits)):
             inner = nodes[(nodes > a) & (nodes < b)]
             inner = inner if inner.size else np.array([0.5 * (a + b)])
-            # Near an end at infinity the curve is evaluated no closer than at these probes.
+            # Bracket intersections near an infinite end of the curve by probes close to it.
             probes = a + PROBE_DISTANCE * (inner[0] - a), b - PROBE_DISTANCE * (b - inner[-1])
             inner = np.concatenate([probes[:1], inner, probes[1:]])
             pieces.append(np.concatenate([[a], inner, [b]]))
@@ -328,32 +330,26 @@ class Boundary:
         arc, block = self.find_arc(w), max(1, BLOCK_SIZE // max(1, len(self.arcs)))
         for part in np.array_split(np.flatnonzero(result), 1 + result.sum() // block):
             sums, consistent = self._sum_below(curve.alpha[part], curve.beta[part], arc[part])
-            # The direction is that of the whole arc: near z = -1 the derivative at one angle may be a rounding error.
+            # Use the direction of the whole arc, because the derivative at one angle may be a rounding error.
             below = self.count_below(curve.beta[part])
             result[part] = consistent & (below + sums == np.where(self._joined.leaving[arc[part]] > 0, 0, 2))
         return result
 
     def count_below(self, beta: np.ndarray) -> np.ndarray | int:
-        """Return the number of poles outside the circle for alpha below all crossings (docs/theory/scenes.md, V14).
-
-        Args:
-            beta: dampings of lines of constant B.
-        """
+        """Return the number of poles outside the circle for alpha below all crossings, for each beta (V14)."""
         return self._count_far(-1.0, beta)
 
     def count_above(self, beta: np.ndarray) -> np.ndarray | int:
-        """Return the number of poles outside the circle for alpha above all crossings.
+        """Return the number of poles outside the circle for alpha above all crossings, for each beta (V14).
 
         On every line of constant B the poles that cross account for the difference from `count_below`.
-
-        Args:
-            beta: dampings of lines of constant B.
         """
         return self._count_far(1.0, beta)
 
     def _count_far(self, side: float, beta: np.ndarray) -> np.ndarray | int:
+        """Return the number of poles outside the circle as alpha -> side * inf."""
         less, more = self._far_counts[side]
-        # Only in a lossless loop does the number of poles depend on the damping.
+        # The number depends on the damping only if the loop is lossless.
         return less if less == more else np.where(beta > self.lossless, more, less)
 
     @cached_property
@@ -415,7 +411,7 @@ class _LoopValues(NamedTuple):
         return _LoopValues(*(part[index] for part in self))
 
     def evaluate_rows(self, beta: np.ndarray) -> _RowValues:
-        """Return the values for one line of constant B per angle."""
+        """Evaluate `_RowValues` for one damping per angle."""
         with np.errstate(all="ignore"):
             value, slope = self.q - beta * self.f, self.q_slope - beta * self.f_slope
             is_zero = self.common == 0

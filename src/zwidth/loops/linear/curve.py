@@ -136,7 +136,8 @@ def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         real = is_end | (np.abs(q.value.imag) <= REAL_TOLERANCE * np.abs(q.value))
     values = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
-    # A zero of G within this distance is at the angle itself. The offset of a zero near z = 1 is relatively exact.
+    # Zeros of G within this distance count as located at the angle. The distance is smallest at z = 1, because offsets
+    # of zeros near z = 1 have a small relative error.
     reach = np.where(w == 0.0, 1e-15, np.where(is_end, 1e-12, 1e-9))
     near = np.abs(points.before[:, None] + loop.zeros) <= reach[:, None]
     selected = np.flatnonzero(real & ~near.any(1) & np.isfinite(values).all(1))
@@ -205,7 +206,7 @@ def cut_arcs(
             betas[end] if np.isfinite(betas[end]) else side * np.inf
             for end, side in ((a, -1.0 if rising else 1.0), (b, 1.0 if rising else -1.0))
         )
-        # The ends have no alpha: walls next to them are always compared with the computed crossing.
+        # The ends of an arc have no tabulated alpha, so walls next to them are compared with the exact crossing.
         with np.errstate(all="ignore"):
             slope = inner.wronskian / inner.im_f**2
         parts = [nodes, inner.beta, inner.alpha, inner.alpha_slope, slope, inner.size]
@@ -309,7 +310,7 @@ class JoinedArcs(NamedTuple):
 
     @classmethod
     def join(cls, arcs: tuple[Arc, ...]) -> JoinedArcs:
-        """Return the arcs of a boundary, joined."""
+        """Join the arcs of a boundary."""
         w, beta, *others = map(np.concatenate, zip(*(arc[:6] for arc in arcs), strict=True))
         sizes = [arc.w.size for arc in arcs]
         dampings, keys = np.unique(beta, return_inverse=True)

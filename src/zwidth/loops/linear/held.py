@@ -70,7 +70,7 @@ def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
 
 
 def compute_chain_transition(chain: AnyChain, A: Any, B: Any, time: Any) -> tuple[Any, Any]:
-    """Return `compute_transition` for the matrices of a chain; of a sampled system A - 1 and B for any time."""
+    """Return `compute_transition` for the matrices of a chain; for a sampled system, A - 1 and B at any time."""
     return (A - np.eye(len(B)), B) if chain.sampled else compute_transition(A, B, time)
 
 
@@ -83,7 +83,7 @@ class Sampled(NamedTuple):
 
 
 def discretize_chain(chain: AnyChain) -> Sampled | Plant:
-    """Discretize a chain for `evaluate_controller`, a rigid one in closed form."""
+    """Discretize a chain: a rigid one in closed form, all others by the matrix exponential."""
     if not (isinstance(chain, Chain) and chain.rigid):
         return discretize_states(chain)
     fraction = chain.d - chain.whole
@@ -140,7 +140,7 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         lag += 1
     numerator = np.trim_zeros(numerator, "f")
     if numerator.size > 1 and abs(numerator[0]) < FAR_ZERO * abs(numerator[1]):
-        # Delays just below an integer have one zero so far from the unit circle that it has no effect there, and
+        # For a delay just below an integer, one zero is so far from the unit circle that it has no effect there, and
         # Aberth's method would not find it.
         numerator = numerator[1:]
     # The coefficients do not resolve zeros near the poles of a soft mode. Start these zeros from those of the
@@ -152,7 +152,7 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow
     candidates = []
     # Modes that decay within a period leave a cluster of zeros near z = 0. If the determinant does not separate them,
-    # keep the roots of ``numerator`` there, whose product is accurate.
+    # keep the roots of ``numerator`` there, which are accurate as a group.
     for is_refined in (np.full(zeros.shape, True), np.abs(1.0 + zeros) > CLUSTER_RADIUS):
         # Start off the real axis, because Aberth's steps keep real approximations real, but two real zeros of the
         # coefficients may be a complex pair of the determinant.

@@ -89,6 +89,7 @@ class OpenLoop(NamedTuple):
         """Return the angles at which ``|L| = 1``, ascending."""
 
         def log_gain(jet: Jet) -> tuple[np.ndarray, np.ndarray]:
+            """Return ``log|L|`` and its derivative."""
             with np.errstate(all="ignore"):
                 return np.log(np.abs(jet.value)), (jet.slope / jet.value).real
 
@@ -98,6 +99,7 @@ class OpenLoop(NamedTuple):
         """Return the angles in (0, pi] at which L is real and negative, ascending."""
 
         def phase_sine(jet: Jet) -> tuple[np.ndarray, np.ndarray]:
+            """Return the sine of arg L and its derivative."""
             with np.errstate(all="ignore"):
                 unit = jet.value / np.abs(jet.value)
                 return unit.imag, unit.real * (jet.slope / jet.value).imag
@@ -229,7 +231,7 @@ def select_phase_margin(stable: bool, w: np.ndarray, phases: Array) -> tuple[flo
 
 # Delays at which crossovers are computed
 N_PARTS = 8  # per period
-# Largest error of a start, in parts, if the number of crossovers changes between two delays.
+# Largest error in the delay of a starting value, in parts of a period, if the number of crossovers changes there.
 START_ERROR = 1.5
 # Further delays below an integer, in time constants of the fastest pole: a strongly damped device tolerates less delay
 # within ln 2 time constants below the integer than at it.
@@ -242,10 +244,9 @@ RELATIVE_STEP = 1e-9  # additional step, relative to the delay
 MAX_STEPS = 30
 LOG_TOLERANCE = 1e-9  # largest |log(-L)| at a solution
 
-# Multiples of the margin at which the wall must be stable
-STABLE_MULTIPLES = (0.25, 0.5, 0.75, 1.0 - 1e-5)
-# and at which it must be unstable.
-UNSTABLE_MULTIPLE = 1.0 + 1e-5
+# Additional delays that confirm a delay margin by pole counts, relative to the margin
+STABLE_MULTIPLES = (0.25, 0.5, 0.75, 1.0 - 1e-5)  # the wall must be stable
+UNSTABLE_MULTIPLE = 1.0 + 1e-5  # the wall must be unstable
 
 
 def build_delayed_loops(chain: AnyChain) -> dict[float, tuple[LoopRoots, np.ndarray]]:
@@ -285,6 +286,7 @@ def find_delay_margin(
     limits = [_solve_delay(chain, wall, w, delay) for w, delay in _list_starts(delays, crossovers, phases)]
 
     def evaluate_at_nyquist(delay: float) -> float:
+        """Return L(-1) with a delay."""
         return open_loop_response(change_delay(chain, delay), *wall, circle(np.array([np.pi]))).value[0].real
 
     at_nyquist = np.array([each.L.value[-1].real for each in loops])

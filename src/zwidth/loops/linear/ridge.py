@@ -109,7 +109,8 @@ def find_ridge(stable_set: StableSet, negative_damping: bool) -> BoundRidge | No
     ridge = None if top is None else _identify_conditions(stable_set, top, least)
     lossless = stable_set.boundary.lossless
     if ridge is not None and abs(ridge.beta - lossless) <= ON_LOSSLESS * stable_set.width:
-        # At exactly this damping no wall decays. With the rounding error of the corner some would appear to decay.
+        # No wall is asymptotically stable at exactly this damping. Remove the rounding error of the corner, with which
+        # some walls would appear to be.
         ridge = ridge._replace(beta=lossless)
     highest = stable_set.find_highest(least)
     if highest > (0.0 if ridge is None else ridge.alpha) * (1.0 + CONTRADICTION):

@@ -79,7 +79,7 @@ class LoopRoots:
         return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
 
     def contract_powers(self) -> tuple[LoopRoots, int]:
-        """Find the largest k for which G and F are functions of z^k, and return them as functions of z.
+        """Find the largest k for which G and F are functions of z^k, and return them with z^k replaced by z.
 
         Returns:
             The loop whose poles are the k-th powers of the poles of this one, and k. For most loops k is 1.

@@ -94,7 +94,7 @@ def _list_intervals(boundary: Boundary, beta: np.ndarray) -> tuple[np.ndarray, .
 
 
 def arrange_by_line(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Arrange values by line.
+    """Arrange the values of all lines in an array with one row per line.
 
     Args:
         lines: number of lines.
@@ -172,6 +172,7 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
         return np.zeros((0, 2))
 
     def label(beta: np.ndarray) -> np.ndarray:
+        """Return whether the walls with this alpha are stable."""
         return label_walls(boundary, np.full(beta.size, alpha), beta)
 
     reach = np.ptp(crossed) + np.abs(crossed).max() + 1.0

@@ -104,10 +104,12 @@ def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits:
 
 
 def _as_decimals(polynomial: Polynomial) -> list[Decimal]:
+    """Convert rational coefficients to the precision of the decimal context."""
     return [_as_decimal(value) for value in polynomial]
 
 
 def _as_decimal(value: Fraction) -> Decimal:
+    """Convert a rational number to the precision of the decimal context."""
     return Decimal(value.numerator) / Decimal(value.denominator)
 
 
