@@ -26,7 +26,7 @@ from zwidth.loops.linear.passivity import PassivityCondition, compute_passivity_
 from zwidth.loops.linear.poles import compute_poles_minus_one, is_marginal, log_modulus
 from zwidth.loops.linear.poles import spectral_radius as linear_radius
 from zwidth.loops.linear.ridge import (
-    BoundRidge,
+    RidgeSolution,
     SceneSensitivities,
     compute_sensitivities,
     differentiate_stiffness,
@@ -74,7 +74,7 @@ class LinearLoop:
 
     scene: Any
     # The stiffest walls that were found: a scene is asked for them often.
-    _ridges: dict[bool, BoundRidge | None] = field(default_factory=dict, init=False, repr=False)
+    _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
     # Random devices per interactive question: one maximum stiffness takes some 10 to 50 ms.
     draws: ClassVar[int] = 200
@@ -232,7 +232,7 @@ class LinearLoop:
         alpha, beta, omega = map(np.float64, (found.alpha, found.beta, found.omega))
         return RidgePoint(alpha, beta, omega, np.int32(found.kind), np.int32(status))
 
-    def ridge(self, negative: bool) -> tuple[BoundRidge | None, Status]:
+    def ridge(self, negative: bool) -> tuple[RidgeSolution | None, Status]:
         """Return the stiffest wall of plain numbers with its active constraints, or None, and a status."""
         border = self.border
         if negative not in self._ridges:

@@ -151,10 +151,9 @@ def list_circle_zeros(loop: LoopRoots) -> np.ndarray:
     return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
 
 
-# Bound of alpha between two nodes whose interpolation is unreliable, relative to `CurvePoints.size`.
-COARSE_TOLERANCE = 0.02
-# Bound of rounding errors of alpha, relative to `CurvePoints.size`.
-ROUNDING_TOLERANCE = 1e-6
+# Errors of alpha between two nodes, relative to `CurvePoints.size`
+COARSE_TOLERANCE = 0.02  # added to 1.5 times the difference of the nodes if alpha may not be interpolated
+ROUNDING_TOLERANCE = 1e-6  # bound of the rounding errors
 
 
 class Arc(NamedTuple):

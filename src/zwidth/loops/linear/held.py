@@ -74,7 +74,7 @@ def compute_chain_transition(chain: AnyChain, A: Any, B: Any, time: Any) -> tupl
     return (A - np.eye(len(B)), B) if chain.sampled else compute_transition(A, B, time)
 
 
-class Sampled(NamedTuple):
+class DiscreteChain(NamedTuple):
     """A chain discretized over one period; the first state is the sensed position."""
 
     psi: Any  # e^A - 1
@@ -82,7 +82,7 @@ class Sampled(NamedTuple):
     late: Any | None  # Gamma(1 - f); None for integer delays
 
 
-def discretize_chain(chain: AnyChain) -> Sampled | Plant:
+def discretize_chain(chain: AnyChain) -> DiscreteChain | Plant:
     """Discretize a chain: a rigid one in closed form, all others by the matrix exponential."""
     if not (isinstance(chain, Chain) and chain.rigid):
         return discretize_states(chain)
@@ -90,16 +90,16 @@ def discretize_chain(chain: AnyChain) -> Sampled | Plant:
     return held_plant(chain.bodies[0].damping, None if is_zero(fraction) else fraction)
 
 
-def discretize_states(chain: AnyChain) -> Sampled:
+def discretize_states(chain: AnyChain) -> DiscreteChain:
     """Discretize a chain by the matrix exponential."""
     A, B, _ = chain.realize()
     psi, full = compute_chain_transition(chain, A, B, 1.0)
     fraction = chain.d - chain.whole
     late = None if is_zero(fraction) else compute_chain_transition(chain, A, B, 1.0 - fraction)[1]
-    return Sampled(psi, full, late)
+    return DiscreteChain(psi, full, late)
 
 
-def evaluate_controller(chain: AnyChain, w: Any, discretized: Sampled | Plant) -> Any:
+def evaluate_controller(chain: AnyChain, w: Any, discretized: DiscreteChain | Plant) -> Any:
     """Evaluate ``q = -1/G`` at ``e^(jw)`` for one angle w, differentiably, because no root is computed."""
     points: CirclePoints = circle(w)
     if isinstance(discretized, Plant):
@@ -169,7 +169,7 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     return min(candidates, key=lambda each: each[0])[1]
 
 
-def _expand_numerator(discretized: Sampled, force: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+def _expand_numerator(discretized: DiscreteChain, force: np.ndarray, denominator: np.ndarray) -> np.ndarray:
     """Return the numerator of ``C (zeta - Psi)^-1 force`` in zeta, computed from its Markov parameters."""
     markov, state = [], force
     for _ in range(denominator.size - 1):
@@ -178,7 +178,7 @@ def _expand_numerator(discretized: Sampled, force: np.ndarray, denominator: np.n
     return np.convolve(denominator, markov)[: denominator.size - 1]
 
 
-def _refine_zeros(discretized: Sampled, zeros: np.ndarray, is_refined: np.ndarray) -> np.ndarray:
+def _refine_zeros(discretized: DiscreteChain, zeros: np.ndarray, is_refined: np.ndarray) -> np.ndarray:
     """Refine zeros of G by Aberth's method on ``det [[zeta - Psi, zeta Gamma(1 - f) + Gamma(1)], [C, 0]]``.
 
     No pole of G makes this determinant small, so zeros near poles are resolved (V4).
@@ -231,10 +231,10 @@ def _factor_rigid_loop(chain: Chain) -> LoopRoots:
 
 def realize_device(chain: AnyChain) -> StateSpace:
     """Return G in state space; its last states are the delayed forces."""
-    return delay_force(discretize_states(chain), chain.whole)
+    return add_input_delay(discretize_states(chain), chain.whole)
 
 
-def delay_force(discretized: Sampled, n: int) -> StateSpace:
+def add_input_delay(discretized: DiscreteChain, n: int) -> StateSpace:
     """Return G in state space for a discretized device, or for several along leading axes, with integer delay n."""
     size, is_fractional = discretized.psi.shape[-1], discretized.late is not None
     newer = discretized.late if is_fractional else discretized.full

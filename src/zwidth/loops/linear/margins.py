@@ -207,6 +207,10 @@ def select_gain_margin(stable: bool, w: np.ndarray, gains: np.ndarray) -> tuple[
         stable: True if the closed loop is stable.
         w: phase crossovers, shape (crossovers,).
         gains: |L| at the phase crossovers, shape (crossovers,).
+
+    Returns:
+        The factor of the gain that puts a pole on the unit circle, and the angle of this pole. Without crossovers the
+        margin is inf for a stable loop and 0 for an unstable one, and the angle is NaN.
     """
     if not w.size:
         return np.inf if stable else 0.0, np.nan
@@ -221,6 +225,10 @@ def select_phase_margin(stable: bool, w: np.ndarray, phases: Array) -> tuple[flo
         stable: True if the closed loop is stable.
         w: gain crossovers, shape (crossovers,).
         phases: arg(-L) at the gain crossovers in rad, shape (crossovers,).
+
+    Returns:
+        The margin and the angle of the crossover. Without crossovers the margin is inf for a stable loop and NaN for an
+        unstable one, and the angle is NaN.
     """
     if not w.size:
         return np.inf if stable else np.nan, np.nan

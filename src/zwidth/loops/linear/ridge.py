@@ -60,7 +60,7 @@ class Condition(IntEnum):
     NO_DAMPING = 4  # beta = 0
 
 
-class BoundRidge(NamedTuple):
+class RidgeSolution(NamedTuple):
     """The stiffest stable wall and its two active constraints; ``w2`` equals w1 if the second one has no angle."""
 
     alpha: float
@@ -84,7 +84,7 @@ class BoundRidge(NamedTuple):
         return RidgeKind.SMOOTH if smooth else RidgeKind.CORNER
 
 
-def find_ridge(stable_set: StableSet, negative_damping: bool) -> BoundRidge | None:
+def find_ridge(stable_set: StableSet, negative_damping: bool) -> RidgeSolution | None:
     """Return the stiffest stable wall with alpha > 0.
 
     Args:
@@ -153,13 +153,13 @@ def _is_reached(stable_set: StableSet, top: _Maximum, least: float) -> bool:
     return bool(np.any(bounded & (intervals.high >= REACHED_FRACTION * top.alpha)))
 
 
-def _identify_conditions(stable_set: StableSet, top: _Maximum, least: float) -> BoundRidge:
+def _identify_conditions(stable_set: StableSet, top: _Maximum, least: float) -> RidgeSolution:
     """Return a maximum with its active constraints."""
     alpha, beta, w = top[:3]
     if beta == least:
-        return BoundRidge(alpha, beta, w, w, _classify_angle(w), Condition.NO_DAMPING)
+        return RidgeSolution(alpha, beta, w, w, _classify_angle(w), Condition.NO_DAMPING)
     if top.inner:
-        return BoundRidge(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
+        return RidgeSolution(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
     return _solve_corner(stable_set, alpha, beta)
 
 
@@ -170,7 +170,7 @@ def _classify_angle(w: float) -> Condition:
     return Condition.MINUS_ONE if w == np.pi else Condition.PAIR
 
 
-def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> BoundRidge:
+def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolution:
     """Compute the corner next to a wall, and its two active constraints."""
     # Newton's method on the difference of two crossings of a line of constant B, because near an undamped mode the end
     # of an edge is only as accurate as the last digit of its angle.
@@ -189,13 +189,13 @@ def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> BoundRidg
         and flatness * gap <= CORNER_TOLERANCE
         and other - w > 1e-6
     ):
-        return BoundRidge(alpha, beta, w, other, _classify_angle(w), _classify_angle(other))
+        return RidgeSolution(alpha, beta, w, other, _classify_angle(w), _classify_angle(other))
     # A double pole at z = -1, or at z = 1 for a device that moves against its force: the curve ends there, on the
     # crossing line.
     for w in (np.pi, 0.0):
         limit, damping = stable_set.boundary.limits[w]
         if abs(limit - alpha) <= NEAR_CORNER * abs(alpha):
-            return BoundRidge(limit, damping, w, w, _classify_angle(w), Condition.STATIONARY)
+            return RidgeSolution(limit, damping, w, w, _classify_angle(w), Condition.STATIONARY)
     raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
 
 
@@ -218,7 +218,7 @@ def _find_nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[floa
     return row.w[0, near].tolist(), heights.tolist(), slopes.tolist(), float(step)
 
 
-def _differentiate_conditions(loop: LoopRoots, ridge: BoundRidge) -> tuple[np.ndarray, list[int]]:
+def _differentiate_conditions(loop: LoopRoots, ridge: RidgeSolution) -> tuple[np.ndarray, list[int]]:
     """Return the Jacobian of the active constraints in the free unknowns.
 
     The five possible equations are Re r and Im r at w1, the same at w2, and Im dr/dw at w1; the unknowns are alpha,
@@ -274,7 +274,7 @@ class SceneSensitivities(NamedTuple):
     status: Array
 
 
-def compute_sensitivities(scene: Any, ridge: BoundRidge | None, status: Status) -> SceneSensitivities:
+def compute_sensitivities(scene: Any, ridge: RidgeSolution | None, status: Status) -> SceneSensitivities:
     """Return the derivatives of the maximum stiffness in all parameters; NaN if ``ridge`` is None."""
     paths = list_ridge_parameters(scene)
     if ridge is None:
@@ -292,7 +292,7 @@ def list_ridge_parameters(scene: Any) -> tuple[str, ...]:
     return tuple(path for path in paths if path not in excluded)
 
 
-def differentiate_stiffness(scene: Any, ridge: BoundRidge, path: str) -> float:
+def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> float:
     """Return the derivative of K_max in one parameter, with the same active constraints (V21); NaN if inaccurate."""
     matrix, equations = _differentiate_conditions(scene.loop.roots, ridge)
     points = circle(np.array([ridge.w1, ridge.w2]))

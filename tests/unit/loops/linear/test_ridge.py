@@ -13,7 +13,7 @@ from waiting import LONGEST
 import zwidth
 from zwidth import Actuator, Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
 from zwidth.loops.linear.curve import evaluate_curve
-from zwidth.loops.linear.ridge import BoundRidge, Condition, find_ridge, list_ridge_parameters
+from zwidth.loops.linear.ridge import Condition, RidgeSolution, find_ridge, list_ridge_parameters
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import RidgeKind
 
@@ -33,7 +33,7 @@ PAPER = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3))
 WINDOW = PAPER.replace(velocity=WindowedDifference(15))
 
 
-def wanted(scene: Scene, negative: bool) -> BoundRidge:
+def wanted(scene: Scene, negative: bool) -> RidgeSolution:
     found = find_ridge(scene.loop.border, negative)
     assert found is not None
     return found
