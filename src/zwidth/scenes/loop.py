@@ -37,7 +37,7 @@ from zwidth.loops.linear.rows import Island, find_stable_dampings, find_stable_i
 from zwidth.loops.rigid.boundary import boundary, boundary_point, stable_region
 from zwidth.loops.rigid.margins import margins, margins_kernel
 from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.outermost_poles import slowest_pole
+from zwidth.loops.rigid.outermost_poles import find_dominant_pole
 from zwidth.loops.rigid.passivity import passivity_margin
 from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.ridge import alpha_max, slopes_kernel, stiffness_slopes
@@ -294,7 +294,7 @@ class RigidLoop(LinearLoop):
 
     def slowest(self, alpha: float, beta: float) -> SlowestMotion:
         with np.errstate(all="ignore"):
-            slowest = slowest_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
+            slowest = find_dominant_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
         # A row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
         return SlowestMotion(alpha == 0 and bool(self.row(np.array([beta])).size), *slowest)
 
