@@ -88,7 +88,7 @@ class Plant(NamedTuple):
     gap: Array  # N(-1) = a2 - a1 + a0, without cancellation
 
 
-def held_plant(
+def discretize_mass(
     delta: Any, fraction: Any = None, functions: Functions = phi_functions, phi: Any = None, phi_t: Any = None
 ) -> Plant:
     """Discretize a mass with damping and a fractional delay, in any arithmetic.
@@ -154,7 +154,7 @@ def classify_delays(d: Any) -> DelayClasses:
     return DelayClasses(not (long.size and np.all(long)), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
 
 
-class DeviceTerms(NamedTuple):
+class DiscretePlant(NamedTuple):
     """Delay, discretized device and phi-functions of points (delta, d); all NaN if delta or d is out of range."""
 
     delta: Array
@@ -171,10 +171,10 @@ class DeviceTerms(NamedTuple):
     a1: Array
     a0: Array
     gap: Array  # N(-1) = a2 - a1 + a0
-    tilt: Array  # P(-1) has the sign of a stable loop if and only if tilt (alpha + 2 beta) < 1
+    minus_one_coefficient: Array  # r; P(-1) has the sign of a stable loop if and only if r (alpha + 2 beta) < 1
 
 
-def device(delta: Array, d: Array, kind: DelayClasses = ANY) -> DeviceTerms:
+def discretize_plant(delta: Array, d: Array, kind: DelayClasses = ANY) -> DiscretePlant:
     """Discretize the device for arrays of delta and d of one shape, or for scalars.
 
     Args:
@@ -182,19 +182,19 @@ def device(delta: Array, d: Array, kind: DelayClasses = ANY) -> DeviceTerms:
         d: delay in periods.
         kind: classes of the delays; if none is fractional, the simpler formulas for f = 0 are used.
     """
-    delta, d = nan_unless(valid_device(delta, d), delta, d)
+    delta, d = nan_unless(is_valid_device(delta, d), delta, d)
     whole, f = split_delay(d)
     phi = phi_functions(delta)
     phi_t = phi_functions(delta * (1.0 - f)) if kind.fractional else phi
-    plant = held_plant(delta, f if kind.fractional else None, phi=phi, phi_t=phi_t)
+    plant = discretize_mass(delta, f if kind.fractional else None, phi=phi, phi_t=phi_t)
     # (-1)^n P(-1) = 2 (1 + c) - (-1)^n N(-1) (alpha + 2 beta) is positive if the loop is stable.
-    tilt = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
-    return DeviceTerms(
+    minus_one_coefficient = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
+    return DiscretePlant(
         *(delta, whole, f, plant.c, plant.em, phi.phi1, phi.phi2, phi.psi, phi_t.phi1, phi_t.psi),
-        *(plant.a2, plant.a1, plant.a0, plant.gap, tilt),
+        *(plant.a2, plant.a1, plant.a0, plant.gap, minus_one_coefficient),
     )
 
 
-def valid_device(delta: Array, d: Array) -> Array:
+def is_valid_device(delta: Array, d: Array) -> Array:
     """Return whether delta and d are in range, elementwise; False for NaN."""
     return (delta >= 0) & (delta <= LARGEST_DAMPING) & (d >= 0) & (d <= LONGEST_DELAY)

@@ -34,6 +34,6 @@ def companion(monic: Coefficients) -> Matrices:
     return xp.concatenate([-monic[..., None, 1:], shift], axis=-2)
 
 
-def square(x: Any) -> Array:
+def abs2(x: Any) -> Array:
     """Return ``|x|^2``."""
     return x.real * x.real + x.imag * x.imag

@@ -71,7 +71,7 @@ def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) 
 GOLDEN_SECTION = 0.3819660112501051  # (3 - sqrt(5))/2, the position of a trial point in the longer part
 
 
-def narrow_dips(
+def minimize_golden_section(
     cost: Function, left: Array, middle: Array, right: Array, value: Array, steps: int, close: float = 0.0
 ) -> tuple[Array, Array]:
     """Find local minima by golden-section search.
@@ -114,7 +114,9 @@ MAX_GOLDEN_STEPS = 52
 SMALL_SHARE = 1e-9  # argument next to 0, relative to the first sample, that shows if the function rises from 0
 
 
-def find_lowest(cost: Function, low: float, high: float, samples: int, close: float = 0.0) -> tuple[float, float]:
+def find_global_minimum(
+    cost: Function, low: float, high: float, samples: int, close: float = 0.0
+) -> tuple[float, float]:
     """Find the global minimum of a function with kinks and several local minima, in NumPy.
 
     The function is sampled, and the lowest samples are refined by golden-section search. The ends of the range count as
@@ -140,7 +142,7 @@ def find_lowest(cost: Function, low: float, high: float, samples: int, close: fl
     minima = minima[np.argsort(values[minima])][:N_MINIMA]
     candidates = [(float(values[0]), low)]
     if minima.size:
-        middle, value = narrow_dips(
+        middle, value = minimize_golden_section(
             cost, grid[minima - 1], grid[minima], grid[minima + 1], values[minima], MAX_GOLDEN_STEPS, close
         )
         candidates += zip(value.tolist(), middle.tolist(), strict=True)
@@ -229,7 +231,7 @@ MAX_BETWEEN_STEPS = 120
 BETWEEN_WIDTH = 4e-16  # relative width of the final bracket
 
 
-def zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: np.ndarray) -> np.ndarray:
+def find_zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: np.ndarray) -> np.ndarray:
     """Find zeros of a function between nodes, in NumPy.
 
     Args:
@@ -251,7 +253,7 @@ def zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: 
         return false_position(lambda x: function(x) * scale, *ends, MAX_BETWEEN_STEPS, BETWEEN_WIDTH * high)
 
 
-def follow_root(
+def attach_root_derivatives(
     function: Callable[..., Array],
     root: Array,
     usable: Callable[..., Array],
@@ -325,7 +327,7 @@ def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes:
     return xp.sum(function(points) * weights, axis=-1)
 
 
-def polish(residual: Callable[[Array, Any], Array], start: Array, args: Any, usable: Array) -> Array:
+def polish_root(residual: Callable[[Array, Any], Array], start: Array, args: Any, usable: Array) -> Array:
     """Solve real equations from a nearby start by the Newton method of optimistix, differentiably in ``args``.
 
     Args:

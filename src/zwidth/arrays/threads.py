@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 
-def processors() -> int:
+def count_processors() -> int:
     """Return the number of processors that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
@@ -24,7 +24,7 @@ def run_in_threads(function: Callable[[Any], Any], items: Sequence[Any], threads
         items: its arguments.
         threads: number of threads; one per processor if left out.
     """
-    threads = min(threads or processors(), len(items))
+    threads = min(threads or count_processors(), len(items))
     if threads < 2:
         return list(map(function, items))
     with ThreadPoolExecutor(threads) as pool:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.roots import narrow_dips
+from zwidth.arrays.roots import minimize_golden_section
 from zwidth.loops.linear.border import Outline
 from zwidth.loops.linear.margins import select_gain_margin, select_phase_margin
 from zwidth.loops.linear.rows import Island, arrange_by_line
@@ -162,7 +162,7 @@ class MeasuredLoop(LinearLoop):
         low, middle, high, cost = (
             np.array([end]) for end in (low if negative else max(low, 0.0), middle, high, -top[best])
         )
-        found = narrow_dips(lambda beta: -self._find_tops(beta), low, middle, high, cost, _STEPS)
+        found = minimize_golden_section(lambda beta: -self._find_tops(beta), low, middle, high, cost, _STEPS)
         middle, value = float(found[0][0]), -float(found[1][0])
         # Just inside: the end itself is not decided.
         value *= 1.0 - _INSIDE

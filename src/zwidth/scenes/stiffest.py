@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
-from zwidth.arrays.roots import find_lowest
+from zwidth.arrays.roots import find_global_minimum
 from zwidth.loops.linear.margins import OpenLoop
 from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.parts.checks import read_texts
@@ -394,5 +394,5 @@ class SceneOptima(SceneAnswers):
         columns = soft_dampings(self, stiffness, negative_damping)
         if not columns:
             return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
-        _, best = min(find_lowest(cost, *ends, _SAMPLES) for ends in columns)
+        _, best = min(find_global_minimum(cost, *ends, _SAMPLES) for ends in columns)
         return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)

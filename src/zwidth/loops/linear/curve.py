@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from zwidth.arrays.roots import zeros_between
+from zwidth.arrays.roots import find_zeros_between
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.parts.circle import are_on_circle, circle
 
@@ -89,7 +89,7 @@ def find_field_zeros(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: 
         field: its name.
     """
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
-    return zeros_between(lambda angles: getattr(evaluate_curve(loop, angles), field), w, values, k)
+    return find_zeros_between(lambda angles: getattr(evaluate_curve(loop, angles), field), w, values, k)
 
 
 # Crossing lines

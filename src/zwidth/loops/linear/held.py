@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.held_mass import Plant, factor_numerator, held_plant
+from zwidth.arrays.held_mass import Plant, discretize_mass, factor_numerator
 from zwidth.loops.linear.roots import LoopRoots, compute_aberth_step
 from zwidth.loops.linear.sampled_zeros import find_sampled_zeros
 from zwidth.parts.chain import AnyChain, Chain, is_zero
@@ -87,7 +87,7 @@ def discretize_chain(chain: AnyChain) -> DiscreteChain | Plant:
     if not (isinstance(chain, Chain) and chain.rigid):
         return discretize_states(chain)
     fraction = chain.d - chain.whole
-    return held_plant(chain.bodies[0].damping, None if is_zero(fraction) else fraction)
+    return discretize_mass(chain.bodies[0].damping, None if is_zero(fraction) else fraction)
 
 
 def discretize_states(chain: AnyChain) -> DiscreteChain:
@@ -218,7 +218,7 @@ def _log_derivative(matrix: np.ndarray, change: np.ndarray) -> complex:
 def _factor_rigid_loop(chain: Chain) -> LoopRoots:
     """Return the open loop of a rigid device in closed form."""
     delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.whole)
-    plant = held_plant(delta, fraction if fraction else None)
+    plant = discretize_mass(delta, fraction if fraction else None)
     if fraction:
         h, q = factor_numerator(plant)
         zeros = [1.0 + h / plant.a2, 1.0 + q]

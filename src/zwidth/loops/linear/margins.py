@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.roots import zeros_between
+from zwidth.arrays.roots import find_zeros_between
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import place_nodes
 from zwidth.loops.linear.held import find_roots
@@ -126,7 +126,7 @@ class OpenLoop(NamedTuple):
             w = np.sort(np.concatenate([w, minima]))
             value, slope = function(self.evaluate(w))
         k = np.flatnonzero((value[:-1] > 0) != (value[1:] > 0))
-        return zeros_between(lambda angles: function(self.evaluate(angles))[0], w, value, k)
+        return find_zeros_between(lambda angles: function(self.evaluate(angles))[0], w, value, k)
 
     def _find_minima(
         self,
@@ -143,7 +143,7 @@ class OpenLoop(NamedTuple):
         with np.errstate(invalid="ignore"):
             lowest = np.minimum(size[:-1] - descent[:-1] * step, size[1:] - descent[1:] * step)
         k = np.flatnonzero(approaching & (lowest < 0))
-        return zeros_between(lambda angles: function(self.evaluate(angles))[1], w, slope, k)
+        return find_zeros_between(lambda angles: function(self.evaluate(angles))[1], w, slope, k)
 
     def find_least_distance(self) -> tuple[float, float]:
         """Return the minimum of ``|1 + L|`` and its angle."""
@@ -155,7 +155,7 @@ class OpenLoop(NamedTuple):
         distance, rising = np.abs(1.0 + self.L.value), np.nan_to_num(slope(self.L))
         k = np.flatnonzero((rising[:-1] <= 0) & (rising[1:] > 0))
         k = k[np.minimum(distance[k], distance[k + 1]) < 2.0 * np.nanmin(distance)]
-        angles = np.concatenate([self.w, zeros_between(lambda w: slope(self.evaluate(w)), self.w, rising, k)])
+        angles = np.concatenate([self.w, find_zeros_between(lambda w: slope(self.evaluate(w)), self.w, rising, k)])
         distances = np.concatenate([distance, np.abs(1.0 + self.evaluate(angles[self.w.size :]).value)])
         at_one = self.evaluate_at_one()
         if at_one is not None:
@@ -300,7 +300,7 @@ def find_delay_margin(
     at_nyquist = np.array([each.L.value[-1].real for each in loops])
     above = np.abs(at_nyquist) - 1.0
     k = np.flatnonzero((above[1:] > 0) != (above[:-1] > 0))
-    real = zeros_between(lambda each: np.abs([*map(evaluate_at_nyquist, each)]) - 1.0, np.array(delays), above, k)
+    real = find_zeros_between(lambda each: np.abs([*map(evaluate_at_nyquist, each)]) - 1.0, np.array(delays), above, k)
     # If L(-1) = 1, one more period of delay makes it -1.
     limits += (real + np.where(at_nyquist[k] < 0, 0.0, 1.0)).tolist()
     limits = [limit - float(chain.d) for limit in limits if limit > chain.d]

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.counting import count_poles
-from zwidth.arrays.polynomials import companion, square
+from zwidth.arrays.polynomials import abs2, companion
 from zwidth.loops.linear.roots import LoopRoots, affine_polynomial, compute_aberth_step, factor_open_loop
 from zwidth.parts.circle import Jet
 from zwidth.parts.velocity import Estimate
@@ -67,7 +67,7 @@ def _power(zeta: Array, exponent: int) -> Jet:
 def _difference(zeta: Array, window: int) -> Jet:
     """Return ``(z^window - 1)/window`` and its derivative."""
     power, slope = _power(zeta, window)
-    log_z = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + square(zeta), -0.999))
+    log_z = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -0.999))
     exponent = window * (log_z + 1j * np.arctan2(zeta.imag, 1.0 + zeta.real))
     # Near z = 1 the subtraction of 1 would cancel, so use expm1 of window log(z).
     near = np.abs(exponent) < 1.0
@@ -78,7 +78,7 @@ def _difference(zeta: Array, window: int) -> Jet:
 def log_modulus(zeta: Array) -> Array:
     """Return ``log|z|`` with full relative accuracy for poles near z = 1."""
     with np.errstate(divide="ignore"):
-        return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + square(zeta), -1.0))
+        return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -1.0))
 
 
 def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> PolynomialValue:

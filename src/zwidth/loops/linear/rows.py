@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.roots import bisect, zeros_between
+from zwidth.arrays.roots import bisect, find_zeros_between
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import evaluate_curve
 from zwidth.loops.linear.poles import compute_poles_minus_one, log_modulus
@@ -163,7 +163,7 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     w, node_alpha = boundary.alpha_nodes
     above = node_alpha - alpha
     k = np.flatnonzero(np.isfinite(above[1:] + above[:-1]) & ((above[1:] > 0) != (above[:-1] > 0)))
-    on_curve = zeros_between(lambda angles: evaluate_curve(boundary.loop, angles).alpha - alpha, w, above, k)
+    on_curve = find_zeros_between(lambda angles: evaluate_curve(boundary.loop, angles).alpha - alpha, w, above, k)
     lossless = np.isfinite(boundary.lossless)
     on_curve = np.array([boundary.lossless]) if lossless else evaluate_curve(boundary.loop, on_curve).beta
     crossed = np.unique(np.concatenate([on_curve, on_lines]))

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth.arrays.evaluate import broadcast_traced
-from zwidth.arrays.roots import polish
+from zwidth.arrays.roots import polish_root
 from zwidth.loops.linear.held import discretize_chain, evaluate_controller
 from zwidth.loops.linear.ridge import Condition, list_ridge_parameters
 from zwidth.parts.chain import AnyChain, chain_of
@@ -149,7 +149,7 @@ def _solve_conditions(
     }
     begin = start / scales
     args = (jax.tree.map(jnp.asarray, discretize_chain(chain)), traced, start, conditions, scales)
-    end = polish(partial(_residual, chain), begin, args, exists)
+    end = polish_root(partial(_residual, chain), begin, args, exists)
     # Newton's method must not converge to a different solution. A double root is accurate to half of the digits.
     close = jnp.all(jnp.abs(end - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
     return *(end * scales), close
