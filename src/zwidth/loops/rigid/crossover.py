@@ -305,7 +305,7 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tupl
         The crossover w in rad per sample, in (0, pi], differentiable under JAX; and whether it exists. If it does not,
         w is meaningless.
     """
-    # Of u = 1 - cos w and v = 2 - u = 1 + cos w compute the smaller one, to full relative accuracy.
+    # Compute the smaller of u = 1 - cos w and v = 2 - u = 1 + cos w, to full relative accuracy.
     xp = namespace(alpha, plant.delta)
     in_u = expand_gain_difference(alpha, beta, plant)
     # |T|^2 - |B|^2 in powers of v. It is positive at v = 0, that is at z = -1, if the crossover exists.

@@ -35,13 +35,13 @@ NAMES: tuple[str, ...] = ("alpha", "beta", "delta", "d")
 class Degree(NamedTuple):
     """The delay class that determines the length of the polynomial."""
 
-    whole: int  # n, the integer part of the delay
+    n: int  # integer part of the delay
     fractional: bool  # the delay has a fractional part
 
     @property
     def poles(self) -> int:
         """Degree of P: 3 + d for integer d, 4 + n otherwise."""
-        return self.whole + (4 if self.fractional else 3)
+        return self.n + (4 if self.fractional else 3)
 
 
 def find_degree(d: float) -> Degree:

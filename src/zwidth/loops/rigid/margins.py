@@ -30,8 +30,8 @@ from zwidth.words.xp import along, apply_each, epsilon, frozen, horner, namespac
 FALSE_POSITION_STEPS = 240
 # Samples of the fractional part of the delay, for the delay margin.
 N_FRACTIONS = 64
-# The samples next to an integer delay are closer to it than 1/delta by this factor, because within 1/delta periods
-# the force on a strongly damped device changes.
+# The samples next to an integer delay are closer to it than 1/delta by this factor, because the effect of the
+# fractional delay on a strongly damped device changes within 1/delta periods.
 GRADING = 50.0
 # Below this delta the samples are practically evenly spaced.
 LIGHT_DAMPING = 1e-3

@@ -5,8 +5,9 @@ kappa = 4 f (1 - f). At one frequency the wall needs the damping N, the larger r
 
     N^2 - A N - S/4 = 0,    S = kappa (a^2 + (b^2 - a^2) u/2)
 
-A is linear in (a, beta). The maximum over frequency is at w = 0, at w = pi, or at a single peak in between, depending
-on the direction beta/alpha (P1 to P3, for alpha >= 0). N is homogeneous in (alpha, beta). At the peak dN/du = 0, i.e.
+A is a times a stiffness term minus beta times a damping term; both contain cos(k w) and tau = sin(k w)/sin w. The
+maximum over frequency is at w = 0, at w = pi, or at a single peak in between, depending on the direction beta/alpha (P1
+to P3, for alpha >= 0). N is homogeneous in (alpha, beta). At the peak dN/du = 0, i.e.
 
     E = A' + kappa (b^2 - a^2)/(8 N) = 0
 

@@ -219,7 +219,7 @@ def denormalize(
     delta: ArrayLike = 0.0,
     d: ArrayLike = 0.0,
 ) -> Physical:
-    """Turn normalized quantities back into SI ones, for a device of this mass and sampling period.
+    """Convert normalized parameters to SI quantities, for a device of this mass and sampling period.
 
     ``K = alpha m/T^2``, ``B = beta m/T``, ``b = delta m/T``, ``t_d = d T``.
 

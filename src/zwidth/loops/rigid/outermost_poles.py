@@ -242,7 +242,7 @@ def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = Fals
 def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: float) -> np.ndarray:
     """Return the decay rates of dominant poles; NaN if their relative error is not certified to be small."""
     rate, allowed, width = 0.0 - poles.re, MAX_RATE_ERROR * np.abs(poles.re), certification_width(poles.re, accuracy)
-    # The count allows other poles to be larger by the width.
+    # The count does not exclude other poles that are larger by up to the width.
     error = np.minimum(poles.error, poles.pole_error + width)
     # If both stiffness and total damping are 0, both poles near 1 are exactly 1.
     error[(poles.re == 0) & (columns[0] == 0) & (columns[1] == -columns[2])] = 0.0

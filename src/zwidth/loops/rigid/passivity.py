@@ -71,7 +71,7 @@ def fit_needed_damping(d: float) -> tuple[float, ...]:
     beta = lower * alpha + variable * width
     with np.errstate(all="ignore"):
         needed = compute_needed_damping(alpha, beta, np.full(N_TERMS, d))
-    # The denominator is ``variable width + alpha width`` = width.
+    # Divide by the width, because ``beta + (width - lower) alpha`` equals it at these walls.
     terms = cosines @ needed * (2.0 / (N_TERMS * width))
     terms[0] *= 0.5
     # Convert to powers, whose coefficients decrease as well, because Clenshaw's recurrence would lose two digits at the

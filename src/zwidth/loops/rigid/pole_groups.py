@@ -267,7 +267,8 @@ def enclose_poles(
         nodes = power + (EXTRA_NODES - 1)
         error = error + (1.0 + (1.0 + np.log(nodes) / 1.57) ** 2) * inverse**nodes / (1.0 - inverse) ** 2
     error = np.where(is_enclosed & (remainder_share < 0.5), error + alias, np.inf)
-    # Two poles stay in the smallest disk that encloses them; for a single pole there is a tighter bound.
+    # Bound how far log |z| of the poles can be below log |z0|: two poles lie in the smallest disk that encloses them;
+    # the bound for a single pole is tighter.
     if poles == 1:
         reach = 1.0 / ratio + sizes[0] / low
         farthest = np.where((ratio > 1.02) & (reach < 0.98), np.log1p(-reach) * disk / (1.0 - disk), -np.inf)

@@ -44,7 +44,7 @@ STEPS_ON_ALL = 10  # without a certificate again: on four starting points
 
 # A sequence has converged if a pole is within this distance of log z.
 CONVERGED_RADIUS = 1e-6
-# Factor by which a Newton step increases the known distance of a pole at most. The distance before the step is bounded by
+# Largest factor by which a Newton step increases the bound of the distance to a pole. The bound before the step is
 # R = N |P/P'|, where N >= 3 is the degree, and the step has the length R/N.
 RADIUS_AFTER_STEP = 1.4
 # Distance between a pole and the circle of the count, see `certification_width`.

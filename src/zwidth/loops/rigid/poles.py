@@ -133,8 +133,8 @@ def _guess_poles(loop: LoopFactors, degree: Degree) -> RootsFirst:
     # Without virtual damping one pole is exactly 0; a step from there would not leave it.
     constant_term = loop.h * xp.where(no_damping, loop.alpha, loop.beta) * (loop.q if degree.fractional else 1.0)
     r = xp.clip(xp.abs(constant_term) ** (1.0 / xp.maximum(n_others - no_damping, 1)), 0.02, 3.0)
-    # Choose a set that is not symmetric about the real axis. The iteration would preserve such a symmetry, and the number
-    # of real poles could never change.
+    # Choose a set that is not symmetric about the real axis. The iteration would preserve such a symmetry, and the
+    # number of real poles could never change.
     circle = np.exp(1j * (2.0 * np.pi * np.arange(n_others) / n_others + 0.4)).reshape(-1, *[1] * (r.ndim - 1))
     first, rest = xp.where(no_damping, 0.0, r * circle[:1]), r * circle[1:]
     return xp.concatenate([first, rest, 0.0 * r + (0.9 + 0.45j), 0.0 * r + (0.75 - 0.4j)])

@@ -25,7 +25,7 @@ from zwidth.words.xp import namespace, nan_with_nan_slopes
 
 def expand_affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
     """Return the coefficient vectors D, N1, N2 of devices of one degree, along a new last axis of degree.poles + 1."""
-    plant = discretize_mass(delta, d - degree.whole if degree.fractional else None)
+    plant = discretize_mass(delta, d - degree.n if degree.fractional else None)
     xp = namespace(plant.a2)
     zero, one = 0.0 * plant.a2, 0.0 * plant.a2 + 1.0
     head = [one, -(1.0 + plant.c), plant.c]
@@ -51,7 +51,7 @@ def compute_coefficients(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degr
     # Replace arguments that are out of range by valid numbers; the caller sets these results to NaN.
     xp, ok = namespace(alpha, beta, delta, d), valid_wall(alpha, beta, delta, d)
     alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
-    polynomials = expand_affine(delta, xp.where(ok, d, float(degree.whole)), degree)
+    polynomials = expand_affine(delta, xp.where(ok, d, float(degree.n)), degree)
     return polynomials.D + alpha[..., None] * polynomials.N1 + beta[..., None] * polynomials.N2
 
 

@@ -110,7 +110,7 @@ class StepResponse(NamedTuple):
 def _simulate(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> np.ndarray:
     """Return x and v at the start of each period, from rest, and the wall's force before and after its change."""
     # Use plain floats: a period takes one or two microseconds, so the import of a compiler would take longer.
-    n = find_degree(d).whole
+    n = find_degree(d).n
     f = d - n
     # x and v after each part of a period are linear in x, v and the force: three coefficients per part.
     coefficients = []

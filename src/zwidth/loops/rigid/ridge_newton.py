@@ -198,7 +198,7 @@ def _evaluate_bivariate(t: Array, u: Array, rows: tuple[tuple[float, ...], ...])
 def guess_start(
     delta: Array, d: Array, fraction: Array, kind: DelayClasses = ANY, strength: Array | None = None
 ) -> Start:
-    """Return the start for one (delta, d); ``strength`` = 1 means delta -> infinity."""
+    """Return the starting point for one (delta, d), from a fit; ``strength`` = 1 means delta -> infinity."""
     xp = namespace(delta, d)
     delta, d, f = frozen((delta, d, fraction), xp)
     r = delta * (d + 1.0)
@@ -214,7 +214,7 @@ def guess_start(
 
 
 class Ridge(NamedTuple):
-    """The ridge of one plant."""
+    """The point of maximum stiffness of one plant."""
 
     alpha: Array
     beta: Array

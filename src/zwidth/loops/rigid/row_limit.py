@@ -85,7 +85,8 @@ def limit_short_delay(beta: Array, plant: DiscretePlant) -> Array:
     limit = 4.0 * y * horner(y, stiffness_terms) / xp.abs(horner(y, modulus_terms))
     corner_reached = (minus_one_coefficient > 0) & (stiffness_terms[0] + stiffness_terms[1] + stiffness_terms[2] > 0)
     beyond = xp.where(corner_reached, xp.inf, 0.0)
-    # After the lobe the curve returns from infinity with b < 0. A line above the whole lobe has no limit there.
+    # Beyond the lobe the curve returns from infinity, with b < 0 at first. A line above the whole lobe may meet that
+    # part, but it is no stability limit.
     fractional = xp.where(meets_curve & (y <= 1) & (u0 + u1 * y > 0), limit, beyond)
     limit = xp.where(plant.f == 0, integer_limit, fractional)
     line_limit = 1.0 / xp.where(minus_one_coefficient > 0, minus_one_coefficient, 1.0) - 2.0 * beta
@@ -220,8 +221,8 @@ def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
             omega - remaining / (n_plus_1 * size + (terms.E * alpha_terms.dF - alpha_terms.F * terms.dE)), limit
         )
 
-    # Use a loop, which compiles five times faster than unrolled steps. Its slower execution does not matter, because each
-    # device is solved once.
+    # Use a loop, which compiles five times faster than unrolled steps. Its slower execution does not matter, because
+    # each device is solved once.
     start = 0.5 * np.pi / n_plus_1 * (1.0 + 0.7 * start_ratio / (start_ratio + 1.0 / n_plus_1))
     return repeat(END_STEPS, step, start, xp)
 
