@@ -26,14 +26,14 @@ from zwidth.words.types import Array
 
 # Search for the maximum
 N_NODES = 129  # initial angles
-MAX_INTERVALS = 1 << 18
+MAX_INTERVALS = 1 << 18  # intervals that are still undecided in one round
 N_PARTS = 16  # parts into which an interval is divided
-MAX_ROUNDS = 20
-SHARES = np.arange(1, N_PARTS)[:, None] / N_PARTS
+MAX_ROUNDS = 20  # rounds of division
+SHARES = np.arange(1, N_PARTS)[:, None] / N_PARTS  # inner points of a divided interval, relative to its width
 CERTIFIED_ERROR = 1e-13  # relative error of the maximum
 
 
-# Fields of a device for which the condition is unknown: description, reason and remedy.
+# Fields of a device for which the condition is unknown: description, and reason with remedy.
 UNSUPPORTED = {
     "response": (
         "a measured response",
@@ -41,16 +41,15 @@ UNSUPPORTED = {
     ),
     "system": (
         "a linear device",
-        "unless the damping is that of a single body; use is_stable on devices that include the hand",
+        "in general; use is_stable on devices that include the hand",
     ),
     "actuator": (
         "an actuator",
-        "if the force lags behind the command; use is_stable with the hand as operator, or omit the actuator",
+        "because the force lags; use is_stable with the hand as operator, or omit the actuator",
     ),
     "modes": (
         "modes",
-        "if the sensor moves relative to the body that the hand holds; use is_stable with the hand as operator, or "
-        "omit the modes",
+        "because the sensor moves relative to the hand; use is_stable with the hand as operator, or omit the modes",
     ),
 }
 
@@ -67,11 +66,11 @@ def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
     for name, (description, reason) in UNSUPPORTED.items():
         part = parts.get(name)
         if part if isinstance(part, tuple | list) else part is not None:
-            return f"with {description}: no passivity condition of this kind is known {reason}"
+            return f"with {description}: no passivity condition is known {reason}"
     if coupling is not None and coupling.sensor == "tip":
         return (
-            "with the sensor at the tip: there is no passivity condition of this kind, because motor damping does not "
-            "bound the energy; use is_stable with the hand as operator"
+            "with the sensor at the tip: there is no passivity condition, because motor damping does not bound the "
+            "energy; use is_stable with the hand as operator"
         )
     return ""
 
@@ -82,8 +81,8 @@ class PassivityCondition:
 
     quotient: Estimate  # E
     spring: float  # F(1)
-    whole: int  # n
-    fraction: float  # f
+    integer_delay: int  # n
+    fractional_delay: float  # f
 
     @classmethod
     def derive(cls, estimate: Estimate, d: float) -> PassivityCondition:
@@ -116,7 +115,7 @@ class PassivityCondition:
 
     def require_damping(self, alpha: float, beta: float, w: np.ndarray) -> np.ndarray:
         """Return the required damping N at angles in [0, pi], for alpha >= 0 that includes ``beta F(1)``."""
-        n, f = self.whole, self.fraction
+        n, f = self.integer_delay, self.fractional_delay
         s = np.sin(0.5 * w)
         kernel = np.where(s == 0, 2.0 * n + 1.0, np.sin((n + 0.5) * w) / np.where(s == 0, 1.0, s))
         damper = beta * self._evaluate_quotient(w)
@@ -129,7 +128,7 @@ class PassivityCondition:
 
     def bound_curvature(self, alpha: float, beta: float, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Return a bound of ``|M''|`` on each interval of angles [low, high]."""
-        n, f = self.whole, self.fraction
+        n, f = self.integer_delay, self.fractional_delay
         difference = _bound_difference(low, high, 0.0)
         damper = _multiply_bounds(self._bound_quotient(low, high), _bound_power(n, low))
         wall = _multiply_bounds(damper, difference)[2]
