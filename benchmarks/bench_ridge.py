@@ -46,12 +46,12 @@ class Row(NamedTuple):
 
 
 def fast(delta: jax.Array, d: jax.Array) -> jax.Array:
-    """alpha_max of one point by the library's own route."""
+    """Return alpha_max of one point, computed by zwidth."""
     return ridge_kernel(delta, d).alpha
 
 
 def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
-    """The same with optimistix' Newton method on the slope of the closed-form curve; smooth optima only."""
+    """Return alpha_max by optimistix' Newton method for a zero derivative of the closed form; smooth optima only."""
 
     def slope(omega: jax.Array, point: tuple[jax.Array, jax.Array]) -> jax.Array:
         loop = build_frequency_loop(*point)

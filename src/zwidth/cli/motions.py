@@ -1,4 +1,4 @@
-"""Time-domain commands: `zwidth simulate` for one response, `zwidth diagnose` for a wall that oscillates."""
+"""Commands in the time domain: `zwidth simulate` for one motion, `zwidth diagnose` for a wall that oscillates."""
 
 from __future__ import annotations
 

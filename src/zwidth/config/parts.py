@@ -168,11 +168,11 @@ class SafeLimitSection(PartSection, what="a safe limit"):
 
 def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Strict]:
     """A base of what has a section for each of the parts that a scene need not have."""
-    known: dict[str, Any] = {"velocity": ("How the velocity is estimated", VelocityField, no_estimate)}
+    known: dict[str, Any] = {"velocity": ("Velocity estimate", VelocityField, no_estimate)}
     known |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
     known["modes"] = "Resonances that the sensor sees", list[ModeSection], no_part
     keys: Any = {
-        name: (form | None, Field(default=None, description=f"{words}; {absent} where left out.{more}"))
+        name: (form | None, Field(default=None, description=f"{words}. Default: {absent}.{more}"))
         for name, (words, form, absent) in known.items()
     }
     return create_model("Parts", __base__=Strict, **keys)

@@ -203,7 +203,7 @@ def spell_rival(rival: RivalDevice, system: UnitSystem) -> str:
 
 
 def _spell(fit: DeviceFit, name: str) -> str:
-    """A value with so many digits that its interval shows."""
+    """Return a value with as many digits as its confidence interval requires."""
     return spell(name, fit.value_of(name), fit.unit_system, _count_digits(fit, name))
 
 

@@ -18,6 +18,7 @@ from zwidth.pages.words import (
     part_lines,
     scene_notes,
     silent_cautions,
+    spell_alarm,
     spell_radius,
     word_of,
 )
@@ -89,10 +90,8 @@ def check_lines(
     if isinstance(scene.device, Device):
         wall_words += f" (alpha {plain(verdict.alpha)}, beta {plain(verdict.beta)})"
         device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
-    alarms = ["exceeds the safe limit"] if limit_cautions(scene) else []
-    alarms += [diagnosis.word.lower()] if diagnosis is not None and diagnosis.cause != "none" else []
-    alarm = f"; CAUTION: {', '.join(alarms)}" if alarms and word == "STABLE" else ""
-    lines = [line(word, wall_words + alarm), line("device", device_words)]
+    alarm = spell_alarm(diagnosis, "exceeds the safe limit" if limit_cautions(scene) else "")
+    lines = [line(word, wall_words + (alarm if word == "STABLE" else "")), line("device", device_words)]
     lines += part_lines(scene)
     lines += [line("CAUTION", text) for text in silent_cautions(scene, silent)]
     # A measured response has no poles.
@@ -233,10 +232,8 @@ def recommend_lines(
     unsaid = [line("CAUTION", text) for text in silent_cautions(scene, silent)]
     if verdict is None:
         return [line("NO WALL", found.reason), *device, *unsaid]
-    alarms = [diagnosis.word.lower()] if diagnosis is not None and diagnosis.cause != "none" else []
-    alarms += ["small margins"] if find_thin(verdict, scene.timing.period) else []
-    alarms += ["unstable in a hand"] if not all(found.grasps.values()) else []
-    alarm = f"; CAUTION: {', '.join(alarms)}" if alarms else ""
+    thin = "small margins" if find_thin(verdict, scene.timing.period) else ""
+    alarm = spell_alarm(diagnosis, thin, "" if all(found.grasps.values()) else "unstable in a hand")
     margins = [line("margins", found.spell_margins())]
     if verbose:
         margins = [

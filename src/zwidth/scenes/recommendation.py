@@ -179,7 +179,7 @@ class Recommendation:
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        # The range of the printed K, which is rounded; a negative lower end is sensitive to this.
+        # Compute the range for the printed K, because a negative lower end is sensitive to the rounding of K.
         column = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
         lower, upper = tell_apart(
             *nearest_interval(column, self.virtual_damping), self.unit_system["N s/m"], self.read[2]

@@ -81,7 +81,7 @@ class RigidVariants(Variants):
 
     @np.errstate(all="ignore")
     def column_ends(self, stiffness: float, side: str) -> np.ndarray:
-        """The least or the largest B with which each variant bears a K; NaN where none does."""
+        """Return the smallest or the largest stable B of each variant at a K; NaN if no B is stable."""
         alpha = stiffness * self.period / self.rate
         point = self.ask(lambda *at: boundary_point(*at[:2], alpha=at[2], side=side).beta, self.delta, self.d, alpha)
         return point * self.rate
@@ -93,7 +93,7 @@ class RigidVariants(Variants):
 
     @staticmethod
     def ask(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-        """A function of arrays, in pieces for each of which NumPy is quicker than a compiler."""
+        """Evaluate a function of arrays in pieces that are small enough to be faster in NumPy than compiled."""
         whole = np.broadcast_arrays(*arrays)
         pieces = -(-whole[0].size // FEW)
         split = [np.array_split(array.ravel(), pieces if pieces <= _MOST_PIECES else 1) for array in whole]

@@ -30,7 +30,7 @@ SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive onl
 NEAR = 5.0  # tolerance of the best B over the tolerance of K
 LEAST = 1e-9  # smallest stiffness tried, relative to the largest allowed one
 STEP_DOWN = 0.25  # factor by which K is lowered until a wall satisfies the requirements
-HELD_GAIN = 1.1  # factor on K and B with which a wall is still stable in a required grasp, because grasps vary
+HELD_GAIN = 1.1  # factor on K and B with which a wall must be stable in a required grasp, because grasps vary
 HELD = 0.95  # factor on K for the initial guess if a grasp destabilizes the wall
 FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
 WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
@@ -159,7 +159,7 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, held: Sequence[SceneOptima
 
 
 def _is_stable_held(held: SceneOptima, stiffness: float, damping: Any) -> Any:
-    """Return whether walls are stable in a grasp, as they are and with K and B increased by the required reserve."""
+    """Return whether walls are stable in a grasp, both with K and B and with ``HELD_GAIN`` times K and B."""
     return np.all([held.is_stable(gain * stiffness, gain * damping) for gain in (1.0, HELD_GAIN)], axis=0)
 
 
@@ -200,7 +200,7 @@ def find_stiffest(
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
             dampings[log_stiffness] = beta * unit
-        # Keep the sign, with a size that lets false_position continue: it ends at a value next to 0.
+        # Keep the sign and limit the size, because false_position ends at values close to 0.
         return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
 
     top = math.log(most)
@@ -260,7 +260,7 @@ def _choose_free(
     width: float,
     held: Sequence[SceneOptima],
 ) -> WallChoice:
-    """Choose the wall by all requirements, with stability in the scenes ``held`` as the only one on grasps."""
+    """Choose the wall by all requirements, but require stability only in the grasps of ``held``."""
     nan = math.nan
     if top.status != Status.OK:
         return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))

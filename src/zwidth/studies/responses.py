@@ -42,7 +42,7 @@ from zwidth.words.quantities import WALL_RANGE, Range
 
 
 class ResponseStudy(ComputedStudy):
-    """What the studies that compute responses share."""
+    """Base of the studies that compute responses."""
 
     remedy_if_too_large = "shorten the duration, or lower substeps"
     # Time, position, velocity and force.

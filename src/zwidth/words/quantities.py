@@ -162,7 +162,7 @@ _PARAMETERS = (
     ),
     Parameter(
         "velocity.coded_period", "period written into the velocity estimate", "T_c", POSITIVE, "s",
-        note="the loop's where left out", short_name="coded period",
+        note="default: that of the loop", short_name="coded period",
     ),
     Parameter("operator.mass", "mass of the hand", "m_h", NOT_NEGATIVE, "kg", (0.0, 2.0), "> 0 behind a spring"),
     Parameter(
@@ -238,7 +238,7 @@ _OF_MOTIONS = (
     Parameter("coulomb", "dry friction while the device slips", "F_c", NOT_NEGATIVE, "N", short_name="dry friction"),
     Parameter(
         "static", "dry friction that holds the device", "F_s", NOT_NEGATIVE, "N",
-        note="at least coulomb, which it is where left out",
+        note="at least coulomb, the default",
     ),
     Parameter("max_force", "the most that the motor gives", "F_m", POSITIVE, "N", note="without one no limit"),
     Parameter("max_rate", "the fastest that the command changes", "R_m", POSITIVE, "N/s", note="without one no limit"),
