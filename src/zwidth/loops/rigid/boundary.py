@@ -77,7 +77,7 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Wall:
 
 
 def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
-    """Return `boundary`, elementwise."""
+    """Compute the wall with a pole pair at ``e^(+-j omega)``, elementwise; NaN if an argument is out of range."""
     xp = namespace(omega, delta, d)
     ok = is_valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     nan_if_invalid = nan_with_nan_slopes(ok, omega, delta, d)
@@ -180,7 +180,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
             lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta
         )
         point = evaluate_lobe(x, curve)
-        # Return exactly the alpha with which `zwidth.is_stable` compares, but with the derivatives of the lobe.
+        # Return the limit of alpha that `zwidth.is_stable` uses, but let its derivatives be those of the lobe's point.
         alpha = limit.alpha if xp is np else frozen(limit.alpha, xp) + (point.alpha - frozen(point.alpha, xp))
         beta = number
     else:
@@ -323,7 +323,7 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
 
 
 def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
-    """Return `stable_area`, elementwise."""
+    """Compute the area of the stable set, elementwise: the integral of alpha d(b) along the lobe, plus a triangle."""
     xp = namespace(delta, d)
     curve = build_lobe(delta, d, kind)
     end = frozen(curve.end, xp)

@@ -195,8 +195,8 @@ def _decide_rest(
     code, alpha, beta, delta, d = np.broadcast_arrays(code, alpha, beta, delta, d)
     status = wall_status(alpha, beta, delta, d)
     in_range, stable = status == Status.OK, np.zeros(code.shape, bool)
-    # For alpha = 0 and |beta| <= delta no pole other than z = 1 lies on or outside the unit circle, because there
-    # |beta N| <= |beta| phi1 <= 1 - c <= |z - c|.
+    # For alpha = 0 and |beta| <= delta, no pole other than z = 1 lies outside the unit circle, because
+    # |beta N| <= |beta| phi1 <= 1 - c <= |z - c| on the circle.
     edge = (alpha == 0) & ((code == EDGE) | (np.abs(beta) <= delta))
     status[in_range & edge] = Status.ON_BOUNDARY
     # Walls with beta <= -delta are unstable, because P(1) = 0 and P'(1) = phi1 (delta + beta) < 0, or by L16.

@@ -291,7 +291,7 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
         device_larger = device_larger != valid
         certain = certain & (~valid | (0.5 - xp.abs(turns - nearest) > tolerance + 4.0 * eps * shift))
         crossovers.append(w)
-    # The count is uncertain if T is larger than B at z = -r but not according to the crossovers, or vice versa.
+    # The count is uncertain if the number of crossovers contradicts which of |T| and |B| is larger at z = -r.
     certain = certain & (device_larger == device_larger_at_end)
     return PoleCount(loop.n_plus_1 + 2.0 - (stop - start + 2.0 * full_turns), certain, crossovers)
 

@@ -18,18 +18,17 @@ at most one gain crossover, and the phase of the loop at that frequency decides 
 A wall on the *boundary curve* (alpha_w, beta_w) has a pole at e^(jw). The *lobe*, the first part of this curve, bounds
 the stable set, together with the line of walls with a pole at z = -1 if the lobe ends on that line, in the *corner*.
 
+The same source code runs in any *arithmetic*: NumPy and JAX arrays, float64 numbers with an error bound, and balls of
+python-flint. In the last two (`loops.rigid.certified`) a value represents a set of numbers, and a comparison is true
+only if it holds for the whole set. So ``stable`` and ``unstable`` are decided separately, and both may be false.
+
 d >= 1: Compute the crossover as the root of the cubic |B|^2 - |T|^2 in u (a quadratic for integer d). The point
     (alpha_w, beta_w) of the boundary curve at this frequency has the same |W| as the wall. The wall is stable if
     and only if this point lies on the lobe and the wall has the larger arg W. The second condition is equivalent to
     ``beta alpha_w > alpha beta_w`` and to ``beta > beta_w`` (S15a), so arg W itself is not computed.
 
-d < 1: Eliminate the crossover. A line of constant beta meets the stability lobe at the root of a quadratic in y; the
-    wall is stable if and only if alpha is below the boundary there, and below the line of poles at z = -1.
-
-The same source code runs on NumPy and JAX arrays, on float64 numbers with an error bound, and on balls of python-flint
-(both in `loops.rigid.certified`). In the last two a value represents a set of numbers, and a comparison is true only if
-it holds for every number of the set. Therefore ``stable`` and ``unstable`` are decided separately, and both may be
-false.
+d < 1: Eliminate the crossover. A line of constant beta meets the lobe at the root of a quadratic in y; the wall is
+    stable if and only if alpha is below the boundary there, and below the line of poles at z = -1.
 
 References:
     docs/theory/one-crossover.md (Theorems 1 and 2, S15a, S15b), docs/theory/boundary.md (B1: E, H, V),
@@ -196,7 +195,7 @@ def decide_long_delay(
     find_root: RootFinder,
     evaluate_phase: DelayPhaseFunction,
 ) -> Verdict:
-    """Decide stability for d >= 1, alpha > 0 and beta > -delta: compare with the boundary at the gain crossover.
+    """Decide stability for d >= 1, alpha > 0 and beta > -delta, by comparing with the boundary at the gain crossover.
 
     For alpha = 0, where one pole is at z = 1, the verdict applies to the other poles and requires beta > delta (S15b).
 
@@ -220,7 +219,7 @@ def decide_long_delay(
     # Evaluate E and F = H sin w, the real and imaginary part of (z - c) conj M.
     E, F = horner(y, E_terms), sin_half * cos_half * horner(y, H_terms) * 2.0
     cos_full = phase.cosine * cos_half - phase.sine * sin_half  # cos((n + 1) w)
-    # The boundary point, multiplied by V cos(w/2) > 0 (boundary.md, B1, second form):
+    # Compute the boundary point, multiplied by V cos(w/2) > 0 (boundary.md, B1, second form):
     #   alpha_w -> 2 sin(w/2) projection
     #   beta_w  -> sine_F - phase.cosine E
     #   beta_w + delta -> boundary_offset, rearranged so that nothing cancels
@@ -312,7 +311,8 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tupl
         The crossover w in rad per sample, in (0, pi], differentiable under JAX; and whether it exists. If it does not,
         w is meaningless.
     """
-    # Compute the smaller of u = 1 - cos w and v = 2 - u = 1 + cos w, to full relative accuracy.
+    # Solve for the smaller of u = 1 - cos w and v = 1 + cos w, because computing it as 2 minus the other one would lose
+    # its relative accuracy.
     xp = namespace(alpha, plant.delta)
     in_u = expand_gain_difference(alpha, beta, plant)
     # Expand |T|^2 - |B|^2 in powers of v. It is positive at v = 0, i.e. at z = -1, if the crossover exists.

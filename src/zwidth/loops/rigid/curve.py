@@ -79,7 +79,8 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
         root, to_corner = _find_short_end(frozen(short_curve, xp))
         ends.append(root)
     if kind.long:
-        # Remove the derivatives of the last five fields, because solvers only start from them.
+        # Compute the last five fields, the end of the lobe and starting values, without derivatives, because solvers
+        # only start from them.
         frozen_lobe = build_long_lobe(frozen(plant, xp))
         long_lobe = frozen_lobe if xp is np else LongLobe(*expand_long_lobe(plant)[:-5], *frozen_lobe[-5:])
         ends.append(long_lobe.end)

@@ -143,7 +143,7 @@ class Points(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The broadcast shape."""
+        """The shape to which the four arguments broadcast."""
         return np.broadcast_shapes(*(array.shape for array in self))
 
     @property

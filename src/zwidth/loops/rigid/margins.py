@@ -40,13 +40,13 @@ N_FRACTIONS = 64
 GRADING = 50.0
 # Value of delta below which the samples are practically evenly spaced.
 LIGHT_DAMPING = 1e-3
-# Golden-section steps to the lowest point between samples.
+# Golden-section steps to a local minimum between these samples.
 GOLDEN_SECTION_STEPS = 24
 # A stable wall (alpha, beta, delta, d and an arbitrary phase), which replaces unstable ones in the delay margin search.
 STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
 # Margin reported for a stable wall if the computed margin is 0 within rounding error.
 LEAST_MARGIN = float(np.finfo(np.float32).tiny)
-# Phase in rad below which its sign may be wrong because of rounding errors.
+# Phase in rad below which the sign of a computed phase may be wrong because of rounding errors.
 SMALL_PHASE = 0.1
 # Value of delta whose square underflows in float64.
 NEGLIGIBLE_DAMPING = 1e-150

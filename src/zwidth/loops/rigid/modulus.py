@@ -138,7 +138,7 @@ def _find_lowest(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> Ar
     """Return the frequency w at which |1 + L| is smallest."""
 
     def find_frequency_of_gain(level: Array) -> Array:
-        """Return the frequency at which |L| has a value; pi if |L| is larger everywhere."""
+        """Return the frequency at which |L| equals ``level``; pi if |L| is larger at all frequencies."""
         w, exists = find_gain_crossover(alpha / level, beta / level, plant)
         w = xp.where(exists, w, np.pi)
         return store_once(w, w)

@@ -93,7 +93,7 @@ def evaluate_condition(u: Array, a: Array, beta: Array, delay: DelayTerms) -> Pe
     f, k, kappa = delay
     xp = namespace(u, a)
     cos_w, sin_squared = 1.0 - u, u * (2.0 - u)
-    # For n = 0 use that all terms are polynomials in u, up to w = pi, where tau = 1.
+    # For n = 0 use that tau = 1 and all terms are polynomials in u, which can be evaluated up to w = pi.
     undelayed = k == 1
     safe_sin_squared = xp.where(undelayed, 1.0, sin_squared)
     cosine, sine = _compute_cosine_and_sine(xp.minimum(u, 1.0), k, xp)
@@ -130,7 +130,7 @@ def evaluate_condition(u: Array, a: Array, beta: Array, delay: DelayTerms) -> Pe
     )
     gain = beta * (beta + 2.0 * a)
     needed, root = solve_larger_root(A, kappa * (a * a + 0.5 * gain * u), xp)
-    # E is 0 where N is stationary; its derivative there is A''.
+    # Return E as the slope. Where N is stationary, E is 0 and the derivative of E is A''.
     slope = A1 + 0.125 * kappa * gain / xp.where(needed > 0, needed, 1.0)
     return PeakCondition(slope, A2, root, needed)
 

@@ -91,12 +91,12 @@ def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
 
 
 def device_status(delta: Array, d: Array) -> Array:
-    """Return the `Status` of a device and its delay."""
+    """Return the `Status` of each device and its delay: OK, INVALID_INPUT or OUT_OF_RANGE."""
     return quantity_status(delta=delta, d=d)
 
 
 def wall_status(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """Return the `Status` of a wall on a device."""
+    """Return the `Status` of each wall on its device: OK, INVALID_INPUT or OUT_OF_RANGE."""
     return quantity_status(alpha=alpha, beta=beta, delta=delta, d=d)
 
 
@@ -114,7 +114,7 @@ def status_of_results(
     status = np.full(shape, Status.OK, np.uint8)
     for values in results:
         status[np.isnan(values)] = Status.NOT_CONVERGED
-    # Check each argument separately first, because usually all are in range.
+    # First test whether all arguments are in range, which is usual and takes less time than a status per point.
     if not (is_valid_device(*device).all() and all(within(part, WALL_RANGE).all() for part in walls)):
         input_status = wall_status(*walls, *device)
         np.copyto(status, input_status, where=input_status != Status.OK, casting="unsafe")

@@ -83,7 +83,7 @@ def fit_needed_damping(d: float) -> tuple[float, ...]:
 
 
 def _evaluate_fit(alpha: Array, beta: Array, delta: Array, *fit: Any) -> Array:
-    """Evaluate `passivity_margin` at one delay.
+    """Evaluate `passivity_margin` at one delay, from the fitted polynomial of the needed damping.
 
     Args:
         alpha: Normalized stiffness.

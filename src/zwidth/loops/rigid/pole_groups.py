@@ -172,7 +172,7 @@ def _expand_taylor(re: np.ndarray, im: np.ndarray, loop: LoopFactors, fractional
 
 
 def _divide_series(a: np.ndarray, x: Any) -> None:
-    """Divide series by 1 + x u, in place, by 1/(1 + x u) = (1 - x u)(1 + x^2 u^2)(1 + x^4 u^4) ..."""
+    """Divide power series in u by 1 + x u in place, as 1/(1 + x u) = (1 - x u)(1 + x^2 u^2)(1 + x^4 u^4) ..."""
     power, x = 1, -x
     while power < len(a):
         a[power:] += x * a[:-power]

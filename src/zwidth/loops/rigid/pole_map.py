@@ -120,7 +120,7 @@ class _AxisPieces:
 
 
 def pad_to_16(index: np.ndarray) -> np.ndarray:
-    """Pad an index array to a multiple of 16 with its last entry, because NumPy may round a remainder otherwise."""
+    """Pad an index array with its last entry to a multiple of 16, because NumPy may round a remainder differently."""
     return np.concatenate([index, np.repeat(index[-1:], -index.size % 16)])
 
 
@@ -286,7 +286,7 @@ class _CellGrid:
         ]
         counts = [sum(group.n_poles for group in groups)] * len(circles)
         if self.errors.is_coarse:
-            # Other poles may be larger than the groups' by the reserve, on the same side of the unit circle.
+            # Accept other poles larger than those of the groups by the reserve, on the same side of the unit circle.
             low = np.maximum.reduce([group.low for group in groups])
             circles.append(_bound_on_one_side(low, self.errors.reserve)[1])
             counts.append(0 * counts[0])

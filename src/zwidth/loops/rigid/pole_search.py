@@ -123,7 +123,7 @@ def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
 
 
 def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
-    """Approximate the first pair: its angle from the delay, its radius from |T| = |B| with z^(1+n) as its only power.
+    """Approximate the first pair: its angle follows from the delay, its radius r from |T| = |B| with r only in r^(1+n).
 
     All other factors of T and B are evaluated on the unit circle.
     """

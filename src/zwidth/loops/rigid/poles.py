@@ -115,7 +115,7 @@ def _subtract_pairwise(z: RootsFirst) -> list[Pair]:
 
 
 def _take_aberth_step(z: RootsFirst, loop: LoopFactors, degree: Degree) -> RootsFirst:
-    """Take one step of Aberth's iteration."""
+    """Return the approximations of all poles after one step of Aberth's iteration from ``z``."""
     q, *others = _subtract_pairwise(z)
     pair = _split(z)
     q_slope = Pair(0.0 * pair.real + 1.0, 0.0 * pair.imag)
@@ -128,7 +128,7 @@ def _take_aberth_step(z: RootsFirst, loop: LoopFactors, degree: Degree) -> Roots
 
 
 def _guess_poles(loop: LoopFactors, degree: Degree) -> RootsFirst:
-    """Return starting points: two near the device's poles, the others on a circle where both parts of P are similar."""
+    """Return starting points: two near the device's poles, the others where both parts of P have similar magnitudes."""
     xp, n_others, no_damping = namespace(loop.c), degree.poles - 2, loop.beta == 0
     # Without virtual damping one pole is exactly 0; one starting point is 0 and stays there.
     constant_term = loop.h * xp.where(no_damping, loop.alpha, loop.beta) * (loop.q if degree.fractional else 1.0)

@@ -176,7 +176,8 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
     check_choice("method", method, get_args(RidgeMethod))
     arguments = {"delta": delta, "d": d}
     if method == "kkt":
-        # Import on demand, because the solvers take a second to import. Compile, because they iterate long formulas.
+        # Import only if requested, because importing the solvers takes a second. Compile them, because they iterate
+        # long formulas.
         from zwidth.loops.rigid.exact_points import kkt_kernel
 
         return RidgePoint(*evaluate(kkt_kernel, arguments, route="jax"))

@@ -205,7 +205,7 @@ def _evaluate_bivariate(t: Array, u: Array, rows: tuple[tuple[float, ...], ...])
 def guess_start(
     delta: Array, d: Array, fraction: Array, kind: DelayClasses = ANY, strength: Array | None = None
 ) -> Start:
-    """Return the starting point of Newton's method from a fit; ``strength`` = 1 replaces t for delta -> infinity."""
+    """Return the starting point of Newton's method from a fit over delta and d; ``strength`` = 1: delta -> infinity."""
     xp = namespace(delta, d)
     delta, d, f = frozen((delta, d, fraction), xp)
     r = delta * (d + 1.0)

@@ -151,7 +151,7 @@ class LobeTerms:
         self.cosine_drop = 2.0 * (s_half * s_half - s4 * s4)
         y = self.s * self.s
         self.E, self.H, self.V = E0 + y * (E1 + y * E2), H0 + y * H1, V0 + y * (V1 + y * V2)
-        # Derivatives in w, with dy/dw = sin(w/2) cos(w/2).
+        # Differentiate with respect to w, with dy/dw = sin(w/2) cos(w/2).
         dy = self.s * self.c
         self.dE, self.dH, self.dV = dy * (E1 + 2.0 * y * E2), dy * H1, dy * (V1 + 2.0 * y * V2)
         self.excess, self.d_excess = y * (excess1 + y * excess2), dy * (excess1 + 2.0 * y * excess2)
