@@ -77,7 +77,13 @@ def evaluate_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyLo
 
 
 def _evaluate_conditions(condition: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Array]) -> Array:
-    """Return the residuals of the three equations, scaled to order 1, for alpha, beta and omega over ``scales``."""
+    """Return the residuals of the three equations, scaled to order 1.
+
+    Args:
+        condition: The third equation: "row" (beta given), "lower" or "upper" (alpha given), or "ridge".
+        unknowns: alpha, beta and omega, divided by their scales.
+        args: The loop, the given beta or alpha, and the scales.
+    """
     loop, number, scales = args
     alpha, beta, omega = unknowns * scales
 
@@ -100,7 +106,15 @@ def _evaluate_conditions(condition: str, unknowns: Array, args: tuple[FrequencyL
 def _solve_conditions(
     condition: str, start: Array, bracketed: Array, number: Array, loop: FrequencyLoop
 ) -> tuple[Array, Wall]:
-    """Return the solution of the three equations near a starting frequency: omega and the wall, with derivatives."""
+    """Return the solution of the three equations near a starting frequency: omega and the wall, with derivatives.
+
+    Args:
+        condition: The third equation, see `_evaluate_conditions`.
+        start: Starting frequency, from a bisection.
+        bracketed: Whether the bisection has found a change of sign.
+        number: The given beta or alpha.
+        loop: Plant and integer delay.
+    """
     wall = jax.lax.stop_gradient(store_once(find_boundary_wall(start, loop), start))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
@@ -148,7 +162,15 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
 
 @partial(jnp.vectorize, excluded=(3, 4))
 def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: Callable[..., Any]) -> tuple[Array, ...]:
-    """Return the fields of `zwidth.boundary_point` for one point; ``find_ridge`` computes `alpha_max`."""
+    """Return the fields of `zwidth.boundary_point` for one point.
+
+    Args:
+        delta: Normalized physical damping.
+        d: Delay in periods.
+        number: The given beta if ``line`` is "row"; the given alpha if it is "lower" or "upper".
+        line: "row" for the largest stable alpha; "lower" or "upper" for the smallest or the largest stable beta.
+        find_ridge: Function of delta and d that computes `zwidth.alpha_max`.
+    """
     inputs, is_row = (delta, d, number), line == "row"
     input_status = wall_status(*((0.0 * number, number) if is_row else (number, 0.0 * number)), delta, d)
     ok = input_status == Status.OK

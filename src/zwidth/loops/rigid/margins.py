@@ -145,7 +145,15 @@ def margins_kernel(
 
 
 def _place_by_verdict(margin: Array, edge: float, least: float, stable: Array, xp: Any) -> Array:
-    """Move a margin to the side of ``edge`` that agrees with the verdict, because rounding errors may contradict it."""
+    """Move a margin to the side of ``edge`` that agrees with the verdict, because rounding errors may contradict it.
+
+    Args:
+        margin: Computed margin.
+        edge: Margin of a wall on the stability boundary: 1 for the gain margin, otherwise 0.
+        least: Least difference between the margin of a stable wall and the edge.
+        stable: The verdict.
+        xp: Array namespace.
+    """
     nearest = xp.where(stable, edge + least, edge)
     # Add a difference that is 0, because it keeps the derivatives of the margin.
     return xp.where((margin < nearest) == stable, nearest + (margin - frozen(margin, xp)), margin)

@@ -120,7 +120,19 @@ class StepResponse(NamedTuple):
 
 
 def _simulate(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> np.ndarray:
-    """Return x and v at the start of each period, from rest, and the wall's force before and after its change."""
+    """Return x and v at the start of each period, from rest, and the wall's force before and after its change.
+
+    Args:
+        alpha: Normalized stiffness.
+        beta: Normalized virtual damping.
+        delta: Normalized physical damping.
+        d: Delay in periods.
+        applied: Constant external force.
+        periods: Number of periods.
+
+    Returns:
+        Array (4, periods).
+    """
     # Use plain floats, because a period takes one or two microseconds and importing a compiler would take longer.
     n = find_degree(d).n
     f = d - n
