@@ -12,8 +12,16 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.fields import LocatedProblem, Strict, listing, printable, problem, problems_of, validation_error
-from zwidth.config.values import quantity_of, read_entries, share
+from zwidth.config.fields import (
+    LocatedProblem,
+    Strict,
+    combine_problems,
+    escape_unprintable,
+    list_problems,
+    problem,
+    quote_names,
+)
+from zwidth.config.values import quantity_of, read_entries, share_schema
 from zwidth.words.contexts import set_temporarily
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, resembling, suggestion
@@ -57,7 +65,7 @@ class DeviceTable:
     def values(self, name: str) -> np.ndarray:
         return np.array(self.columns[name], dtype=np.float64)
 
-    def spelling(self) -> dict[str, Any]:
+    def serialize(self) -> dict[str, Any]:
         """The table as a configuration file writes it, whether it came from a CSV file or not."""
         lists: dict[str, Any] = {LABEL: list(self.labels)} if self.labels else {}
         lists |= {name: list(values) for name, values in self.columns.items()}
@@ -89,10 +97,10 @@ def _read_lists(raw: dict[str, Any]) -> DeviceTable:
             try:
                 columns[key] = read_entries(cells, entry, distinct=False) if cells or key != LABEL else ()
             except (PydanticCustomError, ValidationError) as error:
-                found += problems_of(error, key)
+                found += list_problems(error, key)
             in_periods |= "periods" in units
     if found:
-        raise validation_error("devices", found)
+        raise combine_problems("devices", found)
     labels = columns.pop(LABEL, ())
     if not columns:
         raise problem("got no parameter", f"devices are {_FORMS}", f"add a column such as {'mass'!r}")
@@ -123,7 +131,7 @@ def _read_csv(raw: dict[str, Any]) -> DeviceTable:
         rows = _read_rows(name)
         return _parse_rows(rows, _choose_columns(rows[0][1], name), name)
     except PydanticCustomError as error:
-        raise validation_error("devices", [(("csv",), error)]) from None
+        raise combine_problems("devices", [(("csv",), error)]) from None
 
 
 def _read_rows(name: str) -> list[tuple[int, list[str]]]:
@@ -143,9 +151,11 @@ def _read_rows(name: str) -> list[tuple[int, list[str]]]:
     except InputError as error:
         what, *allowed, remedy = str(error).split("; ", 2)
         allowed = allowed[0] if allowed else "names are relative to this file"
-        raise problem(printable(what), allowed, remedy) from None
+        raise problem(escape_unprintable(what), allowed, remedy) from None
     if len(rows) < 2:
-        raise problem(f"{printable(name)} has {len(rows)} rows", "a header and one row at least", "fill the file")
+        raise problem(
+            f"{escape_unprintable(name)} has {len(rows)} rows", "a header and one row at least", "fill the file"
+        )
     return rows
 
 
@@ -155,13 +165,15 @@ def _choose_columns(header: list[str], name: str) -> dict[str, tuple[int, str]]:
     for index, title in enumerate(header):
         key, unit = split_title(title)
         if key in chosen:
-            raise problem(f"{printable(name)}: the column {describe(key)} comes twice", "each once", "remove one")
+            raise problem(
+                f"{escape_unprintable(name)}: the column {describe(key)} comes twice", "each once", "remove one"
+            )
         if key in _KNOWN:
             chosen[key] = index, unit
         elif resembling(key, _KNOWN):
             # A misspelled column must not be taken for a remark; other ones, as a source, are the reader's own.
-            what = f"{printable(name)}: got the column {describe(key)}"
-            raise problem(what, f"columns are {listing(_KNOWN)}, and others", suggestion(key, _KNOWN, "rename it"))
+            what = f"{escape_unprintable(name)}: got the column {describe(key)}"
+            raise problem(what, f"columns are {quote_names(_KNOWN)}, and others", suggestion(key, _KNOWN, "rename it"))
     return chosen
 
 
@@ -172,14 +184,14 @@ def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, 
         for line, row in rows[1:]:
             if index >= len(row) or not row[index]:
                 allowed = "every device has a value for every parameter"
-                raise problem(f"{printable(name)}, line {line}: {key} is missing", allowed, "fill the cell")
+                raise problem(f"{escape_unprintable(name)}, line {line}: {key} is missing", allowed, "fill the cell")
             lists[key].append(from_cell(row[index]) if key == LABEL else _to_value(row[index], unit))
     try:
         return _read_lists(lists)
     except ValidationError as error:
-        ((key, row), what), *_ = problems_of(error)
+        ((key, row), what), *_ = list_problems(error)
         context = what.context or {}
-        place = f"{printable(name)}, line {rows[1 + int(row)][0]}: {key}"
+        place = f"{escape_unprintable(name)}, line {rows[1 + int(row)][0]}: {key}"
         raise problem(f"{place}: {context['what']}", context["allowed"], context["remedy"]) from None
 
 
@@ -189,7 +201,7 @@ def _to_value(cell: str, unit: str) -> float | str:
 
 
 def _make_schema() -> dict[str, Any]:
-    column = share("column", {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}})
+    column = share_schema("column", {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}})
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
     lists = {LABEL: labels, **dict.fromkeys(PARAMETERS, column)}
     keys = {"csv": {"type": "string"}}
@@ -198,5 +210,5 @@ def _make_schema() -> dict[str, Any]:
     return {"description": f"Devices: {_FORMS}.", "anyOf": forms}
 
 
-_SPELLED = PlainSerializer(DeviceTable.spelling, return_type=dict[str, Any])
+_SPELLED = PlainSerializer(DeviceTable.serialize, return_type=dict[str, Any])
 TableField = Annotated[DeviceTable, PlainValidator(read_table), _SPELLED, WithJsonSchema(_make_schema())]

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.config.device_table import find_file
-from zwidth.config.fields import LocatedProblem, Strict, listing, problem, validation_error
+from zwidth.config.fields import LocatedProblem, Strict, combine_problems, problem, quote_names
 from zwidth.config.parts import PART_NAMES, PartSection, split_refusal
 from zwidth.config.values import Delay, Quantity, get_system, quantity_of
 from zwidth.parts.checks import Span
@@ -80,7 +80,7 @@ class SystemSection(PartSection, what="a linear system"):
     """The period of a system from sample to sample, that of the loop; a continuous one has none."""
 
     @cached_property
-    def known(self) -> LinearDevice:
+    def instance(self) -> LinearDevice:
         form = next(form for form in _OF_SYSTEM if getattr(self, form[-1]) is not None)
         names = {"numerator": "num", "denominator": "den"}
         known: dict[str, Any] = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
@@ -92,7 +92,7 @@ class SystemSection(PartSection, what="a linear system"):
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         # A misspelled key is reported, and its form is as good as there.
         if raw.keys() <= cls.model_fields.keys() and not _is_whole(raw):
-            given, forms = listing(raw.keys() - {"sampled"}) or "nothing", " or ".join(map(listing, _OF_SYSTEM))
+            given, forms = quote_names(raw.keys() - {"sampled"}) or "nothing", " or ".join(map(quote_names, _OF_SYSTEM))
             yield (), problem(f"got {given}", f"a linear system has {forms}", "write one of these")
 
     def limits(self) -> Iterable[LocatedProblem]:
@@ -132,7 +132,7 @@ class ResponseSection(PartSection, what="a response"):
         return cls(**{name: column.tolist() for name, column in columns.items()}, rotary=known.rotary)
 
     @cached_property
-    def known(self) -> MeasuredDevice:
+    def instance(self) -> MeasuredDevice:
         real, imag = (_to_array(part) for part in (self.real, self.imag))
         if real.shape != imag.shape:
             raise InputError(f"imag: got {imag.size} numbers beside {real.size} of real; give one a frequency")
@@ -153,7 +153,7 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
         raise split_refusal(str(error).removeprefix("device: ")) from None
     if not isinstance(raw, dict):
         names = tuple(device.name for device in DEVICES)
-        allowed = f"published are {listing(names)}"
+        allowed = f"published are {quote_names(names)}"
         raise problem(f"got {describe(raw)}", allowed, suggestion(raw, names, f"zwidth devices lists them; or {FORMS}"))
     return (ResponseSection if "frequency" in raw else SystemSection).model_validate(raw)
 
@@ -255,7 +255,7 @@ class SampledMass(OneKind):
         if known.rotary != get_system().rotary:
             allowed = "this device is linear, and others of the file are rotary"
             what = problem(f"got {describe(name)}", allowed, "write two files")
-            raise validation_error(cls.__name__, [(("device",), what)])
+            raise combine_problems(cls.__name__, [(("device",), what)])
         found = {key: number.value for key in ("mass", "damping") if (number := getattr(known, key)) is not None}
         return super().prepare({**found, **{key: value for key, value in raw.items() if key != "device"}})
 

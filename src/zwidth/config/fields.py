@@ -49,7 +49,7 @@ class Fault:
     remedy: str = ""
 
     def __str__(self) -> str:
-        place = printable(self.file)
+        place = escape_unprintable(self.file)
         if self.line is not None:
             place += f":{self.line}:{self.column}"
         text = "; ".join(part for part in (self.problem, self.allowed, self.remedy) if part)
@@ -88,7 +88,7 @@ _PLAIN = {
 _DELAY_MODELS = ("delay_model", "delay_models")  # keys of earlier releases
 
 
-def problems_of(error: ValidationError | PydanticCustomError, *above: str) -> list[LocatedProblem]:
+def list_problems(error: ValidationError | PydanticCustomError, *above: str) -> list[LocatedProblem]:
     """Return all problems of an error with the paths to their fields; ``above`` precedes each path."""
     if not isinstance(error, ValidationError):
         return [(above, error)]
@@ -99,7 +99,7 @@ def problems_of(error: ValidationError | PydanticCustomError, *above: str) -> li
             what = problem(**detail.get("ctx", {}))
         elif kind == "literal_error":
             names = re.findall("'(.*?)'", detail.get("ctx", {})["expected"])
-            allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
+            allowed = f"allowed {'is' if len(names) == 1 else 'are'} {quote_names(names)}"
             what = problem(got, allowed, suggestion(detail["input"], names, "write one of these"))
         else:
             what = problem(got, *_PLAIN.get(kind, (detail["msg"],)))
@@ -107,23 +107,23 @@ def problems_of(error: ValidationError | PydanticCustomError, *above: str) -> li
     return found
 
 
-def validation_error(title: str, problems: Iterable[LocatedProblem]) -> ValidationError:
+def combine_problems(title: str, problems: Iterable[LocatedProblem]) -> ValidationError:
     """Put located problems into one pydantic error; raised in a validator, it keeps all of them apart."""
     details = [InitErrorDetails(type=what, loc=path, input=None) for path, what in problems]
     return ValidationError.from_exception_data(title, details)
 
 
-def listing(names: Iterable[str]) -> str:
+def quote_names(names: Iterable[str]) -> str:
     """Names for a message: ``'a', 'b', 'c'``."""
     return ", ".join(repr(name) for name in names)
 
 
-def printable(text: str) -> str:
+def escape_unprintable(text: str) -> str:
     """The text itself where it fits on one line of a terminal, else an escaped form of it."""
     return text if text.isprintable() else ascii(text)
 
 
-def dotted(path: FieldPath) -> str:
+def format_path(path: FieldPath) -> str:
     """``("studies", 0, "delta")`` as ``studies[0].delta``."""
     text = ""
     for part in path:
@@ -131,11 +131,11 @@ def dotted(path: FieldPath) -> str:
             text += f"[{part}]"
         else:
             short = part if len(part) <= LONGEST_VALUE else f"{part[:LONGEST_VALUE]}..."
-            text += ("." if text else "") + printable(short)
+            text += ("." if text else "") + escape_unprintable(short)
     return text
 
 
-def locate(
+def locate_faults(
     file: str,
     problems: Iterable[LocatedProblem],
     values: Mapping[FieldPath, tuple[int, int]],
@@ -149,7 +149,7 @@ def locate(
         what, allowed, remedy, on_key = (found.context or {}).values()
         above = [keys.get(path) if on_key else None, *(values.get(path[:end]) for end in range(len(path), -1, -1))]
         place = next(filter(None, above), (None, None))
-        faults.append(Fault(file, *place, dotted(path), what, allowed, remedy))
+        faults.append(Fault(file, *place, format_path(path), what, allowed, remedy))
     return faults
 
 
@@ -192,7 +192,7 @@ class Strict(BaseModel):
         key, colon, value = name.partition(":")
         if colon and key in cls.model_fields:
             return "unknown key", "a space follows the colon after a key", f"write '{key}: {value}'"
-        allowed = f"{cls.what} has the keys {listing(cls.model_fields)}"
+        allowed = f"{cls.what} has the keys {quote_names(cls.model_fields)}"
         return "unknown key", allowed, suggestion(name, cls.model_fields, "remove it")
 
     def limits(self) -> Iterable[LocatedProblem]:
@@ -217,7 +217,7 @@ class Strict(BaseModel):
         if isinstance(raw, cls):
             return raw
         if not isinstance(raw, dict):
-            allowed = f"{cls.what} is a mapping with the keys {listing(cls.model_fields)}"
+            allowed = f"{cls.what} is a mapping with the keys {quote_names(cls.model_fields)}"
             raise problem(f"got {describe(raw)}", allowed, "write 'key: value' lines, or {key: value}")
         raw = cls.prepare(raw)
         found = list(cls._unusable(raw))
@@ -231,7 +231,7 @@ class Strict(BaseModel):
             found.extend(model.limits())
             if not found:
                 return model
-        raise validation_error(cls.__name__, found)
+        raise combine_problems(cls.__name__, found)
 
     @classmethod
     def _unusable(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
@@ -248,7 +248,7 @@ class Strict(BaseModel):
         # Faults of their own: a key without a value, and one that is misspelled.
         explained = skipped | {resembling(key, cls.model_fields) for key in skipped}
         details = error.errors(include_url=False, include_input=False, include_context=False)
-        for detail, (path, what) in zip(details, problems_of(error), strict=True):
+        for detail, (path, what) in zip(details, list_problems(error), strict=True):
             absent = detail["type"] == "missing" or (len(path) == 1 and (what.context or {})["what"] == "missing")
             if absent and path[0] in explained:
                 continue
@@ -280,7 +280,7 @@ def _name(value: Any) -> str:
     return value
 
 
-def members(what: str) -> Callable[[Any, Callable[[Any], Any]], Any]:
+def require_entries(what: str) -> Callable[[Any, Callable[[Any], Any]], Any]:
     """A wrapping validator for a list that is not empty and names nothing twice."""
 
     def validate(raw: Any, handler: Callable[[Any], Any]) -> Any:
@@ -291,13 +291,13 @@ def members(what: str) -> Callable[[Any, Callable[[Any], Any]], Any]:
             raise problem(f"got {describe(raw)}", f"it must be a list of {what}", hint)
         if not raw:
             raise problem("got an empty list", f"one of the {what} at least is needed", "fill the list")
-        found = list(repeated(raw, "remove it"))
+        found = list(find_repeated(raw, "remove it"))
         try:
             value = handler(tuple(raw))
         except ValidationError as error:
-            raise validation_error(what, [*found, *problems_of(error)]) from None
+            raise combine_problems(what, [*found, *list_problems(error)]) from None
         if found:
-            raise validation_error(what, found)
+            raise combine_problems(what, found)
         return value
 
     return validate
@@ -307,7 +307,7 @@ def find_kind(
     raw: Any, known: Mapping[str, Kind], what: str, example: str, refused: Mapping[str, tuple[str, str]] | None = None
 ) -> Kind:
     """What a mapping is read as, by its key ``kind``; some names are refused with what is allowed and a remedy."""
-    kinds = f"{what} is a mapping with one of the kinds {listing(known)}"
+    kinds = f"{what} is a mapping with one of the kinds {quote_names(known)}"
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", kinds, f"write {example}")
     if "kind" not in raw:
@@ -315,12 +315,12 @@ def find_kind(
     elif isinstance(kind := raw["kind"], str) and kind in known:
         return known[kind]
     else:
-        parts = f"the kinds are {listing(known)}", suggestion(kind, known, "write one of these")
+        parts = f"the kinds are {quote_names(known)}", suggestion(kind, known, "write one of these")
         found = problem(f"got {describe(kind)}", *(refused or {}).get(str(kind), parts))
-    raise validation_error(what, [(("kind",), found)])
+    raise combine_problems(what, [(("kind",), found)])
 
 
-def repeated(raw: Iterable[Any], remedy: str, allowed: str = "each value once") -> Iterable[LocatedProblem]:
+def find_repeated(raw: Iterable[Any], remedy: str, allowed: str = "each value once") -> Iterable[LocatedProblem]:
     """A problem for every plain value of a list that an earlier entry already holds."""
     seen: dict[Any, int] = {}
     for index, value in enumerate(raw):

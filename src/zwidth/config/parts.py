@@ -57,14 +57,14 @@ class PartSection(Strict):
     part: ClassVar[Any]
 
     @cached_property
-    def known(self) -> Any:
+    def instance(self) -> Any:
         """The part itself."""
         given = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return self.part(**given)
 
     def limits(self) -> Iterable[LocatedProblem]:
         try:
-            self.known  # noqa: B018  (raises where the part refuses)
+            self.instance  # noqa: B018  (raises where the part refuses)
         except InputError as error:
             path, what = locate_refusal(error)
             # A whole part begins the path with its name; a field of the section is its own place.
@@ -188,6 +188,6 @@ def list_parts(owner: Any) -> dict[str, Any]:
 def build_parts(owner: Any) -> dict[str, Any]:
     """The same as parts of a scene."""
     return {
-        name: [each.known for each in section] if isinstance(section, list) else section.known
+        name: [each.instance for each in section] if isinstance(section, list) else section.instance
         for name, section in list_parts(owner).items()
     }

@@ -27,11 +27,11 @@ from zwidth.config.fields import (
     Fault,
     FieldPath,
     LocatedProblem,
-    dotted,
-    locate,
-    printable,
+    escape_unprintable,
+    format_path,
+    list_problems,
+    locate_faults,
     problem,
-    problems_of,
 )
 from zwidth.config.values import read_in_units
 from zwidth.parts.devices import DEVICES
@@ -57,14 +57,14 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
     file = os.fsdecode(path)
     tree = _Tree(file, _read_text(file))
     with files_relative_to(Path(file).parent):
-        return _check(model, tree.data, tree.faults, lambda found: locate(file, found, tree.values, tree.keys))
+        return _check(model, tree.data, tree.faults, lambda found: locate_faults(file, found, tree.values, tree.keys))
 
 
 def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
     """Return the model of a mapping; raise a `ConfigFileError` whose faults have fields but no line numbers."""
     problems: list[LocatedProblem] = []
     simple = _simplify(data, (), problems)
-    return _check(model, simple, locate("", problems, {}, {}), lambda found: locate("", found, {}, {}))
+    return _check(model, simple, locate_faults("", problems, {}, {}), lambda found: locate_faults("", found, {}, {}))
 
 
 def _check(
@@ -76,7 +76,7 @@ def _check(
         with read_in_units(SYSTEMS[has_rotary_devices(data)]):
             found = model.model_validate(data)
     except ValidationError as error:
-        faults = faults + place(problems_of(error))
+        faults = faults + place(list_problems(error))
     if found is None or faults:
         raise ConfigFileError.of(faults)
     return found
@@ -141,7 +141,7 @@ def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
 
 def _fail(file: str, place: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
     line, column = place or (None, None)
-    return ConfigFileError.of([Fault(file, line, column, dotted(path), *parts)])
+    return ConfigFileError.of([Fault(file, line, column, format_path(path), *parts)])
 
 
 def _read_text(file: str) -> str:
@@ -260,7 +260,7 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
         """PyYAML's account of a syntax error, with a remedy."""
         mark = error.problem_mark or error.context_mark
         place = _mark_place(mark) if mark else (1, 1)
-        what, context = printable((error.problem or "unreadable").replace("\n", " ")), error.context or ""
+        what, context = escape_unprintable((error.problem or "unreadable").replace("\n", " ")), error.context or ""
         if what == "but found another document":
             remedy = "remove the '---' or split the file"
             return _fail(self.file, place, "a second document begins here", "one document a file", remedy)
@@ -313,7 +313,7 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
             raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
 
     def _add_fault(self, place: tuple[int, int], path: FieldPath, *parts: str) -> None:
-        self.faults.append(Fault(self.file, *place, dotted(path), *parts))
+        self.faults.append(Fault(self.file, *place, format_path(path), *parts))
 
     def _read(self, node: Any, path: FieldPath, in_alias: bool = False) -> Any:
         """The value of a node; places go to ``values`` and ``keys``, that of an alias before those within."""

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ConfigDict, WrapValidator
 
 from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
-from zwidth.config.fields import LocatedProblem, listing, problem
+from zwidth.config.fields import LocatedProblem, problem, quote_names
 from zwidth.config.parts import (
     SafeLimitSection,
     SimulatedVelocityField,
@@ -93,7 +93,7 @@ class _PhysicalPlant(_Parts, SampledMass):
         # A linear system or measured response is one of the parts, and replaces this device.
         device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
         limit = getattr(self, "safe_limit", None)
-        return replace_parameters(Scene(device, timing, safe_limit=limit and limit.known), build_parts(self))
+        return replace_parameters(Scene(device, timing, safe_limit=limit and limit.instance), build_parts(self))
 
 
 class _NormalizedPlant(OneKind):
@@ -193,7 +193,7 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
         wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
         return replace(super()._scene, wall=wall)
 
-    def bare(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
+    def without_wall(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
         """Return the scene without its wall, by default as a device with a linear velocity estimate."""
         names = "mass", "damping", "period", "delay", "rotary", "safe_limit"
         own = {name: getattr(self, name) for name in names}
@@ -219,7 +219,7 @@ class NormalizedScene(_NormalizedPlant, what="a scene"):
     alpha: Number | None = None
     beta: Number | None = None
 
-    def bare(self) -> NormalizedDevice:
+    def without_wall(self) -> NormalizedDevice:
         """The scene without its wall."""
         return NormalizedDevice(delta=self.delta, d=self.d)
 
@@ -254,7 +254,7 @@ def _as_either(raw: Any, physical: type[Any], normalized: type[Any]) -> Any:
     if isinstance(raw, physical | normalized):
         return raw
     if not isinstance(raw, dict):
-        keys = f"{listing(physical.model_fields)} or, normalized, {listing(normalized.model_fields)}"
+        keys = f"{quote_names(physical.model_fields)} or, normalized, {quote_names(normalized.model_fields)}"
         allowed = f"{physical.what} is a mapping with the keys {keys}"
         raise problem(f"got {describe(raw)}", allowed, "write 'key: value' lines")
     return (normalized if is_normalized(raw) else physical).model_validate(raw)

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, TypeVar, get_args
 from pydantic import GetJsonSchemaHandler, PrivateAttr
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from zwidth.config.fields import LocatedProblem, Name, Strict, listing, problem
+from zwidth.config.fields import LocatedProblem, Name, Strict, problem, quote_names
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
 from zwidth.config.values import Axis, get_system
@@ -37,11 +37,11 @@ def name_parts(parts: Iterable[str]) -> str:
     return " and ".join("a system or response in place of its mass" if name == "device" else name for name in parts)
 
 
-def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticCustomError:
+def make_parts_error(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticCustomError:
     """Return the problem of a device with parts in a study that would ignore them."""
     what = f"got a device with {name_parts(parts)}"
     allowed = f"the kind {kind!r} answers for a rigid mass with the difference of two samples alone"
-    kinds = f"use one of the kinds {listing(name for name in sorted(KINDS) if KINDS[name].takes_parts)}"
+    kinds = f"use one of the kinds {quote_names(name for name in sorted(KINDS) if KINDS[name].takes_parts)}"
     return problem(what, allowed, f"{kinds}, or {remedy}" if remedy else kinds)
 
 
@@ -96,9 +96,9 @@ class Study(Strict):
             supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
             supplied |= scene.hardware
             if "device" in absent:
-                supplied["device"] = scene.bare(SimulatedDevice if cls.simulates else PhysicalDevice)
+                supplied["device"] = scene.without_wall(SimulatedDevice if cls.simulates else PhysicalDevice)
         if "devices" in absent:
-            supplied["devices"] = [scene.bare()]
+            supplied["devices"] = [scene.without_wall()]
         return {**{name: supplied[name] for name in absent if supplied.get(name) is not None}, **raw}
 
     @classmethod
@@ -112,7 +112,7 @@ class Study(Strict):
         """Raise a problem if the study would take parameters of the scene and ignore its parts."""
         taken = cls._list_absent(raw)
         if taken and not cls.takes_parts and scene.parts_beyond:
-            raise refuse_parts(cls.kind_name(), list_parts(scene), f"give {' and '.join(taken)} here")
+            raise make_parts_error(cls.kind_name(), list_parts(scene), f"give {' and '.join(taken)} here")
 
     @classmethod
     def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:

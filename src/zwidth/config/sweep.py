@@ -19,7 +19,7 @@ from zwidth.config.devices import (
     find_second_period,
     read_rotary,
 )
-from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, listing, members, problem
+from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, problem, quote_names, require_entries
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import Study, register
@@ -81,7 +81,7 @@ class Axes(_Axes):
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        return _mixed([key for key in raw if key in PARAMETERS], "axes")
+        return _find_mixed_kinds([key for key in raw if key in PARAMETERS], "axes")
 
     def limits(self) -> Iterable[LocatedProblem]:
         """A parameter that is both an axis and a column, and kinds that only the table's columns show."""
@@ -92,7 +92,9 @@ class Axes(_Axes):
                 twice = "given twice, as an axis and as a column of devices"
                 yield (name,), problem(twice, "each parameter once", "remove one")
         if columns and not any(name in columns for name in own):
-            yield from ((("devices",), what) for _, what in _mixed([*own, *columns], "axes and devices together"))
+            yield from (
+                (("devices",), what) for _, what in _find_mixed_kinds([*own, *columns], "axes and devices together")
+            )
 
     @property
     def given(self) -> tuple[str, ...]:
@@ -100,7 +102,7 @@ class Axes(_Axes):
         return tuple(name for name in PARAMETERS if name in columns or getattr(self, name) is not None)
 
     @property
-    def given_of_parts(self) -> tuple[str, ...]:
+    def part_parameters(self) -> tuple[str, ...]:
         """Those of them that belong to a velocity filter, a hand or another part."""
         return tuple(name for name in self.given if name in OF_PARTS)
 
@@ -123,31 +125,31 @@ class Axes(_Axes):
                 sizes[name] = axis.size
         return sizes
 
-    def ends(self, name: str) -> tuple[float, float]:
-        source = self.devices.columns[name] if self.place(name) == "devices" else getattr(self, name).entries
+    def find_range(self, name: str) -> tuple[float, float]:
+        source = self.devices.columns[name] if self.find_key(name) == "devices" else getattr(self, name).entries
         return min(source), max(source)
 
-    def place(self, name: str) -> str:
+    def find_key(self, name: str) -> str:
         return "devices" if getattr(self, name) is None else name
 
     @property
     def most_periods(self) -> float:
         """The longest delay in the shortest periods."""
         if "d" in self.given:
-            return self.ends("d")[1]
+            return self.find_range("d")[1]
         if "delay" not in self.given:
             return 0.0
-        longest = self.ends("delay")[1]
+        longest = self.find_range("delay")[1]
         if self.delay_in_periods:
             return longest
-        return longest * (self.ends("rate")[1] if "rate" in self.given else 1.0 / self.ends("period")[0])
+        return longest * (self.find_range("rate")[1] if "rate" in self.given else 1.0 / self.find_range("period")[0])
 
 
 _PAIRS = (("alpha", "stiffness"), ("beta", "virtual_damping"), ("delta", "damping"), ("d", "delay"))
 _COUNTERPARTS = dict(_PAIRS) | {physical: normalized for normalized, physical in _PAIRS}
 
 
-def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
+def _find_mixed_kinds(keys: list[str], where: str) -> Iterable[LocatedProblem]:
     if not keys:
         return
     physical = keys[0] in PHYSICAL
@@ -192,7 +194,7 @@ class SweepStudy(_Parts, Study):
         """The unit system of the study's devices, also for a study that is read from a store."""
         return SYSTEMS[bool(self.rotary)]
 
-    outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
+    outputs: Annotated[tuple[OutputName, ...], WrapValidator(require_entries("outputs"))] = ("stable",)
     """What is computed."""
 
     # Closer in, the rounding of the two counts that prove a radius would meet.
@@ -238,7 +240,7 @@ class SweepStudy(_Parts, Study):
     @property
     def with_parts(self) -> bool:
         """Whether its devices have parts, so that every one of them is a scene of its own."""
-        return bool(list_parts(self) or self.axes.given_of_parts)
+        return bool(list_parts(self) or self.axes.part_parameters)
 
     def limits(self) -> Iterable[LocatedProblem]:
         """Parameters that are missing or move nothing, delays that are too long, and too many points."""
@@ -249,18 +251,18 @@ class SweepStudy(_Parts, Study):
             if name not in given and self.device is None:
                 kinds = "a sweep has mass and period or rate, or, normalized, delta and d"
                 yield ("axes",), problem(f"{name} missing", kinds, f"add '{name}: {example}', or a scene")
-        yield from self._outputs_limits(given, physical)
+        yield from self._check_outputs(given, physical)
         if "delay" in given and {"period", "rate"} & set(given) and not self.axes.most_periods <= MAX_DELAY_PERIODS:
             what = f"the longest delay is {self.axes.most_periods:.6g} of the shortest periods"
-            place = ("axes", self.axes.place("delay"))
+            place = ("axes", self.axes.find_key("delay"))
             yield place, problem(what, f"at most {MAX_DELAY_PERIODS:g} periods", "check the units")
         if self.with_parts:
-            yield from self._part_limits(given, physical)
+            yield from self._check_parts(given, physical)
         if self.points > MAX_SWEEP_POINTS:
             what = f"{self.extent} is {self.points:.4g} points"
             yield (), problem(what, f"at most {MAX_SWEEP_POINTS:.4g} points a study", self.remedy_if_too_large)
 
-    def _outputs_limits(self, given: tuple[str, ...], physical: bool) -> Iterable[LocatedProblem]:
+    def _check_outputs(self, given: tuple[str, ...], physical: bool) -> Iterable[LocatedProblem]:
         stiffness = "stiffness" if physical else "alpha"
         walls = [name for name in self.outputs if OUTPUTS[name].family == "wall"]
         if walls and stiffness not in given:
@@ -268,15 +270,15 @@ class SweepStudy(_Parts, Study):
             yield ("axes",), problem(what, f"{walls[0]} belongs to a wall", f"add {stiffness!r}, or remove the output")
         if not walls:
             for name in (name for name in given if name in WALL):
-                allowed = f"{listing(self.outputs)} do not depend on the wall"
+                allowed = f"{quote_names(self.outputs)} do not depend on the wall"
                 what = f"got {name!r}, which moves no output"
-                yield ("axes", self.axes.place(name)), problem(what, allowed, "remove it or add 'stable'")
+                yield ("axes", self.axes.find_key(name)), problem(what, allowed, "remove it or add 'stable'")
         for index, name in enumerate(self.outputs):
             if OUTPUTS[name].physical_only and not physical:
                 allowed = "it needs a device in SI units"
                 yield ("outputs", index), problem(f"got {name!r}", allowed, "write alpha_max, or mass and period")
 
-    def _part_limits(self, given: tuple[str, ...], physical: bool) -> Iterable[LocatedProblem]:
+    def _check_parts(self, given: tuple[str, ...], physical: bool) -> Iterable[LocatedProblem]:
         """Outputs that nobody knows for parts, axes of parts that are not there, and values that parts refuse."""
         if not physical:
             for name in list_parts(self):
@@ -287,7 +289,7 @@ class SweepStudy(_Parts, Study):
         obstacle = find_obstacle(**(vars(parts["device"]) if "device" in parts else parts))
         for index, name in enumerate(self.outputs):
             if name not in OUTPUTS_WITH_PARTS:
-                allowed = f"with a velocity filter, a hand or another part there are {listing(OUTPUTS_WITH_PARTS)}"
+                allowed = f"with a velocity filter, a hand or another part there are {quote_names(OUTPUTS_WITH_PARTS)}"
                 yield ("outputs", index), problem(f"got {name!r}", allowed, "choose from these")
             elif name == "passive" and obstacle:
                 allowed = "it is known where a command acts at once, on the body whose position is sensed"
@@ -303,23 +305,25 @@ class SweepStudy(_Parts, Study):
 
     def _find_part_faults(self) -> Iterable[LocatedProblem]:
         """Axes of parts that are not there, and values that the parts refuse."""
-        absent = [name for name in self.axes.given_of_parts if not self._has_parameter(name)]
+        absent = [name for name in self.axes.part_parameters if not self._has_parameter(name)]
         for name in absent:
             part, _, key = name.partition(".")
             what = f"got the axis {name!r}, but no {part} with the key {key!r}"
             remedy = f"add {_EXAMPLES.get(name, _EXAMPLES.get(part, part))!r}"
-            yield ("axes", self.axes.place(name)), problem(what, "an axis changes a part that is there", remedy)
+            yield ("axes", self.axes.find_key(name)), problem(what, "an axis changes a part that is there", remedy)
         # Every parameter at its least value, and those of parts at their ends.
-        least = {name: self.axes.ends(name)[0] for name in self.axes.given if name not in WALL}
+        least = {name: self.axes.find_range(name)[0] for name in self.axes.given if name not in WALL}
         found = {}
-        for changed in () if absent else ({}, *({name: self.axes.ends(name)[1]} for name in self.axes.given_of_parts)):
+        for changed in (
+            () if absent else ({}, *({name: self.axes.find_range(name)[1]} for name in self.axes.part_parameters))
+        ):
             try:
                 self.make_scene({**least, **changed}).check_parts()
             except InputError as error:
                 found[str(error)] = locate_refusal(error)
         for field, what in found.values():
             name = ".".join(map(str, field))
-            yield (("axes", self.axes.place(name)) if name in self.axes.given else ("axes",)), what
+            yield (("axes", self.axes.find_key(name)) if name in self.axes.given else ("axes",)), what
 
     def _has_parameter(self, name: str) -> bool:
         """Whether the part that an axis belongs to is there, and has such a key."""

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of, repeated, validation_error
+from zwidth.config.fields import LocatedProblem, Strict, combine_problems, find_repeated, list_problems, problem
 from zwidth.parts.checks import Span, read_span
 from zwidth.words.contexts import set_temporarily
 from zwidth.words.errors import UnusableValueError
@@ -147,7 +147,7 @@ Delay = Annotated[Span, quantity_of("delay")]
 Duration = Annotated[Span, Quantity("s", POSITIVE, periods=True)]
 
 
-def share(name: str, schema: dict[str, Any]) -> dict[str, Any]:
+def share_schema(name: str, schema: dict[str, Any]) -> dict[str, Any]:
     """A part of the JSON Schema that `zwidth.studies.document.config_json_schema` writes once, under this name."""
     return {"allOf": [{"shared": re.sub(r"\W+", "_", name.replace("/", " per ")), **schema}]}
 
@@ -159,7 +159,7 @@ def describe_entry(unit: str, *more: str) -> dict[str, Any]:
     words = f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}."
     forms = [{"type": "number"}, {"type": "string", "pattern": pattern}]
     name = f"number in {unit}{f' or {more[0]}' if more else ''}"
-    return share(name, {"description": words, "examples": [dimension.example], "anyOf": forms})
+    return share_schema(name, {"description": words, "examples": [dimension.example], "anyOf": forms})
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class Axis:
             return _SPACINGS[self.form](*self.entries, self.size)
         return np.array(self.entries, dtype=np.float64)
 
-    def spelling(self) -> Any:
+    def serialize(self) -> Any:
         """The axis as a configuration file writes it."""
         written = [f"{value!r} periods" if self.in_periods else value for value in self.entries]
         if self.form in _SPACINGS:
@@ -220,7 +220,7 @@ def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bo
     """The entries of a list, each read by ``entry``; all faults are reported with their positions."""
     if not raw:
         raise problem("got an empty list", "an axis has at least one value", "fill the list")
-    found = list(repeated(raw, "remove it")) if distinct else []
+    found = list(find_repeated(raw, "remove it")) if distinct else []
     entries = []
     for index, value in enumerate(raw):
         try:
@@ -229,9 +229,9 @@ def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bo
             found.append(((index,), error))
     if distinct and not found:
         # Two spellings of one value, as 1 ms and 0.001.
-        found = list(repeated(entries, "remove it"))
+        found = list(find_repeated(entries, "remove it"))
     if found:
-        raise validation_error("axis", found)
+        raise combine_problems("axis", found)
     return tuple(entries)
 
 
@@ -261,7 +261,7 @@ class AxisOf:
             if form not in self._forms:
                 remedy = suggestion(form, self._forms, "write one of these forms")
                 unknown = problem("unknown key", f"an axis is {_FORMS}", remedy, on_key=True)
-                raise validation_error("axis", [((form,), unknown)])
+                raise combine_problems("axis", [((form,), unknown)])
         quantity = self._forms.get(form, self.quantity)
         read, units = quantity.read_alike()
 
@@ -273,7 +273,7 @@ class AxisOf:
             try:
                 spaced = _Spaced.model_validate(ends, context=entry)
             except ValidationError as error:
-                raise validation_error("axis", problems_of(error, form)) from None
+                raise combine_problems("axis", list_problems(error, form)) from None
             entries, size = (spaced.start, spaced.stop), spaced.num
         else:
             entries = read_entries(ends, entry) if form == "list" else (entry(ends),)
@@ -286,7 +286,7 @@ class AxisOf:
         return axis
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        spelling = core_schema.plain_serializer_function_ser_schema(lambda axis: axis.spelling())
+        spelling = core_schema.plain_serializer_function_ser_schema(lambda axis: axis.serialize())
         return core_schema.no_info_plain_validator_function(self.read, serialization=spelling)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -301,7 +301,7 @@ class AxisOf:
         listed = {"type": "array", "items": entry, "minItems": 1, "uniqueItems": True}
         kind = f"of numbers {self.quantity.allowed}".strip() if unit == "1" else f"in {unit}"
         name = f"axis {kind}{' or periods' if self.quantity.periods else ''}"
-        return share(name, {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]})
+        return share_schema(name, {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]})
 
 
 def axis_of(name: str) -> AxisOf:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, members, problem, repeated
+from zwidth.config.fields import LocatedProblem, find_repeated, problem, require_entries
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene
 from zwidth.config.study import name_parts, register
@@ -30,9 +30,9 @@ from zwidth.studies.outcome import (
     ComputedStudy,
     CurvesStudy,
     Outcome,
-    add_si_of_scene,
+    add_si_columns,
     csv_text,
-    share_of_device,
+    find_device_share,
     spell_stiffest,
     summarize_stiffest,
 )
@@ -72,7 +72,7 @@ class BoundaryStudy(CurvesStudy):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         if "device" in raw or (scene.parts_beyond and not {"delta", "d"} & set(raw)):
-            return {"device": scene.bare(), **raw}
+            return {"device": scene.without_wall(), **raw}
         return super().fill(raw, scene)
 
     @classmethod
@@ -139,9 +139,9 @@ class BoundaryStudy(CurvesStudy):
             path["alpha"] = path.pop("alpha_max")
             del path["kind"]
             parts.append({"curve": "ridge_path", **path})
-        share = share_of_device(self.delta, self.d, self.device or scene)
+        share = find_device_share(self.delta, self.d, self.device or scene)
         parts += passive_outlines(deltas, delays, share) if self.passivity else ()
-        table = add_si_of_scene(stack(parts), self.delta, self.d, self.device or scene)
+        table = add_si_columns(stack(parts), self.delta, self.d, self.device or scene)
         return Outcome(table=table, figures={"": partial(figures.draw_boundary, table)}, notes=tuple(notes))
 
 
@@ -182,7 +182,7 @@ class CompareStudy(ComputedStudy):
 
     kind: Literal["compare"]
 
-    devices: Annotated[tuple[LabeledDevice, ...], WrapValidator(members("devices"))]
+    devices: Annotated[tuple[LabeledDevice, ...], WrapValidator(require_entries("devices"))]
     """Devices in SI units, each with a label; what one of them leaves out is the scene's."""
 
     @classmethod
@@ -194,7 +194,7 @@ class CompareStudy(ComputedStudy):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        for place, what in repeated([device.label for device in self.devices], "rename one"):
+        for place, what in find_repeated([device.label for device in self.devices], "rename one"):
             yield ("devices", *place, "label"), what
 
     @property
@@ -253,7 +253,7 @@ class MapStudy(ComputedStudy):
     delta: DeltaAxis
     d: DelayAxis
 
-    outputs: Annotated[tuple[MapOutput, ...], WrapValidator(members("outputs"))] = ("stable",)
+    outputs: Annotated[tuple[MapOutput, ...], WrapValidator(require_entries("outputs"))] = ("stable",)
     """What is computed at every point."""
 
     @property
@@ -263,7 +263,7 @@ class MapStudy(ComputedStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         alpha, beta, delta, d = (axis.values() for axis in (self.alpha, self.beta, self.delta, self.d))
-        share = share_of_device(self.delta, self.d, scene)
+        share = find_device_share(self.delta, self.d, scene)
         shape = tuple(self.sizes.values())
         outputs = {name: np.empty(shape, dtype=OUTPUTS[name].dtype) for name in self.outputs}
         status = np.empty(shape, np.uint8)
@@ -277,7 +277,7 @@ class MapStudy(ComputedStudy):
             numbers = [outputs[name][place] for name in outputs if OUTPUTS[name].dtype == "float64"]
             status[place] = status_of_results(shape[:2], numbers, walls, device)
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs, "status": status}
-        arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
+        arrays = add_si_columns(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()
 
         def find_edge(name: str, delta: float, d: float) -> Outlines | None:

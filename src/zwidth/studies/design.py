@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BeforeValidator, GetPydanticSchema, ValidationInfo, WithJsonSchema
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, listing, problem
+from zwidth.config.fields import LocatedProblem, problem, quote_names
 from zwidth.config.parts import locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
@@ -27,7 +27,7 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
-from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiffest, summarize_stiffest, track
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiffest, summarize_stiffest, track_progress
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, short, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
@@ -114,7 +114,7 @@ class DesignStudy(ComputedStudy):
             yield ("stiffness",), problem(f"got {short(least)} {self.unit_system['N/m']}", "it must be greater than 0")
         known = self._list_parameters()
         if self.find not in known:
-            has = f"this device has {listing(known)}"
+            has = f"this device has {quote_names(known)}"
             yield ("find",), problem(f"got {self.find!r}", has, "add the part to the scene, or write one of these")
         elif not known[self.find] > 0 and self.within is None:
             what = f"{self.find} is 0 now"
@@ -125,7 +125,7 @@ class DesignStudy(ComputedStudy):
         most = 1 / 3 if self.distribution == "normal" else 1.0
         for name, share in (self.tolerances or {}).items():
             if name not in known or name == "rate":
-                yield ("tolerances", name), problem("unknown parameter", f"this device has {listing(known)}")
+                yield ("tolerances", name), problem("unknown parameter", f"this device has {quote_names(known)}")
             elif share >= most:
                 yield ("tolerances", name), problem(f"got {short(share)}", f"it must be less than {most:.3g}")
             elif known[name] == 0 and name != self.find:
@@ -301,7 +301,7 @@ class FiltersStudy(ComputedStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         rows = []
         bare = self.device.to_scene()
-        for damping, (named, velocity) in track(list(product(self.dampings.tolist(), self.estimates()))):
+        for damping, (named, velocity) in track_progress(list(product(self.dampings.tolist(), self.estimates()))):
             top = bare.replace(damping=damping, velocity=velocity).max_stiffness()
             row = {"damping_N_s_per_m": damping, **named, **summarize_stiffest(top)}
             if self.resolution is not None:

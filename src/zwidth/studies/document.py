@@ -28,7 +28,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 import zwidth.config.sweep  # noqa: F401  (registers its kind)
 from zwidth.config.device_table import find_file
-from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, members, problem, repeated
+from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, find_repeated, problem, require_entries
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
@@ -139,7 +139,7 @@ class Config(Strict, what="a configuration"):
     figure: FigureLook | None = None
     """Width, format and resolution of the studies' figures; for sweeps use the options of `zwidth figures`."""
 
-    studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(members("studies"))]
+    studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(require_entries("studies"))]
     """What to compute, in this order."""
 
     _place: _Place = PrivateAttr(default_factory=lambda: _Place(find_file("").absolute()))
@@ -172,7 +172,7 @@ class Config(Strict, what="a configuration"):
         studies = raw.get("studies")
         given = studies if isinstance(studies, list | tuple) else ()
         names = [study.get("name") if isinstance(study, dict) else None for study in given]
-        for place, what in repeated(names, "rename one", "results are kept by name, so each study has its own"):
+        for place, what in find_repeated(names, "rename one", "results are kept by name, so each study has its own"):
             yield ("studies", *place, "name"), what
 
 

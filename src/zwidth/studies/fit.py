@@ -13,7 +13,7 @@ from pydantic_core import CoreSchema
 
 from zwidth import figures
 from zwidth.config.device_table import find_file
-from zwidth.config.fields import LocatedProblem, Strict, members, problem
+from zwidth.config.fields import LocatedProblem, Strict, problem, require_entries
 from zwidth.config.parts import VelocityField, locate_refusal, split_refusal
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
@@ -74,7 +74,7 @@ def _read_logs(raw: Any, handler: Any) -> Any:
         raise problem(f"got {describe(raw)}", "a log is a CSV file and its columns", "write {csv: NAME.csv}")
     if isinstance(raw, dict):
         return (LogSection.model_validate(raw),)
-    return (raw,) if isinstance(raw, LogSection) else members("logs")(raw, handler)
+    return (raw,) if isinstance(raw, LogSection) else require_entries("logs")(raw, handler)
 
 
 class _OneOrSeveral:
@@ -122,7 +122,7 @@ class FitStudy(ComputedStudy):
     log: Annotated[tuple[LogSection, ...], WrapValidator(_read_logs), _OneOrSeveral] | None = None
     """A log of free motion under a commanded force, or a list of logs of one device; give this, buzz, or both."""
 
-    buzz: Annotated[tuple[BuzzSection, ...], WrapValidator(members("walls"))] | None = None
+    buzz: Annotated[tuple[BuzzSection, ...], WrapValidator(require_entries("walls"))] | None = None
     """Walls at the onset of buzzing, two at least, of different dampings."""
 
     period: Annotated[float, Quantity("s", POSITIVE)] | None = None
@@ -228,7 +228,7 @@ class FitStudy(ComputedStudy):
         )
 
     def _fit(self) -> list[_Fitted]:
-        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.known, []
+        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.instance, []
         period = self.period
         if self.log:
             options = {"max_delay": self.max_delay, "resample": self.resample}

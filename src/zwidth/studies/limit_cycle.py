@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import WrapValidator, create_model
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, Strict, members, problem, repeated
+from zwidth.config.fields import LocatedProblem, Strict, find_repeated, problem, require_entries
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Axis, Quantity, axis_of
@@ -22,7 +22,7 @@ from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
-from zwidth.studies.simulate import Circumstances, SimulatedStudy
+from zwidth.studies.simulate import SimulatedStudy, SimulationConditions
 from zwidth.words.formatting import header, spell_short, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.showing import find_unit
@@ -38,19 +38,19 @@ WIDEST_STEPS = 10.0  # lower bound of that default, in encoder steps
 
 
 # A condition may override every parameter of the study; None means not overridden.
-_OWN: Any = {
+_OVERRIDES: Any = {
     name: (hint | None, None)
-    for name, hint in get_type_hints(Circumstances, include_extras=True).items()
-    if name in Circumstances.model_fields
+    for name, hint in get_type_hints(SimulationConditions, include_extras=True).items()
+    if name in SimulationConditions.model_fields
 }
-_Own: Any = create_model("_Own", __base__=Strict, **_OWN)
+_Overrides: Any = create_model("_Own", __base__=Strict, **_OVERRIDES)
 
 
-class CycleCondition(_Own):
+class CycleCondition(_Overrides):
     """Parameters of one panel of a limit_cycle study."""
 
     what = "a condition"
-    described_by = (Circumstances,)
+    described_by = (SimulationConditions,)
 
     label: str
     """Unique name of the condition."""
@@ -77,14 +77,14 @@ class CycleAxes(Strict, what="the axes of a limit_cycle study"):
     def varied(self) -> dict[str, Axis]:
         return {name: axis for name, axis in self.given.items() if axis.size > 1}
 
-    def lay_out(self) -> dict[str, np.ndarray]:
+    def broadcast(self) -> dict[str, np.ndarray]:
         """Return the values of every axis, shaped to broadcast to the grid."""
         grid = np.meshgrid(*(axis.values() for axis in self.varied.values()), indexing="ij", sparse=True)
         return {name: axis.values()[0] for name, axis in self.given.items()} | dict(zip(self.varied, grid, strict=True))
 
 
 @register
-class LimitCycleStudy(SimulatedStudy, Circumstances):
+class LimitCycleStudy(SimulatedStudy, SimulationConditions):
     """Amplitude of limit cycles over one or two parameters, under one or several conditions."""
 
     method = "Simulations, exact between samples; amplitude and frequency as observed in the last quarter."
@@ -95,7 +95,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
     axes: CycleAxes
     """Walls, and encoder and friction if they vary."""
 
-    conditions: Annotated[tuple[CycleCondition, ...], WrapValidator(members("conditions"))]
+    conditions: Annotated[tuple[CycleCondition, ...], WrapValidator(require_entries("conditions"))]
     """Parameters of each panel that differ from those of the study; default: one panel."""
 
     silence: Annotated[float, Quantity("m", POSITIVE)] = 1e-6
@@ -111,7 +111,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        for place, what in repeated([each.label for each in self.conditions], "rename one"):
+        for place, what in find_repeated([each.label for each in self.conditions], "rename one"):
             yield ("conditions", *place, "label"), what
         for index, condition in enumerate(self.conditions):
             for name in self.axes.given:
@@ -125,7 +125,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
             name = "silence" if self.widest is None else "widest"
             received = f"got silence {low}, widest {high}"
             yield (name,), problem(received, "silence must be less than widest", "raise widest or lower silence")
-        found = [list(each.find_clashes(scene)) for each in self.list_circumstances()]
+        found = [list(each.find_inconsistencies(scene)) for each in self.list_conditions()]
         for index, (condition, faults) in enumerate(zip(self.conditions, found, strict=True)):
             for path, what in faults:
                 own = getattr(condition, str(path[0])) is not None
@@ -133,11 +133,13 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
                 if own or index == 0:
                     yield (("conditions", index, *path) if own else path), what
 
-    def list_circumstances(self) -> list[Circumstances]:
-        common = {name: getattr(self, name) for name in Circumstances.model_fields}
+    def list_conditions(self) -> list[SimulationConditions]:
+        common = {name: getattr(self, name) for name in SimulationConditions.model_fields}
         owns = [{name: getattr(each, name) for name in common} for each in self.conditions]
         return [
-            Circumstances.model_construct(**common | {name: value for name, value in own.items() if value is not None})
+            SimulationConditions.model_construct(
+                **common | {name: value for name, value in own.items() if value is not None}
+            )
             for own in owns
         ]
 
@@ -154,14 +156,14 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         return {"conditions": len(self.conditions)} | {name: axis.size for name, axis in self.axes.varied.items()}
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        axes, varied = self.axes.lay_out(), self.axes.varied
+        axes, varied = self.axes.broadcast(), self.axes.varied
         labels = [each.label for each in self.conditions]
         found: dict[str, list[np.ndarray]] = {name: [] for name in (*_OUTPUTS, "linearly_stable")}
         bounds = self.bound_amplitudes(self.device.to_scene())
         edges, notes = [], []
-        for label, given in zip(labels, self.list_circumstances(), strict=True):
-            placed = given.place(self.device.to_scene())
-            options: dict[str, Any] = given.options(self.device.period) | axes
+        for label, given in zip(labels, self.list_conditions(), strict=True):
+            placed = given.set_velocity(self.device.to_scene())
+            options: dict[str, Any] = given.list_options(self.device.period) | axes
             motion = placed.simulate(**options, record=False)
             for name in _OUTPUTS:
                 found[name].append(getattr(motion, name))

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, members, problem
+from zwidth.config.fields import LocatedProblem, problem, require_entries
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene, WallField
 from zwidth.config.study import Study
 from zwidth.config.values import Axis, DelayAxis, DeltaAxis
@@ -31,7 +31,7 @@ Item = TypeVar("Item")
 LISTENER: ContextVar[Callable[[int, int], None]] = ContextVar("LISTENER", default=lambda done, total: None)
 
 
-def track(parts: Sequence[Item]) -> Iterator[Item]:
+def track_progress(parts: Sequence[Item]) -> Iterator[Item]:
     """Yield the parts of a study, and report the number of finished ones to ``LISTENER``."""
     for done, part in enumerate(parts):
         LISTENER.get()(done, len(parts))
@@ -93,7 +93,7 @@ class CurvesStudy(ComputedStudy):
 class WallsStudy(ComputedStudy):
     """What the studies of walls share that are a share of the maximum stiffness or given outright."""
 
-    walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
+    walls: Annotated[tuple[WallField, ...], WrapValidator(require_entries("walls"))] | None = None
     """Walls: any number for one device; for several devices, one for all or one each. Default: that of the scene."""
 
     @classmethod
@@ -118,7 +118,7 @@ class WallsStudy(ComputedStudy):
 _CHOICE = ("stiffness_fraction", "walls")
 
 
-def add_si_of_scene(
+def add_si_columns(
     table: dict[str, np.ndarray], delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None
 ) -> dict[str, np.ndarray]:
     """A table of walls, in SI units as well where delta and d are those of a rigid scene or device alone."""
@@ -129,7 +129,7 @@ def add_si_of_scene(
     return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
 
 
-def share_of_device(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> float:
+def find_device_share(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> float:
     """The part of delta that is the device's own, which alone makes walls passive for any hand; else all of it."""
     scene = _find_scene(delta, d, owner)
     return float(scene.own_delta / scene.delta) if scene is not None and scene.delta else 1.0

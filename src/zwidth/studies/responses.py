@@ -13,7 +13,7 @@ from pydantic import WrapValidator
 from pydantic_core import PydanticCustomError
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, members, problem
+from zwidth.config.fields import LocatedProblem, problem, require_entries
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import (
     AnyDevice,
@@ -25,7 +25,7 @@ from zwidth.config.scenes import (
     PhysicalWall,
     normalized_wall,
 )
-from zwidth.config.study import refuse_parts, register
+from zwidth.config.study import make_parts_error, register
 from zwidth.config.values import Duration, Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.style import WIDTH, house_style, new_figure
@@ -97,7 +97,7 @@ class StepStudy(WallsStudy, ResponseStudy):
 
     kind: Literal["step"]
 
-    devices: Annotated[tuple[DeviceField, ...], WrapValidator(members("devices"))]
+    devices: Annotated[tuple[DeviceField, ...], WrapValidator(require_entries("devices"))]
     """Devices."""
 
     stiffness_fraction: Fraction | None = None
@@ -107,7 +107,7 @@ class StepStudy(WallsStudy, ResponseStudy):
         yield from super().limits()
         for index, device in enumerate(self.devices):
             if device.parts_beyond:
-                yield ("devices", index), refuse_parts("step", list_parts(device))
+                yield ("devices", index), make_parts_error("step", list_parts(device))
         sizes = len(self.devices), len(self.walls or (None,))
         if min(sizes) > 1 and sizes[0] != sizes[1]:
             allowed = "one wall for all devices, one for each, or one device for all walls"

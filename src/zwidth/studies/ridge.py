@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr, ValidationError, WrapValidator
 from zwidth import figures
 from zwidth.config.device_table import DeviceTable, find_file, read_table
 from zwidth.config.devices import find_second_period, read_period
-from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of
+from zwidth.config.fields import LocatedProblem, Strict, list_problems, problem
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Delay, quantity_of
@@ -26,7 +26,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
-from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, share_of_device
+from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, find_device_share
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, name_wall, plain, round_safely, suggestion, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
@@ -93,7 +93,7 @@ class PassivityStudy(CurvesStudy):
         ridge, notes = ridge_table(self.delta.values(), self.d.values())
         table = {name: ridge[name] for name in ("d", "delta", "alpha_max", "beta")}
         slopes = map(passive_stiffness_slope, self.d.values().tolist())
-        own = share_of_device(self.delta, self.d, scene) * table["delta"]
+        own = find_device_share(self.delta, self.d, scene) * table["delta"]
         for name, slope in zip(("alpha_max_passive", "beta_passive"), zip(*slopes, strict=True), strict=True):
             table[name] = np.repeat(slope, self.delta.size) * own
         return Outcome(table=table, figures={"": partial(figures.draw_passivity_cost, table)}, notes=tuple(notes))
@@ -172,7 +172,7 @@ class Poses(Strict, what="a table of poses"):
             values = columns.numbers([place for _, _, place in found])
             self._coordinates = [(name, unit, of.tolist()) for (name, unit, _), of in zip(found, values, strict=True)]
         except ValidationError as error:
-            yield from problems_of(error)
+            yield from list_problems(error)
         except InputError as error:
             yield ("csv",), problem(str(error).partition("; ")[0], _FORM, "complete the file")
 

@@ -34,7 +34,7 @@ LONGEST = 1_000_000
 _OF_SAMPLES = ("measured", "estimated_velocity", "command", "contact")
 
 
-class Circumstances(Strict):
+class SimulationConditions(Strict):
     """How a device meets a wall: start, push, contact, and what motor, encoder, bearings and clock add."""
 
     duration: Duration = Span(1000.0, "periods")
@@ -63,7 +63,7 @@ class Circumstances(Strict):
     seed: Annotated[int, Quantity(allowed=NOT_NEGATIVE, whole=True)] = 0
     """Whole number that decides the random numbers."""
 
-    def find_clashes(self, scene: Scene) -> Iterable[LocatedProblem]:
+    def find_inconsistencies(self, scene: Scene) -> Iterable[LocatedProblem]:
         """Values that do not go together, or not with the device and its sampling period."""
         period = scene.timing.period
         if self.static is not None and self.static < self.coulomb:
@@ -78,18 +78,18 @@ class Circumstances(Strict):
         if isinstance(scene.device, MeasuredDevice):
             allowed = "a motion needs a model: mass and damping, or a linear system"
             yield ("device",), problem("got a measured response", allowed, "fit one to a log with the kind 'fit'")
-        if self.velocity is not None and not isinstance(placed := self.place(scene).velocity, FOAW):
+        if self.velocity is not None and not isinstance(placed := self.set_velocity(scene).velocity, FOAW):
             try:
                 placed.estimate(period)
             except InputError as error:
                 yield locate_refusal(error)
 
-    def place(self, scene: Scene) -> Scene:
+    def set_velocity(self, scene: Scene) -> Scene:
         """The scene with the velocity estimate of these circumstances."""
-        return scene if self.velocity is None else scene.replace(velocity=self.velocity.known)
+        return scene if self.velocity is None else scene.replace(velocity=self.velocity.instance)
 
-    def options(self, period: float) -> dict[str, Any]:
-        names = [name for name in Circumstances.model_fields if name not in ("duration", "velocity", "jitter")]
+    def list_options(self, period: float) -> dict[str, Any]:
+        names = [name for name in SimulationConditions.model_fields if name not in ("duration", "velocity", "jitter")]
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         periods = max(1, round(self.duration.periods(period)))
         return {**given, "periods": periods, "jitter": self.jitter.seconds(period)}
@@ -107,7 +107,7 @@ class SimulatedStudy(ComputedStudy):
 
 
 @register
-class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
+class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
     """Motions of a device on one or several walls over time."""
 
     method = "Matrix exponentials between events, instants of friction to the last bit; rounding alone."
@@ -125,8 +125,8 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
         scene = self.device.to_scene()
-        yield from self.find_clashes(scene)
-        if self.stiffness_fraction is not None and isinstance(self.place(scene).velocity, FOAW):
+        yield from self.find_inconsistencies(scene)
+        if self.stiffness_fraction is not None and isinstance(self.set_velocity(scene).velocity, FOAW):
             what = "got a share of the maximum stiffness"
             yield ("stiffness_fraction",), problem(what, f"{NO_LINEAR_FORM} and no such maximum", "write walls")
 
@@ -153,10 +153,10 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
         return [(name_wall(*wall, scene.unit_system), *wall) for wall in walls]
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        placed = self.place(self.device.to_scene())
+        placed = self.set_velocity(self.device.to_scene())
         walls = self.list_walls(placed)
         stiffness, damping = np.array([wall[1:] for wall in walls]).T
-        motion = placed.simulate(stiffness, damping, substeps=self.substeps, **self.options(self.device.period))
+        motion = placed.simulate(stiffness, damping, substeps=self.substeps, **self.list_options(self.device.period))
         linear = None if isinstance(placed.velocity, FOAW) else placed.is_stable(stiffness, damping)
         parts, rows, notes = [], [], []
         for k, (label, *wall) in enumerate(walls):

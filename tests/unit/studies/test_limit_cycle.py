@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 import zwidth
 from zwidth import figures
-from zwidth.config.fields import problems_of
+from zwidth.config.fields import list_problems
 from zwidth.config.values import read_in_units
 from zwidth.figures.style import style_sheet
 from zwidth.studies.limit_cycle import LimitCycleStudy
@@ -229,7 +229,7 @@ def test_a_fault_of_all_conditions_is_told_once_and_one_of_a_condition_at_its_pl
     def faults(**keys):
         with pytest.raises(ValidationError) as caught:
             study_of(**keys)
-        return [path for path, _ in problems_of(caught.value)]
+        return [path for path, _ in list_problems(caught.value)]
 
     assert faults(jitter="2 ms", conditions=CONDITIONS) == [("jitter",)]
     assert faults(conditions=[{"label": "a"}, {"label": "b", "jitter": "2 ms"}]) == [("conditions", 1, "jitter")]
