@@ -49,7 +49,7 @@ def _check_numbers(raw: Any) -> Any:
 _Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type": ["array", "number"]})]
 
 
-class SystemSection(PartSection, what="a linear system"):
+class SystemSection(PartSection, noun="a linear system"):
     """A device as a linear system, from commanded force in N to sensed position in m."""
 
     numerator: _Numbers | None = None
@@ -89,15 +89,15 @@ class SystemSection(PartSection, what="a linear system"):
         return LinearDevice(SimpleNamespace(**known, D=0.0, dt=self.sampled))
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         # A misspelled key is reported, and its form is as good as there.
         if raw.keys() <= cls.model_fields.keys() and not _is_whole(raw):
             given, forms = quote_names(raw.keys() - {"sampled"}) or "nothing", " or ".join(map(quote_names, _OF_SYSTEM))
             yield (), problem(f"got {given}", f"a linear system has {forms}", "write one of these")
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         # Of its keys at large, for the message tells which.
-        return [((), what) for _, what in super().limits()] if _is_whole(self.model_fields_set) else []
+        return [((), what) for _, what in super().find_faults()] if _is_whole(self.model_fields_set) else []
 
 
 def _is_whole(given: Iterable[str]) -> bool:
@@ -105,7 +105,7 @@ def _is_whole(given: Iterable[str]) -> bool:
     return any(set(form) - {"zeros"} <= set(given) <= {*form, "sampled"} for form in _OF_SYSTEM)
 
 
-class ResponseSection(PartSection, what="a response"):
+class ResponseSection(PartSection, noun="a response"):
     """A device by its measured frequency response, the columns of a table."""
 
     frequency: _Numbers
@@ -170,17 +170,17 @@ class OneKind(Strict):
     """Base of sections that are either physical or normalized, with messages for keys of the other kind."""
 
     @classmethod
-    def unknown(cls, name: str) -> tuple[str, str, str]:
+    def explain_unknown(cls, name: str) -> tuple[str, str, str]:
         if name not in (PHYSICAL_KEYS if NORMALIZED_KEYS & cls.model_fields.keys() else NORMALIZED_KEYS):
-            return super().unknown(name)
+            return super().explain_unknown(name)
         if name in PART_NAMES:
-            allowed = f"{cls.what} that is normalized has no parts: their keys are in SI units"
+            allowed = f"{cls.noun} that is normalized has no parts: their keys are in SI units"
             remedy = "write mass, damping and period in place of delta and d"
             return f"got {name!r} after normalized keys", allowed, remedy
         kind, other = ("physical", "normalized") if name in NORMALIZED_KEYS else ("normalized", "physical")
         return (
             f"{other} key, after {kind} ones",
-            f"{cls.what} is described in SI units or normalized, never both",
+            f"{cls.noun} is described in SI units or normalized, never both",
             f"remove it, or write all keys {'normalized' if other == 'normalized' else 'in SI units'}",
         )
 
@@ -278,7 +278,7 @@ class SampledMass(OneKind):
     delay: Delay = Span(0.0, "s")
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         yield from find_second_period(raw)
         if raw.get("device") is not None:
             yield from find_second_device(raw)

@@ -62,7 +62,7 @@ class PartSection(Strict):
         given = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return self.part(**given)
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         try:
             self.instance  # noqa: B018  (raises where the part refuses)
         except InputError as error:
@@ -93,7 +93,7 @@ def make_section(part: Any, owner: str, what: str, kind: str = "") -> type[PartS
         default: Any = ... if item.default is MISSING else item.default
         keys[item.name] = (form | None if default is None else form, Field(default, description=words))
     section = create_model(f"{part.__name__}Section", __base__=PartSection, __doc__=_head(part), **keys)
-    section.what, section.part = what, part
+    section.noun, section.part = what, part
     return section
 
 
@@ -148,7 +148,7 @@ _SECTIONS: Any = {
 ModeSection: Any = make_section(Mode, "mode", "a mode")
 
 
-class SafeLimitSection(PartSection, what="a safe limit"):
+class SafeLimitSection(PartSection, noun="a safe limit"):
     """Stiffest wall that measurements of the device support."""
 
     part = SafeLimit

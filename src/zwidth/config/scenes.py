@@ -39,7 +39,7 @@ _Parts: Any = make_parts_base("the difference of two samples", "none")
 class _PhysicalPlant(_Parts, SampledMass):
     """A device in SI units with its optional parts."""
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         if not self.d <= MAX_DELAY_PERIODS:
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
             yield ("delay",), problem(f"got {self.delay}, which is {short(self.d)} periods", allowed, "check the units")
@@ -110,7 +110,7 @@ class _NormalizedPlant(OneKind):
         return Scene(Device(1.0, self.delta), Timing(self.period, self.d))
 
 
-class PhysicalDevice(_PhysicalPlant, what="a device"):
+class PhysicalDevice(_PhysicalPlant, noun="a device"):
     """A device in SI units."""
 
     label: str | None = None
@@ -127,7 +127,7 @@ class SimulatedDevice(PhysicalDevice):
     """Velocity estimate. Default: the difference of two samples."""
 
 
-class LabeledDevice(_PhysicalPlant, what="a device"):
+class LabeledDevice(_PhysicalPlant, noun="a device"):
     """A device in SI units among others that a figure names."""
 
     # The scene may supply all the rest.
@@ -137,21 +137,21 @@ class LabeledDevice(_PhysicalPlant, what="a device"):
     """Name of the device in the legend, each one its own."""
 
 
-class NormalizedDevice(_NormalizedPlant, what="a device"):
+class NormalizedDevice(_NormalizedPlant, noun="a device"):
     """A normalized device."""
 
     label: str | None = None
     """Name of the device in legends."""
 
 
-class PhysicalWall(OneKind, what="a wall"):
+class PhysicalWall(OneKind, noun="a wall"):
     """A wall in SI units."""
 
     stiffness: Annotated[float, quantity_of("stiffness")]
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] = 0.0
 
 
-class NormalizedWall(OneKind, what="a wall"):
+class NormalizedWall(OneKind, noun="a wall"):
     """A normalized wall."""
 
     alpha: Number
@@ -164,7 +164,7 @@ def _pick_wall(scene: Any, kind: Any) -> Any:
     return None if set(given.values()) == {None} else kind(**{name: value or 0.0 for name, value in given.items()})
 
 
-class PhysicalScene(_PhysicalPlant, what="a scene"):
+class PhysicalScene(_PhysicalPlant, noun="a scene"):
     """The file's device, timing and wall in SI units."""
 
     stiffness: Annotated[float, quantity_of("stiffness")] | None = None
@@ -213,7 +213,7 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
         return _pick_wall(self, PhysicalWall)
 
 
-class NormalizedScene(_NormalizedPlant, what="a scene"):
+class NormalizedScene(_NormalizedPlant, noun="a scene"):
     """The file's device, timing and wall, normalized."""
 
     alpha: Number | None = None
@@ -255,7 +255,7 @@ def _as_either(raw: Any, physical: type[Any], normalized: type[Any]) -> Any:
         return raw
     if not isinstance(raw, dict):
         keys = f"{quote_names(physical.model_fields)} or, normalized, {quote_names(normalized.model_fields)}"
-        allowed = f"{physical.what} is a mapping with the keys {keys}"
+        allowed = f"{physical.noun} is a mapping with the keys {keys}"
         raise problem(f"got {describe(raw)}", allowed, "write 'key: value' lines")
     return (normalized if is_normalized(raw) else physical).model_validate(raw)
 

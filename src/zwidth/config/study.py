@@ -27,8 +27,8 @@ _Kind = TypeVar("_Kind", bound="type[Study]")
 def register(model: _Kind) -> _Kind:
     """Register a kind of study, a `zwidth.studies.ComputedStudy` whose field ``kind`` has one literal: its name."""
     KINDS[model.kind_name()] = model
-    if "what" not in vars(model):
-        model.what = f"a {model.kind_name()} study"
+    if "noun" not in vars(model):
+        model.noun = f"a {model.kind_name()} study"
     return model
 
 
@@ -83,8 +83,8 @@ class Study(Strict):
         return name
 
     @classmethod
-    def unknown(cls, name: str) -> tuple[str, str, str]:
-        what, allowed, remedy = super().unknown(name)
+    def explain_unknown(cls, name: str) -> tuple[str, str, str]:
+        what, allowed, remedy = super().explain_unknown(name)
         return what, allowed, "write it at the top of the file" if name in ("figure", "scene") else remedy
 
     @classmethod
@@ -121,12 +121,12 @@ class Study(Strict):
             raise problem("got scene.velocity of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         if name == "device":
-            return f"{cls.what} needs a device in SI units", "give the scene mass and period"
+            return f"{cls.noun} needs a device in SI units", "give the scene mass and period"
         if name in cls.from_scene:
             return "a study needs it where the file has no scene to take it from", f"add {name!r}, or a scene"
-        return super().missing(name)
+        return super().explain_missing(name)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -149,7 +149,7 @@ class Study(Strict):
         """What the number of points consists of, for messages."""
         return f"{' x '.join(self.sizes) or 'one point'} = {' x '.join(map(str, self.sizes.values())) or 1}"
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         if self.points <= MAX_POINTS and self.nbytes <= MAX_BYTES:
             return
         what = f"{self.extent} is {self.points:.4g} points and {self.nbytes / 2**30:.3g} GiB"

@@ -77,13 +77,13 @@ _Axes: Any = create_model("_Axes", __base__=Strict, **_FIELDS)
 class Axes(_Axes):
     """The parameters of a sweep and the values that each of them takes."""
 
-    what = "the axes of a sweep"
+    noun = "the axes of a sweep"
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         return _find_mixed_kinds([key for key in raw if key in PARAMETERS], "axes")
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         """A parameter that is both an axis and a column, and kinds that only the table's columns show."""
         columns = tuple(self.devices.columns) if self.devices else ()
         own = [name for name in PARAMETERS if getattr(self, name) is not None]
@@ -242,7 +242,7 @@ class SweepStudy(_Parts, Study):
         """Whether its devices have parts, so that every one of them is a scene of its own."""
         return bool(list_parts(self) or self.axes.part_parameters)
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         """Parameters that are missing or move nothing, delays that are too long, and too many points."""
         given, physical = self.axes.given, self.axes.physical
         if "rate" not in given and "period" not in given and physical:

@@ -94,13 +94,13 @@ class BoundaryStudy(CurvesStudy):
         return {"delta": device.delta, "d": device.d, **raw}
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         if raw.get("plane") == "delta_beta" and raw.get("ridge_path") is True:
             allowed = "the path of maximum stiffness lies in the plane alpha_beta; at alpha -> 0 there is none"
             yield ("ridge_path",), problem("got true with plane delta_beta", allowed, "remove ridge_path")
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         if self.plane == "delta_beta" and self.delta.size < 2:
             allowed = "the plane delta_beta needs two values of delta or more, its curves run over delta"
             yield ("delta",), problem("got one value", allowed, "give delta as a list, linear or log axis")
@@ -192,8 +192,8 @@ class CompareStudy(ComputedStudy):
             return raw
         return {**raw, "devices": [_complete(device, scene) for device in devices]}
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         for place, what in find_repeated([device.label for device in self.devices], "rename one"):
             yield ("devices", *place, "label"), what
 

@@ -101,15 +101,15 @@ class DesignStudy(ComputedStudy):
     """Number of random devices for each required stiffness. Default: 10000, or 200 for a device with parts."""
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         if name == "stiffness":
             return "a design begins with the stiffness that is wanted", "add 'stiffness: [20 kN/m, 40 kN/m]'"
         if name == "find":
             return "a design chooses one parameter, the others as they are", "add 'find: damping', or another"
-        return super().missing(name)
+        return super().explain_missing(name)
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         if not (least := float(self.stiffness.values().min())) > 0:
             yield ("stiffness",), problem(f"got {short(least)} {self.unit_system['N/m']}", "it must be greater than 0")
         known = self._list_parameters()
@@ -265,8 +265,8 @@ class FiltersStudy(ComputedStudy):
     noise_limit: Annotated[float, Quantity("m/s", POSITIVE)] | None = None
     """Standard deviation that the noise of the velocity may have, in m/s or with a unit: the best filter is marked."""
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         if self.cutoff is None and self.samples is None:
             yield (), problem("cutoff and samples are missing", "filters have one of them", "add 'cutoff: [30, 100]'")
         if self.noise_limit is not None and self.resolution is None:

@@ -98,7 +98,7 @@ class _Place:
     folder: Path = field(compare=False)
 
 
-class FigureLook(Strict, what="the look of figures"):
+class FigureLook(Strict, noun="the look of figures"):
     """How the figures of a run are written."""
 
     width: Annotated[float, Quantity("m", Range(0.05, 0.5), turns=False)] | None = None
@@ -121,7 +121,7 @@ class FigureLook(Strict, what="the look of figures"):
         return None if self.width is None else (self.width / 0.0254, None)
 
 
-class Config(Strict, what="a configuration"):
+class Config(Strict, noun="a configuration"):
     """A configuration file, checked and complete: every study holds the values that it runs with."""
 
     version: Annotated[int, BeforeValidator(_check_version), WithJsonSchema({"const": FORMAT_VERSION})]
@@ -150,7 +150,7 @@ class Config(Strict, what="a configuration"):
         return self._place.folder
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         examples = {
             "version": f"version: {FORMAT_VERSION}",
             "name": "name: my_run",
@@ -168,7 +168,7 @@ class Config(Strict, what="a configuration"):
         return {**raw, "studies": [_fill_study(study, scene) for study in studies]}
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         studies = raw.get("studies")
         given = studies if isinstance(studies, list | tuple) else ()
         names = [study.get("name") if isinstance(study, dict) else None for study in given]

@@ -47,7 +47,7 @@ def _read_resolution(raw: Any) -> Any:
 Step = Annotated[float | str, BeforeValidator(_read_resolution), WithJsonSchema(describe_entry("m", "rad", "deg"))]
 
 
-class LogSection(Strict, what="a log"):
+class LogSection(Strict, noun="a log"):
     """One log: a file of columns and which of them is what."""
 
     csv: str
@@ -60,7 +60,7 @@ class LogSection(Strict, what="a log"):
     motor_constant: str | None = Field(default=None, description=OF_LOGS["motor_constant"])
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         return "a log is a CSV file", "add 'csv: log.csv'"
 
     def read(self, period: float | None) -> LoggedMotion:
@@ -86,7 +86,7 @@ class _OneOrSeveral:
         return {"anyOf": [several["items"], several]}
 
 
-class BuzzSection(Strict, what="a wall that buzzed"):
+class BuzzSection(Strict, noun="a wall that buzzed"):
     """A wall at the onset of buzzing."""
 
     stiffness: Annotated[float, Quantity("N/m", POSITIVE)]
@@ -143,7 +143,7 @@ class FitStudy(ComputedStudy):
     _motions: tuple[LoggedMotion, ...] = PrivateAttr(default=())
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         if "log" not in raw and "buzz" not in raw:
             allowed = "a device is found from logs or from walls that buzzed"
             yield (), problem("log or buzz is missing", allowed, "add 'log: {csv: log.csv}'")
@@ -155,8 +155,8 @@ class FitStudy(ComputedStudy):
                 what = f"got {name} without {owner}"
                 yield (name,), problem(what, f"it belongs to {owner}", "remove it", on_key=True)
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         motions: list[LoggedMotion] = []
         for k, section in enumerate(self.log or ()):
             try:

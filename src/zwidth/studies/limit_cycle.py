@@ -49,14 +49,14 @@ _Overrides: Any = create_model("_Own", __base__=Strict, **_OVERRIDES)
 class CycleCondition(_Overrides):
     """Parameters of one panel of a limit_cycle study."""
 
-    what = "a condition"
+    noun = "a condition"
     described_by = (SimulationConditions,)
 
     label: str
     """Unique name of the condition."""
 
 
-class CycleAxes(Strict, what="the axes of a limit_cycle study"):
+class CycleAxes(Strict, noun="the axes of a limit_cycle study"):
     """Parameters of a limit_cycle study, one or two of them with several values."""
 
     stiffness: Annotated[Axis, axis_of("stiffness")]
@@ -64,7 +64,7 @@ class CycleAxes(Strict, what="the axes of a limit_cycle study"):
     resolution: Annotated[Axis, axis_of("resolution")] | None = None
     coulomb: Annotated[Axis, axis_of("coulomb")] | None = None
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         if not 1 <= len(self.varied) <= 2:
             what = f"got {len(self.varied)} axes with several values"
             yield (), problem(what, "one or two are allowed", "write the others as numbers")
@@ -109,8 +109,8 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
         return {"conditions": [{"label": raw.get("name", "")}], **raw}
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         for place, what in find_repeated([each.label for each in self.conditions], "rename one"):
             yield ("conditions", *place, "label"), what
         for index, condition in enumerate(self.conditions):

@@ -104,7 +104,7 @@ class WallsStudy(ComputedStudy):
         return filled
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         given = [key for key in raw if key in _CHOICE]
         if len(given) == 2:
             allowed = "walls are shares of the maximum stiffness or given outright"

@@ -103,8 +103,8 @@ class StepStudy(WallsStudy, ResponseStudy):
     stiffness_fraction: Fraction | None = None
     """Stiffness as a share of alpha_max, with beta as at the ridge; give this or walls."""
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         for index, device in enumerate(self.devices):
             if device.parts_beyond:
                 yield ("devices", index), make_parts_error("step", list_parts(device))

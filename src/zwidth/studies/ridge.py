@@ -135,7 +135,7 @@ def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[s
 _FORM = "poses are a file with columns mass and damping, and the two columns of it that a pose is drawn over"
 
 
-class Poses(Strict, what="a table of poses"):
+class Poses(Strict, noun="a table of poses"):
     """Masses and dampings of a device, one row a pose, and two coordinates of it."""
 
     csv: str
@@ -151,10 +151,10 @@ class Poses(Strict, what="a table of poses"):
     _coordinates: list[tuple[str, str, list[float]]] = PrivateAttr()
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         return _FORM, "write {csv: arm.csv, across: shoulder, up: elbow}"
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         try:
             table, columns = self.table, read_columns(find_file(self.csv))
             known = {name: (unit, place) for place, (name, unit) in enumerate(map(split_head, columns.heads))}
@@ -214,16 +214,16 @@ class WorkspaceStudy(ComputedStudy):
     delay: Delay
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         yield from find_second_period(raw)
-        yield from super().conflicts(raw)
+        yield from super().find_conflicts(raw)
 
     @property
     def sizes(self) -> dict[str, int]:
         return {"poses": self.poses.table.size}
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         if self.poses.table.size < 2:
             yield ("poses",), problem("got one pose", "a map needs several", "use the kind 'recommend' for one device")
 

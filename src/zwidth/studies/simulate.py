@@ -122,8 +122,8 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
     stiffness_fraction: Annotated[Axis, AxisOf(Quantity(allowed=POSITIVE))] | None = None
     """Stiffness as a share of the maximum, with the virtual damping of that wall; give this or walls."""
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         scene = self.device.to_scene()
         yield from self.find_inconsistencies(scene)
         if self.stiffness_fraction is not None and isinstance(self.set_velocity(scene).velocity, FOAW):

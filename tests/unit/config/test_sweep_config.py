@@ -109,7 +109,7 @@ PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
         (NORMAL, ", accuracy: 1e-13", "accuracy", "at least 1e-12"),
         (NORMAL, ", accuracy: tight", "accuracy", "one number"),
         (NORMAL + ", betta: 1", "", "axes.betta", "did you mean 'beta'?"),
-        (NORMAL + ", d: 1", "", "axes.d", "comes twice"),
+        (NORMAL + ", d: 1", "", "axes.d", "occurs twice"),
         ("stiffness: 1, mass: 1, rate: 1, period: 1", "", "axes.period", "both given"),
         ("stiffness: 1, mass: 1, rate: 1, delay: [1 s, 1 periods]", "", "axes.delay[1]", "all in seconds"),
         ("stiffness: [1 N/m, 1], mass: 1, rate: 1", "", "axes.stiffness[1]", "twice"),

@@ -213,7 +213,7 @@ def test_an_adaptive_window_has_no_linear_boundary():
         ({"axes": {"stiffness": [1, 2], "virtual_damping": [1, 2], "coulomb": [1, 2]}}, "got 3 axes"),
         ({"axes": {"stiffness": [1, 2]}}, "virtual_damping"),
         ({"conditions": [{"label": "a"}, {"label": "a"}]}, "got 'a' twice"),
-        ({"conditions": []}, "one of the conditions at least is needed"),
+        ({"conditions": []}, "at least one of the conditions is needed"),
         ({"conditions": [{"resolution": "20 um"}]}, "label"),
         ({"axes": {**PLANE, "coulomb": 0.1}, "conditions": [{"label": "a", "coulomb": 0.2}]}, "here and as an axis"),
         ({"silence": "2 mm"}, "silence must be less than widest"),
