@@ -17,8 +17,8 @@ from zwidth.config.parts import (
     SimulatedVelocityField,
     build_parts,
     list_parts,
-    locate_refusal,
     make_parts_base,
+    parse_input_error,
 )
 from zwidth.config.values import NonNegative, Number, quantity_of
 from zwidth.parts.device import Device
@@ -52,7 +52,7 @@ class _PhysicalPlant(_Parts, SampledMass):
             if not is_adaptive(self):
                 scene.check_parts()
         except InputError as error:
-            path, what = locate_refusal(error)
+            path, what = parse_input_error(error)
             yield path if path[0] in type(self).model_fields else ("device", *path), what
             return
         if self.device is not None:

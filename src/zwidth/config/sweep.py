@@ -20,7 +20,7 @@ from zwidth.config.devices import (
     read_rotary,
 )
 from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, problem, quote_names, require_entries
-from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
+from zwidth.config.parts import build_parts, list_parts, make_parts_base, parse_input_error
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
@@ -320,7 +320,7 @@ class SweepStudy(_Parts, Study):
             try:
                 self.make_scene({**least, **changed}).check_parts()
             except InputError as error:
-                found[str(error)] = locate_refusal(error)
+                found[str(error)] = parse_input_error(error)
         for field, what in found.values():
             name = ".".join(map(str, field))
             yield (("axes", self.axes.find_key(name)) if name in self.axes.given else ("axes",)), what

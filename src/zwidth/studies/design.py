@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, GetPydanticSchema, ValidationInfo, WithJso
 
 from zwidth import figures
 from zwidth.config.fields import LocatedProblem, problem, quote_names
-from zwidth.config.parts import locate_refusal
+from zwidth.config.parts import parse_input_error
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
 from zwidth.config.values import Axis, Fraction, Quantity, axis_of, quantity_of, read_entries
@@ -276,7 +276,7 @@ class FiltersStudy(ComputedStudy):
             try:
                 LowPass(cutoff=max(self.cutoff.entries), order=self.order).estimate(self.device.period)
             except InputError as error:
-                path, what = locate_refusal(error)
+                path, what = parse_input_error(error)
                 yield path[-1:], what
 
     @property

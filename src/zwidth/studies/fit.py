@@ -14,7 +14,7 @@ from pydantic_core import CoreSchema
 from zwidth import figures
 from zwidth.config.device_table import find_file
 from zwidth.config.fields import LocatedProblem, Strict, problem, require_entries
-from zwidth.config.parts import VelocityField, locate_refusal, split_refusal
+from zwidth.config.parts import VelocityField, parse_input_error, parse_message
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Fraction, Quantity, describe_entry, quantity_of
@@ -40,7 +40,7 @@ def _read_resolution(raw: Any) -> Any:
     try:
         read_step(raw)
     except InputError as error:
-        raise locate_refusal(error)[1] from None
+        raise parse_input_error(error)[1] from None
     return raw
 
 
@@ -164,11 +164,11 @@ class FitStudy(ComputedStudy):
             except InputError as error:
                 # File names and headers may hold anything.
                 text = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in str(error))
-                path, what = locate_refusal(InputError(text))
+                path, what = parse_input_error(InputError(text))
                 known = len(path) == 1 and path[0] in LogSection.model_fields
                 # A single log is written without a list around it.
                 place = ("log", *((k,) if len(self.log or ()) > 1 else ()))
-                yield (*place, *(path if known else ("csv",))), (what if known else split_refusal(text))
+                yield (*place, *(path if known else ("csv",))), (what if known else parse_message(text))
         self._motions = tuple(motions)
         if any(motion.rotary for motion in motions) and self.buzz:
             what = "got walls in N/m beside a log of an angle"

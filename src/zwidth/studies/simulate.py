@@ -10,7 +10,7 @@ import numpy as np
 
 from zwidth import figures
 from zwidth.config.fields import LocatedProblem, Strict, problem
-from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, locate_refusal
+from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, parse_input_error
 from zwidth.config.scenes import AnyScene, PhysicalWall, SimulatedDevice
 from zwidth.config.study import register
 from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity, quantity_of
@@ -82,7 +82,7 @@ class SimulationConditions(Strict):
             try:
                 placed.estimate(period)
             except InputError as error:
-                yield locate_refusal(error)
+                yield parse_input_error(error)
 
     def set_velocity(self, scene: Scene) -> Scene:
         """The scene with the velocity estimate of these circumstances."""
