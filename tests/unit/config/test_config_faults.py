@@ -29,7 +29,7 @@ _DELAY_MODEL = "remove it; for the paper's z^(1+d), use the kinds 'paper_fig6' a
 FAULTS = {
     "a_list": [("1:1: got a list of 2 items", "write 'key: value' lines, or {key: value}")],
     "alias_bomb": [("1:29: e[5][5][7][3][7]: too many values", "write long axes as linear or log")],
-    "alias_of_itself": [("4:5: studies[0]: an alias of what it is part of", "write the values out")],
+    "alias_of_itself": [("4:5: studies[0]: an alias of a value that contains it", "write the values out")],
     "alias_undefined": [("3:10: not valid YAML", "define it before with '&', or remove the '*'")],
     "axis_boolean": [("7:16: studies[0].delta[1]: got true", "write a number such as 0.5")],
     "axis_empty": [("7:12: studies[0].delta: got an empty list", "fill the list")],
@@ -63,7 +63,7 @@ FAULTS = {
     "delta_missing": [("4:5: studies[0].delta: missing", "add 'delta', or a scene")],
     "devices_missing": [("4:5: studies[0].devices: missing", "add 'devices', or a scene")],
     "devices_mixed": [("8:22: studies[0].devices[1].period: physical key, after", "remove it, or write all keys")],
-    "duplicate_key": [("8:5: studies[0].delta: the key comes twice, first in line 6", "remove one of them")],
+    "duplicate_key": [("8:5: studies[0].delta: the key occurs twice, first in line 6", "remove one of them")],
     "duration_in_seconds": [("8:15: studies[0].duration: got 0.1 s", "write it in periods, as in '100 periods'")],
     "duration_unit": [("8:15: studies[0].duration: got '100 samples'", "write a number and a unit, as in '1 ms'")],
     "empty": [("1:1: the file is empty", "start with 'version: 1'")],
