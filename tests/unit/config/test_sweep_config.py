@@ -102,7 +102,7 @@ PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
         ("stiffness: 1, mass: 1", "", "axes", "period missing"),
         ("stiffness: 1, rate: 1", "", "axes", "mass missing"),
         ("delta: 1, d: 1", "", "axes", "alpha missing"),
-        (NORMAL, ", outputs: [alpha_max]", "axes.alpha", "moves no output"),
+        (NORMAL, ", outputs: [alpha_max]", "axes.alpha", "changes no output"),
         ("delta: 1, d: 1", ", outputs: [stiffness_max]", "outputs[0]", "SI units"),
         (NORMAL, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),
         (NORMAL, ", accuracy: 0", "accuracy", "at least"),
