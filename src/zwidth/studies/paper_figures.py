@@ -24,7 +24,7 @@ from zwidth.config.study import register
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.loops.rigid.ridge_newton import Curve, Start, expand_curve, guess_start, stationarity, wall, wave
-from zwidth.studies.boundary import stable_intervals
+from zwidth.studies.boundary import tabulate_stable_intervals
 from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table
 from zwidth.words.quantities import WALL_RANGE
@@ -104,7 +104,7 @@ class Fig6Study(_PaperStudy):
         shared = {"curve": "stable", "delta": delta, "beta_lower": -delta}
         power = ({"d": d, **shared, "beta_upper": find_upper_damping(delta, d)} for d in self.fractional)
         columns = "curve", "d", "delay_model", "delta", "beta_lower", "beta_upper"
-        table = _tabulate(columns, stable_intervals(delta, self.d.values()), power)
+        table = _tabulate(columns, tabulate_stable_intervals(delta, self.d.values()), power)
         return Outcome(table=table, figures={"": partial(figures.draw_zero_stiffness, table)})
 
 

@@ -99,7 +99,7 @@ class PassivityStudy(CurvesStudy):
         return Outcome(table=table, figures={"": partial(figures.draw_passivity_cost, table)}, notes=tuple(notes))
 
 
-def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
+def trace_unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
     """Return alpha and beta on the boundary of the passive set for delta = 1, by increasing beta."""
     return passive_edge(Scene(Device(1.0, 1.0), Timing(1.0, d)))
 
@@ -118,7 +118,7 @@ def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0)
     ``share`` is the proportion of the damping that belongs to the device and not to an operator.
     """
     for d in delays:
-        alpha, beta = unit_outline(float(d))
+        alpha, beta = trace_unit_outline(float(d))
         for delta in deltas[share * deltas > 0]:
             yield {"curve": "passive", "d": d, "delta": delta,
                    "alpha": share * delta * alpha, "beta": share * delta * beta}  # fmt: skip
@@ -127,7 +127,7 @@ def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0)
 def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:
     """Yield the passive interval of the virtual damping for alpha -> 0 over delta, as columns."""
     for d in delays:
-        _, beta = unit_outline(float(d))
+        _, beta = trace_unit_outline(float(d))
         yield {"curve": "passive", "d": d, "delta": deltas,
                "beta_lower": deltas * beta[0], "beta_upper": deltas * beta[-1]}  # fmt: skip
 

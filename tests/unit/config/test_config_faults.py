@@ -44,7 +44,7 @@ FAULTS = {
     "axis_twice": [("7:19: studies[0].delta[2]: got 0.0 twice, here and at [0]", "remove it")],
     "axis_two_forms": [("7:12: studies[0].delta: got a mapping of 2 keys", "keep one of these forms")],
     "axis_unknown_form": [("7:13: studies[0].delta.lin: unknown key", "did you mean 'linear'?")],
-    "axis_with_unit": [("7:12: studies[0].delta: got '10 N s/m'", "this field has no unit; write the number")],
+    "axis_with_unit": [("7:12: studies[0].delta: got '10 N s/m'", "this field has no unit; write only the number")],
     "axis_word": [("7:12: studies[0].delta: got 'no'", "write a number such as 0.5")],
     "bad_indent": [("5:10: not valid YAML", "check the indentation, the colons and the")],
     "boolean_as_text": [("8:16: studies[0].passivity: got 'yes'", "write true or false, without quotes")],
