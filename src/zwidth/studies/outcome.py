@@ -85,7 +85,7 @@ class ComputedStudy(Study):
         """Compute all results; figures are drawn later by the functions in the outcome.
 
         Args:
-            scene: scene of the file; None if the file has none or `reads_scene` is false.
+            scene: scene of the file; None if the file has none.
             alone: True if the file has no other study of this kind, which allows shorter file names.
         """
         raise NotImplementedError
