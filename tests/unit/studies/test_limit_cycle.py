@@ -215,7 +215,10 @@ def test_an_adaptive_window_has_no_linear_boundary():
         ({"conditions": [{"label": "a"}, {"label": "a"}]}, "got 'a' twice"),
         ({"conditions": []}, "at least one of the conditions is needed"),
         ({"conditions": [{"resolution": "20 um"}]}, "label"),
-        ({"axes": {**PLANE, "coulomb": 0.1}, "conditions": [{"label": "a", "coulomb": 0.2}]}, "here and as an axis"),
+        (
+            {"axes": {**PLANE, "coulomb": 0.1}, "conditions": [{"label": "a", "coulomb": 0.2}]},
+            "in the condition and as an axis",
+        ),
         ({"silence": "2 mm"}, "silence must be less than widest"),
         ({"conditions": [{"label": "a", "coulomb": 0.2, "static": 0.1}]}, "below coulomb, 0.2 N"),
     ],
