@@ -38,7 +38,7 @@ _NEWTON_STEPS = 16  # sufficient for the shortest delays, whose maximum is close
 def _find_maximum(curve: Curve, lag: Any, start: Start) -> Any:
     """Return s at the maximum of alpha along the boundary, for a fractional delay."""
     # For short delays the maximum is close to omega = pi, where q = 1 - s^2 solves A + B q = C d q^(-3/2) with
-    # coefficients A, B, C that depend on delta. Therefore q is of the order of d^(2/3), which bounds the search below s = 1.
+    # coefficients A, B, C that depend on delta. Therefore q is of the order of d^(2/3), and s is bounded away from 1.
     rest = 0.3 * np.minimum(lag, 0.05) ** (2.0 / 3.0)
     lower, upper = 0.5 * start.scale, np.minimum(np.sqrt(1.0 - rest), 1.05 * start.scale)
 
