@@ -29,7 +29,7 @@ from zwidth.config.parts import build_parts, list_parts, make_parts_base, parse_
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.parts.device import Device
 from zwidth.parts.paths import PARTS
 from zwidth.parts.timing import Timing
@@ -315,7 +315,7 @@ class SweepStudy(_Parts, Study):
             return
         parts = build_parts(self)
         # A linear system or measured response is checked by its own attributes, because it contains all other parts.
-        obstacle = find_obstacle(**(vars(parts["device"]) if "device" in parts else parts))
+        obstacle = find_unsupported_reason(**(vars(parts["device"]) if "device" in parts else parts))
         for index, name in enumerate(self.outputs):
             if name not in OUTPUTS_WITH_PARTS:
                 allowed = f"available for devices with parts are {quote_names(OUTPUTS_WITH_PARTS)}"

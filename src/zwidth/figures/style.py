@@ -1,6 +1,7 @@
 """House style of all figures: sizes, line styles, colors, units, axis labels and file output.
 
-All settings apply within a context; matplotlib's global settings do not change.
+All settings apply within a context; matplotlib's global settings do not change. *Panels* are the Axes of a figure. A
+*look* is a dict of matplotlib properties of a line.
 """
 
 from __future__ import annotations
@@ -30,10 +31,15 @@ from zwidth.words.quantities import PARAMETERS
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
 # Palette of Okabe and Ito (2008), distinguishable with any color vision.
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+BLACK = "#000000"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+PURPLE = "#CC79A7"
 GRAY = "#6E6E6E"
-DISTINCT = (BLUE, ORANGE, BLACK, GREEN, VERMILION, SKY, PURPLE)
+DISTINCT = (BLUE, ORANGE, BLACK, GREEN, VERMILION, SKY, PURPLE)  # colors of curves without an order
 
 # The meaning of line styles is that of the paper's figures, also legible in gray.
 SOLID = "-"
@@ -56,9 +62,8 @@ WIDTH = 7.0  # inches: both columns of a journal page
 DECADES = 3000.0  # ratio of largest to smallest stiffness from which an axis has ticks at powers of ten only
 PNG_DPI = 180  # dots per inch
 LIGHTEST = 0.6  # position in viridis of the lightest curve color; contrast 3:1 against white
-# Ratio of largest to smallest value below which a logarithmic axis has more ticks than 1, 2 and 5.
-_FEW = 5.0
-_AROUND = 2.0  # ratio of the ends of a logarithmic axis to a single value
+_DENSE_TICKS = 5.0  # ratio of largest to smallest value below which a logarithmic axis has more ticks than 1, 2 and 5
+_SINGLE_VALUE_RANGE = 2.0  # ratio of the ends of a logarithmic axis to a single value
 
 # Omit dates and versions, so that the same figure always has the same bytes.
 _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
@@ -101,8 +106,10 @@ def style_sheet(
     dpi: float | None = None,
     system: UnitSystem | None = None,
 ) -> Iterator[None]:
-    """Draw with the settings of a matplotlib style sheet, a size in inches, a resolution and a unit system if given."""
-    # A size without a height does not change the font size. A size or resolution set by an outer call has priority.
+    """Draw with the settings of a matplotlib style sheet, a size in inches, a resolution and a unit system if given.
+
+    A size without a height does not change the font size. A size or resolution set by an outer call has priority.
+    """
     outer = _settings.get()
     try:
         style = outer.style if file is None else dict(rc_params_from_file(file, use_default_template=False))
@@ -113,7 +120,15 @@ def style_sheet(
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **keywords: Any) -> tuple[Figure, Any]:
-    """Return a new figure, which pyplot does not manage, and a 2-D array of its axes."""
+    """Return a new figure, which pyplot does not manage, and a 2-D array of its Axes.
+
+    Args:
+        width: Default width in inches; a size of the current context replaces it.
+        height: Default height in inches; likewise.
+        rows: Number of rows of panels.
+        columns: Number of columns of panels; they are arranged in one column if the figure is narrow.
+        keywords: Arguments of `matplotlib.figure.Figure.subplots`.
+    """
     engine = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05)
     across, up = _settings.get().size or (width, height)
     if up is None:
@@ -126,7 +141,7 @@ def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **k
 
 
 def panels(given: AnyAxes | None, count: int, width: float, height: float, columns: int = 1, **keywords: Any) -> Any:
-    """Return a 1-D array of the Axes to draw into: the given ones, or ``count`` panels of a new figure."""
+    """Return a 1-D array of the Axes to draw into: the given ones, or ``count`` panels of a `new_figure`."""
     if given is not None:
         return np.asarray(given, dtype=object).ravel()[:count]
     _, axes = new_figure(width, height, -(-count // columns), columns, **keywords)
@@ -176,7 +191,15 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
 def legend(
     axes: np.ndarray | Sequence[Axes], handles: Sequence[Any], *, outside: bool, loc: Any = "best", **keywords: Any
 ) -> None:
-    """Add a legend if there are handles: above the panels in columns that fit, or at ``loc`` in the first panel."""
+    """Add a legend if there are handles.
+
+    Args:
+        axes: The panels.
+        handles: Legend entries.
+        outside: Place the legend above the panels, in as many columns as fit, instead of in the first panel.
+        loc: Position in the first panel.
+        keywords: Arguments of `matplotlib.figure.Figure.legend`; ``ncols`` is the largest number of columns.
+    """
     if not handles:
         return
     if not outside:
@@ -201,6 +224,7 @@ class _PlainLocator(LogLocator):
     """Locator of a logarithmic axis that uses linear ticks if fewer than two logarithmic ones are visible."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
+        """Return the ticks of an axis with the given ends."""
         ticks = np.asarray(super().tick_values(vmin, vmax))
         low, high = sorted((vmin, vmax))
         if low <= 0 or np.count_nonzero((low <= ticks) & (ticks <= high)) > 1:
@@ -215,37 +239,44 @@ def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> N
 
     Args:
         ax: Axes to change.
-        which: axis, "x" or "y".
-        values: values along the axis; only finite positive ones count.
-        wide: ratio of largest to smallest value from which only powers of ten have ticks; below, also 2 and 5 times
+        which: Axis, "x" or "y".
+        values: Values along the axis; only finite positive ones count.
+        wide: Ratio of largest to smallest value from which only powers of ten have ticks; below, also 2 and 5 times
             these powers, and more if the ratio is small.
     """
     getattr(ax, f"set_{which}scale")("log")
-    axis, known = getattr(ax, f"{which}axis"), np.asarray(values, dtype=np.float64)
-    known = known[np.isfinite(known) & (known > 0)]
-    if known.size and known.min() == known.max():
+    axis, positive = getattr(ax, f"{which}axis"), np.asarray(values, dtype=np.float64)
+    positive = positive[np.isfinite(positive) & (positive > 0)]
+    if positive.size and positive.min() == positive.max():
         # Without limits, matplotlib shows decades around a single value.
-        getattr(ax, f"set_{which}lim")(known[0] / _AROUND, known[0] * _AROUND)
-    near = not known.size or known.max() < wide * known.min()
-    few = known.size and known.max() < _FEW * known.min()
+        getattr(ax, f"set_{which}lim")(positive[0] / _SINGLE_VALUE_RANGE, positive[0] * _SINGLE_VALUE_RANGE)
+    with_2_and_5 = not positive.size or positive.max() < wide * positive.min()
+    dense = positive.size and positive.max() < _DENSE_TICKS * positive.min()
     axis.set_major_locator(
-        _PlainLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if few else (1.0, 2.0, 5.0) if near else (1.0,))
+        _PlainLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if dense else (1.0, 2.0, 5.0) if with_2_and_5 else (1.0,))
     )
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
 
 def use_whole(ax: Axes) -> None:
-    """Place ticks at integers only on a linear x axis of an integer quantity."""
+    """Place the ticks of the x axis of an integer quantity at integers, if the axis is linear."""
     if ax.get_xscale() == "linear":
         ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
 
 
-def label_ends(ax: Axes, found: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:
-    """Write the delay of each curve to the right of its end; of two delay models only the exact one is labeled."""
-    named = [k for k, curve in enumerate(found) if is_exact(curve)]
-    texts = [f"$d = {found[k].d:g}$" for k in named]
-    name_heights(ax, texts, [ends[k] for k in named], [colors[found[k].d] for k in named])
+def label_ends(ax: Axes, curves: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:
+    """Write the delay of each curve to the right of its end; with two delay models, label only the exact curves.
+
+    Args:
+        ax: Axes of the curves.
+        curves: The curves, with their delay as attribute ``d``.
+        ends: Height of the end of each curve.
+        colors: Color of each delay.
+    """
+    named = [k for k, curve in enumerate(curves) if is_exact(curve)]
+    texts = [f"$d = {curves[k].d:g}$" for k in named]
+    name_heights(ax, texts, [ends[k] for k in named], [colors[curves[k].d] for k in named])
 
 
 def name_heights(ax: Axes, names: Sequence[str], ends: Sequence[float], colors: Sequence[Any]) -> None:
@@ -255,13 +286,14 @@ def name_heights(ax: Axes, names: Sequence[str], ends: Sequence[float], colors: 
     heights = (to_scale(np.array(ends, dtype=np.float64)) - low) / (high - low)
     spec = ax.get_subplotspec()
     rows = spec.get_gridspec().nrows if spec else 1
-    places = spread(heights, 0.18 * rows / figure_of(ax).get_figheight())
+    heights_apart = spread(heights, 0.18 * rows / figure_of(ax).get_figheight())
     look: dict[str, Any] = {"xycoords": "axes fraction", "fontsize": 8, "va": "center", "annotation_clip": False}
-    for name, place, color in zip(names, places, colors, strict=True):
+    for name, place, color in zip(names, heights_apart, colors, strict=True):
         ax.annotate(name, (1.015, place), color=color, **look)
 
 
 def line(label: str, dash: Any = SOLID, width: float | None = None, color: str = GRAY, **keywords: Any) -> Line2D:
+    """Return a line as legend entry, with label, line style, width and color."""
     return Line2D([], [], color=color, linestyle=dash, linewidth=width, label=label, **keywords)
 
 
@@ -270,13 +302,14 @@ def is_exact(curve: Any) -> bool:
     return getattr(curve, "delay_model", "held") == "held"
 
 
-def delay_model_handles(found: Sequence[Any]) -> list[Line2D]:
+def delay_model_handles(curves: Sequence[Any]) -> list[Line2D]:
     """Return legend entries for solid and dashed lines if fractional powers are drawn."""
-    both = not all(map(is_exact, found))
+    both = not all(map(is_exact, curves))
     return [line("held delay (exact)"), line(r"fractional power $z^{1+d}$", DASHED)] if both else []
 
 
 def figure_of(drawn: AnyAxes | Figure) -> Figure:
+    """Return the figure that contains the given Axes, or the given figure itself."""
     figure = drawn if isinstance(drawn, Figure) else np.asarray(drawn, dtype=object).flat[0].get_figure(root=True)
     assert isinstance(figure, Figure), "an Axes belongs to a figure"
     return figure
@@ -291,10 +324,10 @@ def save(
     """Write a figure as ``stem.png`` and so on; return the paths. The same figure always has the same bytes.
 
     Args:
-        drawn: the figure, or its Axes.
-        stem: path of the files without suffix.
-        formats: file formats, of "png", "svg" and "pdf".
-        dpi: resolution in dots per inch, also of maps in SVG and PDF files. Default: 180 for PNG.
+        drawn: The figure, or its Axes.
+        stem: Path of the files without suffix.
+        formats: File formats, of "png", "svg" and "pdf".
+        dpi: Resolution in dots per inch, also of maps in SVG and PDF files. Default: 180 for PNG.
     """
     figure = figure_of(drawn)
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
@@ -355,14 +388,20 @@ def spread(positions: Sequence[float], gap: float) -> np.ndarray:
 
 
 def add_si_axes(ax: Axes, scale: tuple[float, float]) -> None:
-    """Add axes in SI units at the top and the right of an (alpha, beta) plane."""
+    """Add axes in SI units at the top and the right of an (alpha, beta) plane.
+
+    ``scale`` is the pair of K at alpha = 1 and B at beta = 1.
+    """
     ax.spines[["top", "right"]].set_visible(True)
     ends, names = (ax.get_xlim()[1], max(map(abs, ax.get_ylim()))), ("N/m", "N s/m")
-    places: Any = ((ax.secondary_xaxis, "top", "stiffness  $K$"), (ax.secondary_yaxis, "right", "virtual damping  $B$"))
-    for (add, side, words), one, end, unit in zip(places, scale, ends, names, strict=True):
-        factor, spelled = si_unit(one * end, unit)
-        both = (lambda value, by=one * factor: value * by), (lambda value, by=one * factor: value / by)
-        add(side, functions=both).set(**{"xlabel" if side == "top" else "ylabel": f"{words}  in {spelled}"})
+    secondary_axes: Any = (
+        (ax.secondary_xaxis, "top", "stiffness  $K$"),
+        (ax.secondary_yaxis, "right", "virtual damping  $B$"),
+    )
+    for (add, side, words), si_per_unit, end, unit in zip(secondary_axes, scale, ends, names, strict=True):
+        factor, unit_text = si_unit(si_per_unit * end, unit)
+        both = (lambda value, by=si_per_unit * factor: value * by), (lambda value, by=si_per_unit * factor: value / by)
+        add(side, functions=both).set(**{"xlabel" if side == "top" else "ylabel": f"{words}  in {unit_text}"})
 
 
 def si_unit(values: Any, unit: str) -> tuple[float, str]:

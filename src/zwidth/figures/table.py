@@ -1,4 +1,8 @@
-"""Tables of named columns, as in the CSV files of studies, and their curves."""
+"""Tables of named columns, as in the CSV files of studies, and the curves that they contain.
+
+A *curve* is a group of consecutive rows of a table with the same values in some columns, the *keys*. Names of columns
+end with the unit, for example ``stiffness_N_per_m``; tables of rotary devices have the units of rotary devices.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +57,7 @@ def is_of_rotary(data: Any) -> bool:
 
 
 def name_as_linear(table: Any) -> Any:
-    """Return a table with the column names of linear devices; other objects and such tables are returned unchanged."""
+    """Rename the columns of a table of rotary devices to those of linear devices; return other objects unchanged."""
     names = {str(name): convert_header(str(name), LINEAR) for name in table} if hasattr(table, "keys") else {}
     return {linear: table[name] for name, linear in names.items()} if any(k != v for k, v in names.items()) else table
 
@@ -74,14 +78,19 @@ def in_order(columns: Mapping[str, np.ndarray], over: str) -> dict[str, np.ndarr
 
 
 def grid_in_order(arrays: Mapping[str, np.ndarray], axes: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return arrays in ascending order of the axes, the last dimensions of the arrays with most dimensions."""
-    names, most = list(axes), max(values.ndim for values in arrays.values())
-    placed = dict(arrays)
-    for dimension, name in enumerate(names, start=most - len(names)):
+    """Sort arrays in ascending order of their axes.
+
+    Args:
+        arrays: The arrays by name, including one 1-D array per axis.
+        axes: Names of the axes, in the order of the last dimensions of the arrays with the most dimensions.
+    """
+    names, n_dims = list(axes), max(values.ndim for values in arrays.values())
+    ordered = dict(arrays)
+    for dimension, name in enumerate(names, start=n_dims - len(names)):
         order = np.argsort(arrays[name], kind="stable")
-        grids = {each: values.take(order, dimension) for each, values in placed.items() if values.ndim == most}
-        placed |= {**grids, name: arrays[name][order]}
-    return placed
+        grids = {each: values.take(order, dimension) for each, values in ordered.items() if values.ndim == n_dims}
+        ordered |= {**grids, name: arrays[name][order]}
+    return ordered
 
 
 def curves(table: Table, *keys: str, over: str = "", **wanted: object) -> list[Any]:
@@ -95,10 +104,10 @@ def curves(table: Table, *keys: str, over: str = "", **wanted: object) -> list[A
     ends = np.flatnonzero(np.any(changes, axis=0)) + 1
     parts = {name: np.split(column, ends) for name, column in columns.items()}
     rows = [{name: part[k] for name, part in parts.items()} for k in range(ends.size + 1)]
-    found = [SimpleNamespace(**(in_order(each, over) if over else each)) for each in rows]
-    for curve in found if columns[keys[0]].size else ():
+    all_curves = [SimpleNamespace(**(in_order(each, over) if over else each)) for each in rows]
+    for curve in all_curves if columns[keys[0]].size else ():
         vars(curve).update({key: getattr(curve, key)[0] for key in keys})
-    return found if columns[keys[0]].size else []
+    return all_curves if columns[keys[0]].size else []
 
 
 def stack(parts: Iterable[Mapping[str, object]]) -> dict[str, np.ndarray]:

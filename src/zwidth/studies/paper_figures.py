@@ -20,13 +20,21 @@ from typing import Any, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth.arrays.held_mass import Plant, held_plant
+from zwidth.arrays.held_mass import Plant, discretize_mass
 from zwidth.arrays.roots import bisect, newton
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
-from zwidth.loops.rigid.ridge_newton import Curve, Start, expand_curve, guess_start, stationarity, wall, wave
+from zwidth.loops.rigid.ridge_newton import (
+    Curve,
+    Start,
+    evaluate_stationarity,
+    evaluate_wall,
+    evaluate_wave,
+    expand_curve,
+    guess_start,
+)
 from zwidth.studies.boundary import tabulate_stable_intervals
 from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table
@@ -43,7 +51,7 @@ def _find_maximum(curve: Curve, lag: Any, start: Start) -> Any:
     lower, upper = 0.5 * start.scale, np.minimum(np.sqrt(1.0 - rest), 1.05 * start.scale)
 
     def evaluate_decrease(s: Any) -> tuple[Any, Any]:
-        value, slope = stationarity(s, curve, lag)
+        value, slope = evaluate_stationarity(s, curve, lag)
         return -value, -slope
 
     return newton(evaluate_decrease, lower, upper, np.clip(start.s, lower, upper), _NEWTON_STEPS)[0]
@@ -53,9 +61,9 @@ def maximize_alpha(delta: np.ndarray, d: float) -> tuple[Any, Any, Any]:
     """Return the maximum of alpha with the paper's z^(1+d), and beta and omega there."""
     if d.is_integer():
         return alpha_max(delta, d)[:3]
-    curve, lag = expand_curve(held_plant(delta)), np.full_like(delta, d)
-    maximum = wave(_find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta)), lag, False)
-    return *wall(maximum, curve), 2.0 * maximum.half
+    curve, lag = expand_curve(discretize_mass(delta)), np.full_like(delta, d)
+    maximum = evaluate_wave(_find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta)), lag, False)
+    return *evaluate_wall(maximum, curve), 2.0 * maximum.half_omega
 
 
 def limit_slope(d: float) -> float:
@@ -66,16 +74,16 @@ def limit_slope(d: float) -> float:
     # For delta -> infinity the velocity is proportional to the force, without dynamics: delta N(z) becomes z.
     curve = expand_curve(Plant(c=zero, em=zero + 1.0, a2=zero + 1.0, a1=zero, a0=zero, gap=zero + 1.0))
     s = _find_maximum(curve, lag, guess_start(zero, lag, zero, strength=zero + 1.0))
-    return float(wall(wave(s, lag, False), curve)[0][0])
+    return float(evaluate_wall(evaluate_wave(s, lag, False), curve)[0][0])
 
 
 def find_upper_damping(delta: np.ndarray, d: float) -> np.ndarray:
     """Return the largest stable beta for alpha -> 0 with the paper's z^(1+d), for a fractional d."""
-    curve, lag = expand_curve(held_plant(delta)), np.full_like(delta, d)
+    curve, lag = expand_curve(discretize_mass(delta)), np.full_like(delta, d)
     top = _find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta))
     limit = np.full_like(delta, np.sin(0.5 * np.pi / max(1.0, d + 0.5)))  # upper bound of s on the stability lobe
-    s = bisect(lambda s: wall(wave(s, lag, False), curve)[0] > WALL_RANGE[0], top, limit)
-    return wall(wave(s, lag, False), curve)[1]
+    s = bisect(lambda s: evaluate_wall(evaluate_wave(s, lag, False), curve)[0] > WALL_RANGE[0], top, limit)
+    return evaluate_wall(evaluate_wave(s, lag, False), curve)[1]
 
 
 class _PaperStudy(CurvesStudy):

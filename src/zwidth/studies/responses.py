@@ -26,6 +26,7 @@ from zwidth.config.scenes import (
     DeviceField,
     NormalizedDevice,
     PhysicalDevice,
+    PhysicalScene,
     PhysicalWall,
     normalized_wall,
 )
@@ -38,7 +39,9 @@ from zwidth.loops.rigid.response import step_response
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
+from zwidth.scenes.diagnosis import diagnose
 from zwidth.scenes.recommendation import Recommendation
+from zwidth.scenes.trials import spell_hardware
 from zwidth.scenes.wall_search import RANGES, Grasps
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit
@@ -223,6 +226,7 @@ class RecommendStudy(ResponseStudy):
         wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive", "grasps", "beyond_safe")
         recommendation = bare.recommend(**{name: getattr(self, name) for name in wanted})
         summary, notes, response = recommendation.as_dict(), list(recommendation.notes), None
+        lines = (*recommendation.lines(), *self._simulate(recommendation, scene))
         if not bare.parts_beyond and recommendation.verdict is not None:
             # Use the normalized wall of the verdict, because conversion to SI units and back has rounding errors.
             wall = recommendation.verdict.alpha, recommendation.verdict.beta
@@ -235,11 +239,23 @@ class RecommendStudy(ResponseStudy):
             figures={"": partial(draw, recommendation, response)} if table else {},
             documents={
                 f"{stem}.json": json.dumps(summary, indent=2, allow_nan=False) + "\n",
-                f"{stem}.md": _describe(recommendation, summary),
+                f"{stem}.md": _describe(recommendation, summary, lines),
             },
-            answer=recommendation.lines(),
+            answer=lines,
             notes=tuple(notes),
         )
+
+    def _simulate(self, recommendation: Recommendation, scene: AnyScene | None) -> list[str]:
+        """Return a line with the diagnosis of the wall, with encoder, friction and motor of the scene of the file."""
+        hardware = {}
+        if isinstance(scene, PhysicalScene) and self.device == scene.without_wall():
+            hardware = scene.hardware
+        if recommendation.verdict is None or not hardware or isinstance(recommendation.scene.device, MeasuredDevice):
+            return []
+        diagnosis = diagnose(recommendation.scene, **hardware, remedies=False)
+        used = spell_hardware(hardware, recommendation.unit_system)
+        used += "" if {"coulomb", "static"} & hardware.keys() else ", without friction"
+        return [f"simulated with {used}: {diagnosis.word}: {diagnosis.explain()}"]
 
 
 @house_style()
@@ -251,13 +267,9 @@ def draw(recommendation: Recommendation, response: Table | None = None) -> Any:
     return figures.plot.recommendation(recommendation, axes, response=response)
 
 
-def _describe(recommendation: Recommendation, summary: dict[str, Any]) -> str:
-    """Return a recommendation as Markdown; ``summary`` is its JSON representation."""
-    scene, settled, results = (
-        recommendation.scene,
-        summary["recommended"]["settling_time"],
-        list(recommendation.lines()),
-    )
+def _describe(recommendation: Recommendation, summary: dict[str, Any], lines: Iterable[str]) -> str:
+    """Return a recommendation as Markdown: the device, the lines of the terminal, and changes for more stiffness."""
+    scene, settled, results = recommendation.scene, summary["recommended"]["settling_time"], list(lines)
     times = (with_unit(time, "s") for time in (scene.timing.period, scene.timing.delay))
     parts = [f"{name} = {value}" for name, value in summary["device"].items() if name not in _DEVICE_NAMES]
     if isinstance(scene.device, MeasuredDevice) and recommendation.verdict is not None:
@@ -268,7 +280,7 @@ def _describe(recommendation: Recommendation, summary: dict[str, Any]) -> str:
             f"settles to 2 % of a step of {'torque' if recommendation.unit_system.rotary else 'force'} in about "
             f"{with_unit(settled, 's')}"
         )
-    lines = [
+    page = [
         *("# Recommended virtual wall", ""),
         "Device: {}, sampled every {}, force delayed by {}.".format(scene.device.spell(), *times),
         *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
@@ -277,4 +289,4 @@ def _describe(recommendation: Recommendation, summary: dict[str, Any]) -> str:
         *(("To gain stiffness under the same requirements:", "") if recommendation.steps else ()),
         *(f"- {step.spell()}" for step in recommendation.steps),
     ]
-    return "\n".join(lines).rstrip() + "\n"
+    return "\n".join(page).rstrip() + "\n"

@@ -10,9 +10,9 @@ from mpmath import mp, mpf
 
 import oracles
 import zwidth
-from zwidth.arrays.held_mass import held_plant
+from zwidth.arrays.held_mass import discretize_mass
 from zwidth.loops.rigid.folding import find_degree
-from zwidth.loops.rigid.polynomial import affine
+from zwidth.loops.rigid.polynomial import expand_affine
 
 WALLS = [(0.5, 0.5), (1e-8, -0.3), (40.0, -7.0), (-0.1, 0.0), (0.0, 1.0)]
 DAMPINGS = [1e-300, 1e-12, 1e-8, 1e-3, 0.1, 1.0, 2.31, 30.0, 700.0, 1e4, 1e6]
@@ -82,7 +82,7 @@ def test_a_delay_of_hundreds_of_periods():
 
 def test_affine_parts_add_up_to_the_polynomial(x64):
     for d in (0.0, 3.0, 2.25):
-        parts = affine(jax.numpy.float64(0.7), jax.numpy.float64(d), find_degree(d))
+        parts = expand_affine(jax.numpy.float64(0.7), jax.numpy.float64(d), find_degree(d))
         with mp.workdps(oracles.DIGITS):
             free = oracles.polynomial(0, 0, 0.7, d)
             spring = [left - right for left, right in zip(oracles.polynomial(1, 0, 0.7, d), free, strict=True)]
@@ -137,7 +137,7 @@ def test_si_polynomial_without_damping_is_the_limit():
 @pytest.mark.parametrize("scene", PHYSICAL)
 def test_the_closed_loop_s_numerator_is_that_of_eq_10(scene, d):
     mass, damping, period, *_ = scene
-    plant = held_plant(np.float64(damping * period / mass))
+    plant = discretize_mass(np.float64(damping * period / mass))
     got = period * period / mass * np.array([plant.a2, plant.a1])
     with mp.workdps(80):
         m, b, T = mpf(mass), mpf(damping), mpf(period)
