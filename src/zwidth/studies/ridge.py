@@ -163,7 +163,7 @@ class Poses(Strict, noun="a table of poses"):
             chosen = {key: getattr(self, key) for key in ("across", "up")}
             if set(table.columns) != {"mass", "damping"}:
                 message = f"got columns {' and '.join(table.columns)}"
-                yield ("csv",), problem(message, _FORM, "keep only mass and damping as parameters")
+                yield ("csv",), problem(message, _FORM, "give mass and damping as the only parameters")
             for key in (key for key, name in chosen.items() if name not in columns_by_name):
                 remedy = suggestion(chosen[key], columns_by_name, f"choose from {', '.join(columns_by_name)}")
                 yield (key,), problem(f"got {describe(chosen[key])}", "it must be a column of the file", remedy)
@@ -259,7 +259,7 @@ class WorkspaceStudy(ComputedStudy):
         low, high = (with_unit(round_safely(float(each), "below"), units["N/m"]) for each in ends)
         answer = (
             f"K_max from {low} at {self.poses.spell(weakest)} to {high}",
-            f"{name_wall(*wall, units)}, {100 * RECOMMENDED_SHARE:g} % of the lowest, is "
+            f"{name_wall(*wall, units)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
             f"stable in {np.count_nonzero(is_stable_at)} of {np.count_nonzero(has_result)} poses",
         )
         draw = partial(figures.draw_workspace, table, *coordinates, names=self.poses.names)

@@ -125,7 +125,7 @@ FAULTS = {
     "max_rate: 5 N": ("max_rate", "units allowed are N/s"),
     "max_force: 0 N": ("max_force", "greater than 0"),
     "contact: one-sided": ("contact", "'bilateral', 'unilateral', 'push_only'"),
-    "coulomb: 0.3 N, static: 0.2 N": ("static", "at least the friction while slipping"),
+    "coulomb: 0.3 N, static: 0.2 N": ("static", "at least the sliding friction"),
     "jitter: 1 periods": ("jitter", "less than one period"),
     "jitter: 2 ms": ("jitter", "less than one period"),
     "duration: 2000 s": ("duration", "2e+06 periods"),

@@ -114,7 +114,7 @@ def test_faults_have_their_place(load, table, device, more, place, words):
     ("study", "words"),
     [
         ("kind: passivity", "a device with a system or response in place of its mass"),
-        ("kind: boundary, passivity: true", "not for one with a system or response"),
+        ("kind: boundary, passivity: true", "without a system or response"),
         ("kind: sweep, axes: {period: [0.5 ms, 1 ms]}, outputs: [stiffness_max]", "at which it was measured"),
         ("kind: simulate, walls: [{stiffness: 1000}]", "a simulation needs mass"),
     ],

@@ -128,7 +128,7 @@ def test_axes_have_the_names_and_the_units_of_the_file(tmp_path):
 @pytest.mark.parametrize(
     "poses, said",
     [
-        (POSES.replace("mass [g]", "weight"), "give these two"),
+        (POSES.replace("mass [g]", "weight"), "give mass and damping"),
         (POSES.replace("0,90", "x,90"), "'x'"),
         (POSES.splitlines()[0] + "\n0,30,240,1.6\n", "at least two are needed"),
     ],
