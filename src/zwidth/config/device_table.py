@@ -88,6 +88,7 @@ def read_table(raw: Any) -> DeviceTable:
 
 
 def _read_lists(raw: dict[str, Any]) -> DeviceTable:
+    """Return the table of lists of equal length by the names of columns; raise one error with all problems."""
     problems: list[LocatedProblem] = []
     columns: dict[str, tuple[Any, ...]] = {}
     in_periods = False
@@ -123,12 +124,15 @@ def _read_lists(raw: dict[str, Any]) -> DeviceTable:
 
 
 def _check_label(cell: Any) -> Any:
+    """Return a label unchanged; raise a problem if it is not a text."""
     if not isinstance(cell, str) or not cell.strip():
         raise problem(f"got {describe(cell)}", "a label is text", "put it in quotes")
     return cell
 
 
 class _TableFile(Strict, noun="a table from a file"):
+    """Mapping ``{csv: FILE}``."""
+
     csv: str
 
 
@@ -220,6 +224,7 @@ def _to_value(cell: str, unit: str) -> float | str:
 
 
 def _make_schema() -> dict[str, Any]:
+    """Return the JSON Schema of tables of devices."""
     column = share_schema("column", {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}})
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
     lists = {LABEL: labels, **dict.fromkeys(PARAMETERS, column)}

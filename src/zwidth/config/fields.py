@@ -48,10 +48,10 @@ class Fault:
     """One fault of a configuration; line and column are None if it has no position, e.g. for a missing file."""
 
     file: str  # path as given by the user; empty for a configuration passed as a mapping
-    line: int | None  # from 1
-    column: int | None  # in characters, from 1
-    field: str  # such as ``studies[0].delta``; empty for the file as a whole
-    problem: str  # with the value received
+    line: int | None  # line number, counted from 1
+    column: int | None  # column in characters, counted from 1
+    field: str  # path of the field, such as ``studies[0].delta``; empty for the file as a whole
+    problem: str  # description of the problem, with the value received
     allowed: str = ""
     remedy: str = ""
 
@@ -230,6 +230,7 @@ class Strict(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _validate(cls, raw: Any, handler: Handler[Any]) -> Any:
+        """Return the model of a mapping; raise one error with all its problems. ``handler`` validates the fields."""
         if isinstance(raw, cls):
             return raw
         if not isinstance(raw, dict):
@@ -291,6 +292,7 @@ def _find_docstrings(model: type[Strict]) -> Iterator[tuple[str, str]]:
 
 
 def _validate_name(value: Any) -> str:
+    """Return the name unchanged; raise a problem if it is not valid as the name of a folder."""
     allowed = "a name is 1 to 64 of the characters a-z, 0-9, '_' and '-', because it names a folder"
     if not isinstance(value, str):
         raise problem(f"got {describe(value)}", allowed, "write a name, in quotes if it is all digits")

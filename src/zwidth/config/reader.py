@@ -154,6 +154,7 @@ def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
 
 
 def _fail(file: str, position: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
+    """Return an error with one fault; ``parts`` are its problem, allowed values and remedy."""
     line, column = position or (None, None)
     return ConfigFileError.of([Fault(file, line, column, format_path(path), *parts)])
 
@@ -197,6 +198,7 @@ def _find_position(text: str, index: int) -> tuple[int, int]:
 
 
 def _find_mark(mark: yaml.Mark) -> tuple[int, int]:
+    """Return line and column, both from 1, of a mark of PyYAML, which counts from 0."""
     return mark.line + 1, mark.column + 1
 
 
@@ -336,6 +338,7 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
             raise _fail(self.file, position, message, allowed, "use fewer levels", path=path)
 
     def _add_fault(self, position: tuple[int, int], path: FieldPath, *parts: str) -> None:
+        """Append a fault; ``parts`` are its problem, allowed values and remedy."""
         self.faults.append(Fault(self.file, *position, format_path(path), *parts))
 
     def _read(self, node: Any, path: FieldPath, in_alias: bool = False) -> Any:

@@ -33,7 +33,7 @@ Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, stable_set.Outlines]
 
 # Outputs with a contour at the boundary of the stable walls, which is smoother than that of the output "stable".
 SMOOTH = ("margin", "spectral_radius")
-# The same for each output that is drawn as a region.
+# Smooth outputs whose contour is the boundary of a region, by the output of the region.
 _SMOOTH_OUTPUTS = {"stable": SMOOTH, "passive": ("passivity_margin",)}
 # Outputs that are finite for stable walls only.
 _FINITE_IF_STABLE = ("settling_time", "delay_margin")

@@ -33,11 +33,11 @@ from zwidth.words.quantities import POSITIVE
 from zwidth.words.showing import find_unit
 from zwidth.words.status import Status
 
-_COLUMNS = {known.name: column for column, known in AXES.items()}
+_COLUMNS = {parameter.name: column for column, parameter in AXES.items()}
 _OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
 _MAX_CURVES = 6  # values of a list that are drawn as curves; a longer list is drawn as a plane
-# Default of the largest amplitude that counts as a limit cycle, by "is rotary": in m for a linear, in rad for a rotary
-# device.
+# Default of the largest amplitude that counts as a limit cycle: key False for linear devices (in m), True for rotary
+# devices (in rad).
 WIDEST = {False: 1e-3, True: math.radians(20.0)}
 WIDEST_STEPS = 10.0  # lower bound of that default, in encoder steps
 
@@ -185,7 +185,7 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
         arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in results.items()}
         table = stack(edges)
-        # Draw one curve for each value of a short list, or one curve; otherwise a plane.
+        # Draw a curve per value of a short list, or one curve for one varied parameter; otherwise draw a plane.
         short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MAX_CURVES]
         draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
         if short or len(varied) == 1:
@@ -232,11 +232,11 @@ def describe_outcomes(motion: Any, stable: np.ndarray, bounds: tuple[float, floa
         "in a limit cycle": ~rest & ~wide,
         f"larger than {spell_short(bounds[1], find_unit(motion, 'm'))}": wide,
     }
-    words = []
+    parts = []
     for name, kind in {"linearly stable ": 1, "linearly unstable ": 0, "": -1}.items():
         selected = complete & (stable == kind)
         if selected.any():
             counts = ", ".join(f"{np.count_nonzero(end[selected]):,} {word}" for word, end in ends.items())
-            words.append(f"of {np.count_nonzero(selected):,} {name}walls {counts}")
+            parts.append(f"of {np.count_nonzero(selected):,} {name}walls {counts}")
     lost = int(np.count_nonzero(~complete))
-    return "; ".join(words) + (f"; {lost} not simulated to the end" if lost else "")
+    return "; ".join(parts) + (f"; {lost} not simulated to the end" if lost else "")

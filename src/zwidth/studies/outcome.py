@@ -32,7 +32,7 @@ from zwidth.words.unit_system import LINEAR, UnitSystem
 
 Item = TypeVar("Item")
 
-# Receives the number of finished parts and of all parts during a long study.
+# Progress callback for long studies; its arguments are the number of finished parts and of all parts.
 LISTENER: ContextVar[Callable[[int, int], None]] = ContextVar("LISTENER", default=lambda done, total: None)
 
 

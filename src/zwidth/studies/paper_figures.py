@@ -71,7 +71,8 @@ def limit_slope(d: float) -> float:
     if d.is_integer():
         return float(stiffness_slope(d))
     zero, lag = np.zeros(1), np.full(1, d)
-    # For delta -> infinity the velocity is proportional to the force, without dynamics: delta N(z) becomes z.
+    # For delta -> infinity the velocity is proportional to the force, so delta N(z) becomes z, with N the numerator of
+    # the plant.
     curve = expand_curve(Plant(c=zero, em=zero + 1.0, a2=zero + 1.0, a1=zero, a0=zero, gap=zero + 1.0))
     s = _find_maximum(curve, lag, guess_start(zero, lag, zero, strength=zero + 1.0))
     return float(evaluate_wall(evaluate_wave(s, lag, False), curve)[0][0])

@@ -94,7 +94,7 @@ def published_numbers() -> list[Comparison]:
     undamped, damped = (STIFFNESS_FRACTION * _maximize_alpha(delta, DELAY_FACTOR)[0] for delta in (0.0, 1.0))
     over_practice = undamped * MASS / PERIOD**2 / MASSIE_SALISBURY
     return [
-        # Remark 4: K_max T^2/m without physical damping.
+        # Remark 4 of the paper prints these two values of K_max T^2/m without physical damping.
         Comparison("alpha_max(delta = 0, d = 0)", "eq. (24)", "0.6863", _maximize_alpha(0.0, 0)[0]),
         Comparison("alpha_max(delta = 0, d = 1)", "eq. (25)", "0.1445", _maximize_alpha(0.0, 1)[0]),
         *(

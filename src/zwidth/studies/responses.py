@@ -178,7 +178,7 @@ class StepStudy(WallsStudy, ResponseStudy):
         return Outcome(table=table, figures={"": partial(figures.draw_step, table)}, notes=tuple(notes))
 
 
-# Parameters that the report of a recommendation does not list as parts.
+# Parameters of the device that the report does not list among its parts.
 _DEVICE_NAMES = ("mass", "damping", "period", "delay", "delta", "d")
 
 

@@ -170,12 +170,12 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
         for k, (label, *wall) in enumerate(walls):
             named = {"label": label, **dict(zip(SI_COLUMNS, wall, strict=True))}
             parts.append({**named, **tabulate_motion(motion, k, self.substeps)})
-            words = describe_ending(motion, k)
+            ending = describe_ending(motion, k)
             judged = {} if linear is None else {"linearly_stable": bool(linear[k])}
-            whole = {header(name, unit): getattr(motion, name)[k] for name, (_, unit) in OF_WHOLE.items()}
-            rows.append({**named, **judged, **whole, "outcome": words})
+            properties = {header(name, unit): getattr(motion, name)[k] for name, (_, unit) in OF_WHOLE.items()}
+            rows.append({**named, **judged, **properties, "outcome": ending})
             verdict = "" if linear is None else f" (linearly {'stable' if linear[k] else 'unstable'})"
-            notes.append(f"{label}{verdict}: {words}")
+            notes.append(f"{label}{verdict}: {ending}")
         table = stack(parts)
         drawn = {"": figures.draw_motion, "_phase": figures.draw_phase_plane, "_energy": figures.draw_energy}
         return Outcome(
