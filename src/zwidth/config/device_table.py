@@ -1,4 +1,8 @@
-"""Parameters that move together: one row a device, written in the file or read from a CSV file."""
+"""Tables of devices for sweeps: parameters that vary together, one row per device.
+
+A table is written in the configuration as lists of equal length, or read from a CSV file whose header has the names of
+the parameters and, in brackets, their units. File names are relative to the folder of the configuration.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +16,16 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.fields import LocatedProblem, Strict, listing, printable, problem, problems_of, validation_error
-from zwidth.config.values import quantity_of, read_entries, share
+from zwidth.config.fields import (
+    LocatedProblem,
+    Strict,
+    combine_problems,
+    escape_unprintable,
+    list_problems,
+    problem,
+    quote_names,
+)
+from zwidth.config.values import quantity_of, read_entries, share_schema
 from zwidth.words.contexts import set_temporarily
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, resembling, suggestion
@@ -21,14 +33,14 @@ from zwidth.words.quantities import PARAMETERS
 from zwidth.words.tables import DecimalSigns, holds_data, read_lines, split_lines
 from zwidth.words.units import looks_like_number, split_title
 
-LABEL = "label"
-MAX_ROWS = 100_000
-_KNOWN = (LABEL, *PARAMETERS)
+LABEL = "label"  # column with a name for each device
+MAX_ROWS = 100_000  # devices per table
+_COLUMNS = (LABEL, *PARAMETERS)  # names of columns that are read; a CSV file may have others
 MAX_CSV_BYTES = 2**25
 
 _FORMS = "lists of equal length under the names of parameters, or {csv: FILE}"
 
-# A context variable, because values of a configuration do not contain its folder.
+# Folder of the configuration that is being read. A context variable, because validators receive only values.
 _folder: ContextVar[Path] = ContextVar("folder", default=Path())
 
 
@@ -44,21 +56,23 @@ def find_file(name: str) -> Path:
 
 @dataclass(frozen=True)
 class DeviceTable:
-    """Rows of parameters."""
+    """Parameters of several devices, one row per device."""
 
-    columns: dict[str, tuple[float, ...]]  # the parameters in base units
-    labels: tuple[str, ...] = ()  # a name for each row, or none at all
-    in_periods: bool = False  # whether the column ``delay`` counts sampling periods; else it is in seconds
+    columns: dict[str, tuple[float, ...]]  # values by the name of the parameter, in SI base units
+    labels: tuple[str, ...] = ()  # names of all rows, or empty
+    in_periods: bool = False  # True if the column ``delay`` is in sampling periods instead of seconds
 
     @property
     def size(self) -> int:
+        """Number of devices."""
         return len(next(iter(self.columns.values())))
 
     def values(self, name: str) -> np.ndarray:
+        """Return a column as an array."""
         return np.array(self.columns[name], dtype=np.float64)
 
-    def spelling(self) -> dict[str, Any]:
-        """The table as a configuration file writes it, whether it came from a CSV file or not."""
+    def serialize(self) -> dict[str, Any]:
+        """Return the table as lists in the form of a configuration file, also if it was read from a CSV file."""
         lists: dict[str, Any] = {LABEL: list(self.labels)} if self.labels else {}
         lists |= {name: list(values) for name, values in self.columns.items()}
         if self.in_periods:
@@ -67,70 +81,78 @@ class DeviceTable:
 
 
 def read_table(raw: Any) -> DeviceTable:
-    """A validator for a table in any of its forms."""
+    """Return the table that a value of a configuration describes: lists, or the name of a CSV file."""
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", f"devices are {_FORMS}", "write {csv: devices.csv}")
     return _read_csv(raw) if "csv" in raw else _read_lists(raw)
 
 
 def _read_lists(raw: dict[str, Any]) -> DeviceTable:
-    found: list[LocatedProblem] = []
+    """Return the table of lists of equal length by the names of columns; raise one error with all problems."""
+    problems: list[LocatedProblem] = []
     columns: dict[str, tuple[Any, ...]] = {}
     in_periods = False
     for key, cells in raw.items():
-        if key not in _KNOWN:
-            what = problem("unknown key", f"devices are {_FORMS}", suggestion(key, _KNOWN, "remove it"), on_key=True)
-            found.append(((key,), what))
+        if key not in _COLUMNS:
+            fault = problem("unknown key", f"devices are {_FORMS}", suggestion(key, _COLUMNS, "remove it"), on_key=True)
+            problems.append(((key,), fault))
         elif not isinstance(cells, list | tuple):
-            what = problem(f"got {describe(cells)}", "a column of devices is a list", "write [value, value, ...]")
-            found.append(((key,), what))
+            fault = problem(f"got {describe(cells)}", "a column of devices is a list", "write [value, value, ...]")
+            problems.append(((key,), fault))
         else:
-            entry, units = (_check_label, set()) if key == LABEL else quantity_of(key).read_alike()
+            read, units = (_check_label, set()) if key == LABEL else quantity_of(key).read_alike()
             try:
-                columns[key] = read_entries(cells, entry, distinct=False) if cells or key != LABEL else ()
+                columns[key] = read_entries(cells, read, distinct=False) if cells or key != LABEL else ()
             except (PydanticCustomError, ValidationError) as error:
-                found += problems_of(error, key)
+                problems += list_problems(error, key)
             in_periods |= "periods" in units
-    if found:
-        raise validation_error("devices", found)
+    if problems:
+        raise combine_problems("devices", problems)
     labels = columns.pop(LABEL, ())
     if not columns:
         raise problem("got no parameter", f"devices are {_FORMS}", f"add a column such as {'mass'!r}")
     lengths = {name: len(values) for name, values in columns.items()} | ({LABEL: len(labels)} if labels else {})
     if len(set(lengths.values())) > 1:
         sizes = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise problem(f"got columns of different length: {sizes}", "all columns have one entry a row", "complete them")
+        raise problem(
+            f"got columns of different length: {sizes}", "all columns have one entry per row", "complete them"
+        )
     rows = next(iter(lengths.values()))
     if rows > MAX_ROWS:
-        raise problem(f"got {rows} rows", f"at most {MAX_ROWS} devices a study", "split the table")
+        raise problem(f"got {rows} rows", f"at most {MAX_ROWS} devices per study", "split the table")
     return DeviceTable(columns, labels, in_periods)
 
 
 def _check_label(cell: Any) -> Any:
+    """Return a label unchanged; raise a problem if it is not a text."""
     if not isinstance(cell, str) or not cell.strip():
         raise problem(f"got {describe(cell)}", "a label is text", "put it in quotes")
     return cell
 
 
-class _TableFile(Strict, what="a table from a file"):
+class _TableFile(Strict, noun="a table from a file"):
+    """Mapping ``{csv: FILE}``."""
+
     csv: str
 
 
 def _read_csv(raw: dict[str, Any]) -> DeviceTable:
-    """A table from a file, whose header names parameters and, in brackets, their units."""
+    """Return the table of a CSV file."""
     name = _TableFile.model_validate(raw).csv
     try:
         rows = _read_rows(name)
         return _parse_rows(rows, _choose_columns(rows[0][1], name), name)
     except PydanticCustomError as error:
-        raise validation_error("devices", [(("csv",), error)]) from None
+        raise combine_problems("devices", [(("csv",), error)]) from None
 
 
 def _read_rows(name: str) -> list[tuple[int, list[str]]]:
-    """The header of a CSV file and the rows below it that hold something, each with its line."""
-    # Remarks above it begin with # or %, or are the ``sep=;`` of spreadsheets. Columns are separated by tabs, else
-    # semicolons, else commas: the first of these that the header holds. Where commas do not separate, they may be
-    # decimal signs.
+    """Return the header and the rows of a CSV file that are not empty, each with its line number.
+
+    Comments above the header begin with # or %, or are the ``sep=;`` of spreadsheets. The separator is the first of
+    tab, semicolon and comma that the header contains. If the separator is not the comma, commas in numbers are decimal
+    signs.
+    """
     file = find_file(name)
     try:
         lines = read_lines(file, MAX_CSV_BYTES)
@@ -141,55 +163,69 @@ def _read_rows(name: str) -> list[tuple[int, list[str]]]:
             signs = DecimalSigns(file)
             rows[1:] = [(line, [signs.read(line, cell) for cell in cells]) for line, cells in rows[1:]]
     except InputError as error:
-        what, *allowed, remedy = str(error).split("; ", 2)
+        message, *allowed, remedy = str(error).split("; ", 2)
         allowed = allowed[0] if allowed else "names are relative to this file"
-        raise problem(printable(what), allowed, remedy) from None
+        raise problem(escape_unprintable(message), allowed, remedy) from None
     if len(rows) < 2:
-        raise problem(f"{printable(name)} has {len(rows)} rows", "a header and one row at least", "fill the file")
+        raise problem(
+            f"{escape_unprintable(name)} has {len(rows)} rows", "a header and at least one row", "fill the file"
+        )
     return rows
 
 
 def _choose_columns(header: list[str], name: str) -> dict[str, tuple[int, str]]:
-    """For every parameter that the file holds its column and unit."""
+    """Return the index and the unit of the column of each parameter in the header; ignore other columns."""
     chosen: dict[str, tuple[int, str]] = {}
     for index, title in enumerate(header):
         key, unit = split_title(title)
         if key in chosen:
-            raise problem(f"{printable(name)}: the column {describe(key)} comes twice", "each once", "remove one")
-        if key in _KNOWN:
+            raise problem(
+                f"{escape_unprintable(name)}: the column {describe(key)} occurs twice", "each once", "remove one"
+            )
+        if key in _COLUMNS:
             chosen[key] = index, unit
-        elif resembling(key, _KNOWN):
-            # A misspelled column must not be taken for a remark; other ones, as a source, are the reader's own.
-            what = f"{printable(name)}: got the column {describe(key)}"
-            raise problem(what, f"columns are {listing(_KNOWN)}, and others", suggestion(key, _KNOWN, "rename it"))
+        elif resembling(key, _COLUMNS):
+            # Refuse names similar to those of parameters, because a misspelled parameter would be ignored. Other
+            # columns, such as "source", are allowed and ignored.
+            message = f"{escape_unprintable(name)}: got the column {describe(key)}"
+            raise problem(
+                message, f"columns are {quote_names(_COLUMNS)}, and others", suggestion(key, _COLUMNS, "rename it")
+            )
     return chosen
 
 
 def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> DeviceTable:
-    """The chosen columns of a file's rows, read as lists are; a fault is told with its line."""
+    """Return the table of the chosen columns of a CSV file; errors are reported with their lines.
+
+    Args:
+        rows: line number and cells of each row, the header first.
+        chosen: index and unit of the columns to read, by parameter.
+        name: name of the file for messages.
+    """
     lists: dict[str, list[Any]] = {key: [] for key in chosen}
     for key, (index, unit) in chosen.items():
         for line, row in rows[1:]:
             if index >= len(row) or not row[index]:
                 allowed = "every device has a value for every parameter"
-                raise problem(f"{printable(name)}, line {line}: {key} is missing", allowed, "fill the cell")
+                raise problem(f"{escape_unprintable(name)}, line {line}: {key} is missing", allowed, "fill the cell")
             lists[key].append(from_cell(row[index]) if key == LABEL else _to_value(row[index], unit))
     try:
         return _read_lists(lists)
     except ValidationError as error:
-        ((key, row), what), *_ = problems_of(error)
-        context = what.context or {}
-        place = f"{printable(name)}, line {rows[1 + int(row)][0]}: {key}"
-        raise problem(f"{place}: {context['what']}", context["allowed"], context["remedy"]) from None
+        ((key, row), fault), *_ = list_problems(error)
+        context = fault.context or {}
+        position = f"{escape_unprintable(name)}, line {rows[1 + int(row)][0]}: {key}"
+        raise problem(f"{position}: {context['message']}", context["allowed"], context["remedy"]) from None
 
 
 def _to_value(cell: str, unit: str) -> float | str:
-    """A number in the header's unit, or a number with a unit of its own."""
+    """Return a cell as a value of a configuration; a number without a unit gets the unit of the header."""
     return cell if not looks_like_number(cell) else f"{cell} {unit}" if unit else float(cell)
 
 
 def _make_schema() -> dict[str, Any]:
-    column = share("column", {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}})
+    """Return the JSON Schema of tables of devices."""
+    column = share_schema("column", {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}})
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
     lists = {LABEL: labels, **dict.fromkeys(PARAMETERS, column)}
     keys = {"csv": {"type": "string"}}
@@ -198,5 +234,5 @@ def _make_schema() -> dict[str, Any]:
     return {"description": f"Devices: {_FORMS}.", "anyOf": forms}
 
 
-_SPELLED = PlainSerializer(DeviceTable.spelling, return_type=dict[str, Any])
-TableField = Annotated[DeviceTable, PlainValidator(read_table), _SPELLED, WithJsonSchema(_make_schema())]
+_SERIALIZER = PlainSerializer(DeviceTable.serialize, return_type=dict[str, Any])
+TableField = Annotated[DeviceTable, PlainValidator(read_table), _SERIALIZER, WithJsonSchema(_make_schema())]

@@ -1,4 +1,9 @@
-"""Devices of a configuration: a sampled mass and the keys that cannot stand beside it, a linear system, a response."""
+"""Models of devices: a sampled mass with damping, a linear system, and a measured frequency response.
+
+Sections are either in SI units ("physical") or normalized; `OneKind` reports keys of the other kind. A linear system
+or a measured response replaces mass, damping and mechanical parts. Its forms are: numerator and denominator, zeros,
+poles and gain, or the matrices A, B and C.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +17,8 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.config.device_table import find_file
-from zwidth.config.fields import LocatedProblem, Strict, listing, problem, validation_error
-from zwidth.config.parts import PART_NAMES, PartSection, split_refusal
+from zwidth.config.fields import LocatedProblem, Strict, combine_problems, problem, quote_names
+from zwidth.config.parts import PART_NAMES, PartSection, parse_message
 from zwidth.config.values import Delay, Quantity, get_system, quantity_of
 from zwidth.parts.checks import Span
 from zwidth.parts.devices import DEVICES
@@ -25,20 +30,26 @@ from zwidth.words.formatting import describe, suggestion
 from zwidth.words.quantities import HARDWARE, POSITIVE
 
 FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
-_OF_SYSTEM = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"))
+# Keys of a linear system by form; the last key of a form is always required.
+_SYSTEM_FORMS = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"))
 
 
 def _to_array(raw: Any) -> np.ndarray:
-    """Real numbers, or complex ones where one is, of a list or of one; `ValueError` where one is none."""
-    given = np.array([] if raw is None else raw)
-    if given.dtype.kind == "U":
-        given = np.array([complex(text.replace(" ", "")) for text in given.ravel()]).reshape(given.shape)
-    if given.dtype.kind not in "iufc":
+    """Return a number or a list as an array, complex if an entry is a text such as "-3+40j".
+
+    Raises:
+        ValueError: if an entry is not a number.
+    """
+    array = np.array([] if raw is None else raw)
+    if array.dtype.kind == "U":
+        array = np.array([complex(text.replace(" ", "")) for text in array.ravel()]).reshape(array.shape)
+    if array.dtype.kind not in "iufc":
         raise ValueError("no numbers")
-    return given
+    return array
 
 
 def _check_numbers(raw: Any) -> Any:
+    """Return the value unchanged; raise a problem if it is not a number or a list of finite numbers."""
     with suppress(ValueError):
         if np.all(np.isfinite(_to_array(raw))):
             return raw
@@ -49,111 +60,120 @@ def _check_numbers(raw: Any) -> Any:
 _Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type": ["array", "number"]})]
 
 
-class SystemSection(PartSection, what="a linear system"):
+class SystemSection(PartSection, noun="a linear system"):
     """A device as a linear system, from commanded force in N to sensed position in m."""
 
     numerator: _Numbers | None = None
-    """Coefficients in s, or in z of a sampled system, highest power first."""
+    """Numerator coefficients in powers of s, or of z for a sampled system; highest power first."""
 
     denominator: _Numbers | None = None
-    """Likewise; of a higher degree."""
+    """Denominator coefficients, highest power first; the degree must exceed that of the numerator."""
 
     zeros: _Numbers | None = None
-    """Finite zeros in rad/s, or in z; complex ones as text, '-3+40j', with their conjugates. Default: none."""
+    """Finite zeros in rad/s, or in the z plane for a sampled system; complex zeros as text such as '-3+40j', together
+    with their conjugates. Default: none."""
 
     poles: _Numbers | None = None
-    """Poles, likewise."""
+    """Poles, in the same form as the zeros."""
 
     gain: _Numbers | None = None
-    """Of the highest powers, with zeros and poles."""
+    """Ratio of the leading coefficients of numerator and denominator; required with zeros and poles."""
 
     A: _Numbers | None = None
-    """Matrix of the state, a list of rows."""
+    """State matrix, a list of rows."""
 
     B: _Numbers | None = None
-    """Column of the force."""
+    """Input vector, for the force."""
 
     C: _Numbers | None = None
-    """Row of the position."""
+    """Output vector, for the position."""
 
     sampled: Annotated[float, Quantity("s", POSITIVE)] | None = None
-    """The period of a system from sample to sample, that of the loop; a continuous one has none."""
+    """Sampling period of a discrete-time system, in s or with a unit; must equal the period of the loop. Default: the
+    system is continuous-time."""
 
     @cached_property
-    def known(self) -> LinearDevice:
-        form = next(form for form in _OF_SYSTEM if getattr(self, form[-1]) is not None)
+    def instance(self) -> LinearDevice:
+        """The linear system."""
+        form = next(form for form in _SYSTEM_FORMS if getattr(self, form[-1]) is not None)
         names = {"numerator": "num", "denominator": "den"}
-        known: dict[str, Any] = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
+        arguments: dict[str, Any] = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
         if form != ("A", "B", "C"):
-            known = {name: values if name == "gain" else np.atleast_1d(values) for name, values in known.items()}
-        return LinearDevice(SimpleNamespace(**known, D=0.0, dt=self.sampled))
+            arguments = {
+                name: values if name == "gain" else np.atleast_1d(values) for name, values in arguments.items()
+            }
+        return LinearDevice(SimpleNamespace(**arguments, D=0.0, dt=self.sampled))
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        # A misspelled key is reported, and its form is as good as there.
-        if raw.keys() <= cls.model_fields.keys() and not _is_whole(raw):
-            given, forms = listing(raw.keys() - {"sampled"}) or "nothing", " or ".join(map(listing, _OF_SYSTEM))
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        # Skip this check if a key is unknown, because a misspelled key is reported and may complete the form.
+        if raw.keys() <= cls.model_fields.keys() and not _is_complete(raw):
+            given, forms = (
+                quote_names(raw.keys() - {"sampled"}) or "nothing",
+                " or ".join(map(quote_names, _SYSTEM_FORMS)),
+            )
             yield (), problem(f"got {given}", f"a linear system has {forms}", "write one of these")
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        # Of its keys at large, for the message tells which.
-        return [((), what) for _, what in super().limits()] if _is_whole(self.model_fields_set) else []
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        # Locate the problems at the section instead of a key, because their messages name the key.
+        return [((), fault) for _, fault in super().find_faults()] if _is_complete(self.model_fields_set) else []
 
 
-def _is_whole(given: Iterable[str]) -> bool:
-    """Whether keys are those of one form; a system may have no zeros."""
-    return any(set(form) - {"zeros"} <= set(given) <= {*form, "sampled"} for form in _OF_SYSTEM)
+def _is_complete(given: Iterable[str]) -> bool:
+    """Return whether keys form one complete description of a linear system; the zeros are optional."""
+    return any(set(form) - {"zeros"} <= set(given) <= {*form, "sampled"} for form in _SYSTEM_FORMS)
 
 
-class ResponseSection(PartSection, what="a response"):
-    """A device by its measured frequency response, the columns of a table."""
+class ResponseSection(PartSection, noun="a response"):
+    """A device given by its measured frequency response from force to position, as lists of equal length."""
 
     frequency: _Numbers
-    """Of its lines, in Hz."""
+    """Frequencies in Hz."""
 
     real: _Numbers
-    """Real part of position over force, in m/N."""
+    """Real part of the response at each frequency, in m/N."""
 
     imag: _Numbers
-    """Imaginary part, in m/N."""
+    """Imaginary part of the response at each frequency, in m/N."""
 
     deviation: _Numbers | None = None
-    """The radius in which the true response lies, in m/N."""
+    """Radius around each value that contains the true response, in m/N. Default: the values are exact."""
 
     rotary: bool = False
-    """Set to true if the response is that of an angle to a torque, in rad/(N m)."""
+    """True for a response from torque to angle, in rad/(N m). Default: false."""
 
     @classmethod
     def read(cls, file: str) -> ResponseSection:
-        """The columns of a table, so that a run keeps the numbers and not the name."""
-        known = MeasuredDevice.read(find_file(file))
-        columns = {"frequency": known.frequency, "real": known.response.real, "imag": known.response.imag}
-        columns |= {} if known.deviation is None else {"deviation": known.deviation}
-        return cls(**{name: column.tolist() for name, column in columns.items()}, rotary=known.rotary)
+        """Return the response in a table file; the record of a run then contains the values instead of the name."""
+        response = MeasuredDevice.read(find_file(file))
+        columns = {"frequency": response.frequency, "real": response.response.real, "imag": response.response.imag}
+        columns |= {} if response.deviation is None else {"deviation": response.deviation}
+        return cls(**{name: column.tolist() for name, column in columns.items()}, rotary=response.rotary)
 
     @cached_property
-    def known(self) -> MeasuredDevice:
+    def instance(self) -> MeasuredDevice:
+        """The measured response."""
         real, imag = (_to_array(part) for part in (self.real, self.imag))
         if real.shape != imag.shape:
-            raise InputError(f"imag: got {imag.size} numbers beside {real.size} of real; give one a frequency")
+            raise InputError(f"imag: got {imag.size} numbers and {real.size} of real; give one per frequency")
         return MeasuredDevice(self.frequency, real + 1j * imag, self.deviation, self.rotary)
 
 
 def _read_form(raw: Any) -> SystemSection | ResponseSection:
-    """A device in any of its forms but its numbers."""
+    """Return the model of a linear system or a measured response, from any of its forms."""
     if isinstance(raw, SystemSection | ResponseSection):
         return raw
     try:
         if isinstance(raw, str) and raw.endswith(SUFFIXES):
             return ResponseSection.read(raw)
         if isinstance(raw, str) and "/" in raw:
-            raw = dict(zip(_OF_SYSTEM[0], split_fraction(raw), strict=True))
+            raw = dict(zip(_SYSTEM_FORMS[0], split_fraction(raw), strict=True))
     except InputError as error:
-        # Of a table its name is said.
-        raise split_refusal(str(error).removeprefix("device: ")) from None
+        # Remove the prefix "device: ", because the location is reported separately.
+        raise parse_message(str(error).removeprefix("device: ")) from None
     if not isinstance(raw, dict):
         names = tuple(device.name for device in DEVICES)
-        allowed = f"published are {listing(names)}"
+        allowed = f"published are {quote_names(names)}"
         raise problem(f"got {describe(raw)}", allowed, suggestion(raw, names, f"zwidth devices lists them; or {FORMS}"))
     return (ResponseSection if "frequency" in raw else SystemSection).model_validate(raw)
 
@@ -170,17 +190,17 @@ class OneKind(Strict):
     """Base of sections that are either physical or normalized, with messages for keys of the other kind."""
 
     @classmethod
-    def unknown(cls, name: str) -> tuple[str, str, str]:
+    def explain_unknown(cls, name: str) -> tuple[str, str, str]:
         if name not in (PHYSICAL_KEYS if NORMALIZED_KEYS & cls.model_fields.keys() else NORMALIZED_KEYS):
-            return super().unknown(name)
+            return super().explain_unknown(name)
         if name in PART_NAMES:
-            allowed = f"{cls.what} that is normalized has no parts: their keys are in SI units"
+            allowed = f"{cls.noun} that is normalized has no parts: their keys are in SI units"
             remedy = "write mass, damping and period in place of delta and d"
             return f"got {name!r} after normalized keys", allowed, remedy
         kind, other = ("physical", "normalized") if name in NORMALIZED_KEYS else ("normalized", "physical")
         return (
             f"{other} key, after {kind} ones",
-            f"{cls.what} is described in SI units or normalized, never both",
+            f"{cls.noun} is described in SI units or normalized, never both",
             f"remove it, or write all keys {'normalized' if other == 'normalized' else 'in SI units'}",
         )
 
@@ -196,7 +216,7 @@ def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) 
     return 1.0 / rate
 
 
-def _mass(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float | None:
+def _validate_mass(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float | None:
     """Return the mass; None for a linear system or a measured response."""
     if value is not None:
         return read(value)
@@ -217,8 +237,8 @@ def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
     """Return problems of parameters that a linear system or measured response already contains."""
     for key in keys:
         if key.partition(".")[0] in ("mass", "damping", *PARTS, "modes") and keys[key]:
-            what, allowed = f"got {key!r} together with a system or response", "the system or response contains it"
-            yield (key,), problem(what, allowed, "remove one", on_key=True)
+            message, allowed = f"got {key!r} together with a system or response", "the system or response contains it"
+            yield (key,), problem(message, allowed, "remove one", on_key=True)
 
 
 def read_rotary(value: Any = None) -> bool | None:
@@ -249,21 +269,23 @@ class SampledMass(OneKind):
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
         """Replace the name of a published device by its parameters; keys of the section override them."""
         name = raw.get("device")
-        known = {device.name: device for device in DEVICES}.get(name) if isinstance(name, str) else None
-        if known is None:
+        published = {device.name: device for device in DEVICES}.get(name) if isinstance(name, str) else None
+        if published is None:
             return super().prepare(raw)
-        if known.rotary != get_system().rotary:
+        if published.rotary != get_system().rotary:
             allowed = "this device is linear, and others of the file are rotary"
-            what = problem(f"got {describe(name)}", allowed, "write two files")
-            raise validation_error(cls.__name__, [(("device",), what)])
-        found = {key: number.value for key in ("mass", "damping") if (number := getattr(known, key)) is not None}
-        return super().prepare({**found, **{key: value for key, value in raw.items() if key != "device"}})
+            fault = problem(f"got {describe(name)}", allowed, "write two files")
+            raise combine_problems(cls.__name__, [(("device",), fault)])
+        parameters = {
+            key: number.value for key in ("mass", "damping") if (number := getattr(published, key)) is not None
+        }
+        return super().prepare({**parameters, **{key: value for key, value in raw.items() if key != "device"}})
 
     device: DeviceForm | None = None
     """Name of a published device, which supplies mass and damping if they are not given; or a device that is not a mass
     with damping: a linear system ('1 / 0.1 10 0' in s, or a mapping), or a measured response (FILE.csv)."""
 
-    mass: Annotated[float | None, quantity_of("mass"), WrapValidator(_mass)] = Field(
+    mass: Annotated[float | None, quantity_of("mass"), WrapValidator(_validate_mass)] = Field(
         default=None, validate_default=True
     )
     damping: Annotated[float, quantity_of("damping")] = 0.0
@@ -278,7 +300,7 @@ class SampledMass(OneKind):
     delay: Delay = Span(0.0, "s")
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         yield from find_second_period(raw)
         if raw.get("device") is not None:
             yield from find_second_device(raw)

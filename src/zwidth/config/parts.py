@@ -1,6 +1,8 @@
-"""The parts of a scene beside device and timing, as a configuration has them: velocity estimate, hand, coupling, ...
+"""Models of the optional parts of a scene: velocity estimate, operator, coupling, actuator, modes and safe limit.
 
-Each section below has the keys of the part of that name in `zwidth.parts`, and gives that part.
+Parts are those in addition to the device and its timing. The model of a section is generated from the dataclass of
+the part in `zwidth.parts`: its fields are the keys, and `words.quantities` declares their units and ranges. The part
+itself validates combinations of values.
 """
 
 from __future__ import annotations
@@ -38,37 +40,37 @@ NO_LINEAR_FORM = "FOAW chooses its window by the motion and has no linear form"
 SIMULATED = "use the kind 'simulate' or 'limit_cycle', or a linear estimate such as 'windowed_difference'"
 
 
-def locate_refusal(error: InputError) -> LocatedProblem:
-    """What a part or a scene refuses, at the field that its message names."""
+def parse_input_error(error: InputError) -> LocatedProblem:
+    """Return the path and the problem of an error of a part or a scene, from the field that begins its message."""
     field, _, text = str(error).partition(": ")
-    return tuple(field.split(".")), split_refusal(text)
+    return tuple(field.split(".")), parse_message(text)
 
 
-def split_refusal(text: str) -> Any:
-    """A refusal as what was given, what is allowed and the remedy; of two parts the second is the remedy."""
-    what, _, rest = text.partition("; ")
+def parse_message(text: str) -> Any:
+    """Return the problem of a message ``received; allowed; remedy`` or ``received; remedy``."""
+    message, _, rest = text.partition("; ")
     allowed, _, remedy = rest.rpartition("; ")
-    return problem(what, allowed, remedy)
+    return problem(message, allowed, remedy)
 
 
 class PartSection(Strict):
-    """Base of the sections: what the keys give is checked by the part itself."""
+    """Base of the models of parts, whose values are validated by the part itself."""
 
-    part: ClassVar[Any]
+    part: ClassVar[Any]  # class of the part
 
     @cached_property
-    def known(self) -> Any:
-        """The part itself."""
+    def instance(self) -> Any:
+        """The part with the values of the keys."""
         given = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return self.part(**given)
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         try:
-            self.known  # noqa: B018  (raises where the part refuses)
+            self.instance  # noqa: B018  (raises an error if the part refuses the values)
         except InputError as error:
-            path, what = locate_refusal(error)
-            # A whole part begins the path with its name; a field of the section is its own place.
-            yield path if path[0] in type(self).model_fields else path[1:], what
+            path, fault = parse_input_error(error)
+            # Omit the name of the part if the path begins with it, because paths are relative to the section.
+            yield path if path[0] in type(self).model_fields else path[1:], fault
 
 
 def _read_coefficients(raw: Any) -> tuple[Any, ...]:
@@ -89,37 +91,42 @@ Coefficients = Annotated[
 ]
 
 
-def make_section(part: Any, owner: str, what: str, kind: str = "") -> type[PartSection]:
-    """The section of a part: a key a field, as `words.quantities` declares it under the name of its ``owner``."""
+def make_section(part: Any, owner: str, noun: str, kind: str = "") -> type[PartSection]:
+    """Create the model of a part with one key per field of its dataclass.
+
+    Args:
+        part: class of the part.
+        owner: name of the part in `words.quantities`.
+        noun: noun of the section for messages, such as "a coupling".
+        kind: value of the key ``kind``; "" for a section without this key.
+    """
     keys: Any = {"kind": (Literal[kind], ...)} if kind else {}  # pyright: ignore[reportInvalidTypeForm]
     for item in fields(part):
-        form, words = _describe(f"{owner}.{item.name}", item)
+        form, description = _describe(f"{owner}.{item.name}", item)
         default: Any = ... if item.default is MISSING else item.default
-        keys[item.name] = (form | None if default is None else form, Field(default, description=words))
+        keys[item.name] = (form | None if default is None else form, Field(default, description=description))
     section = create_model(f"{part.__name__}Section", __base__=PartSection, __doc__=_head(part), **keys)
-    section.what, section.part = what, part
+    section.noun, section.part = noun, part
     return section
 
 
 def _head(part: Any) -> str:
-    """What a part says of itself, in one line."""
+    """Return the first line of the docstring of a part."""
     return part.__doc__.partition("\n")[0]
 
 
 def _describe(path: str, item: Any) -> tuple[Any, str]:
-    """How a key is read, and what the schema says of it."""
+    """Return the annotation of a key and its description for the schema."""
     if path in CHOICES:
         return Literal[CHOICES[path].names], f"{CHOICES[path].sentence}."
     if path not in FIELDS:
-        words = (
-            f"Coefficients of the {path.rpartition('.')[2]}, highest power of z first, or a list of sections in series."
-        )
-        return Coefficients, words
-    known, allowed = FIELDS[path], find_range(item, path)
+        description = f"Coefficients of the {path.rpartition('.')[2]}, highest power of z first"
+        return Coefficients, f"{description}, or a list of sections in series."
+    parameter, allowed = FIELDS[path], find_range(item, path)
     low, high, low_open, _ = allowed
     bounds = f"{low:g} to {high:g}" if isfinite(high) else f"{'>' if low_open else '>='} {low:g}"
-    words = f"{describe_parameter(known, f', {bounds}')}."
-    return Annotated[int if known.whole else float, Quantity(known.unit, allowed, known.whole)], words
+    description = f"{describe_parameter(parameter, f', {bounds}')}."
+    return Annotated[int if parameter.whole else float, Quantity(parameter.unit, allowed, parameter.whole)], description
 
 
 _ESTIMATES = {
@@ -129,21 +136,21 @@ _ESTIMATES = {
 _LINEAR = {kind: section for kind, section in _ESTIMATES.items() if section.part is not FOAW}
 
 
-def read_velocity(raw: Any, known: dict[str, type[PartSection]] = _LINEAR) -> Any:
-    """A velocity estimate, read as what its kind names."""
-    if isinstance(raw, tuple(known.values())):
+def read_velocity(raw: Any, sections: dict[str, type[PartSection]] = _LINEAR) -> Any:
+    """Return the model of a velocity estimate, selected from ``sections`` by its key ``kind``."""
+    if isinstance(raw, tuple(sections.values())):
         return raw
     if isinstance(raw, PartSection):
         raise problem("got a velocity estimate of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
     refused = {"foaw": (NO_LINEAR_FORM, SIMULATED)}
-    section = find_kind(raw, known, "a velocity estimate", "{kind: low_pass, cutoff: 100 Hz}", refused)
+    section = find_kind(raw, sections, "a velocity estimate", "{kind: low_pass, cutoff: 100 Hz}", refused)
     return section.model_validate(raw)
 
 
-def _make_one_of(known: dict[str, type[PartSection]]) -> GetPydanticSchema:
-    """Make a field one of these estimates; the schema tells them apart by their kind."""
-    every = Annotated[Union[tuple(known.values())], Field(discriminator="kind")]  # noqa: UP007
-    read = Annotated[every, WrapValidator(lambda raw, _: read_velocity(raw, known))]
+def _make_one_of(sections: dict[str, type[PartSection]]) -> GetPydanticSchema:
+    """Return the annotation of a field for one of several velocity estimates, which differ in the key ``kind``."""
+    every = Annotated[Union[tuple(sections.values())], Field(discriminator="kind")]  # noqa: UP007
+    read = Annotated[every, WrapValidator(lambda raw, _: read_velocity(raw, sections))]
     return GetPydanticSchema(lambda _, handler: handler.generate_schema(read))
 
 
@@ -155,7 +162,7 @@ _SECTIONS: Any = {
 ModeSection: Any = make_section(Mode, "mode", "a mode")
 
 
-class SafeLimitSection(PartSection, what="a safe limit"):
+class SafeLimitSection(PartSection, noun="a safe limit"):
     """Stiffest wall that measurements of the device support."""
 
     part = SafeLimit
@@ -177,27 +184,35 @@ class SafeLimitSection(PartSection, what="a safe limit"):
 
 
 def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Strict]:
-    """A base of what has a section for each of the parts that a scene need not have."""
-    known: dict[str, Any] = {"velocity": ("Velocity estimate", VelocityField, no_estimate)}
-    known |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
-    known["modes"] = "Resonances that the sensor sees", list[ModeSection], no_part
+    """Create the base class of models that have one section per optional part of a scene.
+
+    Args:
+        no_estimate: default of the velocity estimate, for descriptions.
+        no_part: default of the other parts, for descriptions.
+        more: sentence to append to the descriptions.
+    """
+    parts: dict[str, Any] = {"velocity": ("Velocity estimate", VelocityField, no_estimate)}
+    parts |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
+    parts["modes"] = "Resonances that the sensor sees", list[ModeSection], no_part
     keys: Any = {
-        name: (form | None, Field(default=None, description=f"{words}. Default: {absent}.{more}"))
-        for name, (words, form, absent) in known.items()
+        name: (form | None, Field(default=None, description=f"{description}. Default: {absent}.{more}"))
+        for name, (description, form, absent) in parts.items()
     }
     return create_model("Parts", __base__=Strict, **keys)
 
 
 def list_parts(owner: Any) -> dict[str, Any]:
-    """The parts that a device, a scene or a study has, by name: a section each, of the modes a list of them."""
-    # The first is a device that is no mass with damping, but given as a whole.
-    found = {name: getattr(owner, name, None) for name in ("device", *PART_NAMES)}
-    return {name: section for name, section in found.items() if section is not None and section != []}
+    """Return the sections of the parts that a device, scene or study has, by name; "modes" is a list of sections.
+
+    "device" is a linear system or a measured response that replaces mass and damping.
+    """
+    parts = {name: getattr(owner, name, None) for name in ("device", *PART_NAMES)}
+    return {name: section for name, section in parts.items() if section is not None and section != []}
 
 
 def build_parts(owner: Any) -> dict[str, Any]:
-    """The same as parts of a scene."""
+    """Return the parts that a device, scene or study has, by name, as objects of `zwidth.parts`."""
     return {
-        name: [each.known for each in section] if isinstance(section, list) else section.known
+        name: [each.instance for each in section] if isinstance(section, list) else section.instance
         for name, section in list_parts(owner).items()
     }

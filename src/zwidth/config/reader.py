@@ -1,6 +1,10 @@
-"""Reading and writing configurations: strict YAML 1.2, where every fault has its place in the file.
+"""Reading and writing of configuration files in YAML 1.2 (core schema), with line and column of every fault.
 
-This is the only module that imports yaml. The model that a file is checked against is `zwidth.studies.document`'s.
+`_Tree` composes the YAML nodes of a file with PyYAML, converts them to plain Python values, and records the position
+of every key and value by its path. `read_model` validates the values with a model (`zwidth.studies.document.Config`
+for whole files) and combines syntax faults and validation faults into one error. Differences from PyYAML: the core
+schema of YAML 1.2 instead of YAML 1.1 (``1e-3`` is a number, ``no`` is a text), limits on size and nesting that stop
+alias bombs, and no tags.
 """
 
 from __future__ import annotations
@@ -27,11 +31,11 @@ from zwidth.config.fields import (
     Fault,
     FieldPath,
     LocatedProblem,
-    dotted,
-    locate,
-    printable,
+    escape_unprintable,
+    format_path,
+    list_problems,
+    locate_faults,
     problem,
-    problems_of,
 )
 from zwidth.config.values import read_in_units
 from zwidth.parts.devices import DEVICES
@@ -45,11 +49,11 @@ from zwidth.words.units import split_head, tell_kind
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
-# Free text, and an angle of any device, which has no unit.
-_TEXTS = ("name", "description", "label", "phase_margin")
+# Keys whose values do not indicate rotary devices: free texts, and an angle that every device has.
+_KEYS_WITHOUT_UNIT = ("name", "description", "label", "phase_margin")
 MAX_FILE_BYTES = 2**20
-MAX_NODES = 50_000
-MAX_DEPTH = 20
+MAX_NODES = 50_000  # values per file, with those of aliases counted once per use
+MAX_DEPTH = 20  # nesting levels
 
 
 def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Model:
@@ -57,29 +61,33 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
     file = os.fsdecode(path)
     tree = _Tree(file, _read_text(file))
     with files_relative_to(Path(file).parent):
-        return _check(model, tree.data, tree.faults, lambda found: locate(file, found, tree.values, tree.keys))
+        return _check(
+            model, tree.data, tree.faults, lambda located: locate_faults(file, located, tree.values, tree.keys)
+        )
 
 
 def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
     """Return the model of a mapping; raise a `ConfigFileError` whose faults have fields but no line numbers."""
     problems: list[LocatedProblem] = []
     simple = _simplify(data, (), problems)
-    return _check(model, simple, locate("", problems, {}, {}), lambda found: locate("", found, {}, {}))
+    return _check(
+        model, simple, locate_faults("", problems, {}, {}), lambda located: locate_faults("", located, {}, {})
+    )
 
 
 def _check(
-    model: type[_Model], data: Any, faults: list[Fault], place: Callable[[list[LocatedProblem]], list[Fault]]
+    model: type[_Model], data: Any, faults: list[Fault], locate: Callable[[list[LocatedProblem]], list[Fault]]
 ) -> _Model:
     """Return the model of plain values; raise a `ConfigFileError` with ``faults`` and those of the model."""
-    found = None
+    instance = None
     try:
         with read_in_units(SYSTEMS[has_rotary_devices(data)]):
-            found = model.model_validate(data)
+            instance = model.model_validate(data)
     except ValidationError as error:
-        faults = faults + place(problems_of(error))
-    if found is None or faults:
+        faults = faults + locate(list_problems(error))
+    if instance is None or faults:
         raise ConfigFileError.of(faults)
-    return found
+    return instance
 
 
 def has_rotary_devices(data: Any, key: str = "") -> bool:
@@ -95,18 +103,24 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
             with suppress(InputError):
                 return MeasuredDevice.read(find_file(data)).rotary
             return False
-        return any(known.rotary for known in DEVICES if known.name == data)
+        return any(device.rotary for device in DEVICES if device.name == data)
     if key == "csv" and isinstance(data, str):
         # Coordinates in degrees do not make a device rotary, so only parameters count.
         with suppress(InputError):
             heads = map(split_head, read_columns(find_file(data)).heads)
             return any(tell_kind(f"1 {unit}") is True for name, unit in heads if name in PARAMETERS)
         return False
-    return data is True if key == "rotary" else key not in _TEXTS and tell_kind(data) is True
+    return data is True if key == "rotary" else key not in _KEYS_WITHOUT_UNIT and tell_kind(data) is True
 
 
 def _simplify(value: Any, path: FieldPath, problems: list[LocatedProblem]) -> Any:
-    """A value as a file would hold it: arrays and tuples as lists; keys that are no text are left out as faults."""
+    """Return a value with arrays and tuples as lists; append a problem for each key that is not a text, and omit it.
+
+    Args:
+        value: mapping, list or scalar.
+        path: path of the value.
+        problems: list to which problems are appended.
+    """
     if len(path) > MAX_DEPTH:
         problems.append((path, problem("the values are nested too deeply", f"at most {MAX_DEPTH} levels")))
         return None
@@ -123,34 +137,35 @@ def _simplify(value: Any, path: FieldPath, problems: list[LocatedProblem]) -> An
 
 
 def write_yaml(data: Mapping[str, Any]) -> str:
-    """Plain values as the text of a file that is read as the same values."""
+    """Return plain values as the text of a configuration file, which reads back to the same values."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
 
 
 def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
-    """Every text that a file without faults has under a key: the value, and where it begins and ends in the file."""
-    found: dict[int, tuple[str, int, int]] = {}
+    """Return all scalar values of a key in a valid file, each with the indices of its start and end in the text."""
+    values: dict[int, tuple[str, int, int]] = {}
     for path, (value, first, last) in _Tree("", text).scalars.items():
         if path[-1:] == (key,):
-            # Marks take in an anchor and the end of the line behind a folded text.
+            # Exclude an anchor before the value and a line break after folded text, which PyYAML's marks include.
             anchor = re.match(r"&\S+\s+", text[first:last])
             first += anchor.end() if anchor else 0
-            found[first] = (value, first, first + len(text[first:last].rstrip()))
-    return list(found.values())
+            values[first] = (value, first, first + len(text[first:last].rstrip()))
+    return list(values.values())
 
 
-def _fail(file: str, place: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
-    line, column = place or (None, None)
-    return ConfigFileError.of([Fault(file, line, column, dotted(path), *parts)])
+def _fail(file: str, position: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
+    """Return an error with one fault; ``parts`` are its problem, allowed values and remedy."""
+    line, column = position or (None, None)
+    return ConfigFileError.of([Fault(file, line, column, format_path(path), *parts)])
 
 
 def _read_text(file: str) -> str:
-    """The text of a file, or an error that says why there is none."""
-    place = Path(file)
-    if os.path.isdir(place):
+    """Return the text of a file; raise a `ConfigFileError` if it cannot be read."""
+    path = Path(file)
+    if os.path.isdir(path):
         raise _fail(file, None, "got a folder", "a configuration is one file", "name a .yaml file in it")
-    # A pipe or a device might never end.
-    if os.path.exists(place) and not os.path.isfile(place):
+    # Refuse pipes and devices, because reading them might never end.
+    if os.path.exists(path) and not os.path.isfile(path):
         raise _fail(file, None, "got no regular file", "a configuration is one file", "save it to a file first")
     try:
         with open(file, "rb") as stream:
@@ -158,7 +173,7 @@ def _read_text(file: str) -> str:
     except PermissionError as error:
         raise _fail(file, None, "permission denied", "", "make the file readable") from error
     except (OSError, ValueError) as error:
-        # ValueError: a path with a null character.
+        # A path with a null character raises a ValueError.
         reason = f"cannot be read ({getattr(error, 'strerror', None) or error})"
         missing = isinstance(error, FileNotFoundError)
         raise _fail(file, None, "no such file" if missing else reason, "", "check the path") from error
@@ -168,24 +183,27 @@ def _read_text(file: str) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        # With a byte order mark, positions count from behind it.
+        # Use the bytes of the error, because its position does not count a byte order mark.
         good = error.object[: error.start].decode("utf-8")
-        what = f"got the byte 0x{error.object[error.start]:02x}, which is not UTF-8"
-        raise _fail(file, _place(good, len(good)), what, "the file must be UTF-8 text", "save it as UTF-8") from error
+        message = f"got the byte 0x{error.object[error.start]:02x}, which is not UTF-8"
+        raise _fail(
+            file, _find_position(good, len(good)), message, "the file must be UTF-8 text", "save it as UTF-8"
+        ) from error
 
 
-def _place(text: str, index: int) -> tuple[int, int]:
-    """Line and column, from 1, of a position in a text."""
+def _find_position(text: str, index: int) -> tuple[int, int]:
+    """Return line and column, both from 1, of an index in a text."""
     before = re.split(r"\r\n|[\n\r\x85\u2028\u2029]", text[:index])
     return len(before), len(before[-1]) + 1
 
 
-def _mark_place(mark: yaml.Mark) -> tuple[int, int]:
+def _find_mark(mark: yaml.Mark) -> tuple[int, int]:
+    """Return line and column, both from 1, of a mark of PyYAML, which counts from 0."""
     return mark.line + 1, mark.column + 1
 
 
 class _Resolver(BaseResolver):
-    """The core schema of YAML 1.2, in place of PyYAML's 1.1."""
+    """Resolver of scalars by the core schema of YAML 1.2; PyYAML's own follows YAML 1.1."""
 
 
 for _tag, _pattern, _first in (
@@ -198,42 +216,49 @@ for _tag, _pattern, _first in (
     _Resolver.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
 
 
-# Keys of a mapping that stand on one line.
-_ON_A_LINE = 4
+MAX_INLINE_KEYS = 4  # mappings of scalars with up to this many keys are written on one line
 
 
 class _Dumper(yaml.SafeDumper):
-    """PyYAML's, with quotes around what the core schema would take for a number."""
+    """Dumper that quotes texts which the core schema would read as numbers."""
 
     yaml_implicit_resolvers = _Resolver.yaml_implicit_resolvers
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write everything out."""
+        """Return True, because values that occur several times are written out without anchors."""
         return True
 
     def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.MappingNode:
-        """A scene, say, has a line for each key; of few numbers one line holds all."""
+        """Return the node of a mapping, in block style if it has more than `MAX_INLINE_KEYS` keys."""
         node = super().represent_mapping(tag, mapping, flow_style)
-        node.flow_style = node.flow_style and len(node.value) <= _ON_A_LINE
+        node.flow_style = node.flow_style and len(node.value) <= MAX_INLINE_KEYS
         return node
 
 
 class _Alias(yaml.Node):
-    """What an alias stands for, ``value``, at the place of the alias."""
+    """Node of an alias: ``value`` is the node that it refers to, the marks are those of the alias."""
 
 
 class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
-    """A file of a name and a text as plain Python values, with the places of all of them."""
+    """Plain Python values of a YAML text (``data``), with the positions of all values and keys, and tag or key faults.
+
+    Args:
+        file: name of the file for messages.
+        text: content of the file.
+
+    Raises:
+        ConfigFileError: if the text is not valid YAML, or exceeds a limit.
+    """
 
     def __init__(self, file: str, text: str) -> None:
         self.file = file
         self.values: dict[FieldPath, tuple[int, int]] = {}
         self.keys: dict[FieldPath, tuple[int, int]] = {}
-        self.scalars: dict[FieldPath, tuple[str, int, int]] = {}  # as written, with the ends in the text
+        self.scalars: dict[FieldPath, tuple[str, int, int]] = {}  # text of each scalar, with start and end index
         self.faults: list[Fault] = []
         self._nodes = 0
-        self._path: FieldPath = ()  # of the node that is being composed
-        self._unfinished: set[str] = set()  # anchors of what has not ended
+        self._path: FieldPath = ()  # path of the node that is being composed
+        self._unfinished: set[str] = set()  # anchors of nodes that are being composed
         try:
             Reader.__init__(self, text)
             for base in (Scanner, Parser, Composer, _Resolver):
@@ -244,80 +269,87 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
                 raise _fail(self.file, (1, 1), "the file is empty", allowed, "start with 'version: 1'")
             self.data = self._read(node, ())
         except yaml.reader.ReaderError as error:
-            what = f"got the character {describe(text[error.position])}"
+            message = f"got the character {describe(text[error.position])}"
             allowed, remedy = "YAML allows no control characters", "remove it"
-            raise _fail(self.file, _place(text, error.position), what, allowed, remedy) from error
+            raise _fail(self.file, _find_position(text, error.position), message, allowed, remedy) from error
         except yaml.MarkedYAMLError as error:
-            raise self._syntax_error(error) from error
+            raise self._explain_syntax_error(error) from error
         except (ValueError, OverflowError) as error:
-            # PyYAML lets these out of chr() and int(), as for "\U00110000" or a version of 5000 digits.
+            # PyYAML does not catch errors of chr() and int(), e.g. for "\U00110000" or a version of 5000 digits.
             if isinstance(error, ConfigFileError):
                 raise
-            what = "an escape or a number that does not exist"
-            raise _fail(self.file, _mark_place(self.get_mark()), what, "", "correct or remove it") from error
+            message = "an escape or a number that does not exist"
+            raise _fail(self.file, _find_mark(self.get_mark()), message, "", "correct or remove it") from error
 
-    def _syntax_error(self, error: yaml.MarkedYAMLError) -> ConfigFileError:
-        """PyYAML's account of a syntax error, with a remedy."""
+    def _explain_syntax_error(self, error: yaml.MarkedYAMLError) -> ConfigFileError:
+        """Return PyYAML's description of a syntax error as an error with position and remedy."""
         mark = error.problem_mark or error.context_mark
-        place = _mark_place(mark) if mark else (1, 1)
-        what, context = printable((error.problem or "unreadable").replace("\n", " ")), error.context or ""
-        if what == "but found another document":
+        position = _find_mark(mark) if mark else (1, 1)
+        message, context = escape_unprintable((error.problem or "unreadable").replace("\n", " ")), error.context or ""
+        if message == "but found another document":
             remedy = "remove the '---' or split the file"
-            return _fail(self.file, place, "a second document begins here", "one document a file", remedy)
+            return _fail(self.file, position, "a second document begins here", "one document per file", remedy)
         remedy = "check the indentation, the colons and the quotes here"
-        opened = "line {}, column {}".format(*_mark_place(error.context_mark)) if error.context_mark else ""
-        if r"'\t'" in what:
-            what, remedy = "got a tab where the line is indented", "indent with spaces"
-        elif what.startswith("found undefined alias"):
+        opened = "line {}, column {}".format(*_find_mark(error.context_mark)) if error.context_mark else ""
+        if r"'\t'" in message:
+            message, remedy = "got a tab where the line is indented", "indent with spaces"
+        elif message.startswith("found undefined alias"):
             remedy = "define it before with '&', or remove the '*'"
         elif context.startswith("found duplicate anchor"):
-            what, remedy = context.partition(";")[0], "give each anchor its own name"
+            message, remedy = context.partition(";")[0], "give each anchor its own name"
         elif opened and "flow" in context:
             remedy = f"close the bracket opened at {opened}"
         elif opened and "quoted" in context:
             remedy = f"check the quoted text that begins at {opened}"
-        return _fail(self.file, place, "not valid YAML", what, remedy)
+        return _fail(self.file, position, "not valid YAML", message, remedy)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """A node with all below it, where PyYAML has no limits and takes an alias for what it stands for."""
-        event, above, where = self.peek_event(), self._path, (parent, index)
-        place, anchor = _mark_place(event.start_mark), event.anchor
-        # A key is named by itself.
-        own = getattr(event if index is None else index, "value", index)
-        self._path = () if parent is None else (*above, own if isinstance(own, int | str) else "?")
+        """Compose a node and its children; in addition to PyYAML, enforce limits and keep the positions of aliases."""
+        event, above, arguments = self.peek_event(), self._path, (parent, index)
+        position, anchor = _find_mark(event.start_mark), event.anchor
+        # The last element of the path is the key or index; for the node of a key itself, its text.
+        key = getattr(event if index is None else index, "value", index)
+        self._path = () if parent is None else (*above, key if isinstance(key, int | str) else "?")
         if isinstance(event, yaml.AliasEvent):
             if anchor in self._unfinished:
-                what, allowed = "an alias of what it is part of", "aliases stand for values that have ended"
-                raise _fail(self.file, place, what, allowed, "write the values out", path=self._path)
-            node: Any = _Alias("", super().compose_node(*where), event.start_mark, event.end_mark)
+                message, allowed = "an alias of a value that contains it", "aliases refer to complete values"
+                raise _fail(self.file, position, message, allowed, "write the values out", path=self._path)
+            node: Any = _Alias("", super().compose_node(*arguments), event.start_mark, event.end_mark)
         else:
-            self._count_node(place, self._path)
+            self._count_node(position, self._path)
             if event.tag is not None:
-                # A fault of its own; the value is read as if it were not there.
-                what = f"got the tag {describe(event.tag)}"
-                self._add_fault(place, self._path, what, "tags are not used", "remove the tag")
+                # Report the tag, and continue without it to find further faults.
+                message = f"got the tag {describe(event.tag)}"
+                self._add_fault(position, self._path, message, "tags are not used", "remove the tag")
             self._unfinished |= {anchor} - self.anchors.keys() - {None}
-            node = super().compose_node(*where)
+            node = super().compose_node(*arguments)
             self._unfinished -= {anchor}
         self._path = above
         return node
 
-    def _count_node(self, place: tuple[int, int], path: FieldPath) -> None:
-        """Refuse one that is too many or too deep."""
+    def _count_node(self, position: tuple[int, int], path: FieldPath) -> None:
+        """Count a node; raise an error if the file has too many nodes or is nested too deeply."""
         self._nodes += 1
         if self._nodes > MAX_NODES:
-            what, allowed = "too many values", f"at most {MAX_NODES} values a file"
-            raise _fail(self.file, place, what, allowed, "write long axes as linear or log", path=path)
+            message, allowed = "too many values", f"at most {MAX_NODES} values per file"
+            raise _fail(self.file, position, message, allowed, "write long axes as linear or log", path=path)
         if len(path) >= MAX_DEPTH:
-            what, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
-            raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
+            message, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
+            raise _fail(self.file, position, message, allowed, "use fewer levels", path=path)
 
-    def _add_fault(self, place: tuple[int, int], path: FieldPath, *parts: str) -> None:
-        self.faults.append(Fault(self.file, *place, dotted(path), *parts))
+    def _add_fault(self, position: tuple[int, int], path: FieldPath, *parts: str) -> None:
+        """Append a fault; ``parts`` are its problem, allowed values and remedy."""
+        self.faults.append(Fault(self.file, *position, format_path(path), *parts))
 
     def _read(self, node: Any, path: FieldPath, in_alias: bool = False) -> Any:
-        """The value of a node; places go to ``values`` and ``keys``, that of an alias before those within."""
-        self.values.setdefault(path, _mark_place(node.start_mark))
+        """Return the value of a node, and record its position; an aliased value has that of the alias.
+
+        Args:
+            node: composed node.
+            path: path of the value.
+            in_alias: True if an alias refers to the node, whose children are then counted again.
+        """
+        self.values.setdefault(path, _find_mark(node.start_mark))
         if isinstance(node, _Alias):
             return self._read(node.value, path, in_alias=True)
         if in_alias:
@@ -330,24 +362,24 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
         return self._read_scalar(node)
 
     def _read_mapping(self, node: Any, path: FieldPath, in_alias: bool) -> dict[str, Any]:
-        """The keys and values of a mapping; a key that is no text or comes twice is a fault and left out."""
-        found: dict[str, Any] = {}
+        """Return a mapping as a dict; report keys that are not texts or occur twice as faults, and omit them."""
+        mapping: dict[str, Any] = {}
         for name, value in node.value:
-            place = _mark_place(name.start_mark)
+            position = _find_mark(name.start_mark)
             key = self._read_scalar(name) if isinstance(name, yaml.ScalarNode) else None
             if not isinstance(key, str):
-                what = f"got the key {describe(key)}" if isinstance(name, yaml.ScalarNode) else "got a complex key"
-                self._add_fault(place, path, what, "keys are text", "write the name of a field")
-            elif key in found:
-                what = f"the key comes twice, first in line {self.keys[*path, key][0]}"
-                self._add_fault(place, (*path, key), what, "each key once", "remove one of them")
+                message = f"got the key {describe(key)}" if isinstance(name, yaml.ScalarNode) else "got a complex key"
+                self._add_fault(position, path, message, "keys are text", "write the name of a field")
+            elif key in mapping:
+                message = f"the key occurs twice, first in line {self.keys[*path, key][0]}"
+                self._add_fault(position, (*path, key), message, "each key once", "remove one of them")
             else:
-                self.keys[*path, key] = place
-                found[key] = self._read(value, (*path, key), in_alias)
-        return found
+                self.keys[*path, key] = position
+                mapping[key] = self._read(value, (*path, key), in_alias)
+        return mapping
 
     def _read_scalar(self, node: Any) -> Any:
-        """The value of a scalar by the core schema; a number beyond float64 becomes infinite."""
+        """Return the value of a scalar by the core schema; numbers that overflow float64 become infinite."""
         text = node.value
         kind = self.resolve(yaml.ScalarNode, text, (node.style is None, True)).rpartition(":")[2]
         if kind == "null":
@@ -356,7 +388,7 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
             return text.lower() == "true"
         if kind == "int" and text[:2] in ("0o", "0x"):
             return int(text, 0)
-        # Python refuses to read integers of thousands of digits; float64 ends at 309.
+        # Read longer integers as floats, because Python refuses thousands of digits, and float64 overflows at 309.
         if kind == "int" and len(text) < 400:
             return int(text)
         if kind not in ("int", "float"):

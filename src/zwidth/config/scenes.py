@@ -1,4 +1,9 @@
-"""Scenes, devices and walls of a configuration, each either in SI units or normalized."""
+"""Models of scenes, devices and walls, each in SI units ("physical") or normalized.
+
+A scene is a device with its timing, optional parts and optional wall, and supplies the default values of the studies.
+A plant is a device with its timing, but without a wall. Normalized parameters are those of `zwidth.Scene.normalized`:
+delta, d, alpha and beta. The kind of a mapping is that of its first key that only one kind has.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +16,14 @@ import numpy as np
 from pydantic import ConfigDict, WrapValidator
 
 from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
-from zwidth.config.fields import LocatedProblem, listing, problem
+from zwidth.config.fields import LocatedProblem, problem, quote_names
 from zwidth.config.parts import (
     SafeLimitSection,
     SimulatedVelocityField,
     build_parts,
     list_parts,
-    locate_refusal,
     make_parts_base,
+    parse_input_error,
 )
 from zwidth.config.values import NonNegative, Number, quantity_of
 from zwidth.parts.device import Device
@@ -39,7 +44,7 @@ _Parts: Any = make_parts_base("the difference of two samples", "none")
 class _PhysicalPlant(_Parts, SampledMass):
     """A device in SI units with its optional parts."""
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         if not self.d <= MAX_DELAY_PERIODS:
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
             yield ("delay",), problem(f"got {self.delay}, which is {short(self.d)} periods", allowed, "check the units")
@@ -52,20 +57,20 @@ class _PhysicalPlant(_Parts, SampledMass):
             if not is_adaptive(self):
                 scene.check_parts()
         except InputError as error:
-            path, what = locate_refusal(error)
-            yield path if path[0] in type(self).model_fields else ("device", *path), what
+            path, message = parse_input_error(error)
+            yield path if path[0] in type(self).model_fields else ("device", *path), message
             return
         if self.device is not None:
             return
         with np.errstate(all="ignore"):
-            numbers = scene.normalized
+            normalized = scene.normalized
         for field, name in (("damping", "delta"), ("stiffness", "alpha"), ("virtual_damping", "beta")):
             least, most = (0.0, LARGEST_DAMPING) if name == "delta" else WALL_RANGE
-            value = float(getattr(numbers, name))
+            value = float(getattr(normalized, name))
             if not within(np.float64(value), (least, most)):
-                what = f"got {short(getattr(self, field))}, whose normalized value is {name} = {short(value)}"
+                message = f"got {short(getattr(self, field))}, whose normalized value is {name} = {short(value)}"
                 bounds = f"0 or {least:g} to {most:g}" if least else f"at most {most:g}"
-                yield (field,), problem(what, f"{name} must be {bounds}", "check the units and the mass")
+                yield (field,), problem(message, f"{name} must be {bounds}", "check the units and the mass")
 
     @property
     def parts_beyond(self) -> tuple[str, ...]:
@@ -74,12 +79,12 @@ class _PhysicalPlant(_Parts, SampledMass):
 
     @property
     def delta(self) -> float:
-        """Normalized damping of the device, with that of a hand held rigidly."""
+        """Normalized damping of the device, including that of an operator with a rigid grasp."""
         return float(self.to_scene().delta)
 
     @property
     def d(self) -> float:
-        """Delay in periods, exact where it is written in periods."""
+        """Delay in sampling periods, without rounding error if it is given in periods."""
         return self.delay.periods(self.period)
 
     def to_scene(self) -> Scene:
@@ -93,7 +98,7 @@ class _PhysicalPlant(_Parts, SampledMass):
         # A linear system or measured response is one of the parts, and replaces this device.
         device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
         limit = getattr(self, "safe_limit", None)
-        return replace_parameters(Scene(device, timing, safe_limit=limit and limit.known), build_parts(self))
+        return replace_parameters(Scene(device, timing, safe_limit=limit and limit.instance), build_parts(self))
 
 
 class _NormalizedPlant(OneKind):
@@ -110,7 +115,7 @@ class _NormalizedPlant(OneKind):
         return Scene(Device(1.0, self.delta), Timing(self.period, self.d))
 
 
-class PhysicalDevice(_PhysicalPlant, what="a device"):
+class PhysicalDevice(_PhysicalPlant, noun="a device"):
     """A device in SI units."""
 
     label: str | None = None
@@ -121,37 +126,37 @@ class PhysicalDevice(_PhysicalPlant, what="a device"):
 
 
 class SimulatedDevice(PhysicalDevice):
-    """A device in SI units whose velocity estimate need not be linear."""
+    """A device in SI units for simulations, which also accept nonlinear velocity estimates."""
 
     velocity: SimulatedVelocityField | None = None
     """Velocity estimate. Default: the difference of two samples."""
 
 
-class LabeledDevice(_PhysicalPlant, what="a device"):
-    """A device in SI units among others that a figure names."""
+class LabeledDevice(_PhysicalPlant, noun="a device"):
+    """A device in SI units with a label; the scene supplies the keys that are not given."""
 
-    # The scene may supply all the rest.
+    # Only the label is required in the schema, because the scene may supply all other keys.
     model_config = ConfigDict(json_schema_extra={"required": ["label"]})
 
     label: str
-    """Name of the device in the legend, each one its own."""
+    """Unique name of the device in the legend."""
 
 
-class NormalizedDevice(_NormalizedPlant, what="a device"):
+class NormalizedDevice(_NormalizedPlant, noun="a device"):
     """A normalized device."""
 
     label: str | None = None
     """Name of the device in legends."""
 
 
-class PhysicalWall(OneKind, what="a wall"):
+class PhysicalWall(OneKind, noun="a wall"):
     """A wall in SI units."""
 
     stiffness: Annotated[float, quantity_of("stiffness")]
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] = 0.0
 
 
-class NormalizedWall(OneKind, what="a wall"):
+class NormalizedWall(OneKind, noun="a wall"):
     """A normalized wall."""
 
     alpha: Number
@@ -164,8 +169,8 @@ def _pick_wall(scene: Any, kind: Any) -> Any:
     return None if set(given.values()) == {None} else kind(**{name: value or 0.0 for name, value in given.items()})
 
 
-class PhysicalScene(_PhysicalPlant, what="a scene"):
-    """The file's device, timing and wall in SI units."""
+class PhysicalScene(_PhysicalPlant, noun="a scene"):
+    """Device, timing and wall in SI units, the default values of the studies."""
 
     stiffness: Annotated[float, quantity_of("stiffness")] | None = None
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
@@ -189,54 +194,56 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
 
     @cached_property
     def _scene(self) -> Scene:
-        # A wall that is not given has no stiffness and no damping.
+        # Use stiffness 0 and damping 0 for a wall that is not given.
         wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
         return replace(super()._scene, wall=wall)
 
-    def bare(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
+    def without_wall(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
         """Return the scene without its wall, by default as a device with a linear velocity estimate."""
         names = "mass", "damping", "period", "delay", "rotary", "safe_limit"
-        own = {name: getattr(self, name) for name in names}
-        return kind(**{name: value for name, value in own.items() if value is not None}, **list_parts(self))
+        values = {name: getattr(self, name) for name in names}
+        return kind(**{name: value for name, value in values.items() if value is not None}, **list_parts(self))
 
     @property
     def doubts(self) -> list[str]:
         """Warnings on implausible values, one line each."""
-        own = {path: value for path, value in self.to_scene().parameters().items() if path not in ("period", "rate")}
-        own |= {"period": self.period} if self.rate is None else {"rate": self.rate}
+        parameters = {
+            path: value for path, value in self.to_scene().parameters().items() if path not in ("period", "rate")
+        }
+        parameters |= {"period": self.period} if self.rate is None else {"rate": self.rate}
         system = self.to_scene().unit_system
-        return list_doubts(own, lambda path, value: f"'{path}: {value}'" if value else f"scene.{path}", system)
+        return list_doubts(parameters, lambda path, value: f"'{path}: {value}'" if value else f"scene.{path}", system)
 
     @property
     def wall(self) -> PhysicalWall | None:
-        """The scene's wall, where one is given."""
+        """Wall of the scene; None if neither stiffness nor virtual damping is given."""
         return _pick_wall(self, PhysicalWall)
 
 
-class NormalizedScene(_NormalizedPlant, what="a scene"):
-    """The file's device, timing and wall, normalized."""
+class NormalizedScene(_NormalizedPlant, noun="a scene"):
+    """Normalized device, delay and wall, the default values of the studies."""
 
     alpha: Number | None = None
     beta: Number | None = None
 
-    def bare(self) -> NormalizedDevice:
-        """The scene without its wall."""
+    def without_wall(self) -> NormalizedDevice:
+        """Return the scene without its wall."""
         return NormalizedDevice(delta=self.delta, d=self.d)
 
     @property
     def wall(self) -> NormalizedWall | None:
-        """The scene's wall, where one is given."""
+        """Wall of the scene; None if neither alpha nor beta is given."""
         return _pick_wall(self, NormalizedWall)
 
 
 def is_adaptive(owner: Any) -> bool:
-    """Whether the velocity estimate of a scene or a device has no linear form."""
+    """Return whether the velocity estimate of a scene or a device has no linear form (FOAW)."""
     velocity = getattr(owner, "velocity", None)
     return velocity is not None and velocity.part is FOAW
 
 
 def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
-    """``alpha`` and ``beta`` of a wall on a device."""
+    """Return alpha and beta of a wall on a device."""
     if isinstance(wall, NormalizedWall):
         return wall.alpha, wall.beta
     alpha, beta = device.to_scene().normalize_walls(wall.stiffness, wall.virtual_damping)
@@ -244,18 +251,18 @@ def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
 
 
 def is_normalized(raw: dict[str, Any]) -> bool:
-    """Whether the first key that tells the kinds apart is a normalized one."""
-    telling = [key for key in raw if key in PHYSICAL_KEYS | NORMALIZED_KEYS]
-    return bool(telling) and telling[0] in NORMALIZED_KEYS
+    """Return whether the first key that only one kind has is a normalized key."""
+    decisive = [key for key in raw if key in PHYSICAL_KEYS | NORMALIZED_KEYS]
+    return bool(decisive) and decisive[0] in NORMALIZED_KEYS
 
 
-def _as_either(raw: Any, physical: type[Any], normalized: type[Any]) -> Any:
-    """Read a mapping as the kind that its first telling key belongs to."""
+def _read_either(raw: Any, physical: type[Any], normalized: type[Any]) -> Any:
+    """Return the physical or the normalized model of a mapping; its first key that only one kind has decides."""
     if isinstance(raw, physical | normalized):
         return raw
     if not isinstance(raw, dict):
-        keys = f"{listing(physical.model_fields)} or, normalized, {listing(normalized.model_fields)}"
-        allowed = f"{physical.what} is a mapping with the keys {keys}"
+        keys = f"{quote_names(physical.model_fields)} or, normalized, {quote_names(normalized.model_fields)}"
+        allowed = f"{physical.noun} is a mapping with the keys {keys}"
         raise problem(f"got {describe(raw)}", allowed, "write 'key: value' lines")
     return (normalized if is_normalized(raw) else physical).model_validate(raw)
 
@@ -266,10 +273,11 @@ AnyWall: TypeAlias = PhysicalWall | NormalizedWall
 
 
 def read_scene(raw: Any) -> AnyScene:
-    return _as_either(raw, PhysicalScene, NormalizedScene)
+    """Return the model of a scene, physical or normalized."""
+    return _read_either(raw, PhysicalScene, NormalizedScene)
 
 
-# The handler, which would try one kind after the other and report the faults of both, is never called.
+# Do not call pydantic's handler of the union, because it would try both kinds and report the faults of both.
 SceneField = Annotated[AnyScene, WrapValidator(lambda raw, _: read_scene(raw))]
-DeviceField = Annotated[AnyDevice, WrapValidator(lambda raw, _: _as_either(raw, PhysicalDevice, NormalizedDevice))]
-WallField = Annotated[AnyWall, WrapValidator(lambda raw, _: _as_either(raw, PhysicalWall, NormalizedWall))]
+DeviceField = Annotated[AnyDevice, WrapValidator(lambda raw, _: _read_either(raw, PhysicalDevice, NormalizedDevice))]
+WallField = Annotated[AnyWall, WrapValidator(lambda raw, _: _read_either(raw, PhysicalWall, NormalizedWall))]

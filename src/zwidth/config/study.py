@@ -1,4 +1,9 @@
-"""A study as a configuration describes it: what all kinds have in common."""
+"""Base class of the models of studies, and the registry of their kinds.
+
+A study describes one computation. Its absent keys are supplied by the scene of the file (`Study.fill`) before
+validation. Kinds differ in the devices that they accept: rigid masses with the backward difference only, or also
+devices with parts (velocity filter, operator, coupling, actuator, modes, linear system, measured response).
+"""
 
 from __future__ import annotations
 
@@ -9,17 +14,17 @@ from typing import Any, ClassVar, TypeVar, get_args
 from pydantic import GetJsonSchemaHandler, PrivateAttr
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from zwidth.config.fields import LocatedProblem, Name, Strict, listing, problem
+from zwidth.config.fields import LocatedProblem, Name, Strict, problem, quote_names
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
 from zwidth.config.values import Axis, get_system
 from zwidth.words.unit_system import UnitSystem
 
-MAX_POINTS = 150_000_000
-MAX_BYTES = 2**30
+MAX_POINTS = 150_000_000  # points per study, except sweeps
+MAX_BYTES = 2**30  # estimated size of the result per study, except sweeps
 
 KINDS: dict[str, type[Study]] = {}
-"""The models of the studies by the name of their kind."""
+"""Models of the studies by the name of their kind."""
 
 _Kind = TypeVar("_Kind", bound="type[Study]")
 
@@ -27,8 +32,8 @@ _Kind = TypeVar("_Kind", bound="type[Study]")
 def register(model: _Kind) -> _Kind:
     """Register a kind of study, a `zwidth.studies.ComputedStudy` whose field ``kind`` has one literal: its name."""
     KINDS[model.kind_name()] = model
-    if "what" not in vars(model):
-        model.what = f"a {model.kind_name()} study"
+    if "noun" not in vars(model):
+        model.noun = f"a {model.kind_name()} study"
     return model
 
 
@@ -37,22 +42,22 @@ def name_parts(parts: Iterable[str]) -> str:
     return " and ".join("a system or response in place of its mass" if name == "device" else name for name in parts)
 
 
-def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticCustomError:
+def make_parts_error(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticCustomError:
     """Return the problem of a device with parts in a study that would ignore them."""
-    what = f"got a device with {name_parts(parts)}"
-    allowed = f"the kind {kind!r} answers for a rigid mass with the difference of two samples alone"
-    kinds = f"use one of the kinds {listing(name for name in sorted(KINDS) if KINDS[name].takes_parts)}"
-    return problem(what, allowed, f"{kinds}, or {remedy}" if remedy else kinds)
+    message = f"got a device with {name_parts(parts)}"
+    allowed = f"the kind {kind!r} accepts only a rigid mass with the difference of two samples"
+    kinds = f"use one of the kinds {quote_names(name for name in sorted(KINDS) if KINDS[name].takes_parts)}"
+    return problem(message, allowed, f"{kinds}, or {remedy}" if remedy else kinds)
 
 
 class Study(Strict):
     """Base of all studies."""
 
     from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")  # fields whose default is the value of the file's scene
-    # True if it computes devices with a velocity filter, a hand or another part; it then has the field device.
+    # True if the kind accepts devices with parts; it then has a field ``device`` or ``devices``, or is a sweep.
     takes_parts: ClassVar[bool] = False
     simulates: ClassVar[bool] = False  # True if it accepts a velocity estimate without a linear form
-    method: ClassVar[str] = ""  # method and errors of the results, in a sentence for reports
+    method: ClassVar[str] = ""  # method and accuracy of the results, in a sentence for reports
     point_bytes: ClassVar[int] = 80  # approximate size of the result in bytes per point
     remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"
 
@@ -69,12 +74,12 @@ class Study(Strict):
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         """Mark the fields that the scene supplies as optional, and describe their default."""
-        found = super().__get_pydantic_json_schema__(schema, handler)
-        own = handler.resolve_ref_schema(found)
-        own["required"] = [name for name in own.get("required", []) if name not in cls.from_scene]
-        for field in (own["properties"][name] for name in cls.from_scene):
+        reference = super().__get_pydantic_json_schema__(schema, handler)
+        definition = handler.resolve_ref_schema(reference)
+        definition["required"] = [name for name in definition.get("required", []) if name not in cls.from_scene]
+        for field in (definition["properties"][name] for name in cls.from_scene):
             field["description"] += " Default: that of the scene."
-        return found
+        return reference
 
     @classmethod
     def kind_name(cls) -> str:
@@ -83,9 +88,9 @@ class Study(Strict):
         return name
 
     @classmethod
-    def unknown(cls, name: str) -> tuple[str, str, str]:
-        what, allowed, remedy = super().unknown(name)
-        return what, allowed, "write it at the top of the file" if name in ("figure", "scene") else remedy
+    def explain_unknown(cls, name: str) -> tuple[str, str, str]:
+        message, allowed, remedy = super().explain_unknown(name)
+        return message, allowed, "write it at the top of the file" if name in ("figure", "scene") else remedy
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
@@ -96,9 +101,9 @@ class Study(Strict):
             supplied |= {"period": scene.period, "delay": scene.delay, "stiffness": scene.stiffness or None}
             supplied |= scene.hardware
             if "device" in absent:
-                supplied["device"] = scene.bare(SimulatedDevice if cls.simulates else PhysicalDevice)
+                supplied["device"] = scene.without_wall(SimulatedDevice if cls.simulates else PhysicalDevice)
         if "devices" in absent:
-            supplied["devices"] = [scene.bare()]
+            supplied["devices"] = [scene.without_wall()]
         return {**{name: supplied[name] for name in absent if supplied.get(name) is not None}, **raw}
 
     @classmethod
@@ -112,7 +117,7 @@ class Study(Strict):
         """Raise a problem if the study would take parameters of the scene and ignore its parts."""
         taken = cls._list_absent(raw)
         if taken and not cls.takes_parts and scene.parts_beyond:
-            raise refuse_parts(cls.kind_name(), list_parts(scene), f"give {' and '.join(taken)} here")
+            raise make_parts_error(cls.kind_name(), list_parts(scene), f"add {' and '.join(taken)} to the study")
 
     @classmethod
     def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:
@@ -121,37 +126,37 @@ class Study(Strict):
             raise problem("got scene.velocity of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         if name == "device":
-            return f"{cls.what} needs a device in SI units", "give the scene mass and period"
+            return f"{cls.noun} needs a device in SI units", "give the scene mass and period"
         if name in cls.from_scene:
-            return "a study needs it where the file has no scene to take it from", f"add {name!r}, or a scene"
-        return super().missing(name)
+            return "a study needs it if the file has no scene", f"add {name!r}, or a scene"
+        return super().explain_missing(name)
 
     @property
     def sizes(self) -> dict[str, int]:
-        """How many there are, by name, of what is combined with each other: values of the axes, or what a kind says."""
-        known = {name: getattr(self, name) for name in type(self).model_fields}
-        return {name: axis.size for name, axis in known.items() if isinstance(axis, Axis)}
+        """Sizes of the grid of the results by the name of the dimension; by default the sizes of the axes."""
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return {name: axis.size for name, axis in values.items() if isinstance(axis, Axis)}
 
     @property
     def points(self) -> int:
-        """About how many points are computed."""
+        """Approximate number of computed points."""
         return math.prod(self.sizes.values())
 
     @property
     def nbytes(self) -> int:
-        """About how many bytes the result has."""
+        """Approximate size of the result in bytes."""
         return self.points * self.point_bytes
 
     @property
     def extent(self) -> str:
-        """What the number of points consists of, for messages."""
+        """Sizes of the grid as text for messages, such as "delta x d = 11 x 3"."""
         return f"{' x '.join(self.sizes) or 'one point'} = {' x '.join(map(str, self.sizes.values())) or 1}"
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         if self.points <= MAX_POINTS and self.nbytes <= MAX_BYTES:
             return
-        what = f"{self.extent} is {self.points:.4g} points and {self.nbytes / 2**30:.3g} GiB"
-        allowed = f"at most {MAX_POINTS:.4g} points and {MAX_BYTES / 2**30:g} GiB a study"
-        yield (), problem(what, allowed, self.remedy_if_too_large)
+        message = f"{self.extent} is {self.points:.4g} points and {self.nbytes / 2**30:.3g} GiB"
+        allowed = f"at most {MAX_POINTS:.4g} points and {MAX_BYTES / 2**30:g} GiB per study"
+        yield (), problem(message, allowed, self.remedy_if_too_large)

@@ -1,6 +1,10 @@
-"""Values of a configuration: numbers, quantities with a unit, lengths of time, and axes.
+"""Values of a configuration: numbers, quantities with a unit, durations, and axes.
 
-An axis is written as one number, a list, ``{linear: {start, stop, num}}`` or ``{log: {start, stop, num}}``.
+A quantity is a number in its SI base unit or a text with a unit, such as ``'2 kN/m'``. A duration is in seconds or in
+sampling periods (a `Span`). An axis, the values of one quantity, is written as one number, a list,
+``{linear: {start, stop, num}}`` (equal steps) or ``{log: {start, stop, num}}`` (equal ratios).
+
+`Quantity` and `AxisOf` are annotations of model fields. They validate the value, and describe it in the JSON Schema.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ import numpy as np
 from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of, repeated, validation_error
+from zwidth.config.fields import LocatedProblem, Strict, combine_problems, find_repeated, list_problems, problem
 from zwidth.parts.checks import Span, read_span
 from zwidth.words.contexts import set_temporarily
 from zwidth.words.errors import UnusableValueError
@@ -37,10 +41,10 @@ from zwidth.words.units import (
 
 _NOT_FINITE_TEXT = {"nan", "inf", "+inf", "-inf", "infinity"}
 LONGEST_AXIS = 10_000_000
-"""More values than any result could use, few enough to be laid out in memory."""
+"""Largest number of values of an axis, which limits its memory to 80 MB."""
 
 Entry: TypeAlias = Callable[[Any], float]
-"""Reads one value of an axis, or raises a problem."""
+"""Function that returns a value of a configuration as a number, or raises a `problem`."""
 
 _FORMS = "a number, a list of numbers, {linear: {start, stop, num}} or {log: {start, stop, num}}"
 
@@ -60,18 +64,18 @@ def get_system() -> UnitSystem:
 
 @dataclass(frozen=True)
 class Quantity:
-    """Makes a field a number of a unit and a range: read, checked, and described in the schema."""
+    """Annotation of a field that is a number with a unit and a range."""
 
-    unit: str = "1"  # the SI base unit, in which a number alone is; "1" for a number without one
+    unit: str = "1"  # SI base unit, also the unit of plain numbers; "1" for a dimensionless number
     allowed: Range = ANY
-    whole: bool = False  # whether the admissible values are whole numbers
-    periods: bool = False  # whether it is a length of time, in s or in sampling periods: a `Span`
-    remedy: str = ""  # what helps where another number is given
-    turns: bool = True  # whether it is an angle, a torque, ... where the device is rotary
-    counts: bool = False  # the quantity is an encoder step, which may also be given as "2000 counts"
+    whole: bool = False  # True if the value must be a whole number
+    periods: bool = False  # True for a duration in s or in sampling periods, which is read as a `Span`
+    remedy: str = ""  # remedy to report for a number out of range
+    turns: bool = True  # True if the unit becomes that of an angle, a torque, ... for rotary devices
+    counts: bool = False  # True for an encoder step, which may also be given as "2000 counts"
 
     def read(self, value: Any) -> Any:
-        """A value of a configuration in the unit."""
+        """Return a value of a configuration in ``unit``; a `Span` for durations in s or in periods."""
         try:
             if self.periods:
                 return read_span(value, self.allowed)
@@ -83,7 +87,10 @@ class Quantity:
             raise problem(*error.parts) from None
 
     def read_alike(self) -> tuple[Entry, set[str]]:
-        """What reads several values, lengths of time all in seconds or all in periods; and the unit of those read."""
+        """Return a function that reads the values of an axis, and the set of the units that it has read.
+
+        The set is filled only for durations, which must be either all in seconds or all in periods.
+        """
         units: set[str] = set()
 
         def entry(raw: Any) -> float:
@@ -97,7 +104,7 @@ class Quantity:
         return entry if self.periods else self.read, units
 
     def _read_number(self, value: Any) -> float:
-        """A number without a unit."""
+        """Return a number without a unit."""
         if isinstance(value, int if self.whole else int | float) and not isinstance(value, bool):
             number = check_range(to_float(value), self.allowed, remedy=self.remedy)
             return value if self.whole else number
@@ -111,18 +118,19 @@ class Quantity:
             elif value.lower() in _NOT_FINITE_TEXT:
                 hint = "write a finite number"
             elif looks_like_number(value.split(" ")[0]):
-                hint = "this field has no unit; write the number alone"
+                hint = "this field has no unit; write only the number"
         raise problem(f"got {describe(value)}", f"it must be {'a whole' if self.whole else 'one'} number", hint)
 
     @property
     def schema(self) -> dict[str, Any]:
+        """JSON Schema of the value."""
         if self.unit != "1":
-            other = find_other(DIMENSIONS[self.unit]) if self.turns else None
-            return describe_entry(self.unit, *(PERIOD_WORDS if self.periods else ()), *(other.units if other else ()))
+            rotary = find_other(DIMENSIONS[self.unit]) if self.turns else None
+            return describe_entry(self.unit, *(PERIOD_WORDS if self.periods else ()), *(rotary.units if rotary else ()))
         low, high, low_open, high_open = self.allowed
         ends = {"exclusiveMinimum" if low_open else "minimum": low}
         ends |= {"exclusiveMaximum" if high_open else "maximum": high}
-        # JSON has no infinity, and needs no point in a whole number.
+        # Omit infinite bounds, which JSON cannot represent, and write whole numbers without a decimal point.
         ends = {key: int(end) if end % 1 == 0 else end for key, end in ends.items() if abs(end) < inf}
         return {"type": "integer" if self.whole else "number", **ends}
 
@@ -135,6 +143,7 @@ class Quantity:
 
 
 def quantity_of(name: str) -> Quantity:
+    """Return the annotation of a parameter, by its name."""
     parameter = FIELDS[name]
     counts = name == "resolution"
     return Quantity(parameter.unit, parameter.allowed, parameter.whole, name == "delay", counts=counts)
@@ -147,37 +156,38 @@ Delay = Annotated[Span, quantity_of("delay")]
 Duration = Annotated[Span, Quantity("s", POSITIVE, periods=True)]
 
 
-def share(name: str, schema: dict[str, Any]) -> dict[str, Any]:
-    """A part of the JSON Schema that `zwidth.studies.document.config_json_schema` writes once, under this name."""
+def share_schema(name: str, schema: dict[str, Any]) -> dict[str, Any]:
+    """Return a schema marked for `config_json_schema`, which moves it to ``$defs`` and replaces it by a reference."""
     return {"allOf": [{"shared": re.sub(r"\W+", "_", name.replace("/", " per ")), **schema}]}
 
 
 def describe_entry(unit: str, *more: str) -> dict[str, Any]:
-    """The JSON Schema of a number in an SI unit, or with one of the units beside it."""
+    """Return the JSON Schema of a number in an SI unit, or with another unit of the same dimension or in ``more``."""
     dimension = DIMENSIONS[unit]
     pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
-    words = f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}."
+    description = f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}."
     forms = [{"type": "number"}, {"type": "string", "pattern": pattern}]
     name = f"number in {unit}{f' or {more[0]}' if more else ''}"
-    return share(name, {"description": words, "examples": [dimension.example], "anyOf": forms})
+    return share_schema(name, {"description": description, "examples": [dimension.example], "anyOf": forms})
 
 
 @dataclass(frozen=True)
 class Axis:
-    """The values that one quantity takes; none of them twice."""
+    """The values of one quantity, without repetitions."""
 
-    form: str  # how it is written: "number", "list", "linear" (equal steps) or "log" (equal ratios)
-    entries: tuple[float, ...]  # the number, the numbers of the list in its order, or the two ends, both included
-    size: int  # how many values there are, known without laying them out
-    in_periods: bool = False  # whether the values are delays in sampling periods
+    form: str  # form in the configuration: "number", "list", "linear" (equal steps) or "log" (equal ratios)
+    entries: tuple[float, ...]  # the number, the entries of the list, or the first and the last value
+    size: int  # number of values
+    in_periods: bool = False  # True if the values are delays in sampling periods
 
     def values(self) -> np.ndarray:
+        """Return all values as an array."""
         if self.form in _SPACINGS:
             return _SPACINGS[self.form](*self.entries, self.size)
         return np.array(self.entries, dtype=np.float64)
 
-    def spelling(self) -> Any:
-        """The axis as a configuration file writes it."""
+    def serialize(self) -> Any:
+        """Return the axis in the form of a configuration file."""
         written = [f"{value!r} periods" if self.in_periods else value for value in self.entries]
         if self.form in _SPACINGS:
             return {self.form: {"start": written[0], "stop": written[1], "num": self.size}}
@@ -185,30 +195,30 @@ class Axis:
 
 
 def _read_end(raw: Any, info: ValidationInfo) -> float:
-    """An end of an axis, as what is swept reads it."""
+    """Return the first or last value of an axis, read by the function in the validation context."""
     return cast(Entry, info.context)(raw)
 
 
-class _Spaced(Strict, what="an axis of equal steps or ratios"):
-    """The mapping below ``linear`` or ``log``."""
+class _Spaced(Strict, noun="an axis of equal steps or ratios"):
+    """First value, last value and number of values: the mapping below ``linear`` or ``log``."""
 
     start: Annotated[float, BeforeValidator(_read_end)]
     stop: Annotated[float, BeforeValidator(_read_end)]
     num: Annotated[int, Quantity(allowed=Range(2, LONGEST_AXIS), whole=True)]
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
-        return f"{cls.what} has start, stop and num", f"add {name!r}"
+    def explain_missing(cls, name: str) -> tuple[str, str]:
+        return f"{cls.noun} has start, stop and num", f"add {name!r}"
 
-    def limits(self) -> Iterator[LocatedProblem]:
+    def find_faults(self) -> Iterator[LocatedProblem]:
         start, stop, num = self.start, self.stop, self.num
         if start == stop:
-            where = "start and stop must differ"
-            yield ("stop",), problem(f"got {short(stop)}, as start", where, "write a number alone")
+            allowed = "start and stop must differ"
+            yield ("stop",), problem(f"got {short(stop)}, equal to start", allowed, "write one number instead")
         elif not math.isfinite(stop - start):
             allowed = "the distance from start to stop must be finite"
             yield ("stop",), problem(f"got {short(stop)}", allowed, "bring the ends closer together")
-        # Neighbors must differ in float64, or the axis would hold one value twice.
+        # Require steps larger than the rounding error of float64, because otherwise neighboring values may coincide.
         elif abs(stop - start) / (num - 1) <= 4 * np.spacing(max(abs(start), abs(stop))):
             yield ("num",), problem(f"got {num}", "the steps are below float64's resolution", "lower num")
 
@@ -217,38 +227,45 @@ _SPACINGS: dict[str, Callable[..., np.ndarray]] = {"linear": np.linspace, "log":
 
 
 def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool = True) -> tuple[float, ...]:
-    """The entries of a list, each read by ``entry``; all faults are reported with their positions."""
+    """Return the entries of a list, each read by ``entry``; raise one error with the problems of all entries.
+
+    Args:
+        raw: list of the configuration.
+        entry: function that reads one value.
+        distinct: refuse equal entries.
+    """
     if not raw:
         raise problem("got an empty list", "an axis has at least one value", "fill the list")
-    found = list(repeated(raw, "remove it")) if distinct else []
+    problems = list(find_repeated(raw, "remove it")) if distinct else []
     entries = []
     for index, value in enumerate(raw):
         try:
             entries.append(entry(value))
         except PydanticCustomError as error:
-            found.append(((index,), error))
-    if distinct and not found:
-        # Two spellings of one value, as 1 ms and 0.001.
-        found = list(repeated(entries, "remove it"))
-    if found:
-        raise validation_error("axis", found)
+            problems.append(((index,), error))
+    if distinct and not problems:
+        # Compare the numbers as well, because texts may differ although the values are equal ("1 ms" and 0.001).
+        problems = list(find_repeated(entries, "remove it"))
+    if problems:
+        raise combine_problems("axis", problems)
     return tuple(entries)
 
 
 @dataclass(frozen=True)
 class AxisOf:
-    """Makes an `Axis` one of a quantity: read, checked, spelled and described in the schema."""
+    """Annotation of a field that is an `Axis` of a quantity."""
 
     quantity: Quantity
 
     @property
     def _forms(self) -> dict[str, Quantity]:
-        """What the ends of equal steps and of equal ratios are: those need values of one sign."""
+        """Quantity of the first and last value by form; those of ``log`` must be positive."""
         low, high, low_open, high_open = self.quantity.allowed
         positive = Range(max(low, 0.0), high, low_open or low <= 0.0, high_open)
         return {"linear": self.quantity, "log": replace(self.quantity, allowed=positive)}
 
     def read(self, raw: Any) -> Axis:
+        """Return the axis that a value of a configuration describes."""
         if isinstance(raw, Axis):
             return raw
         form, ends = "number", raw
@@ -261,32 +278,32 @@ class AxisOf:
             if form not in self._forms:
                 remedy = suggestion(form, self._forms, "write one of these forms")
                 unknown = problem("unknown key", f"an axis is {_FORMS}", remedy, on_key=True)
-                raise validation_error("axis", [((form,), unknown)])
+                raise combine_problems("axis", [((form,), unknown)])
         quantity = self._forms.get(form, self.quantity)
         read, units = quantity.read_alike()
 
         def entry(raw: Any) -> float:
-            # 5.0 is 5, as a store spells the ends of equal steps.
+            # Accept 5.0 as the whole number 5, because stores write the ends of a linear axis as floats.
             return read(int(raw) if quantity.whole and isinstance(raw, float) and raw.is_integer() else raw)
 
         if form in self._forms:
             try:
                 spaced = _Spaced.model_validate(ends, context=entry)
             except ValidationError as error:
-                raise validation_error("axis", problems_of(error, form)) from None
+                raise combine_problems("axis", list_problems(error, form)) from None
             entries, size = (spaced.start, spaced.stop), spaced.num
         else:
             entries = read_entries(ends, entry) if form == "list" else (entry(ends),)
             size = len(entries)
         axis = Axis(form, entries, size, "periods" in units)
-        missed = [value for value in axis.values().tolist() if not value.is_integer()] if quantity.whole else []
-        if missed:
+        fractional = [value for value in axis.values().tolist() if not value.is_integer()] if quantity.whole else []
+        if fractional:
             allowed = "every value is a whole number"
-            raise problem(f"got {short(missed[0])} as one of the steps", allowed, "change num, or write a list")
+            raise problem(f"got {short(fractional[0])} as one of the values", allowed, "change num, or write a list")
         return axis
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        spelling = core_schema.plain_serializer_function_ser_schema(lambda axis: axis.spelling())
+        spelling = core_schema.plain_serializer_function_ser_schema(lambda axis: axis.serialize())
         return core_schema.no_info_plain_validator_function(self.read, serialization=spelling)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -301,10 +318,11 @@ class AxisOf:
         listed = {"type": "array", "items": entry, "minItems": 1, "uniqueItems": True}
         kind = f"of numbers {self.quantity.allowed}".strip() if unit == "1" else f"in {unit}"
         name = f"axis {kind}{' or periods' if self.quantity.periods else ''}"
-        return share(name, {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]})
+        return share_schema(name, {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]})
 
 
 def axis_of(name: str) -> AxisOf:
+    """Return the annotation of an axis of a parameter, by its name."""
     return AxisOf(quantity_of(name))
 
 

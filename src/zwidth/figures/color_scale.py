@@ -1,4 +1,8 @@
-"""Color scales of outputs, and the levels of contours on them."""
+"""Color scales of outputs of sweeps, and the levels of their contours.
+
+The look of an output (`words.quantities`) determines the scale: "diverging" has a favorable and an unfavorable side of
+a center, such as a margin around 0; "steep" is logarithmic and grows without bound; others are linear or logarithmic.
+"""
 
 from __future__ import annotations
 
@@ -46,6 +50,7 @@ def choose_scale(output: Output, finite: np.ndarray) -> ColorScale:
 
 
 def _name_colormap(output: Output) -> str:
+    """Return the name of the colormap of an output in matplotlib."""
     if output.look == "diverging":
         return "PuOr_r" if output.below else "PuOr"
     return "viridis_r" if output.look == "steep" else "viridis"

@@ -1,4 +1,9 @@
-"""Outputs over two parameters: regions with their boundaries, contours of margins, ridge surfaces, workspaces."""
+"""Figures of outputs over two parameters: regions with boundaries, contours of margins, ridge surfaces, workspaces.
+
+A plane has two parameters of a sweep as axes; values of a third parameter have one panel each. Boundaries of regions
+are drawn from exact outlines if the cells agree with them, otherwise as contours or along the cells. The boundary of
+the stable walls is the contour 0 or 1 of a smooth output (margin, spectral radius), if the data contain one.
+"""
 
 from __future__ import annotations
 
@@ -28,15 +33,16 @@ Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, stable_set.Outlines]
 
 # Outputs with a contour at the boundary of the stable walls, which is smoother than that of the output "stable".
 SMOOTH = ("margin", "spectral_radius")
-_SMOOTH = {"stable": SMOOTH, "passive": ("passivity_margin",)}
+# Smooth outputs whose contour is the boundary of a region, by the output of the region.
+_SMOOTH_OUTPUTS = {"stable": SMOOTH, "passive": ("passivity_margin",)}
 # Outputs that are finite for stable walls only.
 _FINITE_IF_STABLE = ("settling_time", "delay_margin")
 # Names of the stiffest stable wall and its damping, by the name of the stiffness.
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
-_FEW_TICKS = 1000.0  # ratio of largest to smallest value below which a color bar has ticks at 2 and 5, too
+_FEW_TICKS = 1000.0  # ratio of largest to smallest value below which a color bar also has ticks at 2 and 5
 _LABELLED = 0.1  # fraction of a panel that a region must fill for contour labels
 _SEEN = 0.003  # fraction of a panel that corner optima must fill for a legend entry
-# Look of a boundary.
+# Styles of boundaries, and of the marker at the stiffest stable wall.
 _EDGE: dict[str, Any] = {"color": style.BLACK, "linestyle": style.SOLID, "linewidth": 1.3, "zorder": 2.2}
 _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
 
@@ -80,10 +86,13 @@ def draw_plane(
 
     Raises:
         InputError: if the output varies over fewer than two parameters.
+
+    Returns:
+        The Axes of the panels.
     """
     dims = grid.choose_axes(data, name, x, y, but=(col,))
     if len(dims) < 2:
-        raise InputError(f"name: {name!r} varies over less than two parameters, a plane needs them")
+        raise InputError(f"name: {name!r} varies over fewer than two parameters; choose another output")
     x, y = dims
     parts, columns = grid.panels(_add_peak(data, _select_drawn(data, name), x, y), dims, plane=dims, col=col)
     panels = panel_grid(axes, len(parts), columns)
@@ -102,16 +111,16 @@ def read_panel(part: xarray.Dataset, name: str, edges: Edges | None) -> Panel:
     peak = {str(each).removesuffix("_peak"): float(values) for each, values in part.items() if not values.ndim}
     inside = all(part[dim].min() <= value <= part[dim].max() for dim, value in peak.items())
     # Outlines have the stiffness first, so swap their columns if it is not along x.
-    turn, found = -1 if across in ("beta", "virtual_damping") else 1, edges(part) if edges else {}
-    outlines = {kind: [(points[:, ::turn], hole) for points, hole in each] for kind, each in found.items()}
+    step, outlines_of_part = -1 if across in ("beta", "virtual_damping") else 1, edges(part) if edges else {}
+    outlines = {kind: [(points[:, ::step], hole) for points, hole in each] for kind, each in outlines_of_part.items()}
     axes = part[across].values, part[up].values
     return Panel(*axes, variables, outlines, tuple(peak.values()) if inside else ())
 
 
 def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
     """Return a dataset of the output and of the variables drawn with it."""
-    shown = ("stable", "passive") if name == "stable" else [each for each in _SMOOTH if each == name]
-    smooth = [next((edge for edge in _SMOOTH[each] if edge in data), each) for each in shown]
+    shown = ("stable", "passive") if name == "stable" else [each for each in _SMOOTH_OUTPUTS if each == name]
+    smooth = [next((edge for edge in _SMOOTH_OUTPUTS[each] if edge in data), each) for each in shown]
     beside = [name, *shown, *smooth, *(["kind"] if OUTPUTS[name].family == "device" else [])]
     data = grid.prepare(data, [each for each in dict.fromkeys(beside) if each in data])
     if name in ("settling_time", "gain_margin", "delay_margin"):
@@ -145,7 +154,7 @@ def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndar
 def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str, *, outside: bool) -> None:
     """Draw an output into panels with a common color scale and a legend."""
     output = OUTPUTS[name]
-    norm, image = make_norm(output, choose_scale(output, _finite(panels, name))), None
+    norm, image = make_norm(output, choose_scale(output, _collect_finite(panels, name))), None
     for ax, panel in zip(axes, panels, strict=True):
         ax.set_facecolor(MISSING)
         grid.scale_axis(ax, "x", panel.x)
@@ -166,7 +175,7 @@ def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str
                     ax.contourf(panel.x, panel.y, corner.astype(float), **hatched)
         if panel.peak:
             ax.plot(*panel.peak, linestyle="", zorder=5, clip_on=False, label="stiffest stable wall", **_PEAK)
-    _explain(axes, panels, name, image, label, outside=outside)
+    _add_legend(axes, panels, name, image, label, outside=outside)
 
 
 def _draw_regions(ax: Axes, panel: Panel, name: str) -> Any:
@@ -177,16 +186,16 @@ def _draw_regions(ax: Axes, panel: Panel, name: str) -> Any:
         if each not in variables or (each != name and name != "stable"):
             continue
         shown = variables[each]
-        edge = next((edge for edge in _SMOOTH[each] if edge in variables), each)
+        edge = next((edge for edge in _SMOOTH_OUTPUTS[each] if edge in variables), each)
         smooth, level = variables[edge], boundary_level(edge)
         # If cells are missing, draw single cells, because a filled contour would hide the gaps.
         whole = min(smooth.shape) > 1 and shown.count() == smooth.count() == shown.size
         outside = "white" if image is None else (0, 0, 0, 0)
         shades = ListedColormap([outside, outside if whole else SHADES[each]])
         image = grid.draw_cells(ax, x, y, shown, cmap=shades, vmin=0, vmax=1)
-        known = panel.outlines.get(each) if whole else None
+        outlines = panel.outlines.get(each) if whole else None
         look = {**_EDGE, "linestyle": dash}
-        if not stable_set.draw_exact(ax, known, x, y, shown.data > 0.5, SHADES[each], **look):
+        if not stable_set.draw_exact(ax, outlines, x, y, shown.data > 0.5, SHADES[each], **look):
             if whole and smooth.min() < level < smooth.max():
                 ends = [-np.inf, level] if OUTPUTS[edge].below else [level, np.inf]
                 ax.contourf(x, y, smooth, levels=ends, colors=[SHADES[each]])
@@ -229,23 +238,34 @@ def draw_edge(ax: Axes, panel: Panel, name: str, **look: Any) -> list[np.ndarray
     crossed = output.look in ("diverging", "truth")
     if not crossed and name not in _FINITE_IF_STABLE:
         return []
-    known = panel.outlines.get("passive" if name == "passivity_margin" else "stable")
+    outlines = panel.outlines.get("passive" if name == "passivity_margin" else "stable")
     good = np.ma.filled(values < level if output.below else values > level, False)
     good = good if crossed else ~np.ma.getmaskarray(values)
-    exact = stable_set.draw_exact(ax, known, panel.x, panel.y, good, **look)
+    exact = stable_set.draw_exact(ax, outlines, panel.x, panel.y, good, **look)
     if exact:
         return [points for points, _ in exact]
     drawn = _draw_line(ax, panel, name, look) if crossed else None
     return drawn.get_paths()[0].to_polygons(closed_only=False) if drawn else []
 
 
-def _finite(panels: Sequence[Panel], name: str) -> np.ndarray:
+def _collect_finite(panels: Sequence[Panel], name: str) -> np.ndarray:
+    """Return the finite values of an output in all panels."""
     return np.concatenate([panel.variables[name].compressed() for panel in panels])
 
 
-def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, label: str, *, outside: bool) -> None:
+def _add_legend(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, label: str, *, outside: bool) -> None:
+    """Add a color bar, and a legend of all regions, lines and markers that the panels contain.
+
+    Args:
+        axes: Axes of the panels.
+        panels: their contents.
+        name: the output.
+        image: colored image, for the color bar.
+        label: label of the color bar.
+        outside: place the legend outside of the Axes.
+    """
     handles: list[Any] = []
-    output, finite = OUTPUTS[name], _finite(panels, name)
+    output, finite = OUTPUTS[name], _collect_finite(panels, name)
     if output.look == "truth":
         for each, dash in (("stable", "-"), ("passive", "-.")):
             if each == name or each in panels[0].variables:
@@ -260,8 +280,8 @@ def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, l
     exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
     crossed = finite.size and finite.min() < output.center < finite.max()
     if crossed if output.look == "diverging" else (exact and output.look != "truth"):
-        what = "passive" if name == "passivity_margin" else "stable"
-        handles.append(style.line(f"edge of what is {what}", width=1.3, color=style.BLACK))
+        walls = "passive" if name == "passivity_margin" else "stable"
+        handles.append(style.line(f"edge of what is {walls}", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):
         handles.append(Patch(facecolor=MISSING, label="unstable"))
     elif any(np.ma.is_masked(panel.variables[name]) for panel in panels):
@@ -314,8 +334,8 @@ def draw_workspace(
     else:
         image = ax.scatter(x, y, c=factor * stiffness, s=9.0, norm=norm, label="poses")
     ax.plot(x[weakest], y[weakest], linestyle="", label="weakest pose", clip_on=False, zorder=5, **_PEAK)
-    for which, (name, own) in zip("xy", names or map(_split_column, (across, up)), strict=True):
-        ax.set(**{f"{which}label": style.literal(name) + (f"  in {style.literal(own)}" if own else "")})
+    for axis, (name, unit_name) in zip("xy", names or map(_split_column, (across, up)), strict=True):
+        ax.set(**{f"{axis}label": style.literal(name) + (f"  in {style.literal(unit_name)}" if unit_name else "")})
     label = rf"maximum stable stiffness  $K_{{\max}}$  in {unit}"
     bar = style.figure_of(panels).colorbar(image, ax=ax, label=label)
     style.use_logarithmic(bar.ax, "y", factor * stiffness)

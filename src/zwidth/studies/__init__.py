@@ -1,7 +1,7 @@
-"""Kinds of studies: what the configuration of each says, and how it is computed.
+"""Kinds of studies: the model of the configuration of each kind, and its computation.
 
-A new kind is a subclass of `ComputedStudy` given to `register`; the command line finds those that an installed package
-names in the entry points ``zwidth.studies``.
+A new kind is a subclass of `ComputedStudy` with the decorator `register`. Other packages provide kinds by entry points
+in the group ``zwidth.studies``.
 """
 
 from zwidth.studies.document import Config, load_config, register

@@ -1,4 +1,8 @@
-"""Stable walls as outlines and maps: boundaries over alpha and beta or delta and beta, devices compared, and grids."""
+"""Studies of the stable set: boundaries ("boundary"), comparison of devices ("compare") and grids ("map").
+
+Boundaries are closed forms over the frequency for rigid devices, and outlines of the stable region for devices with
+parts. A stable region may have islands, i.e. pieces that are not connected to K = 0.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, members, problem, repeated
+from zwidth.config.fields import LocatedProblem, find_repeated, problem, require_entries
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene
 from zwidth.config.study import name_parts, register
@@ -30,9 +34,9 @@ from zwidth.studies.outcome import (
     ComputedStudy,
     CurvesStudy,
     Outcome,
-    add_si_of_scene,
+    add_si_columns,
     csv_text,
-    share_of_device,
+    find_device_share,
     spell_stiffest,
     summarize_stiffest,
 )
@@ -42,14 +46,13 @@ from zwidth.words.status import note_failures
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 
-# Samples of a boundary over frequency; only an estimate of a result's size rests on it.
-_POINTS_PER_CURVE = 1000
-_RIDGE_POINTS = 101
+_POINTS_PER_CURVE = 1000  # typical number of points of a boundary, for the estimated size of the result
+_RIDGE_POINTS = 101  # values of delta on the path of maximum stiffness
 
 
 @register
 class BoundaryStudy(CurvesStudy):
-    """Stability boundaries, one per delta and d."""
+    """Boundary of the stable virtual walls for each delta and d, or of a device with parts."""
 
     method = "Closed form of the boundary, to a few rounding errors; the stable side by counting poles."
     reads_scene = True
@@ -58,21 +61,22 @@ class BoundaryStudy(CurvesStudy):
     kind: Literal["boundary"]
 
     device: PhysicalDevice | None = None
-    """A device in SI units, in place of delta and d; the scene's where it has parts and they are left out."""
+    """Device in SI units, in place of delta and d. Default: that of the scene if it has parts and neither delta nor d
+    is given."""
 
     plane: Plane = "alpha_beta"
-    """Boundary over alpha and beta, or over delta and beta at alpha -> 0."""
+    """Plane of the figure: alpha and beta, or delta and beta for alpha -> 0."""
 
     ridge_path: bool = False
-    """Draw the path of maximum stiffness over delta as well; in the plane alpha_beta."""
+    """True to add the path of maximum stiffness over delta; only in the plane alpha_beta."""
 
     passivity: bool = False
-    """Draw the passivity condition as well."""
+    """True to add the boundary of the passive walls."""
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         if "device" in raw or (scene.parts_beyond and not {"delta", "d"} & set(raw)):
-            return {"device": scene.bare(), **raw}
+            return {"device": scene.without_wall(), **raw}
         return super().fill(raw, scene)
 
     @classmethod
@@ -80,7 +84,7 @@ class BoundaryStudy(CurvesStudy):
         given = [name for name in ("delta", "d") if name in raw]
         if len(given) == 1 and "device" not in raw and scene.parts_beyond:
             remedy = f"remove {given[0]!r}, or give both delta and d"
-            raise problem(f"got {given[0]!r} beside a scene with parts", "a device with parts has its own", remedy)
+            raise problem(f"got {given[0]!r} for a scene with parts", "the device has its own delta and d", remedy)
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
@@ -94,28 +98,28 @@ class BoundaryStudy(CurvesStudy):
         return {"delta": device.delta, "d": device.d, **raw}
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         if raw.get("plane") == "delta_beta" and raw.get("ridge_path") is True:
-            allowed = "the path of maximum stiffness lies in the plane alpha_beta; at alpha -> 0 there is none"
+            allowed = "the path of maximum stiffness exists only in the plane alpha_beta"
             yield ("ridge_path",), problem("got true with plane delta_beta", allowed, "remove ridge_path")
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         if self.plane == "delta_beta" and self.delta.size < 2:
-            allowed = "the plane delta_beta needs two values of delta or more, its curves run over delta"
+            allowed = "the plane delta_beta needs at least two values of delta"
             yield ("delta",), problem("got one value", allowed, "give delta as a list, linear or log axis")
         if self.device is None:
             return
         for name in ("delta", "d"):
             if getattr(self, name).values().tolist() != [getattr(self.device, name)]:
-                what = f"got {name!r} beside a device"
-                yield (name,), problem(what, "a device has its own", "remove one", on_key=True)
+                message = f"got {name!r} together with a device"
+                yield (name,), problem(message, "the device has its own", "remove one", on_key=True)
         if not self.device.parts_beyond:
             return
-        asked = {"plane": "alpha_beta", "ridge_path": False, "passivity": False}
-        for name in [name for name, known in asked.items() if getattr(self, name) != known]:
+        defaults = {"plane": "alpha_beta", "ridge_path": False, "passivity": False}
+        for name in [name for name, default in defaults.items() if getattr(self, name) != default]:
             parts = name_parts(self.device.parts_beyond)
-            allowed = f"it is known for a rigid mass with the difference of two samples, not for one with {parts}"
+            allowed = f"it needs a rigid mass with the difference of two samples, without {parts}"
             yield (name,), problem(f"got {name!r}", allowed, "remove it", on_key=True)
 
     @property
@@ -124,28 +128,28 @@ class BoundaryStudy(CurvesStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         if self.device is not None and self.device.parts_beyond:
-            return outline_device(self.device, self.device.label or self.name)
+            return trace_device(self.device, self.device.label or self.name)
         deltas, delays = self.delta.values(), self.d.values()
         if self.plane == "delta_beta":
             deltas = np.sort(deltas)
-            parts = stable_intervals(deltas, delays)
+            parts = tabulate_stable_intervals(deltas, delays)
             parts += passive_intervals(deltas, delays) if self.passivity else ()
             table = stack(parts)
             return Outcome(table=table, figures={"": partial(figures.draw_zero_stiffness, table)})
         notes: list[str] = []
-        parts = [outline(delta, d) for d, delta in product(delays.tolist(), deltas.tolist())]
+        parts = [tabulate_boundary(delta, d) for d, delta in product(delays.tolist(), deltas.tolist())]
         if self.ridge_path:
             path, notes = ridge_table(np.linspace(deltas.min(), deltas.max(), _RIDGE_POINTS), delays)
             path["alpha"] = path.pop("alpha_max")
             del path["kind"]
             parts.append({"curve": "ridge_path", **path})
-        share = share_of_device(self.delta, self.d, self.device or scene)
+        share = find_device_share(self.delta, self.d, self.device or scene)
         parts += passive_outlines(deltas, delays, share) if self.passivity else ()
-        table = add_si_of_scene(stack(parts), self.delta, self.d, self.device or scene)
+        table = add_si_columns(stack(parts), self.delta, self.d, self.device or scene)
         return Outcome(table=table, figures={"": partial(figures.draw_boundary, table)}, notes=tuple(notes))
 
 
-def outline_device(device: PhysicalDevice, label: str) -> Outcome:
+def trace_device(device: PhysicalDevice, label: str) -> Outcome:
     """Return the outlines of the stable set of a device with parts, islands and holes included, and its K_max."""
     outlines, walls = tabulate_sets({label: device.to_scene()})
     if not outlines:
@@ -155,7 +159,7 @@ def outline_device(device: PhysicalDevice, label: str) -> Outcome:
     return Outcome(table=table, figures={"": partial(figures.draw_stable_set, table, walls)})
 
 
-def outline(delta: float, d: float) -> dict[str, Any]:
+def tabulate_boundary(delta: float, d: float) -> dict[str, Any]:
     """Return the boundary of the stable set of one device, as columns."""
     region = stable_region(delta, d)
     columns = {"omega": region.omega, "alpha": region.alpha, "beta": region.beta}
@@ -163,7 +167,7 @@ def outline(delta: float, d: float) -> dict[str, Any]:
     return {"curve": "boundary", "d": d, "delta": delta, **columns}
 
 
-def stable_intervals(deltas: np.ndarray, delays: np.ndarray) -> list[dict[str, Any]]:
+def tabulate_stable_intervals(deltas: np.ndarray, delays: np.ndarray) -> list[dict[str, Any]]:
     """Return the stable interval of the virtual damping for alpha -> 0 over delta, as columns per delay."""
     # Use the smallest alpha in range, because alpha = 0 is on the stability boundary.
     upper = boundary_point(deltas, delays[:, None], alpha=WALL_RANGE[0], side="upper").beta
@@ -174,7 +178,7 @@ def stable_intervals(deltas: np.ndarray, delays: np.ndarray) -> list[dict[str, A
 
 @register
 class CompareStudy(ComputedStudy):
-    """The stable walls of several devices in one figure, and the stiffest wall of each in a table."""
+    """Stable walls of several devices in one figure, and the stiffest stable wall of each device in a table."""
 
     method = "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge."
     from_scene = ()
@@ -182,8 +186,8 @@ class CompareStudy(ComputedStudy):
 
     kind: Literal["compare"]
 
-    devices: Annotated[tuple[LabeledDevice, ...], WrapValidator(members("devices"))]
-    """Devices in SI units, each with a label; what one of them leaves out is the scene's."""
+    devices: Annotated[tuple[LabeledDevice, ...], WrapValidator(require_entries("devices"))]
+    """Devices in SI units, each with a label. Default of their other keys: those of the scene."""
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
@@ -192,10 +196,10 @@ class CompareStudy(ComputedStudy):
             return raw
         return {**raw, "devices": [_complete(device, scene) for device in devices]}
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
-        for place, what in repeated([device.label for device in self.devices], "rename one"):
-            yield ("devices", *place, "label"), what
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
+        for path, fault in find_repeated([device.label for device in self.devices], "rename one"):
+            yield ("devices", *path, "label"), fault
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -221,12 +225,13 @@ class CompareStudy(ComputedStudy):
 
 
 def _complete(device: Any, scene: PhysicalScene) -> Any:
-    """A device's mapping with what the scene knows and it leaves out; anything else as it is."""
+    """Return the mapping of a device with absent keys supplied by the scene; other values unchanged."""
     if not isinstance(device, dict):
         return device
     supplied = {"mass": scene.mass, "damping": scene.damping, "delay": scene.delay, **list_parts(scene)}
     supplied |= {} if {"period", "rate"} & set(device) else {"period": scene.period}
-    # A device that is given as a whole stands for mass, damping and parts, and they for it.
+    # Supply no mass, damping or mechanical parts to a linear system or measured response, which contains them, and no
+    # system or response to a device with a mass.
     if "device" in device:
         supplied = {name: value for name, value in supplied.items() if name in ("period", "delay", "velocity")}
     elif "mass" in device:
@@ -241,9 +246,9 @@ _OUTPUTS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": 
 
 @register
 class MapStudy(ComputedStudy):
-    """Stability and passivity on a grid of alpha, beta, delta and d."""
+    """Stability, spectral radius and passivity on a grid of alpha, beta, delta and d."""
 
-    method = "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors."
+    method = "Stability by the phase at the gain crossover; radii by Newton's method, to some rounding errors."
     reads_scene = True
 
     kind: Literal["map"]
@@ -253,31 +258,32 @@ class MapStudy(ComputedStudy):
     delta: DeltaAxis
     d: DelayAxis
 
-    outputs: Annotated[tuple[MapOutput, ...], WrapValidator(members("outputs"))] = ("stable",)
-    """What is computed at every point."""
+    outputs: Annotated[tuple[MapOutput, ...], WrapValidator(require_entries("outputs"))] = ("stable",)
+    """Outputs to compute at every point."""
 
     @property
     def nbytes(self) -> int:
-        # And a status code a point.
+        # Add one byte per point for the status code.
         return self.points * (1 + sum(np.dtype(OUTPUTS[name].dtype).itemsize for name in self.outputs))
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         alpha, beta, delta, d = (axis.values() for axis in (self.alpha, self.beta, self.delta, self.d))
-        share = share_of_device(self.delta, self.d, scene)
+        share = find_device_share(self.delta, self.d, scene)
         shape = tuple(self.sizes.values())
         outputs = {name: np.empty(shape, dtype=OUTPUTS[name].dtype) for name in self.outputs}
         status = np.empty(shape, np.uint8)
-        # One plane at a time: the columns that broadcasting lays out are several times as large as the results.
+        # Compute one plane of alpha and beta at a time, because broadcast intermediate arrays are several times as
+        # large as the results.
         for delta_index, d_index in np.ndindex(delta.size, d.size):
-            place = (slice(None), slice(None), delta_index, d_index)
+            index = (slice(None), slice(None), delta_index, d_index)
             walls, device = (alpha[:, None], beta[None, :]), (delta[delta_index], d[d_index])
             for name in outputs:
                 damping = device[0] * (share if name == "passive" else 1.0)
-                outputs[name][place] = np.asarray(_OUTPUTS[name](*walls, damping, device[1]))
-            numbers = [outputs[name][place] for name in outputs if OUTPUTS[name].dtype == "float64"]
-            status[place] = status_of_results(shape[:2], numbers, walls, device)
+                outputs[name][index] = np.asarray(_OUTPUTS[name](*walls, damping, device[1]))
+            numbers = [outputs[name][index] for name in outputs if OUTPUTS[name].dtype == "float64"]
+            status[index] = status_of_results(shape[:2], numbers, walls, device)
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs, "status": status}
-        arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
+        arrays = add_si_columns(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()
 
         def find_edge(name: str, delta: float, d: float) -> Outlines | None:

@@ -1,4 +1,9 @@
-"""What to choose: the design study, which value of a parameter a stiffness needs, and the filters study."""
+"""Studies for the choice of parameters: "design" and "filters".
+
+"design" solves K_max = reserve * K for one parameter of the device, where K_max is the maximum stable stiffness and K
+the required stiffness, and simulates tolerances of the other parameters. "filters" computes K_max over velocity
+filters, and the noise of their velocity from the encoder steps.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +20,8 @@ import numpy as np
 from pydantic import BeforeValidator, GetPydanticSchema, ValidationInfo, WithJsonSchema
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, listing, problem
-from zwidth.config.parts import locate_refusal
+from zwidth.config.fields import LocatedProblem, problem, quote_names
+from zwidth.config.parts import parse_input_error
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
 from zwidth.config.values import Axis, Fraction, Quantity, axis_of, quantity_of, read_entries
@@ -27,24 +32,25 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
-from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiffest, summarize_stiffest, track
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiffest, summarize_stiffest, track_progress
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, short, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
 from zwidth.words.status import Status
 from zwidth.words.unit_system import UnitSystem
 
+# Parameters that the design study can solve for.
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
-# Scenes that the search for one value asks about.
-_TRIALS = 60
+_TRIALS = 60  # typical evaluations of K_max per solution, for the estimated number of points
 
 
 def _read_range(raw: Any, info: ValidationInfo) -> tuple[float, ...]:
+    """Return the two ends of the search range, in the unit of the parameter that the key ``find`` names."""
     name = info.data.get("find")
     if not isinstance(raw, list | tuple) or len(raw) != 2:
         raise problem(f"got {describe(raw)}", "a range is a list of its two ends", "write [low, high]")
     if name is None:
-        raise problem(f"got {describe(raw)}", "it has the unit of what is to be found", "mend 'find' first")
+        raise problem(f"got {describe(raw)}", "its unit is that of the parameter in 'find'", "correct 'find' first")
     ends = read_entries(raw, replace(quantity_of(name), periods=False).read)
     if not 0 < ends[0] < ends[1]:
         raise problem(f"got {short(ends[0])} and {short(ends[1])}", "0 < low < high", "write the lower end first")
@@ -64,9 +70,9 @@ Count = Annotated[int, Quantity(allowed=Range(2, 100_000), whole=True)]
 
 @register
 class DesignStudy(ComputedStudy):
-    """The value of one parameter at which the stiffest wall reaches a wanted stiffness, and what tolerances leave."""
+    """Parameter value at which K_max reaches a required stiffness, and the stable share of devices with tolerances."""
 
-    method = "The stiffest wall, solved for the parameter to 1e-11."
+    method = "The maximum stable stiffness, solved for the parameter to a relative error of 1e-11."
     from_scene = ("device", "stiffness")
     takes_parts = True
 
@@ -76,69 +82,76 @@ class DesignStudy(ComputedStudy):
     """Device in SI units. A delay given in periods keeps its number of periods if the period changes."""
 
     find: Parameter
-    """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
+    """Parameter to solve for, such as damping, rate or velocity.cutoff."""
 
     stiffness: Annotated[Axis, axis_of("stiffness")]
-    """Wanted stiffness K in N/m or with a unit, one or several."""
+    """Required stiffness K, one or several values in N/m or with a unit."""
 
     reserve: Annotated[float, Quantity(allowed=Range(1.0, 100.0))] = 1.0
-    """How many times the wanted stiffness the stiffest stable wall is to reach, 1 or more."""
+    """Required ratio of the maximum stable stiffness to the required stiffness, 1 or more."""
 
     within: Ends | None = None
-    """The two ends of the search range. Default: a thirtieth to 30 times the present value, and
-    delays of no more than 1,000 periods."""
+    """Search range [low, high]. Default: 1/30 to 30 times the present value, with delays of at most 1,000 periods."""
 
     num: Count = 61
-    """Points of the curve in the figure."""
+    """Number of points of the curve in the figure."""
 
     tolerances: dict[str, Fraction] | None = None
-    """Shares by which parameters of a device may differ from their values, by path: the share that bears the wall."""
+    """Relative tolerances by parameter, such as {mass: 0.05}; the study then simulates random devices. Default: no
+    tolerances."""
 
     distribution: Literal["uniform", "normal"] = "uniform"
-    """Of the tolerances: anywhere within the share, or with the share as standard deviation."""
+    """Distribution within the tolerances: uniform over the tolerance range, or normal with the tolerance as standard
+    deviation."""
 
     samples: Count | None = None
     """Number of random devices for each required stiffness. Default: 10000, or 200 for a device with parts."""
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         if name == "stiffness":
-            return "a design begins with the stiffness that is wanted", "add 'stiffness: [20 kN/m, 40 kN/m]'"
+            return "a design needs the required stiffness", "add 'stiffness: [20 kN/m, 40 kN/m]'"
         if name == "find":
-            return "a design chooses one parameter, the others as they are", "add 'find: damping', or another"
-        return super().missing(name)
+            return "a design solves for one parameter", "add 'find: damping', or another parameter"
+        return super().explain_missing(name)
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
-        if not (least := float(self.stiffness.values().min())) > 0:
-            yield ("stiffness",), problem(f"got {short(least)} {self.unit_system['N/m']}", "it must be greater than 0")
-        known = self._list_parameters()
-        if self.find not in known:
-            has = f"this device has {listing(known)}"
-            yield ("find",), problem(f"got {self.find!r}", has, "add the part to the scene, or write one of these")
-        elif not known[self.find] > 0 and self.within is None:
-            what = f"{self.find} is 0 now"
-            yield ("within",), problem(what, "a search from nothing needs a range", "add 'within: [0.1, 100]'")
-        yield from self._check_tolerances(known)
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
+        if not (smallest := float(self.stiffness.values().min())) > 0:
+            yield (
+                ("stiffness",),
+                problem(f"got {short(smallest)} {self.unit_system['N/m']}", "it must be greater than 0"),
+            )
+        parameters = self._list_parameters()
+        if self.find not in parameters:
+            allowed = f"this device has {quote_names(parameters)}"
+            yield ("find",), problem(f"got {self.find!r}", allowed, "add the part to the scene, or write one of these")
+        elif not parameters[self.find] > 0 and self.within is None:
+            message = f"{self.find} is 0"
+            yield ("within",), problem(message, "a search from 0 needs a range", "add 'within: [0.1, 100]'")
+        yield from self._check_tolerances(parameters)
 
-    def _check_tolerances(self, known: dict[str, float]) -> Iterable[LocatedProblem]:
-        most = 1 / 3 if self.distribution == "normal" else 1.0
-        for name, share in (self.tolerances or {}).items():
-            if name not in known or name == "rate":
-                yield ("tolerances", name), problem("unknown parameter", f"this device has {listing(known)}")
-            elif share >= most:
-                yield ("tolerances", name), problem(f"got {short(share)}", f"it must be less than {most:.3g}")
-            elif known[name] == 0 and name != self.find:
-                what = problem(f"{name} is 0, and so is any share of it", "a value greater than 0", "leave it out")
-                yield ("tolerances", name), what
+    def _check_tolerances(self, parameters: dict[str, float]) -> Iterable[LocatedProblem]:
+        """Yield problems of tolerances of unknown parameters, or that are too large or without an effect."""
+        bound = 1 / 3 if self.distribution == "normal" else 1.0
+        for name, tolerance in (self.tolerances or {}).items():
+            if name not in parameters or name == "rate":
+                yield ("tolerances", name), problem("unknown parameter", f"this device has {quote_names(parameters)}")
+            elif tolerance >= bound:
+                yield ("tolerances", name), problem(f"got {short(tolerance)}", f"it must be less than {bound:.3g}")
+            elif parameters[name] == 0 and name != self.find:
+                fault = problem(f"{name} is 0, so a relative tolerance has no effect", "a value > 0", "remove it")
+                yield ("tolerances", name), fault
 
     def _list_parameters(self) -> dict[str, float]:
-        found = self.device.to_scene().parameters()
-        known = {name: float(value) for name, value in found.items() if name in FINDS and isinstance(value, float)}
-        return known | {"rate": 1.0 / known["period"]}
+        """Return the parameters of the device that the study can solve for, by name."""
+        every = self.device.to_scene().parameters()
+        parameters = {name: float(value) for name, value in every.items() if name in FINDS and isinstance(value, float)}
+        return parameters | {"rate": 1.0 / parameters["period"]}
 
     @property
     def draws(self) -> int:
+        """Number of random devices per required stiffness."""
         if self.tolerances is None:
             return 0
         return self.samples or self.device.to_scene().loop.draws
@@ -176,7 +189,13 @@ class DesignStudy(ComputedStudy):
         )
 
     def _describe(self, nominal: Scene, stiffness: float, needed: RequiredValue) -> dict[str, Any]:
-        """A row of the table: what is needed, the wall there, and what tolerances leave of it."""
+        """Return a row of the table: the required value of the parameter, the stiffest wall and the tolerances.
+
+        Args:
+            nominal: device with the present value of the parameter.
+            stiffness: required stiffness in N/m.
+            needed: result of the search for the parameter.
+        """
         unit = PARAMETERS[self.find].unit
         others = [c for c in needed.crossings if c.value != needed.value]
         row: dict[str, Any] = {
@@ -193,24 +212,33 @@ class DesignStudy(ComputedStudy):
             "stiffness_max_N_per_m": math.nan,
             SI_COLUMNS[1]: math.nan,
         }
-        found = None
+        scene = None
         if needed.status == Status.OK:
-            found = nominal.replace(**{self.find: needed.value})
-            top = found.max_stiffness()
+            scene = nominal.replace(**{self.find: needed.value})
+            top = scene.max_stiffness()
             row |= {"stiffness_max_N_per_m": float(top.stiffness), SI_COLUMNS[1]: float(top.virtual_damping)}
-        return row | (self._tolerate(found, stiffness, row[SI_COLUMNS[1]]) if self.tolerances is not None else {})
+        return row | (self._tolerate(scene, stiffness, row[SI_COLUMNS[1]]) if self.tolerances is not None else {})
 
-    def _tolerate(self, found: Scene | None, stiffness: float, virtual_damping: float) -> dict[str, float]:
-        """The share of devices on which the wanted stiffness is stable at the damping that suits the nominal one."""
+    def _tolerate(self, nominal: Scene | None, stiffness: float, virtual_damping: float) -> dict[str, float]:
+        """Return the share of random devices that are stable with the required stiffness, as columns.
+
+        Args:
+            nominal: nominal device with the required value of the parameter; None if there is no such value.
+            stiffness: required stiffness in N/m.
+            virtual_damping: virtual damping at K_max of the nominal device, in N s/m.
+        """
         names = ("stable_share", "stable_share_low", "stable_share_high", "borne_by_99_percent_N_per_m")
-        if found is None:
+        if nominal is None:
             return dict.fromkeys(names, math.nan)
-        scene = found.replace(wall=VirtualWall(stiffness, virtual_damping))
-        shares = {name: Tolerance(share, self.distribution) for name, share in (self.tolerances or {}).items()}
-        drawn = simulate_tolerances(scene, shares, samples=self.draws)
+        scene = nominal.replace(wall=VirtualWall(stiffness, virtual_damping))
+        tolerances = {
+            name: Tolerance(tolerance, self.distribution) for name, tolerance in (self.tolerances or {}).items()
+        }
+        drawn = simulate_tolerances(scene, tolerances, samples=self.draws)
         return dict(zip(names, (drawn.stable, drawn.stable_low, drawn.stable_high, drawn.stiffness), strict=True))
 
     def _note(self, stiffness: float, needed: RequiredValue) -> Iterable[str]:
+        """Yield a note if the search failed, if every value is sufficient, or if several values reach the stiffness."""
         wanted = with_unit(self.reserve * stiffness, self.unit_system["N/m"])
         low, high = (with_unit(end, self.unit_system[PARAMETERS[self.find].unit]) for end in needed.range)
         if needed.status != Status.OK:
@@ -222,7 +250,7 @@ class DesignStudy(ComputedStudy):
             yield f"{wanted}: K_max crosses this value at {count} values of {self._name}; the nearest is reported"
 
     def _trace(self, nominal: Scene, low: float, high: float) -> dict[str, np.ndarray]:
-        """K_max over the parameter; NaN where a value is refused or no wall is stable."""
+        """Return K_max over the parameter as columns, with NaN for invalid values and devices without a stable wall."""
         rows = []
         for value in np.geomspace(low, high, self.num).tolist():
             wall = (math.nan, math.nan)
@@ -236,51 +264,59 @@ class DesignStudy(ComputedStudy):
 
 @register
 class FiltersStudy(ComputedStudy):
-    """The stiffest wall over the cut-off of a low-pass and over the length of a window, and its noise."""
+    """Maximum stable stiffness and velocity noise over the cut-off of a low-pass and the window of a difference."""
 
-    method = "The highest point of all edges of the stable set, one filter after the other, to about 1e-13."
+    method = "The maximum over all boundary curves of the stable set, for each filter, to about 1e-13."
     from_scene = ("device",)
     takes_parts = True
 
     kind: Literal["filters"]
 
     device: PhysicalDevice
-    """Device in SI units. Its velocity estimate is replaced."""
+    """Device in SI units; its velocity estimate is replaced by each filter."""
 
     damping: Annotated[Axis, axis_of("damping")] | None = None
     """Physical damping of the device, in N s/m or with a unit. Default: that of the device."""
 
     cutoff: Annotated[Axis, axis_of("velocity.cutoff")] | None = None
-    """Cut-offs of a low-pass, in Hz or with a unit."""
+    """Cut-off frequencies of the low-pass, in Hz or with a unit. Default: no low-pass."""
 
     order: Annotated[int, quantity_of("velocity.order")] = 1
     """Order of the low-pass, 1 or 2."""
 
     samples: Annotated[Axis, axis_of("velocity.samples")] | None = None
-    """Lengths of a window, in periods."""
+    """Window lengths of the windowed difference, in sampling periods. Default: no windowed difference."""
 
     resolution: Annotated[float, Quantity("m", POSITIVE, counts=True)] | None = None
-    """One count of the position, in m or with a unit: the noise that it makes of the velocity is computed as well."""
+    """Encoder step, in m or with a unit; the noise that it causes in the velocity is then computed. Default: no
+    noise."""
 
     noise_limit: Annotated[float, Quantity("m/s", POSITIVE)] | None = None
-    """Standard deviation that the noise of the velocity may have, in m/s or with a unit: the best filter is marked."""
+    """Largest standard deviation of the velocity noise, in m/s or with a unit; the filter with the largest stiffness
+    within this limit is then marked. Default: no limit."""
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         if self.cutoff is None and self.samples is None:
-            yield (), problem("cutoff and samples are missing", "filters have one of them", "add 'cutoff: [30, 100]'")
+            yield (
+                (),
+                problem(
+                    "cutoff and samples are missing", "filters need at least one of them", "add 'cutoff: [30, 100]'"
+                ),
+            )
         if self.noise_limit is not None and self.resolution is None:
-            what = "got a noise limit without a resolution"
-            yield ("noise_limit",), problem(what, "noise comes from the counts of the position", "add 'resolution'")
+            message = "got a noise limit without a resolution"
+            yield ("noise_limit",), problem(message, "noise is computed from the encoder step", "add 'resolution'")
         if self.cutoff is not None:
             try:
                 LowPass(cutoff=max(self.cutoff.entries), order=self.order).estimate(self.device.period)
             except InputError as error:
-                path, what = locate_refusal(error)
-                yield path[-1:], what
+                path, message = parse_input_error(error)
+                yield path[-1:], message
 
     @property
     def dampings(self) -> np.ndarray:
+        """Values of the physical damping."""
         return np.array([self.device.damping]) if self.damping is None else self.damping.values()
 
     @property
@@ -289,7 +325,7 @@ class FiltersStudy(ComputedStudy):
         return {"damping": self.dampings.size, "filters": filters}
 
     def estimates(self) -> Iterator[tuple[dict[str, Any], Velocity]]:
-        """Every estimate with the columns that name it; the difference of two samples first."""
+        """Yield each velocity estimate with the columns that identify it; the backward difference is the first."""
         absent = {"cutoff_Hz": np.nan, "samples": np.nan}
         yield {"estimate": "backward_difference", **absent, "samples": 1.0}, BackwardDifference()
         for cutoff in () if self.cutoff is None else self.cutoff.values().tolist():
@@ -301,7 +337,7 @@ class FiltersStudy(ComputedStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         rows = []
         bare = self.device.to_scene()
-        for damping, (named, velocity) in track(list(product(self.dampings.tolist(), self.estimates()))):
+        for damping, (named, velocity) in track_progress(list(product(self.dampings.tolist(), self.estimates()))):
             top = bare.replace(damping=damping, velocity=velocity).max_stiffness()
             row = {"damping_N_s_per_m": damping, **named, **summarize_stiffest(top)}
             if self.resolution is not None:
@@ -312,9 +348,9 @@ class FiltersStudy(ComputedStudy):
         if self.resolution is not None:
             limit = np.nan if self.noise_limit is None else self.noise_limit
             quiet = [row for row in rows if row["velocity_noise_m_per_s"] <= limit and np.isfinite(row[SI_COLUMNS[0]])]
-            # The stiffest wall of each damping; rows stand together by it.
-            own = groupby(quiet, itemgetter("damping_N_s_per_m"))
-            best = {id(max(those, key=itemgetter(SI_COLUMNS[0]))) for _, those in own}
+            # Mark the row with the largest K_max per damping; rows of equal damping are adjacent for groupby.
+            groups = groupby(quiet, itemgetter("damping_N_s_per_m"))
+            best = {id(max(group, key=itemgetter(SI_COLUMNS[0]))) for _, group in groups}
             rows = [{**row, "best": id(row) in best} for row in rows]
             drawn["_noise"] = partial(figures.draw_filter_noise, stack(rows), limit)
         answer = tuple(_spell_best(row, self.unit_system) for row in rows if row.get("best"))

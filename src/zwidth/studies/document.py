@@ -1,4 +1,9 @@
-"""The configuration as a whole: its top level, the kinds of studies, and what the scene supplies to them."""
+"""Model of whole configuration files, the functions that load them, and their JSON Schema.
+
+A configuration has a version, a name, an optional scene and a list of studies. Before the studies are validated, the
+scene supplies their absent keys. The kinds of studies are registered by the modules of this package, and by entry
+points of other packages.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +33,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 import zwidth.config.sweep  # noqa: F401  (registers its kind)
 from zwidth.config.device_table import find_file
-from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, members, problem, repeated
+from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, find_repeated, problem, require_entries
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
@@ -40,36 +45,35 @@ from zwidth.words.formatting import describe
 from zwidth.words.quantities import Range
 from zwidth.words.units import looks_like_number
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # version of the configuration format
 
-
-# Every file of this room registers the kind that it holds.
+# Import all modules of this package, because each one registers its kinds of studies.
 for _module in iter_modules([str(Path(__file__).parent)], "zwidth.studies."):
     import_module(_module.name)
 
 
 def _find_model(kind: Any) -> type[Study] | None:
-    """The model of a kind, which an installed package may bring: an entry point in the group ``zwidth.studies``."""
+    """Return the model of a kind, or None; unknown kinds are searched in the entry points ``zwidth.studies``."""
     if isinstance(kind, str) and kind not in KINDS:
-        for found in entry_points(group="zwidth.studies", name=kind):
-            register(found.load())
+        for entry_point in entry_points(group="zwidth.studies", name=kind):
+            register(entry_point.load())
     return KINDS.get(kind) if isinstance(kind, str) else None
 
 
 def _read_study(raw: Any) -> Any:
-    """A validator that reads a mapping as the study that its kind names."""
+    """Return the model of a study, selected by its key ``kind``; raise the value if it is already a problem."""
     if isinstance(raw, Study):
         return raw
     if isinstance(raw, PydanticCustomError):
         raise raw
     _find_model(raw.get("kind") if isinstance(raw, dict) else None)
-    known = {kind: KINDS[kind] for kind in sorted(KINDS)}
-    model = find_kind(raw, known, "a study", "'- kind: boundary' and its fields, or remove the entry")
+    models = {kind: KINDS[kind] for kind in sorted(KINDS)}
+    model = find_kind(raw, models, "a study", "'- kind: boundary' and its fields, or remove the entry")
     return model.model_validate(raw)
 
 
 class _OfAnyKind:
-    """Describes a study of any kind; they are looked up when they are needed, so that more may be registered."""
+    """Annotation for the schema of a study of any kind; the kinds are read late, to include those of other packages."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -81,6 +85,7 @@ _AnyStudy = Annotated[SerializeAsAny[Study], PlainValidator(_read_study), _OfAny
 
 
 def _check_version(value: Any) -> int:
+    """Return the version of the format; raise a problem if this release cannot read it."""
     if value == FORMAT_VERSION and isinstance(value, int) and not isinstance(value, bool):
         return value
     remedy = f"write 'version: {FORMAT_VERSION}'"
@@ -92,65 +97,66 @@ def _check_version(value: Any) -> int:
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where a configuration stands, which makes it no other."""
+class _Location:
+    """Folder of a configuration, excluded from comparisons, so that equal files in different folders are equal."""
 
     folder: Path = field(compare=False)
 
 
-class FigureLook(Strict, what="the look of figures"):
-    """How the figures of a run are written."""
+class FigureLook(Strict, noun="the look of figures"):
+    """Width, format and resolution of the figures of a run."""
 
     width: Annotated[float, Quantity("m", Range(0.05, 0.5), turns=False)] | None = None
-    """Width of every figure, as 85 mm of a journal's column; type is no smaller for it."""
+    """Width of every figure, in m or with a unit, such as 85 mm for a journal column; the font size does not change.
+    Default: the usual width of each figure."""
 
     format: Literal["png", "svg", "pdf"] | None = None
     """Format of the files. Default: PNG and SVG."""
 
     dpi: Annotated[float, Quantity(allowed=Range(10, 2400))] | None = None
-    """Resolution in dots per inch of PNG files and of the maps in SVG and PDF files. Default: 180 for PNG."""
+    """Resolution in dots per inch of PNG files, and of raster images in SVG and PDF files. Default: 180 for PNG."""
 
     @property
     def formats(self) -> tuple[str, ...]:
-        """The endings of the files."""
+        """Extensions of the files."""
         return ("png", "svg") if self.format is None else (self.format,)
 
     @property
     def size(self) -> tuple[float, None] | None:
-        """The width in inches, to which heights follow."""
+        """Width in inches, and None because the height follows; None for the usual size."""
         return None if self.width is None else (self.width / 0.0254, None)
 
 
-class Config(Strict, what="a configuration"):
-    """A configuration file, checked and complete: every study holds the values that it runs with."""
+class Config(Strict, noun="a configuration"):
+    """A validated configuration file; the scene has supplied the absent keys of the studies."""
 
     version: Annotated[int, BeforeValidator(_check_version), WithJsonSchema({"const": FORMAT_VERSION})]
     """Version of the format, 1."""
 
     name: Name
-    """Name of the configuration, and by default of the folder for the results."""
+    """Name of the configuration, and default name of the folder with the results."""
 
     description: str = ""
     """Free text."""
 
     scene: SceneField | None = None
-    """Device, timing and wall, the default values of the studies."""
+    """Device, timing and wall, the default values of the studies. Default: none."""
 
     figure: FigureLook | None = None
     """Width, format and resolution of the studies' figures; for sweeps use the options of `zwidth figures`."""
 
-    studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(members("studies"))]
-    """What to compute, in this order."""
+    studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(require_entries("studies"))]
+    """Studies to compute, in this order."""
 
-    _place: _Place = PrivateAttr(default_factory=lambda: _Place(find_file("").absolute()))
+    _location: _Location = PrivateAttr(default_factory=lambda: _Location(find_file("").absolute()))
 
     @property
     def folder(self) -> Path:
-        """The folder to which file names in the configuration are relative."""
-        return self._place.folder
+        """Folder to which file names in the configuration are relative."""
+        return self._location.folder
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         examples = {
             "version": f"version: {FORMAT_VERSION}",
             "name": "name: my_run",
@@ -160,25 +166,30 @@ class Config(Strict, what="a configuration"):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Let the scene supply what the studies leave out."""
+        """Return the mapping with absent keys of the studies supplied by the scene."""
         studies = raw.get("studies")
         if "scene" not in raw or not isinstance(studies, list | tuple):
             return raw
-        scene = _scene_or_stand_in(raw["scene"])
+        scene = _read_scene_or_substitute(raw["scene"])
         return {**raw, "studies": [_fill_study(study, scene) for study in studies]}
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         studies = raw.get("studies")
-        given = studies if isinstance(studies, list | tuple) else ()
-        names = [study.get("name") if isinstance(study, dict) else None for study in given]
-        for place, what in repeated(names, "rename one", "results are kept by name, so each study has its own"):
-            yield ("studies", *place, "name"), what
+        studies_given = studies if isinstance(studies, list | tuple) else ()
+        names = [study.get("name") if isinstance(study, dict) else None for study in studies_given]
+        for path, fault in find_repeated(
+            names, "rename one", "names of studies are unique, because results are stored by name"
+        ):
+            yield ("studies", *path, "name"), fault
 
 
-def _scene_or_stand_in(raw: Any) -> AnyScene:
-    """The file's scene; where it is faulty, one that only keeps its faults from repeating in every study."""
-    # Its faults are reported where the scene itself is read.
+def _read_scene_or_substitute(raw: Any) -> AnyScene:
+    """Return the scene of the file; a valid substitute if it has faults.
+
+    Without a substitute, the faults of the scene would cause further faults in every study.
+    """
+    # Ignore the faults here, because the validation of the key ``scene`` reports them.
     with suppress(ValueError):
         return read_scene(raw)
     if isinstance(raw, dict) and is_normalized(raw):
@@ -187,63 +198,71 @@ def _scene_or_stand_in(raw: Any) -> AnyScene:
 
 
 def _fill_study(study: Any, scene: AnyScene) -> Any:
-    """A study's mapping with what the scene supplies; anything else as it is."""
+    """Return the mapping of a study with absent keys supplied by the scene; other values unchanged.
+
+    If the study does not accept the scene, return the problem, which `_read_study` raises.
+    """
     model = _find_model(study.get("kind")) if isinstance(study, dict) else None
     if model is None:
         return study
     try:
         model.check_estimate(study, scene)
         model.check_parts(study, scene)
-    except PydanticCustomError as refusal:
-        # Raised where the study is read, at its place in the file.
-        return refusal
+    except PydanticCustomError as error:
+        # Return the problem instead of raising it, because only `_read_study` is called with the path of the study.
+        return error
     return model.fill(study, scene)
 
 
 def config_json_schema() -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of configuration files, for editors.
+    """Return the JSON Schema (draft 2020-12) of configuration files, for editors.
 
-    A first help: units, conflicts between keys and sizes are checked by `load_config` alone.
+    The schema does not contain all rules: only `load_config` checks units, conflicts between keys, and sizes.
     """
     shared: dict[str, Any] = {}
-    schema = _tidy(Config.model_json_schema(), shared)
+    schema = _simplify_schema(Config.model_json_schema(), shared)
     schema["$defs"] |= dict(sorted(shared.items()))
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-def _tidy(schema: Any, shared: dict[str, Any]) -> Any:
-    """The schema without null, which stands for "not given" in the models and is never written in a file."""
-    # What is to be shared is moved to ``shared``, and a reference takes its place.
+def _simplify_schema(schema: Any, shared: dict[str, Any]) -> Any:
+    """Return a schema without null types, and with shared parts replaced by references.
+
+    Null means "not given" in the models and is never written in a file. Parts marked by `share_schema` are moved to
+    the dict ``shared``.
+    """
     if isinstance(schema, list):
-        return [_tidy(item, shared) for item in schema if item != {"type": "null"}]
+        return [_simplify_schema(item, shared) for item in schema if item != {"type": "null"}]
     if not isinstance(schema, dict):
         return schema
-    kept = {key: _tidy(value, shared) for key, value in schema.items() if key != "default" or value is not None}
+    kept = {
+        key: _simplify_schema(value, shared) for key, value in schema.items() if key != "default" or value is not None
+    }
     if "shared" in kept:
         name = kept.pop("shared")
         return {"$ref": f"#/$defs/{name}"} if shared.setdefault(name, kept) == kept else kept
     for key in ("allOf", "anyOf"):
-        # One form alone is no choice.
+        # Replace a choice with only one alternative by this alternative.
         if len(kept.get(key, ())) == 1:
             return {**kept.pop(key)[0], **kept}
     return kept
 
 
 def load_config(path: str | bytes | os.PathLike[str]) -> Config:
-    """Read a configuration file and check all of it.
+    """Read and validate a configuration file.
 
-    The file is YAML 1.2 (core schema): ``1e-3`` is a number, ``no`` and ``on`` are texts. Unknown keys,
-    repeated keys and values in the wrong unit or out of range are faults; nothing is guessed.
+    The file is YAML 1.2 (core schema): ``1e-3`` is a number, ``no`` and ``on`` are texts. Unknown keys, repeated keys,
+    and values with a wrong unit or out of range are faults.
 
     Args:
-        path: the file, at most 1 MiB of UTF-8.
+        path: path of the file, at most 1 MiB of UTF-8 text.
 
     Returns:
-        The configuration, frozen. What a study leaves out and the scene knows is filled in.
+        The configuration, immutable. The scene has supplied the absent keys of the studies.
 
     Raises:
-        ConfigError: the file cannot be read or has faults. The message has one line for each fault, with file,
-            line, column, field, the value received, what is allowed and the remedy; ``.faults`` lists them.
+        ConfigError: if the file cannot be read or has faults. The message has one line per fault, with file, line,
+            column, field, value received, allowed values and remedy; the attribute ``faults`` lists them.
 
     Example:
         >>> import pathlib, tempfile
@@ -268,8 +287,8 @@ def load_scene(path: str | bytes | os.PathLike[str]) -> Scene:
         A `zwidth.Scene` in SI units; without a wall if the file gives neither stiffness nor virtual damping.
 
     Raises:
-        ConfigError: the file cannot be read or is invalid.
-        InputError: the file has no section ``scene``, or its scene is normalized.
+        ConfigError: if the file cannot be read or is invalid.
+        InputError: if the file has no section ``scene``, or its scene is normalized.
 
     Example:
         >>> import pathlib, tempfile
@@ -288,8 +307,8 @@ def load_scene(path: str | bytes | os.PathLike[str]) -> Scene:
         )
     if isinstance(given, NormalizedScene):
         raise InputError(
-            f"{os.fsdecode(path)}: scene: got normalized parameters; SI units are needed, write mass, damping, rate "
-            "and delay in place of delta and d"
+            f"{os.fsdecode(path)}: scene: got normalized parameters; SI units are needed; write mass, damping, rate "
+            "and delay instead of delta and d"
         )
     scene = given.to_scene()
     return scene if given.wall else dataclasses.replace(scene, wall=NoWall())

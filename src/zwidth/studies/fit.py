@@ -1,4 +1,9 @@
-"""The fit study: a device's mass, damping and delay from logs, from walls that began to buzz, or from both."""
+"""Study "fit": mass, damping and delay of a device from logs of its motion, from walls at the onset of instability
+("buzz"), or from both.
+
+Fits to logs and to walls are computed separately (`zwidth.fitting`); if both are given, a chi-squared test compares
+their parameters. The study writes tables with the fitted parameters and the evidence, and a scene file for each fit.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +18,8 @@ from pydantic_core import CoreSchema
 
 from zwidth import figures
 from zwidth.config.device_table import find_file
-from zwidth.config.fields import LocatedProblem, Strict, members, problem
-from zwidth.config.parts import VelocityField, locate_refusal, split_refusal
+from zwidth.config.fields import LocatedProblem, Strict, problem, require_entries
+from zwidth.config.parts import VelocityField, parse_input_error, parse_message
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Fraction, Quantity, describe_entry, quantity_of
@@ -32,26 +37,27 @@ from zwidth.words.quantities import OF_LOGS, POSITIVE
 from zwidth.words.status import Status
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
-# 95 % of chi-squared with three degrees of freedom, and of a normal distribution within so many standard deviations.
-_CHANCE, _NORMAL = 7.815, 1.96
+_CHI_SQUARED_95 = 7.815  # 95 % quantile of chi-squared with three degrees of freedom
+_NORMAL_95 = 1.96  # half-width of the 95 % interval of a normal distribution, in standard deviations
 
 
 def _read_resolution(raw: Any) -> Any:
+    """Return the encoder step unchanged; raise a problem if it is invalid."""
     try:
         read_step(raw)
     except InputError as error:
-        raise locate_refusal(error)[1] from None
+        raise parse_input_error(error)[1] from None
     return raw
 
 
 Step = Annotated[float | str, BeforeValidator(_read_resolution), WithJsonSchema(describe_entry("m", "rad", "deg"))]
 
 
-class LogSection(Strict, what="a log"):
-    """One log: a file of columns and which of them is what."""
+class LogSection(Strict, noun="a log"):
+    """Log of a motion: a file, and the columns of time, position and force."""
 
     csv: str
-    """Name of the file, relative to the configuration: a text of columns, .npz, .npy or .mat."""
+    """Name of the file, relative to the configuration: a text file with columns, .npz, .npy or .mat."""
 
     time: str | None = Field(default=None, description=OF_LOGS["time"])
     position: str | None = Field(default=None, description=OF_LOGS["position"])
@@ -60,25 +66,27 @@ class LogSection(Strict, what="a log"):
     motor_constant: str | None = Field(default=None, description=OF_LOGS["motor_constant"])
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         return "a log is a CSV file", "add 'csv: log.csv'"
 
     def read(self, period: float | None) -> LoggedMotion:
+        """Return the logged motion; ``period`` replaces the times of the log."""
         columns = {name: getattr(self, name) for name in ("time", "position", "force")}
         options = {"resolution": self.resolution, "motor_constant": self.motor_constant}
         return read_log(find_file(self.csv), columns, period=period, **options)
 
 
 def _read_logs(raw: Any, handler: Any) -> Any:
+    """Return one log or a list of logs as a tuple of models."""
     if isinstance(raw, str):
         raise problem(f"got {describe(raw)}", "a log is a CSV file and its columns", "write {csv: NAME.csv}")
     if isinstance(raw, dict):
         return (LogSection.model_validate(raw),)
-    return (raw,) if isinstance(raw, LogSection) else members("logs")(raw, handler)
+    return (raw,) if isinstance(raw, LogSection) else require_entries("logs")(raw, handler)
 
 
 class _OneOrSeveral:
-    """Lets an editor's check take one entry for a list of it."""
+    """Annotation for the schema of a list that may be written as one entry without a list."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -86,56 +94,56 @@ class _OneOrSeveral:
         return {"anyOf": [several["items"], several]}
 
 
-class BuzzSection(Strict, what="a wall that buzzed"):
-    """A wall at the onset of buzzing."""
+class BuzzSection(Strict, noun="a wall at the onset of instability"):
+    """A wall at the onset of instability."""
 
     stiffness: Annotated[float, Quantity("N/m", POSITIVE)]
-    """K in N/m or with a unit, raised at this damping until the wall buzzed."""
+    """Stiffness K at which the wall became unstable at this virtual damping, in N/m or with a unit."""
 
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] = 0.0
 
     frequency: Annotated[float, Quantity("Hz", POSITIVE)]
-    """Of the buzz, in Hz or with a unit."""
+    """Frequency of the oscillation, in Hz or with a unit."""
 
 
 class _Fitted(NamedTuple):
     """One of the fits of a study."""
 
-    name: str
-    source: str
+    name: str  # "log" or "buzz", part of file names
+    source: str  # description of the data
     fit: DeviceFit
-    points: tuple[BuzzPoint, ...] = ()
+    points: tuple[BuzzPoint, ...] = ()  # walls at the onset of instability, if the fit is to walls
 
 
 @register
 class FitStudy(ComputedStudy):
-    """Mass, damping and delay of a device from records of it, and the walls that follow."""
+    """Mass, damping and delay of a device, fitted to logs or to walls at the onset of instability."""
 
     method = "Least squares with exact derivatives; the band of the boundary by 200 devices drawn from the covariance."
     from_scene = ()
     remedy_if_too_large = "shorten the logs"
-    # Time, force, position, model, residual and number of the log.
-    point_bytes = 48
+    point_bytes = 48  # time, force, position, model, residual and number of the log
 
     kind: Literal["fit"]
 
     log: Annotated[tuple[LogSection, ...], WrapValidator(_read_logs), _OneOrSeveral] | None = None
-    """A log of free motion under a commanded force, or a list of logs of one device; give this, buzz, or both."""
+    """Log of free motion under a commanded force, or a list of logs of one device. Default: none; log, buzz or both are
+    required."""
 
-    buzz: Annotated[tuple[BuzzSection, ...], WrapValidator(members("walls"))] | None = None
-    """Walls at the onset of buzzing, two at least, of different dampings."""
+    buzz: Annotated[tuple[BuzzSection, ...], WrapValidator(require_entries("walls"))] | None = None
+    """Walls at the onset of instability, at least two with different virtual dampings. Default: none."""
 
     period: Annotated[float, Quantity("s", POSITIVE)] | None = None
-    """Sampling period T in s or with a unit; of buzzing walls alone, or of logs in place of their times."""
+    """Sampling period T in s or with a unit; required without a log. Default: from the times of the log."""
 
     noise: Fraction | None = None
-    """Relative noise of stiffness and frequency of buzzing walls. Default: estimated."""
+    """Relative standard deviation of stiffness and frequency of the walls in buzz. Default: estimated."""
 
     max_delay: Annotated[float, Quantity("s", POSITIVE)] | None = None
-    """Longest delay to search for in logs, in s or with a unit. Default: 20 periods."""
+    """Longest delay in the search, for logs, in s or with a unit. Default: 20 periods."""
 
     resample: bool = False
-    """Whether times off by up to a quarter of a period are taken for those of a clock that wavers, samples as even."""
+    """True to accept timestamp jitter of up to a quarter of a period and assume uniform sampling, for logs."""
 
     velocity: VelocityField | None = None
     """Velocity estimate of the loop. Default: the difference of two samples."""
@@ -143,54 +151,54 @@ class FitStudy(ComputedStudy):
     _motions: tuple[LoggedMotion, ...] = PrivateAttr(default=())
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         if "log" not in raw and "buzz" not in raw:
-            allowed = "a device is found from logs or from walls that buzzed"
+            allowed = "a fit needs logs, or walls at the onset of instability"
             yield (), problem("log or buzz is missing", allowed, "add 'log: {csv: log.csv}'")
         elif "log" not in raw and "period" not in raw:
-            yield ("period",), problem("missing", "walls that buzzed need the sampling period", "add 'period: 1 ms'")
+            yield ("period",), problem("missing", "a fit without a log needs the period", "add 'period: 1 ms'")
         strange = {"noise": "buzz", "max_delay": "log", "resample": "log"}
         for name, owner in strange.items():
             if name in raw and owner not in raw:
-                what = f"got {name} without {owner}"
-                yield (name,), problem(what, f"it belongs to {owner}", "remove it", on_key=True)
+                message = f"got {name} without {owner}"
+                yield (name,), problem(message, f"it belongs to {owner}", "remove it", on_key=True)
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         motions: list[LoggedMotion] = []
         for k, section in enumerate(self.log or ()):
             try:
                 motions.append(section.read(self.period if section.time is None else None))
             except InputError as error:
-                # File names and headers may hold anything.
+                # Escape characters that are not printable, which file names and headers may contain.
                 text = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in str(error))
-                path, what = locate_refusal(InputError(text))
-                known = len(path) == 1 and path[0] in LogSection.model_fields
-                # A single log is written without a list around it.
+                path, message = parse_input_error(InputError(text))
+                is_key = len(path) == 1 and path[0] in LogSection.model_fields
+                # Omit the index for one log, because a single log is written without a list.
                 place = ("log", *((k,) if len(self.log or ()) > 1 else ()))
-                yield (*place, *(path if known else ("csv",))), (what if known else split_refusal(text))
+                yield (*place, *(path if is_key else ("csv",))), (message if is_key else parse_message(text))
         self._motions = tuple(motions)
         if any(motion.rotary for motion in motions) and self.buzz:
-            what = "got walls in N/m beside a log of an angle"
-            yield ("buzz",), problem(what, "both are of one axis", "fit them in two studies", on_key=True)
+            message = "got walls in N/m and a log of an angle"
+            yield ("buzz",), problem(message, "both must be of one axis", "fit them in two studies", on_key=True)
         for k, motion in enumerate(motions):
             if motion.rotary != motions[0].rotary or motion.resolution != motions[0].resolution:
-                what = "got another axis, or another resolution, than of the first log"
-                yield ("log", k), problem(what, "all logs are of one device", "fit it in a study of its own")
+                message = "got another axis or encoder step than in the first log"
+                yield ("log", k), problem(message, "all logs are of one device", "fit this log in a separate study")
         for k, wall in enumerate(self.buzz or ()):
             if self.period is not None and wall.frequency * self.period >= 0.5:
-                half = with_unit(0.5 / self.period, "Hz")
-                what = f"got {with_unit(wall.frequency, 'Hz')}"
-                allowed = f"it must lie below half the sampling rate, {half}"
-                yield ("buzz", k, "frequency"), problem(what, allowed, "check the frequency, or the period")
+                nyquist = with_unit(0.5 / self.period, "Hz")
+                message = f"got {with_unit(wall.frequency, 'Hz')}"
+                allowed = f"it must be below the Nyquist frequency, {nyquist}"
+                yield ("buzz", k, "frequency"), problem(message, allowed, "check the frequency, or the period")
         if self.buzz and len({wall.virtual_damping for wall in self.buzz}) < 2:
-            what, remedy = "got walls of one damping alone", "add a wall of another virtual_damping"
-            yield ("buzz",), problem(what, "m, b and t_d need two", remedy, on_key=True)
+            message, remedy = "got walls of only one virtual_damping", "add a wall with another one"
+            yield ("buzz",), problem(message, "m, b and t_d need two", remedy, on_key=True)
 
     @property
     def extent(self) -> str:
         parts = [f"{len(self.log)} log{'' if len(self.log) == 1 else 's'}"] if self.log else []
-        return " and ".join(parts + ([f"{len(self.buzz)} walls that buzzed"] if self.buzz else []))
+        return " and ".join(parts + ([f"{len(self.buzz)} buzzing walls"] if self.buzz else []))
 
     @property
     def points(self) -> int:
@@ -198,7 +206,7 @@ class FitStudy(ComputedStudy):
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The linear system: the names of the columns already have the units of the fitted device."""
+        """Unit system of linear devices, because column names already have the units of the fitted device."""
         return LINEAR
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -228,26 +236,27 @@ class FitStudy(ComputedStudy):
         )
 
     def _fit(self) -> list[_Fitted]:
-        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.known, []
+        """Return the fit to the logs and the fit to the walls, if their data are given."""
+        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.instance, []
         period = self.period
         if self.log:
             options = {"max_delay": self.max_delay, "resample": self.resample}
-            found = fit_motions(self._motions, period=period, velocity=velocity, **options)
-            period = found.period
-            fits.append(_Fitted("log", " and ".join(Path(section.csv).name for section in self.log), found))
+            fit = fit_motions(self._motions, period=period, velocity=velocity, **options)
+            period = fit.period
+            fits.append(_Fitted("log", " and ".join(Path(section.csv).name for section in self.log), fit))
         if self.buzz:
             walls = tuple(BuzzPoint(each.stiffness, each.virtual_damping, each.frequency) for each in self.buzz)
-            found = fit_buzz(walls, period=period, velocity=velocity, noise=self.noise)
-            fits.append(_Fitted("buzz", f"{len(walls)} buzzing walls", found, walls))
+            fit = fit_buzz(walls, period=period, velocity=velocity, noise=self.noise)
+            fits.append(_Fitted("buzz", f"{len(walls)} buzzing walls", fit, walls))
         return fits
 
 
 def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
-    """One row: every number with its standard error and its 95 % interval."""
+    """Return a row of the table: each parameter with its standard error and 95 % interval."""
     row: dict[str, Any] = {"fitted_to": source, "status": Status(fit.status).name}
     errors = fit.errors | {"stiffness_max": fit.stiffness_error}
-    of_log = [name for name in ("friction", "offset") if name in errors]
-    for name in (*fit.numbers[:3], "stiffness_max", *fit.numbers[3:], *of_log):
+    log_parameters = [name for name in ("friction", "offset") if name in errors]
+    for name in (*fit.numbers[:3], "stiffness_max", *fit.numbers[3:], *log_parameters):
         ends = fit.intervals[name]
         numbers = {"": fit.value_of(name), "_error": errors[name], "_low": ends.low, "_high": ends.high}
         row |= {header(name + end, unit_of(name, fit.unit_system)): value for end, value in numbers.items()}
@@ -255,13 +264,17 @@ def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
 
 
 def _compare(one: DeviceFit, other: DeviceFit) -> str:
-    """Whether two fits of one device agree, by how far apart they are in their common covariance."""
+    """Return a line with the result of a chi-squared test of the difference between two fits of one device.
+
+    The statistic is the squared difference of mass, damping and delay in units of its covariance, the sum of both
+    covariances.
+    """
     values = [np.array([fit.mass, fit.damping, fit.delay]) for fit in (one, other)]
-    away = values[0] - values[1]
-    spread = sum((fit.reach / _NORMAL) ** 2 * fit.covariance[:3, :3] for fit in (one, other))
-    # Exact records would leave nothing to divide by.
+    difference = values[0] - values[1]
+    covariance = sum((fit.reach / _NORMAL_95) ** 2 * fit.covariance[:3, :3] for fit in (one, other))
+    # Add a lower bound to the variances, because they are 0 for data without noise.
     floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
-    far = float(away @ np.linalg.solve(spread + np.diag(floor), away))
-    verdict = "log and buzzing walls agree" if far <= _CHANCE else "log and buzzing walls do NOT agree"
-    apart = f"squared, they are {plain(far, 3)} apart in units of their errors"
-    return f"{verdict}: {apart}; 95 % of equal devices stay below {_CHANCE}"
+    statistic = float(difference @ np.linalg.solve(covariance + np.diag(floor), difference))
+    verdict = "log and buzzing walls agree" if statistic <= _CHI_SQUARED_95 else "log and buzzing walls do NOT agree"
+    distance = f"chi-squared = {plain(statistic, 3)}"
+    return f"{verdict}: {distance} (95 % quantile {_CHI_SQUARED_95})"

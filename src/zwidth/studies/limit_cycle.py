@@ -1,4 +1,9 @@
-"""Study "limit_cycle": amplitude and frequency of limit cycles over one or two parameters, for several conditions."""
+"""Study "limit_cycle": amplitude and frequency of limit cycles over one or two parameters, for several conditions.
+
+Every point of the grid is simulated. Its motion is at rest, in a limit cycle or at a larger amplitude, depending on
+the amplitude in the last quarter. The linear stability boundary is drawn for comparison. Parameters of the grid are K,
+B, encoder step and Coulomb friction; each condition has its own panel in the figure.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,7 @@ import numpy as np
 from pydantic import WrapValidator, create_model
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, Strict, members, problem, repeated
+from zwidth.config.fields import LocatedProblem, Strict, find_repeated, problem, require_entries
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Axis, Quantity, axis_of
@@ -22,41 +27,41 @@ from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
-from zwidth.studies.simulate import Circumstances, SimulatedStudy
+from zwidth.studies.simulate import SimulatedStudy, SimulationConditions
 from zwidth.words.formatting import header, spell_short, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.showing import find_unit
 from zwidth.words.status import Status
 
-_COLUMNS = {known.name: column for column, known in AXES.items()}
+_COLUMNS = {parameter.name: column for column, parameter in AXES.items()}
 _OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
-_MOST_CURVES = 6  # values of a list that are drawn as curves; a longer list is drawn as a plane
-# Default of the largest amplitude that counts as a limit cycle, by "is rotary": in m for a linear, in rad for a rotary
-# device.
+_MAX_CURVES = 6  # values of a list that are drawn as curves; a longer list is drawn as a plane
+# Default of the largest amplitude that counts as a limit cycle: key False for linear devices (in m), True for rotary
+# devices (in rad).
 WIDEST = {False: 1e-3, True: math.radians(20.0)}
 WIDEST_STEPS = 10.0  # lower bound of that default, in encoder steps
 
 
 # A condition may override every parameter of the study; None means not overridden.
-_OWN: Any = {
+_OVERRIDES: Any = {
     name: (hint | None, None)
-    for name, hint in get_type_hints(Circumstances, include_extras=True).items()
-    if name in Circumstances.model_fields
+    for name, hint in get_type_hints(SimulationConditions, include_extras=True).items()
+    if name in SimulationConditions.model_fields
 }
-_Own: Any = create_model("_Own", __base__=Strict, **_OWN)
+_Overrides: Any = create_model("_Own", __base__=Strict, **_OVERRIDES)
 
 
-class CycleCondition(_Own):
-    """Parameters of one panel of a limit_cycle study."""
+class CycleCondition(_Overrides):
+    """Condition of one panel of a limit_cycle study; its parameters replace those of the study."""
 
-    what = "a condition"
-    described_by = (Circumstances,)
+    noun = "a condition"
+    described_by = (SimulationConditions,)
 
     label: str
-    """Unique name of the condition."""
+    """Unique name of the condition, the title of its panel."""
 
 
-class CycleAxes(Strict, what="the axes of a limit_cycle study"):
+class CycleAxes(Strict, noun="the axes of a limit_cycle study"):
     """Parameters of a limit_cycle study, one or two of them with several values."""
 
     stiffness: Annotated[Axis, axis_of("stiffness")]
@@ -64,28 +69,30 @@ class CycleAxes(Strict, what="the axes of a limit_cycle study"):
     resolution: Annotated[Axis, axis_of("resolution")] | None = None
     coulomb: Annotated[Axis, axis_of("coulomb")] | None = None
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         if not 1 <= len(self.varied) <= 2:
-            what = f"got {len(self.varied)} axes with several values"
-            yield (), problem(what, "one or two are allowed", "write the others as numbers")
+            message = f"got {len(self.varied)} axes with several values"
+            yield (), problem(message, "one or two are allowed", "write the others as numbers")
 
     @property
     def given(self) -> dict[str, Axis]:
+        """Axes by the name of the parameter."""
         return {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
 
     @property
     def varied(self) -> dict[str, Axis]:
+        """Axes with several values, by the name of the parameter."""
         return {name: axis for name, axis in self.given.items() if axis.size > 1}
 
-    def lay_out(self) -> dict[str, np.ndarray]:
+    def broadcast(self) -> dict[str, np.ndarray]:
         """Return the values of every axis, shaped to broadcast to the grid."""
         grid = np.meshgrid(*(axis.values() for axis in self.varied.values()), indexing="ij", sparse=True)
         return {name: axis.values()[0] for name, axis in self.given.items()} | dict(zip(self.varied, grid, strict=True))
 
 
 @register
-class LimitCycleStudy(SimulatedStudy, Circumstances):
-    """Amplitude of limit cycles over one or two parameters, under one or several conditions."""
+class LimitCycleStudy(SimulatedStudy, SimulationConditions):
+    """Amplitude and frequency of simulated limit cycles over one or two parameters, under one or more conditions."""
 
     method = "Simulations, exact between samples; amplitude and frequency as observed in the last quarter."
     point_bytes = 8 * (1 + len(_OUTPUTS))
@@ -93,10 +100,10 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
     kind: Literal["limit_cycle"]
 
     axes: CycleAxes
-    """Walls, and encoder and friction if they vary."""
+    """Stiffness and virtual damping of the walls, and optionally encoder step and Coulomb friction."""
 
-    conditions: Annotated[tuple[CycleCondition, ...], WrapValidator(members("conditions"))]
-    """Parameters of each panel that differ from those of the study; default: one panel."""
+    conditions: Annotated[tuple[CycleCondition, ...], WrapValidator(require_entries("conditions"))]
+    """Conditions, one per panel, with the parameters that differ from those of the study. Default: one panel."""
 
     silence: Annotated[float, Quantity("m", POSITIVE)] = 1e-6
     """Amplitude below which a motion counts as at rest, in m or rad or with a unit."""
@@ -109,15 +116,15 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
         return {"conditions": [{"label": raw.get("name", "")}], **raw}
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
-        for place, what in repeated([each.label for each in self.conditions], "rename one"):
-            yield ("conditions", *place, "label"), what
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
+        for path, message in find_repeated([each.label for each in self.conditions], "rename one"):
+            yield ("conditions", *path, "label"), message
         for index, condition in enumerate(self.conditions):
             for name in self.axes.given:
                 if getattr(condition, name, None) is not None:
-                    what = "given twice, here and as an axis"
-                    yield ("conditions", index, name), problem(what, "each parameter once", "remove one")
+                    message = "given twice, in the condition and as an axis"
+                    yield ("conditions", index, name), problem(message, "each parameter once", "remove one")
         scene = self.device.to_scene()
         silence, widest = self.bound_amplitudes(scene)
         if widest <= silence:
@@ -125,20 +132,23 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
             name = "silence" if self.widest is None else "widest"
             received = f"got silence {low}, widest {high}"
             yield (name,), problem(received, "silence must be less than widest", "raise widest or lower silence")
-        found = [list(each.find_clashes(scene)) for each in self.list_circumstances()]
-        for index, (condition, faults) in enumerate(zip(self.conditions, found, strict=True)):
-            for path, what in faults:
-                own = getattr(condition, str(path[0])) is not None
+        problems = [list(each.find_inconsistencies(scene)) for each in self.list_conditions()]
+        for index, (condition, faults) in enumerate(zip(self.conditions, problems, strict=True)):
+            for path, message in faults:
+                is_overridden = getattr(condition, str(path[0])) is not None
                 # Report a fault of the whole study only once.
-                if own or index == 0:
-                    yield (("conditions", index, *path) if own else path), what
+                if is_overridden or index == 0:
+                    yield (("conditions", index, *path) if is_overridden else path), message
 
-    def list_circumstances(self) -> list[Circumstances]:
-        common = {name: getattr(self, name) for name in Circumstances.model_fields}
-        owns = [{name: getattr(each, name) for name in common} for each in self.conditions]
+    def list_conditions(self) -> list[SimulationConditions]:
+        """Return the complete conditions of each panel, with absent parameters from the study."""
+        common = {name: getattr(self, name) for name in SimulationConditions.model_fields}
+        overrides = [{name: getattr(each, name) for name in common} for each in self.conditions]
         return [
-            Circumstances.model_construct(**common | {name: value for name, value in own.items() if value is not None})
-            for own in owns
+            SimulationConditions.model_construct(
+                **common | {name: value for name, value in override.items() if value is not None}
+            )
+            for override in overrides
         ]
 
     def bound_amplitudes(self, scene: Scene) -> tuple[float, float]:
@@ -154,29 +164,29 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         return {"conditions": len(self.conditions)} | {name: axis.size for name, axis in self.axes.varied.items()}
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        axes, varied = self.axes.lay_out(), self.axes.varied
+        axes, varied = self.axes.broadcast(), self.axes.varied
         labels = [each.label for each in self.conditions]
-        found: dict[str, list[np.ndarray]] = {name: [] for name in (*_OUTPUTS, "linearly_stable")}
+        results: dict[str, list[np.ndarray]] = {name: [] for name in (*_OUTPUTS, "linearly_stable")}
         bounds = self.bound_amplitudes(self.device.to_scene())
         edges, notes = [], []
-        for label, given in zip(labels, self.list_circumstances(), strict=True):
-            placed = given.place(self.device.to_scene())
-            options: dict[str, Any] = given.options(self.device.period) | axes
-            motion = placed.simulate(**options, record=False)
+        for label, given in zip(labels, self.list_conditions(), strict=True):
+            scene_of_panel = given.set_velocity(self.device.to_scene())
+            options: dict[str, Any] = given.list_options(self.device.period) | axes
+            motion = scene_of_panel.simulate(**options, record=False)
             for name in _OUTPUTS:
-                found[name].append(getattr(motion, name))
+                results[name].append(getattr(motion, name))
             stable = np.full(motion.outcome.shape, -1, np.int8)
-            if not isinstance(placed.velocity, FOAW):
-                stable[...] = placed.is_stable(axes["stiffness"], axes["virtual_damping"])
-                edges += trace_edges(placed, label, varied, axes)
-            found["linearly_stable"].append(stable)
+            if not isinstance(scene_of_panel.velocity, FOAW):
+                stable[...] = scene_of_panel.is_stable(axes["stiffness"], axes["virtual_damping"])
+                edges += trace_edges(scene_of_panel, label, varied, axes)
+            results["linearly_stable"].append(stable)
             notes.append(f"{label}: {describe_outcomes(motion, stable, bounds)}")
         units = {name: unit for name, (_, unit) in OF_WHOLE.items()}
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
-        arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
+        arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in results.items()}
         table = stack(edges)
-        # Draw one curve for each value of a short list, or one curve; otherwise a plane.
-        short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MOST_CURVES]
+        # Draw a curve per value of a short list, or one curve for one varied parameter; otherwise draw a plane.
+        short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MAX_CURVES]
         draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
         if short or len(varied) == 1:
             family = _COLUMNS[short[0]] if len(varied) > 1 else ""
@@ -216,17 +226,17 @@ def describe_outcomes(motion: Any, stable: np.ndarray, bounds: tuple[float, floa
     """Return the numbers of linearly stable and unstable walls at rest, in a limit cycle or at a larger amplitude."""
     wide = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > bounds[1])
     rest = ~wide & (motion.amplitude < bounds[0])
-    known = motion.status == Status.OK
+    complete = motion.status == Status.OK
     ends = {
         "at rest": rest,
         "in a limit cycle": ~rest & ~wide,
         f"larger than {spell_short(bounds[1], find_unit(motion, 'm'))}": wide,
     }
-    words = []
+    parts = []
     for name, kind in {"linearly stable ": 1, "linearly unstable ": 0, "": -1}.items():
-        those = known & (stable == kind)
-        if those.any():
-            counts = ", ".join(f"{np.count_nonzero(end[those]):,} {word}" for word, end in ends.items())
-            words.append(f"of {np.count_nonzero(those):,} {name}walls {counts}")
-    lost = int(np.count_nonzero(~known))
-    return "; ".join(words) + (f"; {lost} not simulated to the end" if lost else "")
+        selected = complete & (stable == kind)
+        if selected.any():
+            counts = ", ".join(f"{np.count_nonzero(end[selected]):,} {word}" for word, end in ends.items())
+            parts.append(f"of {np.count_nonzero(selected):,} {name}walls {counts}")
+    lost = int(np.count_nonzero(~complete))
+    return "; ".join(parts) + (f"; {lost} not simulated to the end" if lost else "")

@@ -1,4 +1,9 @@
-"""A study that is computed as a whole, and what it hands to the run: tables, arrays, figures and texts."""
+"""Base classes of studies that are computed at once (all kinds but sweeps), and their results.
+
+`ComputedStudy.compute` returns an `Outcome`: a table, arrays, figures, documents and lines for the terminal. Sweeps
+are computed in chunks by `zwidth.sweep` instead. Tables have column names with linear units, such as
+``stiffness_N_per_m``; they are converted to rotary units when they are written.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +19,7 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, members, problem
+from zwidth.config.fields import LocatedProblem, problem, require_entries
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene, WallField
 from zwidth.config.study import Study
 from zwidth.config.values import Axis, DelayAxis, DeltaAxis
@@ -27,11 +32,11 @@ from zwidth.words.unit_system import LINEAR, UnitSystem
 
 Item = TypeVar("Item")
 
-# Receives the number of finished parts and of all parts during a long study.
+# Progress callback for long studies; its arguments are the number of finished parts and of all parts.
 LISTENER: ContextVar[Callable[[int, int], None]] = ContextVar("LISTENER", default=lambda done, total: None)
 
 
-def track(parts: Sequence[Item]) -> Iterator[Item]:
+def track_progress(parts: Sequence[Item]) -> Iterator[Item]:
     """Yield the parts of a study, and report the number of finished ones to ``LISTENER``."""
     for done, part in enumerate(parts):
         LISTENER.get()(done, len(parts))
@@ -66,62 +71,76 @@ class Outcome:
 
 
 class ComputedStudy(Study):
-    """A study whose results are tables, figures and texts: a kind is such a class, its model and its computation.
+    """Base of the kinds of studies that are computed at once.
 
-    A subclass has a field ``kind`` of one literal, the fields of its configuration, ``sizes`` for the
-    plan, and `compute`. `zwidth.studies.register` makes it known.
+    A subclass is the model of the study and computes its results. It defines a field ``kind`` with one literal, the
+    fields of its configuration, `sizes` (unless those of its axes are sufficient) and `compute`, and is registered
+    with the decorator `zwidth.studies.register`.
     """
 
     # True if the results depend on the scene in addition to the values that `fill` takes from it.
     reads_scene: ClassVar[bool] = False
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """Compute all results in the scene of the file; ``alone``: no other study of this kind. Drawing comes later."""
+        """Compute all results; figures are drawn later by the functions in the outcome.
+
+        Args:
+            scene: scene of the file; None if the file has none.
+            alone: True if the file has no other study of this kind, which allows shorter file names.
+        """
         raise NotImplementedError
 
 
 class CurvesStudy(ComputedStudy):
     """Base of the studies over delta and d."""
 
-    # alpha, beta, frequency and two codes.
-    point_bytes = 32
+    point_bytes = 32  # alpha, beta, frequency and two codes
 
     delta: DeltaAxis
     d: DelayAxis
 
 
 class WallsStudy(ComputedStudy):
-    """What the studies of walls share that are a share of the maximum stiffness or given outright."""
+    """Base of the studies of walls that are given explicitly or as a fraction of the maximum stiffness."""
 
-    walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
-    """Walls: any number for one device; for several devices, one for all or one each. Default: that of the scene."""
+    walls: Annotated[tuple[WallField, ...], WrapValidator(require_entries("walls"))] | None = None
+    """Walls: any number for one device; for several devices, one for all or one per device. Default: that of the
+    scene."""
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         filled = super().fill(raw, scene)
-        if scene.wall is not None and not {"device", "devices", *_CHOICE} & set(raw):
+        if scene.wall is not None and not {"device", "devices", *_WALL_KEYS} & set(raw):
             filled["walls"] = [scene.wall]
         return filled
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        given = [key for key in raw if key in _CHOICE]
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        given = [key for key in raw if key in _WALL_KEYS]
         if len(given) == 2:
-            allowed = "walls are shares of the maximum stiffness or given outright"
-            what = "stiffness_fraction and walls are both given"
-            yield (given[1],), problem(what, allowed, "remove one", on_key=True)
+            allowed = "walls are given explicitly or as fractions of the maximum stiffness"
+            message = "stiffness_fraction and walls are both given"
+            yield (given[1],), problem(message, allowed, "remove one", on_key=True)
         elif not given:
-            what, needed = "stiffness_fraction or walls is missing", "the study needs a wall"
-            yield (), problem(what, needed, "add 'stiffness_fraction: 0.75'")
+            message, needed = "stiffness_fraction or walls is missing", "the study needs a wall"
+            yield (), problem(message, needed, "add 'stiffness_fraction: 0.75'")
 
 
-_CHOICE = ("stiffness_fraction", "walls")
+_WALL_KEYS = ("stiffness_fraction", "walls")
 
 
-def add_si_of_scene(
+def add_si_columns(
     table: dict[str, np.ndarray], delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None
 ) -> dict[str, np.ndarray]:
-    """A table of walls, in SI units as well where delta and d are those of a rigid scene or device alone."""
+    """Return a table of walls with columns in SI units added, if delta and d are those of a rigid device.
+
+    Args:
+        table: columns with alpha and beta.
+        delta: axis of the study.
+        d: axis of the study.
+        owner: scene or device. If it is normalized, has parts, or has another delta or d than the axes, or the axes
+            have several values, the table is returned unchanged.
+    """
     scene = _find_scene(delta, d, owner)
     if scene is None:
         return table
@@ -129,14 +148,18 @@ def add_si_of_scene(
     return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
 
 
-def share_of_device(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> float:
-    """The part of delta that is the device's own, which alone makes walls passive for any hand; else all of it."""
+def find_device_share(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> float:
+    """Return the fraction of delta that belongs to the device and not to an operator with a rigid grasp.
+
+    Passivity for any operator relies only on the damping of the device. The fraction is 1 under the conditions in
+    which `add_si_columns` leaves tables unchanged.
+    """
     scene = _find_scene(delta, d, owner)
     return float(scene.own_delta / scene.delta) if scene is not None and scene.delta else 1.0
 
 
 def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Scene | None:
-    """The scene of a rigid device in SI units, where delta and d are those of it alone."""
+    """Return the scene of a rigid device in SI units if both axes have only its values of delta and d, else None."""
     if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.parts_beyond:
         return None
     alone = [axis.values().tolist() for axis in (delta, d)] == [[owner.delta], [owner.d]]
@@ -144,8 +167,9 @@ def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Sce
 
 
 def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
-    found = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
-    return {**found, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
+    """Return K, B, frequency and kind of a stiffest wall, by column name."""
+    columns = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
+    return {**columns, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 
 
 def spell_stiffest(row: Mapping[str, Any], system: UnitSystem) -> str:

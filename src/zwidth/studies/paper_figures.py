@@ -1,8 +1,11 @@
-"""Figs. 6 and 10 of the paper: exact fractional delays and, in addition, the paper's z^(1+d) with real d.
+"""Studies "paper_fig6" and "paper_fig10": the figures of the paper with two models of fractional delays.
 
-For integer d both models are equal. For other d, z^d has several branches, and poles are not defined. On the principal
-branch, the boundary is the closed form for integer delays, evaluated at real d. Symbols as in
-`loops.rigid.ridge_newton`: ``s = sin(omega/2)``; ``lag`` is the delay d.
+The models are the exact fractional delay ("held": the force changes within a period) and the paper's z^(1+d) with real
+d ("fractional_power"). For integer d both are equal. For other d, z^d has several branches, and poles are not defined.
+On the principal branch, the boundary is the closed form for integer delays, evaluated at real d.
+
+Symbols as in `loops.rigid.ridge_newton`: ``s = sin(omega/2)``, with the angular frequency omega in rad per sample;
+``lag`` is the delay d in sampling periods.
 
 References:
     Hulin, Preusche, Hirzinger 2006, sections V and VII.
@@ -32,26 +35,26 @@ from zwidth.loops.rigid.ridge_newton import (
     expand_curve,
     guess_start,
 )
-from zwidth.studies.boundary import stable_intervals
+from zwidth.studies.boundary import tabulate_stable_intervals
 from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table
 from zwidth.words.quantities import WALL_RANGE
 
-_STEPS = 16  # Newton steps; sufficient for the shortest delays, whose maximum is close to omega = pi
+_NEWTON_STEPS = 16  # sufficient for the shortest delays, whose maximum is close to omega = pi
 
 
 def _find_maximum(curve: Curve, lag: Any, start: Start) -> Any:
     """Return s at the maximum of alpha along the boundary, for a fractional delay."""
-    # For short delays the maximum is close to omega = pi, where q = 1 - s^2 solves A + B q = C d q^(-3/2). Therefore q
-    # is of the order of d^(2/3), and the search starts below s = 1.
+    # For short delays the maximum is close to omega = pi, where q = 1 - s^2 solves A + B q = C d q^(-3/2) with
+    # coefficients A, B, C that depend on delta. Therefore q is of the order of d^(2/3), and s is bounded away from 1.
     rest = 0.3 * np.minimum(lag, 0.05) ** (2.0 / 3.0)
     lower, upper = 0.5 * start.scale, np.minimum(np.sqrt(1.0 - rest), 1.05 * start.scale)
 
-    def fall(s: Any) -> tuple[Any, Any]:
+    def evaluate_decrease(s: Any) -> tuple[Any, Any]:
         value, slope = evaluate_stationarity(s, curve, lag)
         return -value, -slope
 
-    return newton(fall, lower, upper, np.clip(start.s, lower, upper), _STEPS)[0]
+    return newton(evaluate_decrease, lower, upper, np.clip(start.s, lower, upper), _NEWTON_STEPS)[0]
 
 
 def maximize_alpha(delta: np.ndarray, d: float) -> tuple[Any, Any, Any]:
@@ -59,8 +62,8 @@ def maximize_alpha(delta: np.ndarray, d: float) -> tuple[Any, Any, Any]:
     if d.is_integer():
         return alpha_max(delta, d)[:3]
     curve, lag = expand_curve(discretize_mass(delta)), np.full_like(delta, d)
-    at = evaluate_wave(_find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta)), lag, False)
-    return *evaluate_wall(at, curve), 2.0 * at.half_omega
+    maximum = evaluate_wave(_find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta)), lag, False)
+    return *evaluate_wall(maximum, curve), 2.0 * maximum.half_omega
 
 
 def limit_slope(d: float) -> float:
@@ -68,7 +71,8 @@ def limit_slope(d: float) -> float:
     if d.is_integer():
         return float(stiffness_slope(d))
     zero, lag = np.zeros(1), np.full(1, d)
-    # For delta -> infinity the velocity is proportional to the force, without dynamics: delta N(z) becomes z.
+    # For delta -> infinity the velocity is proportional to the force, so delta N(z) becomes z, with N the numerator of
+    # the plant.
     curve = expand_curve(Plant(c=zero, em=zero + 1.0, a2=zero + 1.0, a1=zero, a0=zero, gap=zero + 1.0))
     s = _find_maximum(curve, lag, guess_start(zero, lag, zero, strength=zero + 1.0))
     return float(evaluate_wall(evaluate_wave(s, lag, False), curve)[0][0])
@@ -112,13 +116,13 @@ class Fig6Study(_PaperStudy):
         shared = {"curve": "stable", "delta": delta, "beta_lower": -delta}
         power = ({"d": d, **shared, "beta_upper": find_upper_damping(delta, d)} for d in self.fractional)
         columns = "curve", "d", "delay_model", "delta", "beta_lower", "beta_upper"
-        table = _tabulate(columns, stable_intervals(delta, self.d.values()), power)
+        table = _tabulate(columns, tabulate_stable_intervals(delta, self.d.values()), power)
         return Outcome(table=table, figures={"": partial(figures.draw_zero_stiffness, table)})
 
 
 @register
 class Fig10Study(_PaperStudy):
-    """Fig. 10 of the paper: maximum stiffness over delta in two scalings, also with the paper's z^(1+d)."""
+    """Fig. 10 of the paper: maximum stable stiffness over delta in two scalings, also with the paper's z^(1+d)."""
 
     kind: Literal["paper_fig10"]
 

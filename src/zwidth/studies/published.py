@@ -1,6 +1,12 @@
-"""The published study: every number that the paper prints, beside the same number computed.
+"""Study "published": all numbers printed in the paper compared with computed ones.
 
-Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006.
+A printed number agrees if the computed one is within half a unit of its last digit. In addition, the study computes
+more precise values of numbers that the paper gives roughly or not at all ("sharpened"). Symbols of the paper: alpha,
+beta, delta and d are normalized stiffness, virtual damping, physical damping and delay; g is the limit of
+alpha_max/delta for strong damping; phi1, phi2, psi and c are the coefficients of the sampled mass (docs/theory/model).
+
+References:
+    Hulin, Preusche, Hirzinger 2006, Stability Boundary for Haptic Rendering: Influence of Physical Damping.
 """
 
 from __future__ import annotations
@@ -28,19 +34,19 @@ from zwidth.words.formatting import with_unit
 
 SOURCE = "Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006"
 
-# The example of section VIII: given, not computed.
-MASS, PERIOD, DELAY_FACTOR = 0.1, 1e-3, 1
-DAMPINGS = (0.0, 10.0, 100.0)
-STIFFNESS_FRACTION = 0.75
-# Massie and Salisbury's maximum for the PHANToM, in N/m, to which section VIII compares.
-MASSIE_SALISBURY = 3.5e3
-# The delays of Fig. 5, and of Fig. 10 as far as they are whole.
-SLOPE_DELAYS = (0.0, 1.0, 2.0, 4.0)
-FIG10_DELAYS = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
+# Parameters of the example in section VIII
+MASS = 0.1  # kg
+PERIOD = 1e-3  # s
+DELAY_FACTOR = 1  # d, in sampling periods
+DAMPINGS = (0.0, 10.0, 100.0)  # N s/m
+STIFFNESS_FRACTION = 0.75  # fraction of alpha_max
+MASSIE_SALISBURY = 3.5e3  # N/m; maximum stiffness of the PHANToM, which section VIII cites from Massie and Salisbury
+SLOPE_DELAYS = (0.0, 1.0, 2.0, 4.0)  # d of Fig. 5, and the integer d of Fig. 10
+FIG10_DELAYS = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # d of Fig. 10
 LINEAR_WITHIN = 0.1  # largest relative difference between d alpha_max/d delta and its limit g that counts as linear
 FILTER_LAG = 0.05  # s; lag of the velocity filter, cited in section VIII
-_LINE = "delta above which the line appears for d = 0"
-_LINEAR = (
+_LINE_APPEARS = "delta above which the line appears for d = 0"
+_LINEAR_FROM = (
     f"delta above which alpha_max is linear: derivative within {100 * LINEAR_WITHIN:g} % of g, all curves of Fig. 10"
 )
 
@@ -68,7 +74,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Sharpened:
-    """A number that the paper gives roughly or not at all, and how it is found."""
+    """A computed value of a number that the paper gives roughly or not at all, and the method of its computation."""
 
     quantity: str
     where: str
@@ -79,27 +85,27 @@ class Sharpened:
 def published_numbers() -> list[Comparison]:
     """Compare all numbers printed in the paper except its inputs (parameters of section VIII and of the figures)."""
     deltas = [float(normalize(mass=MASS, damping=damping, period=PERIOD).delta) for damping in DAMPINGS]
-    ridge = [_ridge(delta, DELAY_FACTOR) for delta in deltas]
+    ridge = [_maximize_alpha(delta, DELAY_FACTOR) for delta in deltas]
     columns = (
         ("delta", ("0", "0.1", "1"), deltas),
         ("0.75 alpha_max", ("0.108", "0.149", "0.656"), [STIFFNESS_FRACTION * alpha for alpha, _ in ridge]),
         ("beta at alpha_max", ("0.425", "0.416", "0.388"), [beta for _, beta in ridge]),
     )
-    undamped, damped = (STIFFNESS_FRACTION * _ridge(delta, DELAY_FACTOR)[0] for delta in (0.0, 1.0))
+    undamped, damped = (STIFFNESS_FRACTION * _maximize_alpha(delta, DELAY_FACTOR)[0] for delta in (0.0, 1.0))
     over_practice = undamped * MASS / PERIOD**2 / MASSIE_SALISBURY
     return [
-        # Remark 4: K_max T^2/m without physical damping.
-        Comparison("alpha_max(delta = 0, d = 0)", "eq. (24)", "0.6863", _ridge(0.0, 0)[0]),
-        Comparison("alpha_max(delta = 0, d = 1)", "eq. (25)", "0.1445", _ridge(0.0, 1)[0]),
+        # Remark 4 of the paper prints these two values of K_max T^2/m without physical damping.
+        Comparison("alpha_max(delta = 0, d = 0)", "eq. (24)", "0.6863", _maximize_alpha(0.0, 0)[0]),
+        Comparison("alpha_max(delta = 0, d = 1)", "eq. (25)", "0.1445", _maximize_alpha(0.0, 1)[0]),
         *(
             Comparison(f"{name}, b = {damping:g} N s/m", "section VIII", text, computed)
-            for name, printed, found in columns
-            for damping, text, computed in zip(DAMPINGS, printed, found, strict=True)
+            for name, printed, values in columns
+            for damping, text, computed in zip(DAMPINGS, printed, values, strict=True)
         ),
         Comparison("stiffness for b = 100 N s/m over that for b = 0", "section VIII", "6", damped / undamped),
         Comparison("stiffness for b = 0 over 3.5 kN/m", "section VIII", "3", over_practice),
-        Comparison(_LINE, "section V, remark 3", "2.3", line_appears()),
-        Comparison(_LINEAR, "section VII", "6", linear_from()),
+        Comparison(_LINE_APPEARS, "section V, remark 3", "2.3", line_appears()),
+        Comparison(_LINEAR_FROM, "section VII", "6", linear_from()),
         Comparison("K_max of a PHANToM in kN/m", "section VIII", "3.5", None, "cited from [11]"),
         Comparison("lag of its velocity filter in ms", "section VIII", "50", None, f"cited from [12]; {_with_lag()}"),
     ]
@@ -118,19 +124,20 @@ def _with_lag() -> str:
     )
 
 
-def _ridge(delta: float, d: float) -> tuple[float, float]:
+def _maximize_alpha(delta: float, d: float) -> tuple[float, float]:
+    """Return alpha_max and its beta."""
     point = alpha_max(delta, d)
     return float(point.alpha), float(point.beta)
 
 
 def line_appears() -> float:
-    """The delta from which, for d = 0, the line of a real pole at z = -1 bounds the stable set."""
-    # The boundary curve ends at omega = pi, in the corner where two poles meet at z = -1. The line starts there, so it
-    # bounds the stable set (alpha > 0) from the delta on at which the corner crosses alpha = 0.
-    # Slow to load, and no other kind of study has a use for it.
+    """Return the delta above which, for d = 0, the line of a real pole at z = -1 bounds the stable set."""
+    # The boundary curve ends at omega = pi, in the corner where two poles are at z = -1. The line starts at this
+    # corner, so it bounds the stable set (alpha > 0) above the delta at which the corner crosses alpha = 0.
+    # Import scipy.optimize here, because it loads slowly and no other study needs it.
     from scipy.optimize import root_scalar
 
-    # To the last digits of float64.
+    # Use tolerances of a few rounding errors.
     exact: dict[str, Any] = {"bracket": (1.0, 6.0), "method": "brentq", "xtol": 1e-15, "rtol": 1e-15}
     return float(root_scalar(lambda delta: float(boundary(np.pi, delta, 0).alpha), **exact).root)
 
@@ -156,17 +163,17 @@ def linear_from() -> float:
 
 
 def corner_takes_over() -> float:
-    """The delta from which, for d = 0, the stiffest stable wall sits in the corner at z = -1."""
+    """Return the delta above which, for d = 0, the stiffest stable wall is in the corner at z = -1."""
     # For d = 0 the curve is a graph over beta, ``alpha = (1 - c + beta (phi2 + c psi) - beta^2 psi phi1)/(psi (1 + phi2
-    # beta))``. Its maximum passes the corner, where the curve ends, when ``d alpha/d beta = 0`` there.
-    # Extended precision where the machine has it: in float64 rounding blurs the last two digits of this root.
+    # beta))``. Its maximum reaches the corner, where the curve ends, if ``d alpha/d beta = 0`` there.
+    # Use extended precision if the machine has it, because rounding errors of float64 affect the last two digits.
     return float(bisect(lambda delta: _slope_at_corner(delta) < 0, np.longdouble(2.5), np.longdouble(6.0)))
 
 
 def _slope_at_corner(delta: np.longdouble) -> np.longdouble:
-    """The numerator of d alpha/d beta at the corner for d = 0; beta there as P(-1) = P'(-1) = 0 gives it."""
+    """Return the numerator of d alpha/d beta at the corner for d = 0, where P(-1) = P'(-1) = 0 determines beta."""
     c = np.exp(-delta)
-    # Far from delta = 0, where these quotients would cancel.
+    # The quotients do not cancel, because delta is at least 2.5 here.
     p1 = -np.expm1(-delta) / delta
     p2 = (1 - p1) / delta
     psi = p1 - p2
@@ -178,8 +185,8 @@ def _slope_at_corner(delta: np.longdouble) -> np.longdouble:
 
 
 def sharpened_numbers() -> list[Sharpened]:
-    """Compute what the paper leaves open."""
-    alpha, beta = _ridge(0.0, 0)
+    """Compute numbers that the paper gives roughly or not at all."""
+    alpha, beta = _maximize_alpha(0.0, 0)
     slopes = np.asarray(stiffness_slope(np.array(SLOPE_DELAYS)))
     return [
         Sharpened(
@@ -204,6 +211,7 @@ def sharpened_numbers() -> list[Sharpened]:
 
 
 def as_json(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
+    """Return the comparison as JSON."""
     given = {"where": "section VIII", "mass_kg": MASS, "period_s": PERIOD, "d": DELAY_FACTOR}
     content = {
         "source": SOURCE,
@@ -224,6 +232,7 @@ def _spell(row: Comparison) -> str:
 
 
 def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
+    """Return the comparison as a page in Markdown."""
     computed = [row for row in printed if row.computed is not None]
     agreeing = sum(row.agrees is True for row in computed)
     cited = f" Cited from other papers: {len(printed) - len(computed)}." if len(computed) < len(printed) else ""
@@ -257,7 +266,7 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
 
 @register
 class PublishedStudy(ComputedStudy):
-    """Every number that the paper prints beside the computed one."""
+    """Comparison of all numbers printed in the paper with computed ones."""
 
     method = "The paper's numbers, from closed forms."
     from_scene = ()
@@ -267,6 +276,6 @@ class PublishedStudy(ComputedStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         printed, sharpened = published_numbers(), sharpened_numbers()
         texts = {"md": as_markdown(printed, sharpened), "json": as_json(printed, sharpened)}
-        away = (row for row in printed if row.agrees is False)
-        notes = tuple(f"{row.quantity}: printed {row.printed}, computed {row.computed:.10g}" for row in away)
+        disagreeing = (row for row in printed if row.agrees is False)
+        notes = tuple(f"{row.quantity}: printed {row.printed}, computed {row.computed:.10g}" for row in disagreeing)
         return Outcome(documents={f"{self.name}.{ending}": text for ending, text in texts.items()}, notes=notes)

@@ -1,4 +1,8 @@
-"""Responses of walls: the step study, and the recommend study: the wall to set, what limits it, and how it moves."""
+"""Studies of step responses: "step" for given walls, and "recommend" for the recommended wall of a device.
+
+The response of the position to a step of 1 N (or 1 N m) is computed with the wall acting on both sides of its surface.
+The recommended wall is the stiffest one that satisfies the required margins (`zwidth.scenes.recommendation`).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ from pydantic import WrapValidator
 from pydantic_core import PydanticCustomError
 
 from zwidth import figures
-from zwidth.config.fields import LocatedProblem, members, problem
+from zwidth.config.fields import LocatedProblem, problem, require_entries
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import (
     AnyDevice,
@@ -26,7 +30,7 @@ from zwidth.config.scenes import (
     PhysicalWall,
     normalized_wall,
 )
-from zwidth.config.study import refuse_parts, register
+from zwidth.config.study import make_parts_error, register
 from zwidth.config.values import Duration, Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.style import WIDTH, house_style, new_figure
@@ -48,39 +52,48 @@ class ResponseStudy(ComputedStudy):
     """Base of the studies that compute responses."""
 
     remedy_if_too_large = "shorten the duration, or lower substeps"
-    # Time, position, velocity and force.
-    point_bytes = 32
+    point_bytes = 32  # time, position, velocity and force
 
     duration: Duration = Span(100.0, "periods")
-    """Length of the response, in s or in periods."""
+    """Duration of the response, in s or in periods."""
 
     substeps: Annotated[int, Quantity(allowed=Range(1, 10_000), whole=True)] = 10
-    """Points computed per period."""
+    """Number of computed points per period."""
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
-        """Each device with its wall; the wall is None where stiffness_fraction decides it."""
+        """Return each device with its wall; the wall is None if the study computes it."""
         raise NotImplementedError
 
     def respond(
         self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
     ) -> tuple[dict[str, Any], str]:
-        """Return the response of a device to 1 N, normalized to a unit force, as columns, and a note on settling."""
+        """Return the step response of a device with a wall as columns, and a note on settling or "".
+
+        Args:
+            device: device without parts.
+            alpha: normalized stiffness of the wall.
+            beta: normalized damping of the wall.
+            label: name of the response.
+            physical: True for a step of 1 N and columns in SI units, False for normalized columns.
+        """
         periods = max(1, round(self.duration.periods(device.period)))
         raw = step_response(alpha, beta, device.delta, device.d, periods=periods, substeps=self.substeps)
-        clock, length = (device.period, 1.0 / device.to_scene().units.stiffness) if physical else (1.0, 1.0)
-        second, meter, speed, newton = ("_s", "_m", "_m_per_s", "_N") if physical else ("",) * 4
-        time, settling_time = raw.time * clock, raw.settling_time * clock
+        time_unit, length_unit = (device.period, 1.0 / device.to_scene().units.stiffness) if physical else (1.0, 1.0)
+        time_suffix, position_suffix, velocity_suffix, force_suffix = (
+            ("_s", "_m", "_m_per_s", "_N") if physical else ("",) * 4
+        )
+        time, settling_time = raw.time * time_unit, raw.settling_time * time_unit
         columns = {
             **{"label": label, "alpha": alpha, "beta": beta, "delta": device.delta, "d": device.d},
-            f"time{second}": time,
-            f"position{meter}": raw.position * length,
-            f"velocity{speed}": raw.velocity * length / clock,
-            f"wall_force{newton}": raw.wall_force,
-            f"final_position{meter}": raw.final_position * length,
-            f"settling_time{second}": settling_time,
+            f"time{time_suffix}": time,
+            f"position{position_suffix}": raw.position * length_unit,
+            f"velocity{velocity_suffix}": raw.velocity * length_unit / time_unit,
+            f"wall_force{force_suffix}": raw.wall_force,
+            f"final_position{position_suffix}": raw.final_position * length_unit,
+            f"settling_time{time_suffix}": settling_time,
         }
         if np.isnan(settling_time):
-            return columns, "no settling time: the wall is not stable, or needs more than 500,000 periods to settle"
+            return columns, "no settling time: the wall is unstable, or settles after more than 500,000 periods"
         after = with_unit(settling_time, "s", 3) if physical else f"{plain(settling_time)} periods"
         late = settling_time > time[-1]
         return columns, f"the response settles after {after}, later than the time shown" if late else ""
@@ -93,36 +106,36 @@ class ResponseStudy(ComputedStudy):
 
 @register
 class StepStudy(WallsStudy, ResponseStudy):
-    """Response of the position to a step of force, for one or more devices."""
+    """Response of the position to a step of the external force, for one or more devices and walls."""
 
-    method = "Exact solution between the instants at which a force changes; rounding alone."
+    method = "Exact solution between changes of the force; rounding errors only."
     from_scene = ("devices",)
 
     kind: Literal["step"]
 
-    devices: Annotated[tuple[DeviceField, ...], WrapValidator(members("devices"))]
-    """Devices."""
+    devices: Annotated[tuple[DeviceField, ...], WrapValidator(require_entries("devices"))]
+    """Devices in SI units or normalized, without parts."""
 
     stiffness_fraction: Fraction | None = None
-    """Stiffness as a share of alpha_max, with beta as at the ridge; give this or walls."""
+    """Stiffness as a fraction of alpha_max, with beta at alpha_max; alternative to walls."""
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         for index, device in enumerate(self.devices):
             if device.parts_beyond:
-                yield ("devices", index), refuse_parts("step", list_parts(device))
+                yield ("devices", index), make_parts_error("step", list_parts(device))
         sizes = len(self.devices), len(self.walls or (None,))
         if min(sizes) > 1 and sizes[0] != sizes[1]:
-            allowed = "one wall for all devices, one for each, or one device for all walls"
+            allowed = "allowed are one wall for all devices, one per device, or one device"
             yield ("walls",), problem(f"got {sizes[1]} walls for {sizes[0]} devices", allowed, "make the numbers equal")
             return
         if self.duration.unit == "s" and any(isinstance(device, NormalizedDevice) for device in self.devices):
-            allowed = "a normalized device has no period to measure seconds in"
+            allowed = "the period of a normalized device in seconds is unknown"
             yield ("duration",), problem(f"got {self.duration}", allowed, "write it in periods, as in '100 periods'")
         yield from self._wall_limits()
 
     def _wall_limits(self) -> Iterable[LocatedProblem]:
-        """Walls that do not fit their device, each reported once."""
+        """Yield problems of walls that are not valid for their devices, once per wall."""
         least, most = WALL_RANGE
         faults: dict[int, PydanticCustomError] = {}
         for number, (device, wall) in enumerate(self.pairs()):
@@ -165,12 +178,13 @@ class StepStudy(WallsStudy, ResponseStudy):
         return Outcome(table=table, figures={"": partial(figures.draw_step, table)}, notes=tuple(notes))
 
 
-_BARE = ("mass", "damping", "period", "delay", "delta", "d")
+# Parameters of the device that the report does not list among its parts.
+_DEVICE_NAMES = ("mass", "damping", "period", "delay", "delta", "d")
 
 
 @register
 class RecommendStudy(ResponseStudy):
-    """The wall to set on a device in SI units, at wanted margins, and its response."""
+    """Recommended virtual wall of a device at required margins, the limits of this wall, and its step response."""
 
     method = "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings."
     from_scene = ("device",)
@@ -183,24 +197,25 @@ class RecommendStudy(ResponseStudy):
     """Device in SI units."""
 
     stiffness_fraction: Fraction | None = None
-    """Largest stiffness of the recommended wall as a fraction of K_max. If neither a fraction, a margin nor passivity
-    is given, the defaults are 0.75 of K_max, a gain margin of 2, a phase margin of 30 degrees and soft grasps."""
+    """Largest stiffness of the recommended wall as a fraction of K_max. Default: 0.75 of K_max, a gain margin of 2, a
+    phase margin of 30 degrees and soft grasps, if no fraction, margin or passivity is given."""
 
     gain_margin: Annotated[float, Quantity(allowed=RANGES["gain_margin"])] | None = None
-    """The factor on stiffness and damping together that the wall must bear, at least."""
+    """Required gain margin: factor on stiffness and virtual damping together, up to which the wall stays stable.
+    Default: see stiffness_fraction."""
 
     phase_margin: Annotated[float, Quantity(allowed=RANGES["phase_margin"])] | None = None
-    """The phase margin that the wall must have, at least, in degrees."""
+    """Required phase margin in degrees. Default: see stiffness_fraction."""
 
     passive: bool = False
-    """Whether the wall must be passive."""
+    """True to require a passive wall."""
 
     grasps: Grasps | None = None
-    """Require stability in all reference grasps, in the soft ones, or in none. By default soft, with the default
-    margins; none if a requirement is given or the scene has a hand."""
+    """Reference grasps in which the wall must be stable: all, soft or none. Default: soft together with the default
+    margins; none if a requirement is given or the scene has an operator."""
 
     beyond_safe: bool = False
-    """Ignore the safe limit of the device, which is usually set by a fit."""
+    """True to ignore the safe limit of the device, which is usually set by a fit."""
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         return ((self.device, None),)
@@ -209,69 +224,69 @@ class RecommendStudy(ResponseStudy):
         stem, label = "recommendation" if alone else f"{self.name}_recommendation", self.device.label or self.name
         bare = self.device.to_scene()
         wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive", "grasps", "beyond_safe")
-        found = bare.recommend(**{name: getattr(self, name) for name in wanted})
-        told, notes, response = found.as_dict(), list(found.notes), None
-        lines = (*found.lines(), *self._simulate(found, scene))
-        if not bare.parts_beyond and found.verdict is not None:
-            # The wall as it was judged: from SI units and back, a last digit may be another.
-            wall = found.verdict.alpha, found.verdict.beta
+        recommendation = bare.recommend(**{name: getattr(self, name) for name in wanted})
+        summary, notes, response = recommendation.as_dict(), list(recommendation.notes), None
+        lines = (*recommendation.lines(), *self._simulate(recommendation, scene))
+        if not bare.parts_beyond and recommendation.verdict is not None:
+            # Use the normalized wall of the verdict, because conversion to SI units and back has rounding errors.
+            wall = recommendation.verdict.alpha, recommendation.verdict.beta
             columns, note = self.respond(self.device, *wall, label=label, physical=True)
-            told["recommended"]["settling_time"] = to_json(float(columns["settling_time_s"]))
+            summary["recommended"]["settling_time"] = to_json(float(columns["settling_time_s"]))
             response, notes = stack([columns]), [*notes, note] if note else notes
         table = response or stack(trace_outlines(bare, label=label))
         return Outcome(
             table=table,
-            figures={"": partial(draw, found, response)} if table else {},
+            figures={"": partial(draw, recommendation, response)} if table else {},
             documents={
-                f"{stem}.json": json.dumps(told, indent=2, allow_nan=False) + "\n",
-                f"{stem}.md": _describe(found, told, lines),
+                f"{stem}.json": json.dumps(summary, indent=2, allow_nan=False) + "\n",
+                f"{stem}.md": _describe(recommendation, summary, lines),
             },
             answer=lines,
             notes=tuple(notes),
         )
 
-    def _simulate(self, found: Recommendation, scene: AnyScene | None) -> list[str]:
+    def _simulate(self, recommendation: Recommendation, scene: AnyScene | None) -> list[str]:
         """Return a line with the diagnosis of the wall, with encoder, friction and motor of the scene of the file."""
         hardware = {}
-        if isinstance(scene, PhysicalScene) and self.device == scene.bare():
+        if isinstance(scene, PhysicalScene) and self.device == scene.without_wall():
             hardware = scene.hardware
-        if found.verdict is None or not hardware or isinstance(found.scene.device, MeasuredDevice):
+        if recommendation.verdict is None or not hardware or isinstance(recommendation.scene.device, MeasuredDevice):
             return []
-        diagnosis = diagnose(found.scene, **hardware, remedies=False)
-        used = spell_hardware(hardware, found.unit_system)
+        diagnosis = diagnose(recommendation.scene, **hardware, remedies=False)
+        used = spell_hardware(hardware, recommendation.unit_system)
         used += "" if {"coulomb", "static"} & hardware.keys() else ", without friction"
         return [f"simulated with {used}: {diagnosis.word}: {diagnosis.explain()}"]
 
 
 @house_style()
-def draw(found: Recommendation, response: Table | None = None) -> Any:
+def draw(recommendation: Recommendation, response: Table | None = None) -> Any:
     """Draw a recommendation into a figure that pyplot does not know, and return its Axes."""
-    # Of a measured response no motion is known.
-    columns = 1 if found.verdict is None or math.isnan(found.verdict.frequency) else 2
+    # Omit the step response of a measured device (without a frequency in its verdict), which has no model to simulate.
+    columns = 1 if recommendation.verdict is None or math.isnan(recommendation.verdict.frequency) else 2
     _, axes = new_figure(WIDTH if columns == 2 else 5.6, 3.5, 1, columns)
-    return figures.plot.recommendation(found, axes, response=response)
+    return figures.plot.recommendation(recommendation, axes, response=response)
 
 
-def _describe(found: Recommendation, told: dict[str, Any], lines: Iterable[str]) -> str:
-    """A recommendation as Markdown: its device, what a terminal is told of the wall, and what would allow more."""
-    scene, settled, said = found.scene, told["recommended"]["settling_time"], list(lines)
+def _describe(recommendation: Recommendation, summary: dict[str, Any], lines: Iterable[str]) -> str:
+    """Return a recommendation as Markdown: the device, the lines of the terminal, and changes for more stiffness."""
+    scene, settled, results = recommendation.scene, summary["recommended"]["settling_time"], list(lines)
     times = (with_unit(time, "s") for time in (scene.timing.period, scene.timing.delay))
-    parts = [f"{name} = {value}" for name, value in told["device"].items() if name not in _BARE]
-    if isinstance(scene.device, MeasuredDevice) and found.verdict is not None:
+    parts = [f"{name} = {value}" for name, value in summary["device"].items() if name not in _DEVICE_NAMES]
+    if isinstance(scene.device, MeasuredDevice) and recommendation.verdict is not None:
         every = "by the measured curve" if scene.device.deviation is None else "for every response in the band"
-        said.append(f"stable {every}")
+        results.append(f"stable {every}")
     if settled is not None:
-        said.append(
-            f"settles to 2 % of a step of {'torque' if found.unit_system.rotary else 'force'} in about "
+        results.append(
+            f"settles to 2 % of a step of {'torque' if recommendation.unit_system.rotary else 'force'} in about "
             f"{with_unit(settled, 's')}"
         )
     page = [
         *("# Recommended virtual wall", ""),
         "Device: {}, sampled every {}, force delayed by {}.".format(scene.device.spell(), *times),
         *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
-        *("", *(f"- {text}" for text in said), ""),
-        *(text for note in found.notes for text in (f"Note: {note}", "")),
-        *(("To gain stiffness under the same requirements:", "") if found.steps else ()),
-        *(f"- {step.spell()}" for step in found.steps),
+        *("", *(f"- {text}" for text in results), ""),
+        *(text for note in recommendation.notes for text in (f"Note: {note}", "")),
+        *(("To gain stiffness under the same requirements:", "") if recommendation.steps else ()),
+        *(f"- {step.spell()}" for step in recommendation.steps),
     ]
     return "\n".join(page).rstrip() + "\n"

@@ -1,4 +1,9 @@
-"""Stiffest walls, stable and passive ones over delta, and of every pose of a workspace; and their studies."""
+"""Studies of maximum stiffness: "ridge" and "passivity" over delta, and "workspace" over the poses of a device.
+
+The ridge is the path of the stiffest stable wall, alpha_max and its beta, over delta for a fixed delay d. Its limit
+alpha_max/delta for strong damping is g(d). Passive walls are those of Colgate's condition; for a fixed d, their set
+scales with delta, so it is computed once for delta = 1.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +18,7 @@ from pydantic import Field, PrivateAttr, ValidationError, WrapValidator
 from zwidth import figures
 from zwidth.config.device_table import DeviceTable, find_file, read_table
 from zwidth.config.devices import find_second_period, read_period
-from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of
+from zwidth.config.fields import LocatedProblem, Strict, list_problems, problem
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Delay, quantity_of
@@ -26,7 +31,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
-from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, share_of_device
+from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, find_device_share
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, name_wall, plain, round_safely, suggestion, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
@@ -34,22 +39,20 @@ from zwidth.words.status import RidgeKind, Status
 from zwidth.words.tables import read_columns
 from zwidth.words.units import split_head
 
-# A path that goes this far shows what alpha_max/delta tends to: within some percent.
-_STRONG_DAMPING = 100.0
-# Delays at which g(d) is sampled between two whole ones; it has kinks at these.
-_SLOPE_SAMPLES = 64
+_STRONG_DAMPING = 100.0  # delta at which alpha_max/delta is within some percent of its limit g(d)
+_SLOPE_SAMPLES = 64  # samples of g(d) per unit of d; integer delays are included, because g has kinks there
 
 
 @register
 class RidgeStudy(CurvesStudy):
-    """Maximum stiffness over delta, one curve per d."""
+    """Maximum stable stiffness over delta, one curve per d."""
 
     method = "Stationary points of the closed form and corners at z = -1, to some ten rounding errors."
 
     kind: Literal["ridge"]
 
     two_scalings: bool = False
-    """Show the small deltas in a panel of their own, as fig. 10 of the paper does."""
+    """True to show small values of delta in a separate panel, as in Fig. 10 of the paper."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         table, notes = ridge_table(self.delta.values(), self.d.values())
@@ -82,7 +85,7 @@ def slope_table(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 @register
 class PassivityStudy(CurvesStudy):
-    """Largest passive and largest stable stiffness over delta."""
+    """Maximum passive stiffness and maximum stable stiffness over delta, one pair of curves per d."""
 
     method = "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms."
     reads_scene = True
@@ -93,13 +96,13 @@ class PassivityStudy(CurvesStudy):
         ridge, notes = ridge_table(self.delta.values(), self.d.values())
         table = {name: ridge[name] for name in ("d", "delta", "alpha_max", "beta")}
         slopes = map(passive_stiffness_slope, self.d.values().tolist())
-        own = share_of_device(self.delta, self.d, scene) * table["delta"]
+        own_delta = find_device_share(self.delta, self.d, scene) * table["delta"]
         for name, slope in zip(("alpha_max_passive", "beta_passive"), zip(*slopes, strict=True), strict=True):
-            table[name] = np.repeat(slope, self.delta.size) * own
+            table[name] = np.repeat(slope, self.delta.size) * own_delta
         return Outcome(table=table, figures={"": partial(figures.draw_passivity_cost, table)}, notes=tuple(notes))
 
 
-def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
+def trace_unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
     """Return alpha and beta on the boundary of the passive set for delta = 1, by increasing beta."""
     return passive_edge(Scene(Device(1.0, 1.0), Timing(1.0, d)))
 
@@ -118,7 +121,7 @@ def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0)
     ``share`` is the proportion of the damping that belongs to the device and not to an operator.
     """
     for d in delays:
-        alpha, beta = unit_outline(float(d))
+        alpha, beta = trace_unit_outline(float(d))
         for delta in deltas[share * deltas > 0]:
             yield {"curve": "passive", "d": d, "delta": delta,
                    "alpha": share * delta * alpha, "beta": share * delta * beta}  # fmt: skip
@@ -127,85 +130,86 @@ def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0)
 def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:
     """Yield the passive interval of the virtual damping for alpha -> 0 over delta, as columns."""
     for d in delays:
-        _, beta = unit_outline(float(d))
+        _, beta = trace_unit_outline(float(d))
         yield {"curve": "passive", "d": d, "delta": deltas,
                "beta_lower": deltas * beta[0], "beta_upper": deltas * beta[-1]}  # fmt: skip
 
 
-_FORM = "poses are a file with columns mass and damping, and the two columns of it that a pose is drawn over"
+_FORM = "poses are a file with the columns mass and damping, and two columns with coordinates"
 
 
-class Poses(Strict, what="a table of poses"):
-    """Masses and dampings of a device, one row a pose, and two coordinates of it."""
+class Poses(Strict, noun="a table of poses"):
+    """Table file with mass, damping and two coordinates of a device, one row per pose."""
 
     csv: str
     """Name of the file, relative to the configuration."""
 
     across: str
-    """Name of the column that poses are drawn over from left to right."""
+    """Name of the column with the coordinate along the x axis of the figure."""
 
     up: str
-    """Name of the one from bottom to top."""
+    """Name of the column with the coordinate along the y axis of the figure."""
 
-    # Name, unit and values of both.
-    _coordinates: list[tuple[str, str, list[float]]] = PrivateAttr()
+    _coordinates: list[tuple[str, str, list[float]]] = PrivateAttr()  # name, unit and values of both coordinates
 
     @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
+    def explain_missing(cls, name: str) -> tuple[str, str]:
         return _FORM, "write {csv: arm.csv, across: shoulder, up: elbow}"
 
-    def limits(self) -> Iterable[LocatedProblem]:
+    def find_faults(self) -> Iterable[LocatedProblem]:
         try:
             table, columns = self.table, read_columns(find_file(self.csv))
-            known = {name: (unit, place) for place, (name, unit) in enumerate(map(split_head, columns.heads))}
+            columns_by_name = {name: (unit, index) for index, (name, unit) in enumerate(map(split_head, columns.heads))}
             chosen = {key: getattr(self, key) for key in ("across", "up")}
             if set(table.columns) != {"mass", "damping"}:
-                what = f"got columns {' and '.join(table.columns)}"
-                yield ("csv",), problem(what, _FORM, "give these two, and no other parameter")
-            for key in (key for key, name in chosen.items() if name not in known):
-                remedy = suggestion(chosen[key], known, f"choose from {', '.join(known)}")
-                yield (key,), problem(f"got {describe(chosen[key])}", "it names a column of the file", remedy)
+                message = f"got columns {' and '.join(table.columns)}"
+                yield ("csv",), problem(message, _FORM, "give mass and damping as the only parameters")
+            for key in (key for key, name in chosen.items() if name not in columns_by_name):
+                remedy = suggestion(chosen[key], columns_by_name, f"choose from {', '.join(columns_by_name)}")
+                yield (key,), problem(f"got {describe(chosen[key])}", "it must be a column of the file", remedy)
             if self.across == self.up:
-                what = f"got {describe(self.up)}, as across"
-                yield ("up",), problem(what, "a map has two coordinates", "name another")
-            found = [(name, *known[name]) for name in chosen.values() if name in known]
-            values = columns.numbers([place for _, _, place in found])
-            self._coordinates = [(name, unit, of.tolist()) for (name, unit, _), of in zip(found, values, strict=True)]
+                message = f"got {describe(self.up)}, equal to across"
+                yield ("up",), problem(message, "the coordinates must differ", "name another column")
+            coordinates = [(name, *columns_by_name[name]) for name in chosen.values() if name in columns_by_name]
+            values = columns.numbers([index for _, _, index in coordinates])
+            self._coordinates = [
+                (name, unit, column.tolist()) for (name, unit, _), column in zip(coordinates, values, strict=True)
+            ]
         except ValidationError as error:
-            yield from problems_of(error)
+            yield from list_problems(error)
         except InputError as error:
             yield ("csv",), problem(str(error).partition("; ")[0], _FORM, "complete the file")
 
     @cached_property
     def table(self) -> DeviceTable:
-        """The masses and dampings."""
+        """Mass and damping of all poses."""
         return read_table({"csv": self.csv})
 
     def tabulate(self) -> dict[str, np.ndarray]:
-        """The coordinates as columns, across and up."""
+        """Return the coordinates as columns, ``across`` first."""
         return {header(name, unit): np.array(values) for name, unit, values in self._coordinates}
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
-        """The name and the unit of both coordinates."""
+        """Name and unit of both coordinates."""
         return tuple((name, unit) for name, unit, _ in self._coordinates)
 
     def spell(self, pose: int) -> str:
-        """A pose by its coordinates."""
+        """Return the coordinates of a pose as text, by the index of its row."""
         return ", ".join(f"{name} {values[pose]:.4g} {unit}".rstrip() for name, unit, values in self._coordinates)
 
 
 @register
 class WorkspaceStudy(ComputedStudy):
-    """The stiffest stable wall over a device's workspace, from the mass and damping that it has in every pose."""
+    """Maximum stable stiffness over the workspace of a device, from its mass and damping in each pose."""
 
-    method = "The stiffest wall of each pose as that of a rigid device, to some rounding errors."
+    method = "Maximum stable stiffness of a rigid device per pose, to some rounding errors."
     from_scene = ("period", "delay")
 
     kind: Literal["workspace"]
 
     poses: Poses
-    """A file with a row for each pose: its mass and damping, and the two columns that they are drawn over."""
+    """Table file with mass, damping and two coordinates of each pose."""
 
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
     period: Annotated[float, quantity_of("period"), WrapValidator(read_period)] = Field(
@@ -214,18 +218,18 @@ class WorkspaceStudy(ComputedStudy):
     delay: Delay
 
     @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         yield from find_second_period(raw)
-        yield from super().conflicts(raw)
+        yield from super().find_conflicts(raw)
 
     @property
     def sizes(self) -> dict[str, int]:
         return {"poses": self.poses.table.size}
 
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        yield from super().find_faults()
         if self.poses.table.size < 2:
-            yield ("poses",), problem("got one pose", "a map needs several", "use the kind 'recommend' for one device")
+            yield ("poses",), problem("got one pose", "at least two are needed", "use the kind 'recommend' instead")
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         mass, damping = (self.poses.table.values(name) for name in ("mass", "damping"))
@@ -236,26 +240,27 @@ class WorkspaceStudy(ComputedStudy):
         coordinates = self.poses.tabulate()
         table = {**coordinates, "mass_kg": mass, "damping_N_s_per_m": damping}
         table |= dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))
-        known, file, units = np.isfinite(stiffness), self.poses.csv, self.unit_system
+        has_result, file, units = np.isfinite(stiffness), self.poses.csv, self.unit_system
         notes = [
             f"{self.poses.spell(k)}: mass {with_unit(mass[k], units['kg'])} and damping "
             f"{with_unit(damping[k], units['N s/m'])} (delta = {plain(delta[k])}) have no K_max: "
             f"{Status(int(top.status[k])).message} Correct this pose in "
             f"{file}, or leave it out."
-            for k in np.flatnonzero(~known).tolist()
+            for k in np.flatnonzero(~has_result).tolist()
         ]
-        if not known.any():
-            raise InputError(f"poses: no pose of {file} has a K_max; the first, {notes[0]}")
+        if not has_result.any():
+            raise InputError(f"poses: no pose of {file} has a K_max; first pose: {notes[0]}")
         weakest = int(np.nanargmin(stiffness))
-        # Other poses are heavier or more damped, but not alike in both: the wall as it is written is tried on each.
+        # Test the rounded wall in every pose, because a wall that is stable in the pose with the smallest K_max may be
+        # unstable in others: their K_max has another virtual damping.
         wall = round_safely(RECOMMENDED_SHARE * stiffness[weakest], "below"), float(f"{virtual_damping[weakest]:.4g}")
-        bears = np.asarray(is_stable(wall[0] * self.period / rate, wall[1] / rate, delta, d))
+        is_stable_at = np.asarray(is_stable(wall[0] * self.period / rate, wall[1] / rate, delta, d))
         ends = stiffness[weakest], np.nanmax(stiffness)
         low, high = (with_unit(round_safely(float(each), "below"), units["N/m"]) for each in ends)
         answer = (
             f"K_max from {low} at {self.poses.spell(weakest)} to {high}",
             f"{name_wall(*wall, units)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
-            f"stable in {np.count_nonzero(bears)} of {np.count_nonzero(known)} poses",
+            f"stable in {np.count_nonzero(is_stable_at)} of {np.count_nonzero(has_result)} poses",
         )
         draw = partial(figures.draw_workspace, table, *coordinates, names=self.poses.names)
         return Outcome(table=table, figures={"": draw}, answer=answer, notes=tuple(notes))

@@ -1,4 +1,4 @@
-"""Temporary values of context variables."""
+"""Context manager for temporary values of context variables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Value = TypeVar("Value")
 
 @contextmanager
 def set_temporarily(variable: ContextVar[Value], value: Value) -> Iterator[None]:
-    """Set a context variable, and restore its previous value at the end of the ``with`` block."""
+    """Set a context variable, and restore its previous value at the end of the ``with`` block, also after an error."""
     token = variable.set(value)
     try:
         yield

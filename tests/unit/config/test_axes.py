@@ -24,7 +24,7 @@ def test_values(raw, form, values):
     np.testing.assert_allclose(made.values(), values, rtol=1e-15)
     assert made.size == len(values)
     assert max(made.entries) == max(values)
-    assert AxisOf(Quantity()).read(made.spelling()) == made
+    assert AxisOf(Quantity()).read(made.serialize()) == made
     assert AxisOf(Quantity()).read(made) is made
     assert hash(made) == hash(AxisOf(Quantity()).read(raw))
 

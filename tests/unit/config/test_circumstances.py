@@ -8,7 +8,7 @@ import pytest
 import zwidth
 from zwidth.config.fields import ConfigFileError
 from zwidth.studies.document import Config
-from zwidth.studies.simulate import Circumstances
+from zwidth.studies.simulate import SimulationConditions
 
 DEVICE = "mass: 100 g, period: 1 ms, delay: 1 periods"
 FOAW = "velocity: {kind: foaw, noise: 20 um, samples: 12}"
@@ -22,7 +22,7 @@ CYCLE = {"kind": "limit_cycle", "wall": "axes: {stiffness: [1 kN/m, 2 kN/m], vir
 
 
 def test_units_become_the_arguments_of_simulate():
-    given = Circumstances.model_validate(
+    given = SimulationConditions.model_validate(
         {
             "duration": "0.2 s",
             "start_position": "-1 mm",
@@ -39,7 +39,7 @@ def test_units_become_the_arguments_of_simulate():
             "seed": 7,
         }
     )
-    found = given.options(1e-3)
+    found = given.list_options(1e-3)
     assert {name: value for name, value in found.items() if isinstance(value, str | int)} == {
         "periods": 200,
         "contact": "push_only",
@@ -56,9 +56,9 @@ def test_units_become_the_arguments_of_simulate():
 
 def test_what_is_left_out_is_as_in_python():
     defaults = {name: each.default for name, each in inspect.signature(zwidth.simulate).parameters.items()}
-    for name, value in Circumstances().options(1e-3).items():
+    for name, value in SimulationConditions().list_options(1e-3).items():
         assert value == defaults[name], name
-    assert {"static", "max_force", "max_rate"}.isdisjoint(Circumstances().options(1e-3))
+    assert {"static", "max_force", "max_rate"}.isdisjoint(SimulationConditions().list_options(1e-3))
     assert [defaults[name] for name in ("static", "max_force", "max_rate")] == [None, math.inf, math.inf]
 
 
@@ -67,7 +67,7 @@ def test_simulations_take_an_estimate_without_a_linear_form(load, kind):
     for text in (simulate("", f"{DEVICE}, {FOAW}", **kind), simulate(FOAW, **kind)):
         config = load(text)
         study = config.studies[0]
-        assert study.place(study.device.to_scene()).velocity == zwidth.FOAW(2e-5, 12)
+        assert study.set_velocity(study.device.to_scene()).velocity == zwidth.FOAW(2e-5, 12)
         # What a run keeps of a configuration says the same.
         assert Config.model_validate(config.model_dump(mode="json", exclude_none=True)) == config
 
@@ -125,7 +125,7 @@ FAULTS = {
     "max_rate: 5 N": ("max_rate", "units allowed are N/s"),
     "max_force: 0 N": ("max_force", "greater than 0"),
     "contact: one-sided": ("contact", "'bilateral', 'unilateral', 'push_only'"),
-    "coulomb: 0.3 N, static: 0.2 N": ("static", "at least the friction while slipping"),
+    "coulomb: 0.3 N, static: 0.2 N": ("static", "at least the sliding friction"),
     "jitter: 1 periods": ("jitter", "less than one period"),
     "jitter: 2 ms": ("jitter", "less than one period"),
     "duration: 2000 s": ("duration", "2e+06 periods"),

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from sweeping import main_of
 
-from zwidth.config.fields import ConfigFileError, dotted
+from zwidth.config.fields import ConfigFileError, format_path
 from zwidth.config.reader import MAX_DEPTH, MAX_NODES
 from zwidth.studies.document import Config, load_config
 
@@ -63,11 +63,11 @@ def fields_of(data, loader=yaml.SafeLoader):
         # Deeper, or more, than any file that is read may have.
         if len(path) > 2 * MAX_DEPTH or len(found) > 2 * MAX_NODES:
             return
-        found[dotted(path)] = node
+        found[format_path(path)] = node
         if isinstance(node, yaml.MappingNode):
             for key, value in node.value:
                 # Of a key that comes twice the first counts.
-                if isinstance(key, yaml.ScalarNode) and dotted((*path, key.value)) not in found:
+                if isinstance(key, yaml.ScalarNode) and format_path((*path, key.value)) not in found:
                     walk(value, (*path, key.value))
         elif isinstance(node, yaml.SequenceNode):
             for index, value in enumerate(node.value):

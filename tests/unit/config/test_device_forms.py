@@ -87,7 +87,7 @@ def test_a_response_is_read_beside_the_file_and_kept_by_its_numbers(load, table,
         ("'1 / 2 / 3'", "period: 1 ms", "scene.device", "coefficients in s"),
         ("missing.csv", "period: 1 ms", "scene.device", "missing.csv: no such file; check the path"),
         ("3", "period: 1 ms", "scene.device", "published are"),
-        ("{frequency: [1, 2], real: [1, 2], imag: [1]}", "period: 1 ms", "scene.device.imag", "beside 2 of real"),
+        ("{frequency: [1, 2], real: [1, 2], imag: [1]}", "period: 1 ms", "scene.device.imag", "and 2 of real"),
         ("{numerator: [1]}", "period: 1 ms", "scene.device", "'numerator', 'denominator' or"),
         ("{numerator: [1], poles: [0]}", "period: 1 ms", "scene.device", "a linear system has"),
         ("{numerator: [1, 0, 0], denominator: [1, 0]}", "period: 1 ms", "scene.device", "add the lag"),
@@ -114,9 +114,9 @@ def test_faults_have_their_place(load, table, device, more, place, words):
     ("study", "words"),
     [
         ("kind: passivity", "a device with a system or response in place of its mass"),
-        ("kind: boundary, passivity: true", "not for one with a system or response"),
-        ("kind: sweep, axes: {period: [0.5 ms, 1 ms]}, outputs: [stiffness_max]", "it was measured with"),
-        ("kind: simulate, walls: [{stiffness: 1000}]", "a motion needs a model"),
+        ("kind: boundary, passivity: true", "without a system or response"),
+        ("kind: sweep, axes: {period: [0.5 ms, 1 ms]}, outputs: [stiffness_max]", "at which it was measured"),
+        ("kind: simulate, walls: [{stiffness: 1000}]", "a simulation needs mass"),
     ],
 )
 def test_what_needs_a_mass_or_a_model_is_refused(load, table, study, words):

@@ -150,8 +150,12 @@ def test_kinds_that_forget_parts_name_those_that_answer(load, kind):
     ("study", "field", "said"),
     [
         ("kind: boundary, name: b, delta: 1", "studies[0]", "remove 'delta', or give both"),
-        ("kind: boundary, name: b, passivity: true", "studies[0].passivity", "not for one with velocity"),
-        ("kind: boundary, name: b, device: {mass: 1, period: 1}, delta: 3", "studies[0].delta", "a device has its own"),
+        ("kind: boundary, name: b, passivity: true", "studies[0].passivity", "two samples, without velocity"),
+        (
+            "kind: boundary, name: b, device: {mass: 1, period: 1}, delta: 3",
+            "studies[0].delta",
+            "the device has its own",
+        ),
         (
             "kind: step, name: s, stiffness_fraction: 0.5, devices: [{mass: 1, period: 1, operator: {stiffness: 1}}]",
             "studies[0].devices[0]",
@@ -161,7 +165,7 @@ def test_kinds_that_forget_parts_name_those_that_answer(load, kind):
         (
             "kind: sweep, name: s, axes: {stiffness: 1}, outputs: [margin]",
             "studies[0].outputs[0]",
-            "there are 'stable'",
+            "parts are 'stable'",
         ),
         ("kind: compare, name: c, devices: [{mass: 1}]", "studies[0].devices[0].label", "missing"),
         ("kind: compare, name: c, devices: [{label: a}, {label: a, mass: 1}]", "studies[0].devices[1].label", "twice"),

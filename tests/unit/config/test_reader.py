@@ -59,8 +59,8 @@ def test_the_scene_supplies_what_a_study_leaves_out(load):
     assert list(boundary.d.values()) == [0, 1]
     assert grid.delta.values() == [3]
     assert tuple(grid.sizes.values()) == (1, 2, 1, 1)
-    assert step.devices == (recommend.device,) == (config.scene.bare(),)
-    assert step.pairs() == ((config.scene.bare(), None),)
+    assert step.devices == (recommend.device,) == (config.scene.without_wall(),)
+    assert step.pairs() == ((config.scene.without_wall(), None),)
     assert (recommend.device.mass, recommend.device.period) == (0.1, 1e-3)
 
 

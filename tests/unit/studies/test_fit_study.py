@@ -200,7 +200,7 @@ FAULTS = {
     "a study's key": ("    log: {csv: log.csv}\n    max_dely: 1 ms\n", "did you mean 'max_delay'?"),
     "a resolution": ("    log: {csv: log.csv, resolution: 1 kg}\n", "got '1 kg'"),
     "an empty list": ("    log: []\n", "got an empty list"),
-    "no period": ("    buzz: [{stiffness: 1, frequency: 2}]\n", "walls that buzzed need the sampling period"),
+    "no period": ("    buzz: [{stiffness: 1, frequency: 2}]\n", "a fit without a log needs the period"),
     "noise of a log": ("    log: {csv: log.csv}\n    noise: 0.1\n", "got noise without buzz"),
     "delay of walls": (
         "    buzz: [{stiffness: 1, frequency: 2}]\n    period: 1 ms\n    max_delay: 1 ms\n",
@@ -211,16 +211,16 @@ FAULTS = {
     "too fast": (
         "    buzz: [{stiffness: 1, frequency: 2}, {stiffness: 2, virtual_damping: 1, frequency: 700}]\n"
         "    period: 1 ms\n",
-        "studies[0].buzz[1].frequency: got 700.0 Hz; it must lie below half the sampling rate, 500.0 Hz",
+        "studies[0].buzz[1].frequency: got 700.0 Hz; it must be below the Nyquist frequency, 500.0 Hz",
     ),
     "one damping": (
         "    buzz: [{stiffness: 1, frequency: 2}, {stiffness: 1.1, frequency: 2.1}]\n    period: 1 ms\n",
-        "studies[0].buzz: got walls of one damping alone",
+        "studies[0].buzz: got walls of only one virtual_damping",
     ),
     "no frequency": ("    buzz: [{stiffness: 1}]\n    period: 1 ms\n", "frequency"),
     "angles and walls": (
         "    log: {csv: turn.csv}\n    buzz: [{stiffness: 1, frequency: 2}]\n    period: 1 ms\n",
-        "got walls in N/m beside a log of an angle",
+        "got walls in N/m and a log of an angle",
     ),
 }
 

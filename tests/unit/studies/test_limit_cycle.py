@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 import zwidth
 from zwidth import figures
-from zwidth.config.fields import problems_of
+from zwidth.config.fields import list_problems
 from zwidth.config.values import read_in_units
 from zwidth.figures.style import style_sheet
 from zwidth.studies.limit_cycle import LimitCycleStudy
@@ -213,9 +213,12 @@ def test_an_adaptive_window_has_no_linear_boundary():
         ({"axes": {"stiffness": [1, 2], "virtual_damping": [1, 2], "coulomb": [1, 2]}}, "got 3 axes"),
         ({"axes": {"stiffness": [1, 2]}}, "virtual_damping"),
         ({"conditions": [{"label": "a"}, {"label": "a"}]}, "got 'a' twice"),
-        ({"conditions": []}, "one of the conditions at least is needed"),
+        ({"conditions": []}, "at least one of the conditions is needed"),
         ({"conditions": [{"resolution": "20 um"}]}, "label"),
-        ({"axes": {**PLANE, "coulomb": 0.1}, "conditions": [{"label": "a", "coulomb": 0.2}]}, "here and as an axis"),
+        (
+            {"axes": {**PLANE, "coulomb": 0.1}, "conditions": [{"label": "a", "coulomb": 0.2}]},
+            "in the condition and as an axis",
+        ),
         ({"silence": "2 mm"}, "silence must be less than widest"),
         ({"conditions": [{"label": "a", "coulomb": 0.2, "static": 0.1}]}, "below coulomb, 0.2 N"),
     ],
@@ -229,7 +232,7 @@ def test_a_fault_of_all_conditions_is_told_once_and_one_of_a_condition_at_its_pl
     def faults(**keys):
         with pytest.raises(ValidationError) as caught:
             study_of(**keys)
-        return [path for path, _ in problems_of(caught.value)]
+        return [path for path, _ in list_problems(caught.value)]
 
     assert faults(jitter="2 ms", conditions=CONDITIONS) == [("jitter",)]
     assert faults(conditions=[{"label": "a"}, {"label": "b", "jitter": "2 ms"}]) == [("conditions", 1, "jitter")]

@@ -12,10 +12,10 @@ from zwidth.figures.table import stack
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.parts.checks import read_texts
-from zwidth.studies.boundary import BoundaryStudy, MapStudy, outline, stable_intervals
+from zwidth.studies.boundary import BoundaryStudy, MapStudy, tabulate_boundary, tabulate_stable_intervals
 from zwidth.studies.outcome import csv_text
 from zwidth.studies.responses import RecommendStudy, StepStudy
-from zwidth.studies.ridge import PassivityStudy, RidgeStudy, ridge_table, slope_table, unit_outline
+from zwidth.studies.ridge import PassivityStudy, RidgeStudy, ridge_table, slope_table, trace_unit_outline
 from zwidth.words.status import Status
 
 DELTAS = np.array([0.0, 0.5, 2.0, 2.5, 4.0])
@@ -31,7 +31,7 @@ def read_csv(text):
 def test_the_interval_at_zero_stiffness_is_where_poles_cross():
     # Close enough to alpha = 0 that beta moves by less than the step, far enough that the pole near 1 is counted.
     alpha, step = 1e-7, 1e-3
-    for found in stable_intervals(DELTAS, DELAYS):
+    for found in tabulate_stable_intervals(DELTAS, DELAYS):
         lower, upper, d = found["beta_lower"], found["beta_upper"], found["d"]
         inside = radius_by_companion(alpha, np.stack([lower + step, upper - step]), DELTAS, d)
         beyond = radius_by_companion(alpha, np.stack([lower - step, upper + step]), DELTAS, d)
@@ -41,7 +41,7 @@ def test_the_interval_at_zero_stiffness_is_where_poles_cross():
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.0, 2.0])
 def test_the_passive_edge_separates_passive_from_not(d):
-    alpha, beta = unit_outline(d)
+    alpha, beta = trace_unit_outline(d)
     for delta in (0.1, 3.0):
         inside = zwidth.is_passive(delta * alpha * (1 - 1e-9), delta * beta * (1 - 1e-9), delta, d)
         beyond = zwidth.is_passive(delta * alpha * (1 + 1e-9), delta * beta * (1 + 1e-9), delta, d)
@@ -50,7 +50,7 @@ def test_the_passive_edge_separates_passive_from_not(d):
 
 
 def test_without_delay_the_passive_set_is_colgates_triangle():
-    alpha, beta = unit_outline(0.0)
+    alpha, beta = trace_unit_outline(0.0)
     np.testing.assert_allclose(alpha / 2 + np.abs(beta), 1.0, rtol=1e-13)
 
 
@@ -117,7 +117,7 @@ def test_strong_damping_is_drawn_with_its_limit():
 
 
 def test_an_outline_has_names_for_its_pieces():
-    edge = outline(3.0, 0.0)
+    edge = tabulate_boundary(3.0, 0.0)
     assert set(edge["piece"]) == {"complex_pair", "minus_one"}
 
 

@@ -100,11 +100,14 @@ def test_the_scene_gives_period_and_delay(tmp_path):
     [
         (
             ("shoulder, up", "sholder, up"),
-            "across: got 'sholder'; it names a column of the file; did you mean 'shoulder'",
+            "across: got 'sholder'; it must be a column of the file; did you mean 'shoulder'",
         ),
         ((", up: elbow", ""), r"write {csv: arm.csv, across: shoulder, up: elbow}"),
         (("arm.csv", "leg.csv"), "leg.csv"),
-        (("up: elbow", "up: shoulder"), "up: got 'shoulder', as across; a map has two coordinates; name another"),
+        (
+            ("up: elbow", "up: shoulder"),
+            "up: got 'shoulder', equal to across; the coordinates must differ; name another column",
+        ),
     ],
 )
 def test_faults_are_told(change, said, tmp_path):
@@ -125,9 +128,9 @@ def test_axes_have_the_names_and_the_units_of_the_file(tmp_path):
 @pytest.mark.parametrize(
     "poses, said",
     [
-        (POSES.replace("mass [g]", "weight"), "give these two"),
+        (POSES.replace("mass [g]", "weight"), "give mass and damping"),
         (POSES.replace("0,90", "x,90"), "'x'"),
-        (POSES.splitlines()[0] + "\n0,30,240,1.6\n", "a map needs several"),
+        (POSES.splitlines()[0] + "\n0,30,240,1.6\n", "at least two are needed"),
     ],
 )
 def test_faults_of_the_file_are_told(poses, said, tmp_path):
@@ -155,4 +158,4 @@ def test_a_pose_without_a_wall_is_named_and_leaves_the_others_their_values(tmp_p
 def test_poses_without_any_wall_fail_with_the_first(tmp_path, capsys):
     poses = POSES.splitlines()[0] + "\n0,30,1e-20,1e5\n60,30,1e-20,1e6\n"
     assert main_of("run", write(tmp_path, poses=poses), "--out", tmp_path / "out") == 1
-    assert "no pose of arm.csv has a K_max; the first, shoulder 0 deg, elbow 30 deg" in capsys.readouterr().err
+    assert "no pose of arm.csv has a K_max; first pose: shoulder 0 deg, elbow 30 deg" in capsys.readouterr().err
