@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.evaluate import FEW
-from zwidth.loops.linear.rows import reaches_down
+from zwidth.loops.linear.rows import are_connected
 from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.verdict import is_stable
@@ -39,7 +39,7 @@ class Variants:
     def row_ends(self, damping: np.ndarray) -> np.ndarray:
         """Up to which K every softer wall is stable, for each variant and each B of a row; 0 where none is."""
         rows = (np.moveaxis(scene.stable_stiffness(damping), -1, 0) for scene in self.scenes())
-        firsts = (np.where(reaches_down(low, high), high, 0.0) for low, high in rows)
+        firsts = (np.where(are_connected(low, high), high, 0.0) for low, high in rows)
         return np.array([first.max(-1, initial=0.0) for first in firsts])
 
     def stiffest(self) -> tuple[np.ndarray, np.ndarray]:
