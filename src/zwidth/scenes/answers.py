@@ -36,7 +36,7 @@ class SceneMargins(Margins):
     """`zwidth.Margins` of a wall of a scene, with the delay margin in s and the frequencies in Hz."""
 
 
-class SceneAnswers(SceneParts):
+class SceneAnalysis(SceneParts):
     """The methods of `zwidth.Scene` that evaluate walls.
 
     Without a stiffness and a damping, each method evaluates the wall of the scene (`zwidth.parts.wall.resolve_wall`). A
@@ -183,7 +183,7 @@ class SceneAnswers(SceneParts):
         given = self.wall.virtual_damping if virtual_damping is None else virtual_damping
         damping = read_texts("virtual_damping", given, self.unit_system["N s/m"])
         beta = as_float64("virtual_damping", damping) / self.units.virtual_damping
-        both = self.loop.row(beta.reshape(-1)) * self.units.stiffness
+        both = self.loop.find_stable_alpha(beta.reshape(-1)) * self.units.stiffness
         return both.reshape(*beta.shape, *both.shape[1:])
 
     def stable_damping(self, stiffness: Wall = None) -> np.ndarray:
@@ -196,8 +196,8 @@ class SceneAnswers(SceneParts):
             Array of shape (n, 2) in N s/m. The intervals are open.
         """
         stiffness = resolve_wall(self.wall, None, None, self.unit_system)[0] if stiffness is None else stiffness
-        alpha, _ = one_wall(*self.normalize_walls(stiffness, 0.0))
-        return self.loop.column(alpha) * self.units.virtual_damping
+        alpha, _ = read_single_wall(*self.normalize_walls(stiffness, 0.0))
+        return self.loop.find_stable_beta(alpha) * self.units.virtual_damping
 
     def damper_range(self) -> np.ndarray:
         """Return the intervals of B in which a pure damper (K = 0) is stable except for its pole at z = 1.
@@ -215,7 +215,7 @@ class SceneAnswers(SceneParts):
             >>> print("{:.2f} to {:.2f} N s/m".format(*scene.damper_range()[0]))
             -10.00 to 90.48 N s/m
         """
-        return self.loop.dampers() * self.units.virtual_damping
+        return self.loop.find_damper_intervals() * self.units.virtual_damping
 
     def decide_stability(
         self, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
@@ -239,7 +239,7 @@ class SceneAnswers(SceneParts):
 
         A sentence each; none where the wall is decided, as it is of every device that is a model.
         """
-        return self.loop.explain(*one_wall(*self.normalize_walls(stiffness, virtual_damping)))
+        return self.loop.explain(*read_single_wall(*self.normalize_walls(stiffness, virtual_damping)))
 
     def passivity_margin(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is out of range.
@@ -303,7 +303,7 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
 def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, alpha: Any, beta: Any) -> StateSpace:
     """A loop with one wall, its states in m, m/s and N in place of units of the period and the mass."""
     chain, period, mass = scene.loop.chain, scene.timing.period, float(scene.mass)
-    loop = build(chain, *one_wall(alpha, beta))
+    loop = build(chain, *read_single_wall(alpha, beta))
     force = mass / period**2
     own = np.array(chain.state_units(1.0 / period, force))
     waiting = realize_device(chain).A.shape[0] - own.size
@@ -313,7 +313,7 @@ def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, a
     return StateSpace(A, B, loop.C / scale, loop.D * unit, period)
 
 
-def to_control(scene: SceneAnswers, stiffness: Wall = None, virtual_damping: Wall = None) -> control.StateSpace:
+def to_control(scene: SceneAnalysis, stiffness: Wall = None, virtual_damping: Wall = None) -> control.StateSpace:
     """Return the closed loop of a scene and a wall as a model of python-control.
 
     From a force held on the device (N) to the sensed position (m), exactly discretized: ``scene.state_space``.
@@ -345,7 +345,7 @@ def to_control(scene: SceneAnswers, stiffness: Wall = None, virtual_damping: Wal
     return control.StateSpace(*scene.state_space(stiffness, virtual_damping))
 
 
-def one_wall(alpha: np.ndarray, beta: np.ndarray) -> tuple[float, float]:
+def read_single_wall(alpha: np.ndarray, beta: np.ndarray) -> tuple[float, float]:
     """Return K and B (or alpha and beta) of one wall as floats; raise `InputError` for several walls."""
     alpha, beta = np.broadcast_arrays(alpha, beta)
     if alpha.size != 1:

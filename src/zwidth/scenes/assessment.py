@@ -13,7 +13,7 @@ from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.parts.checks import Span
 from zwidth.parts.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.scenes.answers import allows_negative
-from zwidth.scenes.base import of_scene
+from zwidth.scenes.base import wrap_function
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
@@ -88,7 +88,7 @@ class Assessment:
 _NUMBERS = [field.name for field in fields(Assessment) if field.name != "unit_system"]
 
 
-@of_scene
+@wrap_function
 def assess(scene: SceneOptima) -> Assessment:
     """Judge the wall of a scene.
 
@@ -113,12 +113,12 @@ def assess(scene: SceneOptima) -> Assessment:
         (True, False)
     """
     # Compute the dominant pole first, because this raises an error if the loop has too many poles.
-    slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
+    slowest, period = scene.loop.find_dominant(float(scene.alpha), float(scene.beta)), scene.timing.period
     stands, best, known = scene.margins(), scene.max_stiffness(), not find_unsupported_reason(**vars(scene.device))
     margin = float(scene.passivity_margin()) if known else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
     row, column = (tuple(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
-    lower, upper = nearest_interval(column, scene.wall.virtual_damping)
+    lower, upper = find_nearest_interval(column, scene.wall.virtual_damping)
     stable = bool(scene.is_stable())
     return Assessment(
         **{name: float(value) for name, value in scene.normalized._asdict().items()},
@@ -128,7 +128,7 @@ def assess(scene: SceneOptima) -> Assessment:
         decay_rate=slowest.rate / period,
         stable_stiffness=row,
         stable_damping=column,
-        stiffness_limit=nearest_interval(row, scene.wall.stiffness)[1],
+        stiffness_limit=find_nearest_interval(row, scene.wall.stiffness)[1],
         virtual_damping_lower=lower,
         virtual_damping_upper=upper,
         passive=margin > 0 if known else None,
@@ -161,7 +161,7 @@ def round_margin(
     return round_safely(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
 
 
-def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
+def find_nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
     """The interval that holds a value or is the nearest to it; NaN where there is none."""
     away = [max(low - value, value - high, 0.0) for low, high in intervals]
     return intervals[away.index(min(away))] if away else (math.nan, math.nan)
@@ -247,7 +247,7 @@ class Improvement(NamedTuple):
     note: str = ""  # quantity that stays constant
 
 
-@of_scene
+@wrap_function
 def limits_of(scene: SceneOptima) -> list[Limit]:
     """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 
@@ -362,7 +362,7 @@ def _double_rate(scene: SceneOptima) -> SceneOptima:
     return scene.replace(**changes)
 
 
-def passive_edge(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
+def trace_passivity_boundary(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
     """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping."""
     # The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
     own, units = float(scene.device.damping), scene.units

@@ -66,7 +66,7 @@ class SceneParts(Part):
 
     def __post_init__(self) -> None:
         if isinstance(self.wall, Velocity):
-            self._move_up()
+            self._shift_parts()
         for name, (kind, example) in _KINDS.items():
             part = getattr(self, name)
             if not isinstance(part, kind):
@@ -78,7 +78,7 @@ class SceneParts(Part):
                 "operator: a hand holds a body, and of this device no body is known; make the hand a part of it"
             )
 
-    def _move_up(self) -> None:
+    def _shift_parts(self) -> None:
         """Without a wall the velocity estimate is the third part, and the hand the fourth."""
         estimate, fourth, hand = self.wall, self.velocity, self.operator
         if isinstance(fourth, Operator) and hand is None:
@@ -112,14 +112,14 @@ class SceneParts(Part):
     @cached_property
     def mass(self) -> Any:
         """The mass that the wall's force acts on, in kg: the unit of the normalized stiffness."""
-        return self._with_hand("mass")
+        return self._add_rigid_operator("mass")
 
     @cached_property
     def damping(self) -> Any:
         """The damping to ground of that mass, in N s/m."""
-        return self._with_hand("damping")
+        return self._add_rigid_operator("damping")
 
-    def _with_hand(self, name: str) -> Any:
+    def _add_rigid_operator(self, name: str) -> Any:
         """A number of the device, with that of a hand that holds it rigidly."""
         held = self.operator is not None and self.operator.rigid and self.device.coupling is None
         return getattr(self.device, name) + (getattr(self.operator, name) if held else 0.0)
@@ -157,7 +157,7 @@ class SceneParts(Part):
         return self.normalized.delta
 
     @property
-    def own_delta(self) -> float:
+    def device_delta(self) -> float:
         """The same without the hand: what passivity, which is for any hand, counts on."""
         return self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
 
@@ -167,7 +167,7 @@ class SceneParts(Part):
         return self.timing.d
 
     @property
-    def whole_delay(self) -> int:
+    def integer_delay(self) -> int:
         """Whole periods of it."""
         return int(np.floor(self.d))
 
@@ -240,7 +240,7 @@ class SceneParts(Part):
         )
 
 
-def of_scene(
+def wrap_function(
     function: Callable[Concatenate[Owner, Parameters], Result],
 ) -> Callable[Concatenate[Owner, Parameters], Result]:
     """Wrap a function of a scene: check the scene, and show the result in the units of its device."""

@@ -59,7 +59,7 @@ from zwidth.words.xp import is_jax, is_traced, namespace, nan_beyond
 _ON_CIRCLE = 1e-7
 
 
-class SlowestMotion(NamedTuple):
+class DominantPole(NamedTuple):
     """The slowest motion of a loop with one wall."""
 
     marginal: bool  # poles on the unit circle, none outside: one at z = 1, or all of a plant without damping
@@ -102,14 +102,14 @@ class LinearLoop:
         return Boundary.trace(self.roots)
 
     @cached_property
-    def _in_powers(self) -> tuple[LoopRoots, int]:
+    def _contracted(self) -> tuple[LoopRoots, int]:
         """The loop of which its own has the k-th roots as poles, and k: they come k at a time, and so would edges."""
         return self.roots.contract_powers()
 
     @cached_property
-    def border(self) -> StableSet:
+    def stable_set(self) -> StableSet:
         """The edge of its stable set."""
-        roots, k = self._in_powers
+        roots, k = self._contracted
         return StableSet(self.boundary if k == 1 else Boundary.trace(roots))
 
     @cached_property
@@ -156,31 +156,31 @@ class LinearLoop:
         found = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)
         return found.reshape(alpha.shape)[()]
 
-    def slowest(self, alpha: float, beta: float) -> SlowestMotion:
+    def find_dominant(self, alpha: float, beta: float) -> DominantPole:
         """The slowest motion of one wall."""
         if is_marginal(self.roots, alpha, beta):
-            return SlowestMotion(True, 1.0, 0.0, 0.0)
+            return DominantPole(True, 1.0, 0.0, 0.0)
         wall = np.array([alpha]), np.array([beta])
         zeta = compute_poles_minus_one(self.roots, *wall)[0]
         slowest = zeta[np.argmax(log_modulus(zeta))]
         turn = abs(np.arctan2(slowest.imag, 1.0 + slowest.real))
         if self.boundary.are_lossless(wall[1])[0] and log_modulus(slowest) <= _ON_CIRCLE:
-            return SlowestMotion(True, 1.0, 0.0, float(turn))
-        return SlowestMotion(False, float(self.radius(*wall)[0]), -float(log_modulus(slowest)), float(turn))
+            return DominantPole(True, 1.0, 0.0, float(turn))
+        return DominantPole(False, float(self.radius(*wall)[0]), -float(log_modulus(slowest)), float(turn))
 
-    def row(self, beta: np.ndarray) -> np.ndarray:
+    def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
         """The stable intervals of alpha at each damping: shape (rows, intervals, 2), NaN where a row has fewer."""
         return np.stack(find_stable_intervals(self.boundary, *nan_beyond(WALL_RANGE, beta))[:2], -1)
 
-    def column(self, alpha: float) -> np.ndarray:
+    def find_stable_beta(self, alpha: float) -> np.ndarray:
         """The stable intervals of beta at a stiffness: shape (intervals, 2)."""
         return find_stable_dampings(self.boundary, float(*nan_beyond(WALL_RANGE, alpha)))
 
-    def dampers(self) -> np.ndarray:
+    def find_damper_intervals(self) -> np.ndarray:
         """Return the beta intervals, shape (n, 2), in which all poles of a damper but z = 1 lie inside the circle."""
         damper = self.roots.as_damper()
         if damper is None:
-            return LinearLoop.column(self, 0.0)
+            return LinearLoop.find_stable_beta(self, 0.0)
         intervals = find_stable_intervals(Boundary.trace(damper), np.zeros(1))
         return np.stack([intervals.low[0], intervals.high[0]], -1)
 
@@ -192,18 +192,18 @@ class LinearLoop:
         """Return the reason for an undecided stiffest wall: "", because the stability of a model is always decided."""
         return ""
 
-    def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
+    def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:
         """Those above ``least`` whose walls lie in a piece of the stable set with soft walls."""
-        column = np.maximum(self.column(alpha), least).tolist()
-        return [(low, high) for low, high in column if low < high and self.holds_softly(alpha, 0.5 * (low + high))]
+        column = np.maximum(self.find_stable_beta(alpha), least).tolist()
+        return [(low, high) for low, high in column if low < high and self.is_connected(alpha, 0.5 * (low + high))]
 
-    def holds_softly(self, alpha: float, beta: float) -> bool:
+    def is_connected(self, alpha: float, beta: float) -> bool:
         """Whether a path of stable walls leads from soft ones to a stable wall."""
-        return self.border.is_in_main(alpha, beta)
+        return self.stable_set.is_in_main(alpha, beta)
 
     def islands(self, least: float) -> list[Island]:
         """The pieces of the stable set without soft walls, with dampings above ``least``."""
-        return self.border.islands(least)
+        return self.stable_set.islands(least)
 
     def critical_walls(self, w: Array) -> tuple[Array, Array]:
         """Return alpha and beta of the walls that have a pole pair on the unit circle at the angles w in (0, pi)."""
@@ -212,12 +212,12 @@ class LinearLoop:
 
     def least_stiffness(self, least: float) -> float | None:
         """Return the alpha below which no wall is stable, for a device unstable without a wall; None for others."""
-        softest = self.border.find_softest(least) if self.roots.device_is_unstable else 0.0
+        softest = self.stable_set.find_softest(least) if self.roots.device_is_unstable else 0.0
         return softest if softest > 0 else None
 
     def outlines(self) -> list[Outline]:
         """Closed outlines of the stable set, the largest first."""
-        return self.border.outlines()
+        return self.stable_set.outlines()
 
     def stiffest(self, negative: bool) -> RidgePoint:
         """Return the stiffest stable wall, with beta >= 0 unless ``negative``."""
@@ -234,10 +234,10 @@ class LinearLoop:
 
     def ridge(self, negative: bool) -> tuple[RidgeSolution | None, Status]:
         """Return the stiffest wall with its active constraints, None if there is none, and a status; not traceable."""
-        border = self.border
+        border = self.stable_set
         if negative not in self._ridges:
             try:
-                found, k = find_ridge(border, negative), self._in_powers[1]
+                found, k = find_ridge(border, negative), self._contracted[1]
                 self._ridges[negative] = found and found._replace(w1=found.w1 / k, w2=found.w2 / k)
             except (ArithmeticError, ZwidthError):
                 return None, Status.NOT_CONVERGED
@@ -260,7 +260,7 @@ class LinearLoop:
         """The device's own damping in excess of what passive walls need."""
         condition = PassivityCondition.derive(self.chain.estimate, self.scene.d)
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
-        return compute_passivity_margins(condition, alpha, beta, self.scene.own_delta)[()]
+        return compute_passivity_margins(condition, alpha, beta, self.scene.device_delta)[()]
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:
         """The scene with each of the values drawn of some of its parameters."""
@@ -292,23 +292,23 @@ class RigidLoop(LinearLoop):
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         return spectral_radius(alpha, beta, self.scene.delta, self.scene.d)
 
-    def slowest(self, alpha: float, beta: float) -> SlowestMotion:
+    def find_dominant(self, alpha: float, beta: float) -> DominantPole:
         with np.errstate(all="ignore"):
             slowest = find_dominant_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
         # A row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
-        return SlowestMotion(alpha == 0 and bool(self.row(np.array([beta])).size), *slowest)
+        return DominantPole(alpha == 0 and bool(self.find_stable_alpha(np.array([beta])).size), *slowest)
 
-    def row(self, beta: np.ndarray) -> np.ndarray:
+    def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
         end = np.asarray(boundary_point(self.scene.delta, self.scene.d, beta=beta).alpha)
         return np.stack([0.0 * end, end], -1)[:, None][:, : int(np.isfinite(end).any())]
 
-    def column(self, alpha: float) -> np.ndarray:
+    def find_stable_beta(self, alpha: float) -> np.ndarray:
         at = np.array([alpha])
         ends = [boundary_point(self.scene.delta, self.scene.d, alpha=at, side=side).beta for side in ("lower", "upper")]
         column = np.stack(ends, -1)
         return column[column[:, 0] < column[:, 1]]
 
-    def holds_softly(self, alpha: float, beta: float) -> bool:
+    def is_connected(self, alpha: float, beta: float) -> bool:
         return True
 
     def islands(self, least: float) -> list[Island]:
@@ -348,7 +348,7 @@ class RigidLoop(LinearLoop):
             return margins_kernel(*walls, with_delay=False, with_modulus="modulus_margin" in wanted)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        return passivity_margin(alpha, beta, self.scene.own_delta, self.scene.d)
+        return passivity_margin(alpha, beta, self.scene.device_delta, self.scene.d)
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:
         return RigidVariants(self.scene, drawn) if set(drawn) <= set(RIGID_PARAMETERS) else super().vary(drawn)

@@ -15,7 +15,7 @@ from zwidth.loops.linear.margins import select_gain_margin, select_phase_margin
 from zwidth.loops.linear.rows import Island, arrange_by_line
 from zwidth.loops.rigid.verdict import StabilityMethod
 from zwidth.parts.chain import AnyChain
-from zwidth.scenes.loop import LinearLoop, SlowestMotion
+from zwidth.scenes.loop import DominantPole, LinearLoop
 from zwidth.scenes.measured_curve import Decided, DecidedWalls, ResponseCurve
 from zwidth.words.errors import InputError
 from zwidth.words.results import Margins, RidgePoint, Stability
@@ -91,27 +91,27 @@ class MeasuredLoop(LinearLoop):
         shape, used = alpha.shape, np.full(alpha.shape, Method.CROSSOVER, np.int32)
         return Stability(stable.reshape(shape)[()], status.reshape(shape)[()], used[()])
 
-    def slowest(self, alpha: float, beta: float) -> SlowestMotion:
+    def find_dominant(self, alpha: float, beta: float) -> DominantPole:
         """Not known without a model: NaN."""
-        return SlowestMotion(False, np.nan, np.nan, np.nan)
+        return DominantPole(False, np.nan, np.nan, np.nan)
 
-    def row(self, beta: np.ndarray) -> np.ndarray:
+    def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
         """The intervals of alpha that are surely stable: shape (rows, intervals, 2), NaN where a row has fewer."""
         return _only(self.walls.rows(beta), True)
 
-    def column(self, alpha: float) -> np.ndarray:
+    def find_stable_beta(self, alpha: float) -> np.ndarray:
         """The intervals of beta that are surely stable: shape (intervals, 2)."""
         return _only(self.walls.columns(np.array([alpha])), True)[0]
 
-    def soft_rows(self, beta: np.ndarray) -> np.ndarray:
+    def _find_connected_alpha(self, beta: np.ndarray) -> np.ndarray:
         """The surely stable intervals of alpha below all walls of rows that are surely unstable; as `row` has them."""
         found = self.walls.rows(beta)
         first = np.min(found.low, 1, where=~(found.stable | np.isnan(found.low)), initial=np.inf)
         return _only(found, found.low < first[:, None])
 
-    def holds_softly(self, alpha: float, beta: float) -> bool:
+    def is_connected(self, alpha: float, beta: float) -> bool:
         """Whether a wall is surely stable, and no softer one of its damping surely unstable."""
-        ends = self.soft_rows(np.array([beta]))[0]
+        ends = self._find_connected_alpha(np.array([beta]))[0]
         return bool(np.any((ends[:, 0] < alpha) & (alpha < ends[:, 1])))
 
     def islands(self, least: float) -> list[Island]:
@@ -140,18 +140,18 @@ class MeasuredLoop(LinearLoop):
         return beta, top
 
     def _find_tops(self, beta: np.ndarray) -> np.ndarray:
-        return np.nanmax(self.soft_rows(beta)[:, :, 1], 1, initial=0.0)
+        return np.nanmax(self._find_connected_alpha(beta)[:, :, 1], 1, initial=0.0)
 
     def outlines(self) -> list[Outline]:
         """The stiffest surely stable wall of each damping and the softest, a closed curve for pictures, if any is."""
         beta, top = self._tops
         beta, top = beta[top > 0], top[top > 0]
-        low = self.soft_rows(beta)[:, 0, 0] if beta.size else beta
+        low = self._find_connected_alpha(beta)[:, 0, 0] if beta.size else beta
         walls = np.concatenate([low, top[::-1], low[:1]]), np.concatenate([beta, beta[::-1], beta[:1]])
         return [Outline(*walls, False, False)] if beta.size else []
 
     def stiffest(self, negative: bool) -> RidgePoint:
-        """The stiffest wall that `holds_softly`, with beta >= 0 unless negative ones count."""
+        """The stiffest wall that `is_connected`, with beta >= 0 unless negative ones count."""
         beta, top = self._tops
         top = np.where((beta < 0) & (not negative), 0.0, top)
         best = int(np.argmax(top))

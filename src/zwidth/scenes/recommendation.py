@@ -21,8 +21,8 @@ from zwidth.scenes.assessment import (
     assess,
     compute_gains,
     describe_islands,
+    find_nearest_interval,
     name_kind,
-    nearest_interval,
     round_margin,
 )
 from zwidth.scenes.cautions import judge_grasps, list_cautions
@@ -182,7 +182,7 @@ class Recommendation:
         # Compute the range for the printed K, because a negative lower end is sensitive to the rounding of K.
         column = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
         lower, upper = tell_apart(
-            *nearest_interval(column, self.virtual_damping), self.unit_system["N s/m"], self.read[2]
+            *find_nearest_interval(column, self.virtual_damping), self.unit_system["N s/m"], self.read[2]
         )
         room = f"B from {lower} to {upper} is stable at this K"
         margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"

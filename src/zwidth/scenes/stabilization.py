@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.scenes.assessment import nearest_interval
-from zwidth.scenes.base import of_scene
+from zwidth.scenes.assessment import find_nearest_interval
+from zwidth.scenes.base import wrap_function
 from zwidth.scenes.stiffest import SceneOptima
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, round_safely, tell_apart, with_unit
@@ -79,7 +79,7 @@ def count_steps(resolution: float) -> int:
     return math.ceil(2.0 * math.pi / resolution - 1e-6)
 
 
-@of_scene
+@wrap_function
 def stabilize(scene: SceneOptima) -> list[Remedy]:
     """Return the ranges of single parameters in which the wall of a scene is stable.
 
@@ -91,10 +91,10 @@ def stabilize(scene: SceneOptima) -> list[Remedy]:
     row, column = (list(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
     ranges = []
     if row:
-        low, high = _round_inwards(*nearest_interval(tuple(row), K))
+        low, high = _round_inwards(*find_nearest_interval(tuple(row), K))
         ranges.append(Remedy("stiffness", low if low > 0 or low >= K else -math.inf, high))
     if column:
-        ranges.append(Remedy("virtual_damping", *_round_inwards(*nearest_interval(tuple(column), B))))
+        ranges.append(Remedy("virtual_damping", *_round_inwards(*find_nearest_interval(tuple(column), B))))
     values = {**scene.parameters(), "rate": 1.0 / scene.timing.period}
     for path, (direction, factor) in DIRECTIONS.items():
         if path in values and (path != "delay" or values[path] > 0):

@@ -14,7 +14,7 @@ from zwidth.loops.linear.margins import OpenLoop
 from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.parts.checks import read_texts
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.answers import SceneAnswers, allows_negative
+from zwidth.scenes.answers import SceneAnalysis, allows_negative
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import FIELDS, WALL
 from zwidth.words.showing import shown
@@ -38,7 +38,7 @@ class StiffestWall(NamedTuple):
     status: Array
 
 
-def explain_missing(scene: SceneAnswers, status: Any) -> str:
+def explain_missing(scene: SceneAnalysis, status: Any) -> str:
     """Return the reason why a scene has no stiffest wall, from the status of the search."""
     if status == Status.NO_BOUNDARY:
         return "no stiffness is stable at any damping"
@@ -46,7 +46,7 @@ def explain_missing(scene: SceneAnswers, status: Any) -> str:
     return explained or Status(int(status)).message
 
 
-def choose_damping(scene: SceneAnswers, top: StiffestWall, stiffness: float) -> float:
+def choose_damping(scene: SceneAnalysis, top: StiffestWall, stiffness: float) -> float:
     """A damping with which a softer wall than the stiffest is stable, where it can be so without leaving its piece."""
     # That of the stiffest wall, if all walls of that damping between the two are stable; else the middle of the widest
     # interval of dampings.
@@ -54,17 +54,17 @@ def choose_damping(scene: SceneAnswers, top: StiffestWall, stiffness: float) -> 
     row = scene.stable_stiffness(damping)
     if np.any((row[:, 0] < stiffness) & (row[:, 1] > (1.0 - _ROUNDED) * top.stiffness)):
         return damping
-    column = soft_dampings(scene, stiffness)
+    column = find_connected_dampings(scene, stiffness)
     low, high = max(column, key=lambda ends: ends[1] - ends[0], default=(math.nan, math.nan))
     return 0.5 * (low + high) * scene.units.virtual_damping if column else damping
 
 
-def soft_dampings(
-    scene: SceneAnswers, stiffness: float, negative_damping: bool | None = None
+def find_connected_dampings(
+    scene: SceneAnalysis, stiffness: float, negative_damping: bool | None = None
 ) -> list[tuple[float, float]]:
     """The intervals of beta with which walls of a stiffness are stable in a piece with soft walls."""
     least = -math.inf if allows_negative(scene, negative_damping) else 0.0
-    return scene.loop.soft_column(stiffness / scene.units.stiffness, least)
+    return scene.loop.find_connected_beta(stiffness / scene.units.stiffness, least)
 
 
 # How far the range reaches to both sides of the present value where none is given, and its points.
@@ -111,7 +111,7 @@ def _read_stiffness(given: Any, unit: str) -> float:
     return float(stiffness)
 
 
-def _present_value(scene: SceneAnswers, parameter: str) -> float:
+def _present_value(scene: SceneAnalysis, parameter: str) -> float:
     known = {path: value for path, value in scene.parameters().items() if path not in WALL}
     known["rate"] = 1.0 / known["period"]
     if not isinstance(parameter, str) or parameter not in known:
@@ -121,7 +121,7 @@ def _present_value(scene: SceneAnswers, parameter: str) -> float:
     return float(known[parameter])
 
 
-def _range(scene: SceneAnswers, parameter: str, now: float, within: tuple[Any, Any] | None) -> tuple[float, float]:
+def _range(scene: SceneAnalysis, parameter: str, now: float, within: tuple[Any, Any] | None) -> tuple[float, float]:
     """Return the range of a parameter to search: ``within`` if given, otherwise around the present value ``now``."""
     if within is None:
         timing = scene.timing
@@ -194,7 +194,7 @@ class BestDamping(NamedTuple):
     status: Status
 
 
-class SceneOptima(SceneAnswers):
+class SceneOptima(SceneAnalysis):
     """The questions of `zwidth.Scene` that look for a wall, or for a device that bears it."""
 
     def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
@@ -392,7 +392,7 @@ class SceneOptima(SceneAnswers):
             return wall.find_least_distance()[0]
 
         cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)
-        columns = soft_dampings(self, stiffness, negative_damping)
+        columns = find_connected_dampings(self, stiffness, negative_damping)
         if not columns:
             return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
         _, best = min(find_global_minimum(cost, *ends, _SAMPLES) for ends in columns)

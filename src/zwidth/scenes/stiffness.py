@@ -20,7 +20,7 @@ from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import namespace
 
 
-def checked_device(**quantities: ArrayLike) -> Normalized:
+def normalize_device(**quantities: ArrayLike) -> Normalized:
     """The normalized device; raises `InputError` also where a scalar delta or d is beyond the range of the model."""
     device = normalize(**quantities)
     check_scalars({"delta": device.delta, "d": device.d})
@@ -54,16 +54,16 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
         >>> print(f"{max_stiffness(mass=0.1, damping=10, period=1e-3, delay=1e-3):.0f} N/m")
         19865 N/m
     """
-    device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
+    device = normalize_device(mass=mass, damping=damping, period=period, delay=delay)
     arguments = {"mass": mass, "period": period, "delta": device.delta, "d": device.d}
-    return evaluate(max_stiffness_kernel, arguments, classify_delays(device.d), slopes=move_max_stiffness)
+    return evaluate(max_stiffness_kernel, arguments, classify_delays(device.d), slopes=differentiate_max_stiffness)
 
 
 def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     return ridge_kernel(delta, d, kind).alpha * (mass / period) / period
 
 
-def move_max_stiffness(
+def differentiate_max_stiffness(
     mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses
 ) -> tuple[Array, tuple[Array, ...]]:
     """Return `max_stiffness_kernel` and its derivatives with respect to mass, period, delta and d."""
@@ -123,7 +123,7 @@ def sensitivities(
         >>> print(f"{gain.per_damping:.0f} N/m per N s/m")
         572 N/m per N s/m
     """
-    device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
+    device = normalize_device(mass=mass, damping=damping, period=period, delay=delay)
     given = {"mass": mass, "damping": damping, "period": period, "delay": delay}
     arguments = given | {"delta": device.delta, "d": device.d}
     return evaluate(_sensitivities_kernel, arguments, classify_delays(device.d))

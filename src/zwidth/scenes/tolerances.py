@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from zwidth.parts.checks import check_whole
-from zwidth.scenes.base import of_scene
+from zwidth.scenes.base import wrap_function
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import WALL
@@ -51,7 +51,7 @@ class ToleranceEstimate:
     labels: np.ndarray  # whether each device bears the wall
 
 
-@of_scene
+@wrap_function
 def simulate_tolerances(
     scene: Scene, tolerances: dict[str, Any], *, samples: int = 10_000, seed: int = 0, reliability: float = 0.99
 ) -> ToleranceEstimate:
@@ -92,7 +92,7 @@ def simulate_tolerances(
     drawn = _draw(scene, tolerances, count, check_whole("seed", seed, 0, 2**63 - 1))
     wall, variants = scene.wall, scene.loop.vary(drawn)
     labels = variants.labels(wall.stiffness, wall.virtual_damping)
-    limits = variants.row_ends(np.array([wall.virtual_damping]))[:, 0]
+    limits = variants.find_stiffness_limits(np.array([wall.virtual_damping]))[:, 0]
     stable = int(np.count_nonzero(labels))
     low, high = _interval(stable, count)
     return ToleranceEstimate(
@@ -101,8 +101,8 @@ def simulate_tolerances(
         low,
         high,
         reliability,
-        borne_by(limits, reliability),
-        np.nan if variants.searched else borne_by(variants.stiffest()[0], reliability),
+        compute_stiffness_quantile(limits, reliability),
+        np.nan if variants.searched else compute_stiffness_quantile(variants.stiffest()[0], reliability),
         drawn,
         labels,
     )
@@ -139,7 +139,7 @@ def _factors(generator: np.random.Generator, share: float, distribution: str, co
     return factors
 
 
-def borne_by(limits: np.ndarray, share: float) -> float:
+def compute_stiffness_quantile(limits: np.ndarray, share: float) -> float:
     """The stiffness up to which a share of the devices is stable; 0 where too few are stable at all."""
     ordered = np.sort(np.where(np.isnan(limits), 0.0, limits))
     # The tolerance keeps 1 - 0.99 of 100 devices at one device.

@@ -36,7 +36,7 @@ class Variants:
         """Which variants bear a wall."""
         return np.array([bool(scene.is_stable(stiffness, damping)) for scene in self.scenes()])
 
-    def row_ends(self, damping: np.ndarray) -> np.ndarray:
+    def find_stiffness_limits(self, damping: np.ndarray) -> np.ndarray:
         """Up to which K every softer wall is stable, for each variant and each B of a row; 0 where none is."""
         rows = (np.moveaxis(scene.stable_stiffness(damping), -1, 0) for scene in self.scenes())
         firsts = (np.where(are_connected(low, high), high, 0.0) for low, high in rows)
@@ -74,13 +74,13 @@ class RigidVariants(Variants):
         return self.ask(is_stable, stiffness / self.rate * self.period, damping / self.rate, self.delta, self.d)
 
     @np.errstate(all="ignore")
-    def row_ends(self, damping: np.ndarray) -> np.ndarray:
+    def find_stiffness_limits(self, damping: np.ndarray) -> np.ndarray:
         rate, delta, d = (values[:, None] for values in (self.rate, self.delta, self.d))
         ends = self.ask(lambda delta, d, beta: boundary_point(delta, d, beta=beta).alpha, delta, d, damping / rate)
         return np.where(np.isnan(ends), 0.0, ends * rate / self.period[:, None])
 
     @np.errstate(all="ignore")
-    def column_ends(self, stiffness: float, side: str) -> np.ndarray:
+    def find_damping_limits(self, stiffness: float, side: str) -> np.ndarray:
         """Return the smallest or the largest stable B of each variant at a K; NaN if no B is stable."""
         alpha = stiffness * self.period / self.rate
         point = self.ask(lambda *at: boundary_point(*at[:2], alpha=at[2], side=side).beta, self.delta, self.d, alpha)

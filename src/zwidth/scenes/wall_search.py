@@ -16,7 +16,7 @@ from zwidth.arrays.roots import false_position, find_global_minimum
 from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
 from zwidth.parts.safe_limit import SafeLimit
-from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, soft_dampings
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, find_connected_dampings
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.status import Status
@@ -190,7 +190,7 @@ def find_stiffest(
         def cost(beta: Any) -> np.ndarray:
             return -np.min(list(slack(stiffness, beta * unit).values()), axis=0)
 
-        intervals = soft_dampings(scene, stiffness)
+        intervals = find_connected_dampings(scene, stiffness)
         if safe is not None:
             intervals = _clip(intervals, *(end / unit for end in safe.dampings(stiffness) or (math.inf, -math.inf)))
         dips = [

@@ -132,7 +132,7 @@ def add_si_of_scene(
 def share_of_device(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> float:
     """The part of delta that is the device's own, which alone makes walls passive for any hand; else all of it."""
     scene = _find_scene(delta, d, owner)
-    return float(scene.own_delta / scene.delta) if scene is not None and scene.delta else 1.0
+    return float(scene.device_delta / scene.delta) if scene is not None and scene.delta else 1.0
 
 
 def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Scene | None:
