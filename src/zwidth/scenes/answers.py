@@ -256,7 +256,8 @@ class SceneAnalysis(SceneParts):
         This is Colgate's condition for any velocity estimate and delay; the required damping is the certified maximum
         over all frequencies (`loops.linear.passivity`). For a rigid device the condition is necessary and sufficient
         for any operator. With a coupling and the sensor at the motor it uses the damping of the motor and is only
-        sufficient. No condition is known for a sensor at the tip, an actuator or modes (`InputError`).
+        sufficient. No condition is known for a sensor at the tip, an actuator or modes (`InputError`). For K < 0 the
+        margin is at most K T, because such a wall supplies energy without limit.
         """
         if obstacle := find_unsupported_reason(**vars(self.device)):
             raise InputError(f"passivity {obstacle}")
