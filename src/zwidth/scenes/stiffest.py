@@ -1,10 +1,10 @@
 """Optimal walls of a scene: the stiffest wall, its sensitivities, parameters for a required K_max, the best damping.
 
 K and B are the stiffness and damping of a wall. K_max is the stiffness of the stiffest stable wall that is *connected
-to K = 0*, i.e. that a path of stable walls connects to K = 0. The *surplus* of a parameter value is ``log(K_max/K)`` for a
-required stiffness K: the value is sufficient if the surplus is nonnegative. `SceneOptima.required` samples the surplus
-on a grid, refines extrema between grid points that may reach zero, and finds each sign change by Brent's method (Brent
-1973). `SceneOptima.best_damping` minimizes the spectral radius, or maximizes the modulus margin, by a global
+to K = 0*, i.e. that a path of stable walls connects to K = 0. The *surplus* of a parameter value is ``log(K_max/K)``
+for a required stiffness K: the value is sufficient if the surplus is nonnegative. `SceneOptima.required` samples the
+surplus on a grid, refines extrema between grid points that may reach zero, and finds each sign change by Brent's method
+(Brent 1973). `SceneOptima.best_damping` minimizes the spectral radius, or maximizes the modulus margin, by a global
 one-dimensional search. The computations in alpha and beta (K and B in units of m/T^2 and m/T, with the mass m of the
 device and the period T) are those of `zwidth.scenes.loop`.
 """
