@@ -118,8 +118,8 @@ def test_a_resonance_between_two_lines_is_undecided_and_named():
     assert coarse.decide_stability(*wall).status == Status.UNDECIDED
     assert not coarse.is_stable(*wall)
     said = " ".join(coarse.explain_undecided(*wall))
-    assert "measure anew from" in said
-    low, high = (float(word) for word in said.split("anew from ")[1].split(" Hz")[0].split(" to "))
+    assert "measure again from" in said
+    low, high = (float(word) for word in said.split("again from ")[1].split(" Hz")[0].split(" to "))
     assert low <= 97.0 <= high
 
 
@@ -277,6 +277,6 @@ def test_too_few_lines_are_named_as_the_cause():
     found = zwidth.Scene(device, zwidth.Timing(1e-3)).recommend()
     assert found.status == Status.UNDECIDED
     assert found.reason.startswith(
-        "the 8 frequencies of the response decide the stability of no wall; measure anew from"
+        "the 8 frequencies of the response decide the stability of no wall; measure again from"
     )
-    assert found.reason.endswith("lines there are too far apart; measure more")
+    assert found.reason.endswith("with finer frequency spacing")

@@ -137,7 +137,7 @@ SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
         (lambda: zwidth.VirtualWall(stiffness=np.nan), "stiffness: got nan; it must be finite"),
         (lambda: zwidth.Timing(period=1e-3, delay=-1.0), "delay: got -1 s; it must be at least 0 s"),
         *(
-            (lambda ask=ask, given=given: ask(given), "scene: got .*; a zwidth.Scene is needed, as zwidth.Scene")
+            (lambda ask=ask, given=given: ask(given), "scene: got .*; pass a zwidth.Scene, such as zwidth.Scene")
             for ask in ASKED
             for given in (zwidth.Device(0.1), np.ones(2), 3)
         ),
