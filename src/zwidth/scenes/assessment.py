@@ -257,8 +257,8 @@ class Limit(NamedTuple):
     def spell(self) -> str:
         """Describe the improvement and the increase of the stiffness that it brings."""
         K = with_unit(round_safely(self.stiffness, "below"), find_unit(self, "N/m"))
-        kept = f"; {self.note}" if self.note else ""
-        return f"{self.words}: {K} (x {plain(self.gain, 3)}{kept})"
+        note = f"; {self.note}" if self.note else ""
+        return f"{self.words}: {K} (x {plain(self.gain, 3)}{note})"
 
 
 class Improvement(NamedTuple):

@@ -142,9 +142,9 @@ class LinearLoop:
         if method == "certified":
             from zwidth.loops.linear.certified import decide_walls
 
-            stable, proved = decide_walls(self.scene, *exact)
+            stable, certified_status = decide_walls(self.scene, *exact)
             inside = status == Status.OK
-            stable, status = stable & inside, np.where(inside, proved, status)
+            stable, status = stable & inside, np.where(inside, certified_status, status)
             used = Method.CERTIFIED
         elif method == "companion":
             with np.errstate(invalid="ignore"):

@@ -31,7 +31,7 @@ from zwidth.words.types import Array
 
 # Search for the stiffest wall over beta
 N_SIDE = 60  # values of beta on each side of beta = 0
-DENSITY = 5.0  # argument of sinh at the largest beta; larger values index more of them close to beta = 0
+DENSITY = 5.0  # argument of sinh at the largest beta; larger values place more of them close to beta = 0
 N_REFINED = 49  # further values of beta in the range with stable walls
 SEARCH_STEPS = 30  # steps of the golden-section search for the best beta
 INSIDE = 1e-9  # relative distance of the stiffest wall below the end of its decided interval
@@ -201,7 +201,8 @@ class MeasuredLoop(LinearLoop):
         first, last, reasons = c.w[0] * hertz, c.w[-1] * hertz, []
         if c.no_asymptote:
             reasons.append(
-                f"the response at {first:.4g} Hz is uncertain, or not that of a mass, damper or spring; measure below"
+                f"the response at {first:.4g} Hz is uncertain, or not that of a mass, damper or spring; "
+                "measure lower frequencies"
             )
         if not alpha > self.walls.bound_alpha(beta)[0]:
             reasons.append(f"this wall is too soft for the measured range; measure below {first:.4g} Hz")

@@ -87,9 +87,8 @@ SAME_VALUE = 1e-9  # relative distance from the present value below which a grid
 # Relative distances from a crossing at which the surplus is evaluated. The smallest distance with different signs on
 # both sides confirms the crossing.
 CONFIRMATION_DISTANCES = (1e-11, 1e-9, 1e-7, 1e-5)
-EXTREMUM_OPTIONS = {
-    "xatol": 1e-6
-}  # options of SciPy's minimizer: tolerance of the logarithm of the parameter at an extremum
+# Options of the minimizer of SciPy: absolute tolerance of the logarithm of the parameter at an extremum.
+EXTREMUM_OPTIONS = {"xatol": 1e-6}
 NO_STIFFNESS = 60.0  # negative of the surplus if no wall is stable; K_max then counts as exp(-60) times the required K
 
 Side = Literal["above", "below", "everywhere", "nowhere"]
@@ -113,11 +112,11 @@ class RequiredValue(NamedTuple):
     status: Status
 
 
-def _read_stiffness(given: Any, unit: str) -> float:
+def _read_stiffness(value: Any, unit: str) -> float:
     """Return a required stiffness in its SI unit."""
-    stiffness = read_texts("stiffness", given, unit)
+    stiffness = read_texts("stiffness", value, unit)
     if not (isinstance(stiffness, int | float | np.number) and math.isfinite(to_float(stiffness)) and stiffness > 0):
-        raise InputError(f"stiffness: got {stiffness!r}; pass a finite value greater than 0 (in {unit})")
+        raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in {unit})")
     return float(stiffness)
 
 
@@ -404,10 +403,12 @@ class SceneOptima(SceneAnalysis):
         units = self.units
 
         def radius(beta: Any) -> np.ndarray:
+            """Return the spectral radius of walls with this stiffness."""
             return self.spectral_radius(stiffness, beta * units.virtual_damping)
 
         @np.vectorize
         def margin(beta: float) -> float:
+            """Return the modulus margin of a wall with this stiffness."""
             loop = self.loop
             wall = OpenLoop.tabulate(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
             return wall.find_least_distance()[0]

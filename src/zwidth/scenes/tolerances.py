@@ -114,10 +114,10 @@ def _draw(scene: Scene, tolerances: dict[str, Any], count: int, seed: int) -> di
     nominal = {name: value for name, value in parameters.items() if isinstance(value, float) and name not in WALL}
     generator = np.random.default_rng(seed)
     drawn = {}
-    for name, given in tolerances.items():
+    for name, tolerance in tolerances.items():
         if name not in nominal:
             raise InputError(f"tolerances: {describe_choice(name, tuple(nominal))}")
-        share, distribution = given if isinstance(given, Tolerance) else Tolerance(given)
+        share, distribution = tolerance if isinstance(tolerance, Tolerance) else Tolerance(tolerance)
         check_choice(f"tolerances: {name}", distribution, ("uniform", "normal"))
         most = 1 / 3 if distribution == "normal" else 1.0
         if isinstance(share, bool | str) or not np.isreal(share) or not 0 < share < most:
@@ -149,7 +149,7 @@ def compute_stiffness_quantile(limits: np.ndarray, share: float) -> float:
         share: required share of stable devices.
     """
     ordered = np.sort(np.where(np.isnan(limits), 0.0, limits))
-    # Add 1e-9 before rounding down, because (1 - 0.99) 100 is slightly below 1 in floating point.
+    # Add 1e-9 before rounding down, because e.g. (1 - 0.9) 10 is slightly below 1 in floating point.
     return float(ordered[int(np.floor((1.0 - share) * ordered.size + 1e-9))])
 
 

@@ -143,9 +143,9 @@ def test_parts_by_place():
     scene = zwidth.Scene(DEVICE, TIMING, SLOW, HAND)  # pyright: ignore[reportArgumentType]
     assert scene == zwidth.Scene(DEVICE, TIMING, velocity=SLOW, operator=HAND)
     assert zwidth.Scene(DEVICE, TIMING, SLOW, operator=HAND) == scene  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="as the velocity as well"):
+    with pytest.raises(InputError, match="but velocity is given too"):
         zwidth.Scene(DEVICE, TIMING, SLOW, zwidth.LowPass(cutoff=50))  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="as the velocity as well"):
+    with pytest.raises(InputError, match="but velocity is given too"):
         zwidth.Scene(DEVICE, TIMING, SLOW, HAND, HAND)  # pyright: ignore[reportArgumentType]
 
 

@@ -143,9 +143,9 @@ SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
         ),
         (
             lambda: zwidth.plot.region({"one": SCENE, "two": zwidth.Device(0.1)}),  # pyright: ignore[reportArgumentType]
-            "scene: got Device.*; a zwidth.Scene is needed",
+            "scene: got Device.*; pass a zwidth.Scene",
         ),
-        (lambda: SCENE.max_stiffness(negative_damping=np.ones(2)), "negative_damping: got array.*; it is True, False"),
+        (lambda: SCENE.max_stiffness(negative_damping=np.ones(2)), "negative_damping: got array.*; pass True, False"),
         (lambda: SCENE.required(np.ones(2), 1e3), "parameter: got array"),
         (lambda: SCENE.best_damping(1e3, goal=np.ones(2)), "goal: got array"),
     ],
