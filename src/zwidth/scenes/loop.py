@@ -62,7 +62,7 @@ from zwidth.words.xp import is_jax, is_traced, namespace, nan_beyond
 
 # Largest log|z| of poles that count as on the unit circle, in a lossless loop. A rounding error of 1e-16 moves a double
 # pole by its square root, about 1e-8.
-_ON_CIRCLE = 1e-7
+ON_CIRCLE = 1e-7
 
 
 class DominantPole(NamedTuple):
@@ -174,7 +174,7 @@ class LinearLoop:
         zeta = compute_poles_minus_one(self.roots, *wall)[0]
         dominant = zeta[np.argmax(log_modulus(zeta))]
         angle = abs(np.arctan2(dominant.imag, 1.0 + dominant.real))
-        if self.boundary.are_lossless(wall[1])[0] and log_modulus(dominant) <= _ON_CIRCLE:
+        if self.boundary.are_lossless(wall[1])[0] and log_modulus(dominant) <= ON_CIRCLE:
             return DominantPole(True, 1.0, 0.0, float(angle))
         return DominantPole(False, float(self.radius(*wall)[0]), -float(log_modulus(dominant)), float(angle))
 

@@ -1,4 +1,10 @@
-"""Recommended wall of a device: the stiffest with the required margins, its cautions, and useful improvements."""
+"""Recommended wall of a device: the stiffest that satisfies requirements, with cautions and useful improvements.
+
+The requirements (`wall_search.Wanted`) limit the stiffness K relative to the maximum stiffness K_max of the device, the
+margins, the passivity, and the stability in reference grasps, which are models of a hand. The *safe limit* of a scene
+bounds K and the damping B to walls that measurements of the device support. The *active* requirement is the one that
+excludes every stiffer wall.
+"""
 
 from __future__ import annotations
 
