@@ -2,10 +2,10 @@
 
 The *slack* of a requirement is the relative excess over it: 0 at the limit, negative if the requirement is violated, -1
 for an unstable wall. The slack of a stiffness K is the smallest slack of all requirements with the best damping B. The
-search brackets the largest K with nonnegative slack by steps on log K, and then finds the zero of the slack by a
-safeguarded secant method (`arrays.roots.false_position`). The active requirement of a wall is the one that excludes
-every stiffer wall. Grasps are models of a hand on the device; the *safe limit* bounds K and B to walls that measurements
-of the device support.
+search brackets the largest K with nonnegative slack by steps on log K, and then finds the zero of the slack by false
+position (`arrays.roots.false_position`). The active requirement of a wall is the one that excludes every stiffer wall.
+Grasps are models of a hand on the device; the *safe limit* bounds K and B to walls that measurements of the device
+support.
 """
 
 from __future__ import annotations
