@@ -75,6 +75,7 @@ class SceneParts(Part):
     safe_limit: SafeLimit | None = None
 
     def __post_init__(self) -> None:
+        """Check the types and units of the parts, and the operator; raise `InputError` if they do not fit together."""
         if isinstance(self.wall, Velocity):
             self._shift_parts()
         for name, (kind, example) in _KINDS.items():
@@ -276,6 +277,8 @@ def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Col
 
 
 def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], traceable: bool) -> Callable[..., Result]:
+    """Wrap one method for `wrap_methods`."""
+
     @wraps(method)
     def wrapped(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         if not traceable and (scene.traced_path is not None or is_traced(*args, *kwargs.values())):

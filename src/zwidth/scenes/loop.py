@@ -82,7 +82,7 @@ class LinearLoop:
     # Cache of the ridge, by whether negative damping is allowed.
     _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
-    # Number of random devices in an interactive computation; one maximum stiffness takes some 10 to 50 ms.
+    # Default number of random devices for tolerances, low because the maximum stiffness of one device takes 10 to 50 ms.
     draws: ClassVar[int] = 200
     # True if the methods that take walls work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
@@ -282,7 +282,11 @@ class LinearLoop:
 
 
 class RigidLoop(LinearLoop):
-    """Loop of a rigid mass with the backward difference: closed forms in alpha, beta, delta and d."""
+    """Loop of a rigid mass with the backward difference: closed forms in alpha, beta, delta and d.
+
+    The normalized damping of the device is ``delta = b T/m``, the delay in periods d. Methods without docstring are
+    described in `LinearLoop`.
+    """
 
     draws = 10_000
     most_periods = math.inf

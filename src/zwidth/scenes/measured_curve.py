@@ -80,6 +80,7 @@ class ResponseCurve:
         """Return S and F at other angles by linear interpolation; NaN outside the measured range."""
 
         def interpolate(values: np.ndarray) -> np.ndarray:
+            """Interpolate real values at the angles w."""
             return np.interp(w, self.w, values, np.nan, np.nan)
 
         parts = (self.S, self.F)

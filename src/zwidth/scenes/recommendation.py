@@ -145,7 +145,7 @@ class Recommendation:
             near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
             return choose_wall(improved, self.wanted, top, near, COARSE).stiffness
         except InputError:
-            # Doubling the rate may turn a long delay into more periods than the model supports.
+            # At twice the rate a long delay may have more periods than the model supports.
             return math.nan
 
     @cached_property

@@ -212,7 +212,7 @@ def _stable_dampings(stiffness: float, devices: np.ndarray) -> tuple[np.ndarray,
 
 
 def _find_lowest(cost: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the device with the lowest cost that a pattern search finds in a box, shape (1, 4).
+    """Return the device with the lowest cost (its limit) that a pattern search finds in a box, shape (1, 4).
 
     A pattern is a center and its neighbors, one step away along any of the uncertain parameters. It moves to the
     neighbor with the lowest cost; if no neighbor improves on the center, the step is halved.

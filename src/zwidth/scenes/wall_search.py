@@ -31,7 +31,7 @@ DEFAULT_PHASE_MARGIN = 30.0  # degrees
 DEFAULT_GAIN_MARGIN = 2.0  # factor on K and B together, 6 dB
 
 SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive only in a small part of its stable range
-NEAR = 5.0  # tolerance of the best B over the tolerance of K
+NEAR = 5.0  # ratio of the tolerance of the best B to that of K; B may be less accurate, because its optimum is flat
 LEAST = 1e-9  # smallest stiffness tried, relative to the largest allowed one
 STEP_DOWN = 0.25  # factor by which K is lowered until a wall satisfies the requirements
 STEP_DOWN_UNSTABLE = 0.95  # the same for a device unstable without a wall, whose stable walls have a lower end in K
