@@ -82,7 +82,7 @@ class LinearLoop:
     # Cache of the ridge, by whether negative damping is allowed.
     _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
-    # Default number of random devices for tolerances, low because the maximum stiffness of one device takes 10 to 50 ms.
+    # Default number of random devices for tolerances; the maximum stiffness of one device takes 10 to 50 ms.
     draws: ClassVar[int] = 200
     # True if the methods that take walls work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
@@ -313,8 +313,7 @@ class RigidLoop(LinearLoop):
     def find_dominant(self, alpha: float, beta: float) -> DominantPole:
         with np.errstate(all="ignore"):
             dominant = find_dominant_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
-        # A wall with K = 0 is marginal if walls with slightly larger K are stable, because then only the pole at z = 1
-        # is on the unit circle.
+        # If walls with slightly larger K are stable, a wall with K = 0 has one pole at z = 1 and no pole outside.
         return DominantPole(alpha == 0 and bool(self.find_stable_alpha(np.array([beta])).size), *dominant)
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:

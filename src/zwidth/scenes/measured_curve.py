@@ -50,7 +50,8 @@ PHASE_TOLERANCE = 0.8  # rad; deviation of the phase of the first line from that
 N_FIRST = 4  # lines from which the low-frequency asymptote is identified, at least
 EXTRAPOLATION_FACTOR = 2.0  # bound of |G| above the last line, over its root mean square at the last lines
 LAST_SHARE = 0.8  # the last lines start at this share of the highest frequency
-# If |S| increases by more than this factor over the last lines, a resonance may follow above them, so |G| is unbounded.
+# If |S| increases by more than this factor over the last lines, a resonance may follow above them, and |G| has no
+# bound there.
 MAX_RISE = 1.2
 N_EXTRAPOLATED = 65  # angles below the first and above the last line at which |F| is bounded
 
@@ -288,7 +289,7 @@ class DecidedWalls:
         discriminant = half * half - a * c
         # Walls between the two roots are undecided at a point if a > 0; walls outside them are undecided if a <= 0.
         has_roots, outer = discriminant >= 0, a <= 0
-        # On the other lines all walls are undecided.
+        # On unusable lines no wall is decided, because of one point or of the bounds outside the measured range.
         usable = (least < most) & ~np.any(outer & (discriminant <= 0), 1) & (not self.curve.no_asymptote)
         line, point = np.nonzero(has_roots & usable[:, None])
         half, c, a = half[line, point], c[line, point], a[point]
