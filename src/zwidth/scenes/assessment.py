@@ -302,7 +302,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
 
 def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima], float]) -> list[Limit]:
-    """Return all improvements, sorted by the gain in the stiffness that ``measure`` returns: largest first, NaN last."""
+    """Return all improvements, sorted by their gain in the stiffness from ``measure``: largest first, NaN last."""
     limits = []
     for name, words, improved, note in list_improvements(scene):
         stiffness = measure(improved)

@@ -113,7 +113,7 @@ def test_a_crossing_next_to_what_cannot_be_computed_is_none():
     [
         (("velocity.cutof", 1e3), "parameter: got 'velocity.cutof'.*did you mean 'velocity.cutoff'"),
         (("stiffness", 1e3), "parameter: got 'stiffness'"),
-        (("velocity.order", 1e3), "a whole number"),
+        (("velocity.order", 1e3), "must be an integer"),
         (("mass", -1.0), "stiffness: got -1.0"),
         (("mass", 1e3, (2.0, 1.0)), "within: got"),
     ],
