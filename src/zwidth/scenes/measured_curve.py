@@ -66,10 +66,10 @@ class ResponseCurve:
     F: np.ndarray  # velocity estimate
     band: np.ndarray  # bound of the error of S due to the error of the lines
     gap: np.ndarray  # bound of the error of S due to the interpolation between the lines
-    min_response: float  # lower bound of |G| at and below the first line
-    max_response: float  # upper bound of |G| above the last line
-    max_estimate_below: float  # upper bound of |F| below the first line
-    max_estimate_above: float  # upper bound of |F| above the last line
+    min_G: float  # lower bound of |G| at and below the first line
+    max_G: float  # upper bound of |G| above the last line
+    max_F_below: float  # upper bound of |F| below the first line
+    max_F_above: float  # upper bound of |F| above the last line
     no_asymptote: bool  # True if the first line does not belong to a mass, a damper or a spring
 
     @property
@@ -243,10 +243,7 @@ class DecidedWalls:
     def decide_beta(self, alpha: np.ndarray) -> DecidedIntervals:
         """Return the decided intervals of beta for each alpha."""
         c = self.curve
-        most = np.minimum(
-            (alpha - 1.0 / max(c.min_response, TINY)) / c.max_estimate_below,
-            (1.0 / c.max_response - alpha) / c.max_estimate_above,
-        )
+        most = np.minimum((alpha - 1.0 / max(c.min_G, TINY)) / c.max_F_below, (1.0 / c.max_G - alpha) / c.max_F_above)
         return self._find_intervals(2, alpha, -most, most)
 
     def bound_alpha(self, beta: Any) -> tuple[Any, Any]:
@@ -256,9 +253,7 @@ class DecidedWalls:
         the upper end, no wall of this beta is decided.
         """
         c = self.curve
-        return np.abs(beta) * c.max_estimate_below + 1.0 / max(c.min_response, TINY), 1.0 / c.max_response - np.abs(
-            beta
-        ) * c.max_estimate_above
+        return np.abs(beta) * c.max_F_below + 1.0 / max(c.min_G, TINY), 1.0 / c.max_G - np.abs(beta) * c.max_F_above
 
     def _find_intervals(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> DecidedIntervals:
         """Return the decided intervals on lines of constant alpha or beta, computed in batches.

@@ -145,7 +145,7 @@ class MeasuredLoop(LinearLoop):
         """Values of beta, and the largest alpha of the stable walls connected to K = 0 for each; 0 if none exists."""
         # For larger |beta| no wall is decided.
         low, high = self.walls.bound_alpha(0.0)
-        most = max((high - low) / (self.walls.curve.max_estimate_below + self.walls.curve.max_estimate_above), 1e-300)
+        most = max((high - low) / (self.walls.curve.max_F_below + self.walls.curve.max_F_above), 1e-300)
         side = most * np.sinh(DENSITY * np.arange(1, N_SIDE + 1) / N_SIDE) / np.sinh(DENSITY)
         beta = np.concatenate([-side[::-1], [0.0], side])
         top = self._find_tops(beta)
@@ -263,7 +263,7 @@ class MeasuredLoop(LinearLoop):
             if stable and not np.any(sizes < 1.0):
                 # No phase crossover with |L| < 1 was measured. Above the last line |L| is at most ``most``, so a factor
                 # below 1/most moves no pole onto the unit circle there.
-                most = c.max_response * (abs(alpha) + abs(beta) * c.max_estimate_above)
+                most = c.max_G * (abs(alpha) + abs(beta) * c.max_F_above)
                 crossovers, sizes = np.append(crossovers, c.w[-1]), np.append(sizes, most)
             k, share = _find_zeros(np.log(np.abs(L)))
             w = c.w[k] + share * np.diff(c.w)[k]
