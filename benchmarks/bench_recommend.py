@@ -84,7 +84,7 @@ def find_radius(scene: zwidth.Scene, stiffness: float, damping: float) -> float:
 def measure_margins(scene: zwidth.Scene, stiffness: float, damping: float) -> dict[str, float]:
     """Return the gain margin, the phase margin in degrees and the delay margin in s from the open-loop response."""
     a, b, sensor = continuous(scene)
-    period, part = scene.timing.period, scene.d - scene.whole_delay
+    period, part = scene.timing.period, scene.d - scene.integer_delay
     step, older = flow(a, b, period)[0], flow(a, b, part * period)[1]
     rest, newer = flow(a, b, (1 - part) * period)
     eigenvalues, vectors = np.linalg.eig(step)
@@ -95,7 +95,7 @@ def measure_margins(scene: zwidth.Scene, stiffness: float, damping: float) -> di
     def respond(angle: np.ndarray) -> np.ndarray:
         z = np.exp(1j * angle)
         modal = (left / (z[:, None] - eigenvalues)) @ right
-        plant = (modal[:, 0] + modal[:, 1] / z) * z**-scene.whole_delay
+        plant = (modal[:, 0] + modal[:, 1] / z) * z**-scene.integer_delay
         return (stiffness + damping * np.polyval(top, z) / np.polyval(bottom, z)) * plant
 
     def cross(values: np.ndarray) -> np.ndarray:

@@ -45,9 +45,9 @@ def loop_in_numpy(scene: zwidth.Scene, stiffness: float, virtual_damping: float)
     """What one writes first: the device's matrices once, then a sample at a time."""
     period, mass = scene.timing.period, scene.device.mass
     rate = np.array([[0.0, 1.0, 0.0], [0.0, -scene.device.damping / mass, 1.0 / mass], [0.0, 0.0, 0.0]])
-    fraction = scene.d - scene.whole_delay
+    fraction = scene.d - scene.integer_delay
     first, second = scipy.linalg.expm(rate * fraction * period), scipy.linalg.expm(rate * (1 - fraction) * period)
-    commands = deque([0.0] * (scene.whole_delay + 2), maxlen=scene.whole_delay + 2)
+    commands = deque([0.0] * (scene.integer_delay + 2), maxlen=scene.integer_delay + 2)
     state, last, positions = np.zeros(2), 0.0, np.empty(PERIODS)
     for k in range(PERIODS):
         positions[k] = position = state[0]

@@ -51,11 +51,11 @@ def test_labels(loops):
 
 def test_rows_and_columns(loops):
     rigid, linear, top, alpha, beta = loops
-    expected, found = rigid.row(beta), linear.row(beta)
+    expected, found = rigid.find_stable_alpha(beta), linear.find_stable_alpha(beta)
     assert expected.shape == found.shape == (40, 1, 2)
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     for stiffness in alpha[:6].tolist():
-        expected, found = rigid.column(stiffness), linear.column(stiffness)
+        expected, found = rigid.find_stable_beta(stiffness), linear.find_stable_beta(stiffness)
         assert expected.shape == found.shape == (int(stiffness < top.alpha), 2)
         size = rigid.scene.delta + np.abs(expected).max(initial=0.0)
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * size)
@@ -65,12 +65,12 @@ def test_a_stable_set_of_one_piece(loops):
     rigid, linear, top, _, _ = loops
     assert rigid.islands(-np.inf) == linear.islands(-np.inf) == []
     wall = 0.9 * float(top.alpha), float(top.beta)
-    assert rigid.holds_softly(*wall)
-    assert linear.holds_softly(*wall)
+    assert rigid.is_connected(*wall)
+    assert linear.is_connected(*wall)
     for least in (-np.inf, 0.0):
-        expected, found = (np.array(loop.soft_column(wall[0], least)) for loop in (rigid, linear))
+        expected, found = (np.array(loop.find_connected_beta(wall[0], least)) for loop in (rigid, linear))
         np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
-    assert rigid.soft_column(wall[0], -np.inf)
+    assert rigid.find_connected_beta(wall[0], -np.inf)
 
 
 @pytest.mark.parametrize("negative", [True, False])
@@ -103,12 +103,12 @@ def test_poles_and_radius(loops):
 def test_the_slowest_motion(loops):
     rigid, linear, _, alpha, beta = loops
     for wall in zip(alpha[:4].tolist(), beta[:4].tolist(), strict=True):
-        expected, found = rigid.slowest(*wall), linear.slowest(*wall)
+        expected, found = rigid.find_dominant(*wall), linear.find_dominant(*wall)
         assert found.marginal == expected.marginal is False
         np.testing.assert_allclose([found.radius, found.rate], [expected.radius, expected.rate], rtol=1e-6, atol=1e-9)
     # Nothing pulls back, but damping slows down.
     wall = 0.0, 0.5 * float(rigid.stiffest(True).beta)
-    assert rigid.slowest(*wall).marginal == linear.slowest(*wall).marginal
+    assert rigid.find_dominant(*wall).marginal == linear.find_dominant(*wall).marginal
 
 
 def test_margins(loops):
@@ -135,5 +135,7 @@ def test_variants_of_a_device():
     assert type(expected) is not type(found)
     np.testing.assert_array_equal(expected.labels(12e3, 20.0), found.labels(12e3, 20.0))
     dampings = np.array([0.0, 20.0, 1e5])
-    np.testing.assert_allclose(expected.row_ends(dampings), found.row_ends(dampings), rtol=1e-9)
+    np.testing.assert_allclose(
+        expected.find_stiffness_limits(dampings), found.find_stiffness_limits(dampings), rtol=1e-9
+    )
     np.testing.assert_allclose(expected.stiffest(), found.stiffest(), rtol=1e-9)

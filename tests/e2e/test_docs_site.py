@@ -153,7 +153,7 @@ def test_names_are_links_and_examples_are_code(site):
     pages = {page.name: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
     scene = set(re.findall(r'id="zwidth\.Scene\.(\w+)"', pages["scene.html"]))
     assert scene >= {"is_stable", "max_stiffness"}
-    assert not scene & {"check_parts", "loop", "whole_delay"}
+    assert not scene & {"check_parts", "loop", "integer_delay"}
     for path in sorted((DOCS / "theory").glob("*.md")):
         shown = (site / "theory" / f"{path.stem}.html").read_text(encoding="utf-8")
         prompts = re.findall("^>>>", path.read_text(encoding="utf-8"), re.MULTILINE)

@@ -143,7 +143,7 @@ def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
 def _sample(scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the transition over a period, the effects of the newer and the older force, and the sensor row."""
     a, b, seen = continuous(scene)
-    period, fraction = scene.timing.period, scene.d - scene.whole_delay
+    period, fraction = scene.timing.period, scene.d - scene.integer_delay
     rest, newer = flow(a, b, (1.0 - fraction) * period)
     return flow(a, b, period)[0], newer, rest @ flow(a, b, fraction * period)[1], seen
 
@@ -151,7 +151,7 @@ def _sample(scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> np.ndarray:
     """Return the state matrix of the closed loop: positions, velocities, filter, then the delayed commands."""
     step, newer, older, seen = _sample(scene)
-    size, late = len(step), scene.whole_delay
+    size, late = len(step), scene.integer_delay
     fraction = scene.d - late
     top, bottom = velocity_polynomials(scene)
     top, bottom = top / bottom[0], bottom / bottom[0]
@@ -245,7 +245,7 @@ def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np
     The response of the device is computed from its state matrix at each frequency.
     """
     own, newer, older, seen = _sample(scene)
-    size, late = len(own), scene.whole_delay
+    size, late = len(own), scene.integer_delay
     fraction = scene.d - late
     top, bottom = velocity_polynomials(scene)
 

@@ -46,7 +46,7 @@ def _ball_filter(scene: Any) -> tuple[flint.acb_poly, flint.acb_poly]:
 def ball_parts(scene: Any) -> tuple[flint.acb_poly, flint.acb_poly, flint.acb_poly]:
     """Return D, N1 and N2 of ``P = D + K N1 + B N2`` in SI units, at the precision of `flint.ctx`."""
     table, size, sees = rate_table(scene, flint.arb)
-    late = scene.whole_delay
+    late = scene.integer_delay
     fraction = flint.arb(scene.d) - late
     rate = flint.arb_mat(table) * flint.arb(scene.timing.period)
     step, rest, first = (_top((rate * part).exp(), size) for part in (flint.arb(1), 1 - fraction, fraction))

@@ -72,7 +72,7 @@ def test_labels_describe_the_recorded_positions(contact: Any) -> None:
     }
     found: Any = zwidth.simulate([scene for scene, _ in motions], **columns, contact=contact, periods=PERIODS)
     expected = [
-        label(position, velocity, int(scene.whole_delay))
+        label(position, velocity, int(scene.integer_delay))
         for position, velocity, (scene, _) in zip(found.position, found.velocity, motions, strict=True)
     ]
     assert [MotionKind(code).name for code in found.outcome] == [kind.name for kind in expected]

@@ -151,6 +151,6 @@ def _choose_start(
 
 def _choose_length(scene: Any) -> int:
     """Return the number of periods needed to show the slowest decay of the linear loop."""
-    dominant = scene.loop.slowest(float(scene.alpha), float(scene.beta))
+    dominant = scene.loop.find_dominant(float(scene.alpha), float(scene.beta))
     rate = abs(float(dominant.rate))
     return int(min(max(TIME_CONSTANTS / rate, FEWEST_PERIODS), MOST_PERIODS)) if 0 < rate < math.inf else MOST_PERIODS

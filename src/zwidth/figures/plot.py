@@ -38,8 +38,8 @@ from zwidth.loops.rigid.response import settling_time
 from zwidth.parts.checks import read_texts
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.assessment import passive_edge, round_margin
-from zwidth.scenes.base import check_scene, of_scene
+from zwidth.scenes.assessment import round_margin, trace_passivity_boundary
+from zwidth.scenes.base import check_scene, wrap_function
 from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
@@ -77,7 +77,7 @@ def _with_checked_scene(
     function: Callable[Concatenate[Scene, Parameters], Result],
 ) -> Callable[Concatenate[Scene, Parameters], Result]:
     """Wrap a function of a scene as `_with_house_style` does, and check the scene."""
-    return of_scene(_with_house_style(function))
+    return wrap_function(_with_house_style(function))
 
 
 def _choose_axes(ax: Axes | None) -> Axes:
@@ -136,7 +136,7 @@ def region(
 
 def _trace_passive(scene: Scene, label: str = "") -> dict[str, Any]:
     """Return the outline of the passive walls, with the columns of `tabulate_sets`."""
-    edge = tabulate_walls(scene, *passive_edge(scene, N_ANGLES))
+    edge = tabulate_walls(scene, *trace_passivity_boundary(scene, N_ANGLES))
     return {"label": label, "number": 0, "piece": "passive", **edge}
 
 

@@ -85,7 +85,7 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """Return the stiffness up to which all walls are stable, a row per device, a column per damping; 0 if none."""
-    return fit.nominal.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).row_ends(damping)
+    return fit.nominal.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).find_stiffness_limits(damping)
 
 
 def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str, np.ndarray]:

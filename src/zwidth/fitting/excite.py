@@ -196,7 +196,7 @@ def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.
 def _answer_at(scene: Scene, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the interpolated response in m/N, the velocity estimate and the interpolation error in m/N."""
     c = cast("MeasuredLoop", scene.loop).walls.curve
-    S, F = c.at(np.clip(w, c.w[0], c.w[-1]))
+    S, F = c.evaluate(np.clip(w, c.w[0], c.w[-1]))
     unit = scene.units.stiffness * 4.0 * np.sin(0.5 * w) ** 2
     return S / unit, F, np.interp(w, c.w, np.maximum(c.gap - 0.5 * c.band, 0.0)) / unit
 

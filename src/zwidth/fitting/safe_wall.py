@@ -26,7 +26,7 @@ from zwidth.parts.chain import Body, Chain, Resonance
 from zwidth.parts.circle import circle
 from zwidth.parts.state_space import StateSpace, estimate_matrices, in_series
 from zwidth.parts.velocity import BackwardDifference, Estimate
-from zwidth.scenes.tolerances import borne_by
+from zwidth.scenes.tolerances import compute_stiffness_quantile
 from zwidth.scenes.variants import RigidVariants
 from zwidth.simulation.flow import flow
 from zwidth.words.quantities import SI_RANGE
@@ -119,7 +119,7 @@ def bears_resonances(fit: DeviceEstimate, stiffness: float, virtual_damping: flo
     if scene is None or stiffness == 0:
         return True
     alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
-    return scene.loop.holds_softly(float(alpha), float(beta))
+    return scene.loop.is_connected(float(alpha), float(beta))
 
 
 class _RigidDevices(RigidVariants):
@@ -127,7 +127,7 @@ class _RigidDevices(RigidVariants):
 
     def find(self, reliability: float, most: float) -> tuple[float, float]:
         """K and B, which is ``most`` at most; both 0 where there is none."""
-        low, high, damping = 0.0, borne_by(self.stiffest()[0], reliability), 0.0
+        low, high, damping = 0.0, compute_stiffness_quantile(self.stiffest()[0], reliability), 0.0
         least = _NOTHING * high
         while high > max((1.0 + _CLOSE) * low, least):
             stiffness = 0.5 * (low + high)
@@ -143,11 +143,11 @@ class _RigidDevices(RigidVariants):
 
     def limit(self, virtual_damping: float, reliability: float) -> float:
         """The K up to which so many devices bear walls of a damping."""
-        return borne_by(self.row_ends(np.array([virtual_damping]))[:, 0], reliability)
+        return compute_stiffness_quantile(self.find_stiffness_limits(np.array([virtual_damping]))[:, 0], reliability)
 
     def _most_borne(self, stiffness: float) -> float:
         """The middle of the dampings at which most devices bear this stiffness."""
-        sides = [self.column_ends(stiffness, side) for side in ("lower", "upper")]
+        sides = [self.find_damping_limits(stiffness, side) for side in ("lower", "upper")]
         real = np.isfinite(sides[0]) & np.isfinite(sides[1])
         places = np.concatenate([side[real] for side in sides])
         if not places.size:
@@ -203,7 +203,7 @@ class _SearchedDevices:
         return float(borne.sum()) / (borne.size + self.others.size)
 
     def _borne_by(self, limits: np.ndarray, reliability: float) -> float:
-        return borne_by(np.concatenate([limits, self.others]), reliability)
+        return compute_stiffness_quantile(np.concatenate([limits, self.others]), reliability)
 
 
 def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damping: float) -> np.ndarray:

@@ -62,7 +62,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
         rows = [("NO WALL", "resolve the warnings first, then record again")]
     elif recommended.status == Status.OK:
         limit = recommended.scene.safe_limit
-        cause = limit.reason.partition("; ")[0] if limit is not None and recommended.is_held_back else ""
+        cause = limit.reason.partition("; ")[0] if limit is not None and recommended.is_at_safe_limit else ""
         reason = ": ".join(filter(None, (recommended.spell_requirement(), cause)))
         rows = [("SET", recommended.spell_wall()), ("", reason)]
     rows += [("", ""), *_describe_device(fit)]
@@ -78,7 +78,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
     rows += [("note", note) for note in fit.notes]
     if fit.next is not None:
         rows.append(("next", _describe_next(fit)))
-    elif fit.motions and recommended.is_held_back and (rigid := _assume_rigid(fit)) is not None:
+    elif fit.motions and recommended.is_at_safe_limit and (rigid := _assume_rigid(fit)) is not None:
         stiffest = spell("stiffness", rigid.stiffness, fit.unit_system)
         rows.append(("next", f"for a stiffer wall (up to {stiffest} without hidden resonances) {advise_record(fit)}"))
     return rows

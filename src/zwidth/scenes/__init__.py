@@ -1,1 +1,1 @@
-"""Scenes in SI units and every question about their walls: verdict, stiffest wall, price, robustness, limits."""
+"""Analyses of scenes in SI units: stability, maximum stiffness, margins, robustness, recommendation and diagnosis."""

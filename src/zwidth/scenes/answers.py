@@ -1,4 +1,10 @@
-"""What a scene answers of its walls, in SI units: labels, poles, margins, passivity, state space, responses."""
+"""Analyses of the walls of a scene in SI units: stability, poles, margins, passivity, state space, frequency response.
+
+`SceneAnalysis` adds these methods to the parts of a scene (`zwidth.scenes.base`). They check and broadcast the walls,
+convert them to the normalized alpha and beta, call the loop of the scene (`zwidth.scenes.loop`), and convert the
+results back. K and B are the stiffness and damping of the wall, F(z) is the velocity estimate, G(z) the plant, and
+``L = (K + B F) G`` the open loop.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +32,17 @@ from zwidth.words.xp import is_traced, namespace
 if TYPE_CHECKING:
     import control
 
-# K or B of walls, texts with a unit as well; None means those of the scene's own wall.
+# K or B of walls, or of one wall; a text has a unit. None stands for the value of the wall of the scene.
 Walls: TypeAlias = ArrayLike | None
 Wall: TypeAlias = float | str | None
 
 
 @shown(phase_margin="degrees", delay_margin="s", phase_crossover="Hz", gain_crossover="Hz", modulus_frequency="Hz")
 class SceneMargins(Margins):
-    """`zwidth.Margins` of a wall of a scene, with the delay margin in s and the frequencies in Hz."""
+    """`zwidth.Margins` of walls of a scene, with the delay margin in s and the frequencies in Hz."""
 
 
-class SceneAnswers(SceneParts):
+class SceneAnalysis(SceneParts):
     """The methods of `zwidth.Scene` that evaluate walls.
 
     Without a stiffness and a damping, each method evaluates the wall of the scene (`zwidth.parts.wall.resolve_wall`). A
@@ -66,37 +72,39 @@ class SceneAnswers(SceneParts):
         """Raise `InputError` if JAX traces a value and the loop is not traceable."""
         if is_traced(*values) and not self.loop.traceable:
             raise InputError(
-                f"{self.traced_path or 'stiffness, virtual_damping'}: got a value that JAX traces, which needs a rigid "
-                "device with the backward difference; pass numbers, outside of jit, vmap and grad"
+                f"{self.traced_path or 'stiffness, virtual_damping'}: got a value traced by JAX, allowed only for a "
+                "rigid device with the backward difference; pass plain numbers, outside jit, vmap and grad"
             )
 
     def poles(self, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
-        """All poles of walls, along a new last axis and in no particular order; NaN where a wall is out of range.
+        """Return all poles of the closed loop, along a new last axis in no particular order; NaN if out of range.
 
-        Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
-        is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
+        The eigenvalues of the companion matrix are refined by Aberth's iteration on the factored polynomial, expanded
+        around z = 1. The error is about 1e-15 times the condition number for a simple pole and 1e-16^(1/k) for a k-fold
+        one. The run time per wall is O(degree^3).
         """
         return self.loop.poles(*self._broadcast_walls(stiffness, virtual_damping))
 
     def spectral_radius(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
-        """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
+        """Return the largest pole magnitude of walls; NaN if out of range or if the device is a measured response.
 
-        From all poles; beyond 150 of them by counting poles in circles, at a cost that does not grow with the delay.
+        It is below 1 if and only if `is_stable` is true. Up to 150 poles, all are computed; for more poles the method
+        counts the poles inside circles, and its run time does not increase with the delay.
         """
         return self.loop.radius(*self._broadcast_walls(stiffness, virtual_damping))
 
     def islands(self, *, negative_damping: bool | None = None) -> list[Island]:
-        """The islands: pieces of the stable set that no path of stable walls leads to from soft ones.
+        """Return the islands: the pieces of the stable set that are not connected to K = 0 by paths of stable walls.
 
-        A wall on an island is stable, but as its stiffness falls it becomes unstable before it is soft, whatever B does
-        meanwhile. It does not count for `max_stiffness`.
+        A wall on an island is stable, but on the way to K = 0 it becomes unstable, however B changes along the path.
+        Islands do not count for `max_stiffness`.
 
         Args:
-            negative_damping: as for `max_stiffness`; False leaves out islands that lie in B <= 0.
+            negative_damping: as for `max_stiffness`; False omits islands with B <= 0.
 
         Returns:
-            A list, the stiffest first; ``stiffness`` in N/m and ``virtual_damping`` in N s/m are pairs, the least and
-            the largest of the island. Empty for a rigid scene, whose stable walls are one piece.
+            A list, the stiffest first; ``stiffness`` in N/m and ``virtual_damping`` in N s/m are pairs: the smallest
+            and the largest value on the island. Empty for a rigid scene, whose stable set is connected.
 
         Example:
             >>> import zwidth
@@ -106,36 +114,37 @@ class SceneAnswers(SceneParts):
             7537 to 9037 N/m
         """
         units = np.array([self.units.stiffness, self.units.virtual_damping])[:, None]
-        found = self.loop.islands(-np.inf if allows_negative(self, negative_damping) else 0.0)
-        return [Island(*(tuple(pair.tolist()) for pair in np.array(one) * units)) for one in found]
+        islands = self.loop.islands(-np.inf if allows_negative(self, negative_damping) else 0.0)
+        return [Island(*(tuple(pair.tolist()) for pair in np.array(one) * units)) for one in islands]
 
     def state_space(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
-        """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
+        """Return the closed loop with one wall, from an external force on the device (N) to the sensed position (m).
 
-        Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
+        The force is constant within each period (zero-order hold), and the discretization is exact. The states include
+        those of the velocity estimate and the delayed forces. The result has A, B, C, D and the period dt.
         """
         compliance = self.timing.period**2 / float(self.mass)
         return _realize(self, realize_closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
     def open_loop(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
-        """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
+        """Return the open loop L with one wall in the form of `state_space`; negative feedback closes the loop."""
         return _realize(self, realize_open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
     def frequency_response(
         self, stiffness: Walls = None, virtual_damping: Walls = None, frequency: ArrayLike | None = None
     ) -> Array:
-        """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
+        """Return the complex open loop ``L = (K + B F) G`` at frequencies in Hz up to the Nyquist frequency.
 
-        All three broadcast; the wall is stable or not by how L winds around -1. NaN for other frequencies.
+        All arguments broadcast. NaN for frequencies out of range. The winding number of L around -1 decides stability.
         """
         if frequency is None:
-            raise InputError("frequency: none is given; give frequencies in Hz, up to half the sampling rate")
+            raise InputError("frequency: missing; pass frequencies in Hz, up to half the sampling rate")
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         hertz = as_float64("frequency", read_texts("frequency", frequency, "Hz"))
         join_shapes([("frequency", hertz.shape), ("stiffness", alpha.shape), ("virtual_damping", beta.shape)])
         hertz, alpha, beta = np.broadcast_arrays(hertz, alpha, beta)
         w = 2.0 * np.pi * hertz * self.timing.period
-        # Half the sampling rate is half a turn, whatever the rounding of the quotient.
+        # Map the Nyquist frequency to exactly pi, because the rounded product may exceed pi.
         w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)
         inside = (w > 0) & (w <= np.pi)
         value = self.loop.open_loop(alpha, beta, np.where(inside, w, 1.0))
@@ -144,24 +153,24 @@ class SceneAnswers(SceneParts):
     def is_stable(
         self, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
     ) -> Array:
-        """Whether walls are stable: every pole strictly inside the unit circle.
+        """Return whether walls are stable, i.e. all poles of the closed loop lie strictly inside the unit circle.
 
         Args:
             stiffness: K in N/m.
-            virtual_damping: B in N s/m. Both broadcast; neither means the scene's own wall.
-            method: as for `decide_stability`, which has the statuses as well.
+            virtual_damping: B in N s/m. Both broadcast. Without both, the wall of the scene is evaluated. If the scene
+                has no wall, ``virtual_damping`` may be omitted and is then 0.
+            method: as for `decide_stability`, which also returns a status.
 
         Returns:
-            Boolean array of the broadcast shape, False for what is NaN or, in arrays, out of range.
+            Boolean array of the broadcast shape; False for NaN and for entries of arrays that are out of range.
 
         Raises:
-            InputError: a single wall is out of range; it is not said which wall is meant. K alone, with B = 0, is meant
-                where the scene has no wall.
+            InputError: a single wall is out of range, or it is ambiguous which wall is meant.
 
         Numerics:
-            Closed form for a rigid device with the backward difference. Otherwise by the signed crossings of each
-            row (`loops.linear.boundary`): the first call lays out the boundary (some 5 to 20 ms), then each damping
-            costs some microseconds and a stiffness next to nothing.
+            Closed form for a rigid device with the backward difference. Otherwise by the signed crossings on each line
+            of constant B (`loops.linear.boundary`). The first call traces the boundary (5 to 20 ms); then each value of
+            B takes some microseconds, and each further K much less.
         """
         if method != "auto":
             return self.decide_stability(stiffness, virtual_damping, method=method).stable
@@ -180,11 +189,11 @@ class SceneAnswers(SceneParts):
             Array of shape (n, 2) in N/m; for an array of dampings, of shape (*shape, n, 2), with NaN if a damping has
             fewer intervals. The intervals are open.
         """
-        given = self.wall.virtual_damping if virtual_damping is None else virtual_damping
-        damping = read_texts("virtual_damping", given, self.unit_system["N s/m"])
+        value = self.wall.virtual_damping if virtual_damping is None else virtual_damping
+        damping = read_texts("virtual_damping", value, self.unit_system["N s/m"])
         beta = as_float64("virtual_damping", damping) / self.units.virtual_damping
-        both = self.loop.row(beta.reshape(-1)) * self.units.stiffness
-        return both.reshape(*beta.shape, *both.shape[1:])
+        intervals = self.loop.find_stable_alpha(beta.reshape(-1)) * self.units.stiffness
+        return intervals.reshape(*beta.shape, *intervals.shape[1:])
 
     def stable_damping(self, stiffness: Wall = None) -> np.ndarray:
         """Return all stable intervals of the virtual damping at one stiffness.
@@ -196,8 +205,8 @@ class SceneAnswers(SceneParts):
             Array of shape (n, 2) in N s/m. The intervals are open.
         """
         stiffness = resolve_wall(self.wall, None, None, self.unit_system)[0] if stiffness is None else stiffness
-        alpha, _ = one_wall(*self.normalize_walls(stiffness, 0.0))
-        return self.loop.column(alpha) * self.units.virtual_damping
+        alpha, _ = read_single_wall(*self.normalize_walls(stiffness, 0.0))
+        return self.loop.find_stable_beta(alpha) * self.units.virtual_damping
 
     def damper_range(self) -> np.ndarray:
         """Return the intervals of B in which a pure damper (K = 0) is stable except for its pole at z = 1.
@@ -215,7 +224,7 @@ class SceneAnswers(SceneParts):
             >>> print("{:.2f} to {:.2f} N s/m".format(*scene.damper_range()[0]))
             -10.00 to 90.48 N s/m
         """
-        return self.loop.dampers() * self.units.virtual_damping
+        return self.loop.find_damper_intervals() * self.units.virtual_damping
 
     def decide_stability(
         self, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
@@ -235,20 +244,20 @@ class SceneAnswers(SceneParts):
         return self.loop.decide(alpha, beta, method, (K, B))
 
     def explain_undecided(self, stiffness: Walls = None, virtual_damping: Walls = None) -> list[str]:
-        """Why the measured response of a device leaves one wall UNDECIDED, and at which frequencies to measure.
+        """Return the reasons why one wall is UNDECIDED, each with the frequencies to measure.
 
-        A sentence each; none where the wall is decided, as it is of every device that is a model.
+        Only a measured response can leave a wall undecided. The list is empty if the wall is decided.
         """
-        return self.loop.explain(*one_wall(*self.normalize_walls(stiffness, virtual_damping)))
+        return self.loop.explain(*read_single_wall(*self.normalize_walls(stiffness, virtual_damping)))
 
     def passivity_margin(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
-        """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is out of range.
+        """Return the damping of the device minus that required for a passive wall, in N s/m; NaN if out of range.
 
-        Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
-        (`loops.linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
-        motor the motor's own damping counts, which is sufficient and not necessary; with the sensor at the tip, with an
-        actuator and with modes there is no such condition, and InputError says so. A wall that pushes has at most its
-        K T.
+        This is Colgate's condition for any velocity estimate and delay; the required damping is the certified maximum
+        over all frequencies (`loops.linear.passivity`). For a rigid device the condition is necessary and sufficient
+        for any operator. With a coupling and the sensor at the motor it uses the damping of the motor and is only
+        sufficient. No condition is known for a sensor at the tip, an actuator or modes (`InputError`). For K < 0 the
+        margin is at most K T, because such a wall supplies energy without limit.
         """
         if obstacle := find_unsupported_reason(**vars(self.device)):
             raise InputError(f"passivity {obstacle}")
@@ -256,30 +265,30 @@ class SceneAnswers(SceneParts):
         return self.loop.passivity_margin(alpha, beta) * self.units.virtual_damping
 
     def is_passive(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
-        """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
+        """Return whether walls are passive (positive `passivity_margin`), i.e. stable with every passive operator."""
         margin = self.passivity_margin(stiffness, virtual_damping)
         return (margin if is_traced(margin) else np.asarray(margin)) > 0
 
     def margins(self, stiffness: Walls = None, virtual_damping: Walls = None) -> SceneMargins:
-        """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
+        """Return gain, phase, delay and modulus margin of walls, with their frequencies in Hz.
 
-        Of several crossovers the nearest counts, as in python-control: ``gain_margin`` is the factor nearest to 1 on K
-        and B together, and ``phase_margin`` the least turn in degrees, that bring a pole to the unit circle; the turn
-        is negative for an unstable wall. ``delay_margin`` in s is the least extra delay that does, held as the hardware
-        does it, fraction by fraction with the exact loop (0 for an unstable wall, NaN where poles counted before and
-        beyond do not confirm it); ``modulus_margin`` is the least distance of L from -1. Where no factor, turn or delay
-        brings a pole there, the first three are infinite for a stable wall, and 0, NaN and 0 for an unstable one.
-        Walls out of range are NaN. A rigid scene answers by `zwidth.margins`. A wall takes some milliseconds, its
-        delay margin some 0.1 s.
+        With several crossovers, the nearest counts, as in python-control. ``gain_margin`` is the factor nearest to 1 on
+        K and B together, ``phase_margin`` the smallest change of phase in degrees, and ``delay_margin`` the smallest
+        additional delay in s that moves a pole onto the unit circle. ``modulus_margin`` is the smallest distance of L
+        from -1. The phase margin of an unstable wall is negative, its delay margin 0. The delay margin is computed with
+        the exact discretization of every fractional delay, and is NaN if counts of poles below and above it do not
+        confirm it. If no factor, phase or delay moves a pole onto the unit circle, the first three margins are infinite
+        for a stable wall, and 0, NaN and 0 for an unstable one. Walls out of range are NaN. A rigid scene uses
+        `zwidth.margins`; otherwise a wall takes some milliseconds, and its delay margin about 0.1 s.
         """
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
-        found = SceneMargins._make(self.loop.margins(alpha, beta))
-        return found._replace(
-            delay_margin=found.delay_margin * self.timing.period,
-            phase_crossover=found.phase_crossover * hertz,
-            gain_crossover=found.gain_crossover * hertz,
-            modulus_frequency=found.modulus_frequency * hertz,
+        margins = SceneMargins._make(self.loop.margins(alpha, beta))
+        return margins._replace(
+            delay_margin=margins.delay_margin * self.timing.period,
+            phase_crossover=margins.phase_crossover * hertz,
+            gain_crossover=margins.gain_crossover * hertz,
+            modulus_frequency=margins.modulus_frequency * hertz,
         )
 
 
@@ -296,38 +305,47 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
         estimate = scene.velocity.estimate(scene.timing.period)
         return estimate.is_difference and bool(is_traced(estimate.gain) or estimate.gain > 0)
     if not isinstance(negative_damping, bool | np.bool_):
-        raise InputError(f"negative_damping: got {negative_damping!r}; it is True, False or None")
+        raise InputError(f"negative_damping: got {negative_damping!r}; pass True, False or None")
     return bool(negative_damping)
 
 
 def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, alpha: Any, beta: Any) -> StateSpace:
-    """A loop with one wall, its states in m, m/s and N in place of units of the period and the mass."""
+    """Return a loop with one wall, its states converted from normalized units to m, m/s and N.
+
+    Args:
+        scene: the scene.
+        build: function that builds the normalized loop from the chain, alpha and beta.
+        unit: SI unit of the ratio of output to input.
+        alpha: normalized stiffness of the wall.
+        beta: normalized damping of the wall.
+    """
     chain, period, mass = scene.loop.chain, scene.timing.period, float(scene.mass)
-    loop = build(chain, *one_wall(alpha, beta))
+    loop = build(chain, *read_single_wall(alpha, beta))
     force = mass / period**2
-    own = np.array(chain.state_units(1.0 / period, force))
-    waiting = realize_device(chain).A.shape[0] - own.size
-    filtered = loop.A.shape[0] - own.size - waiting
-    scale = np.concatenate([np.ones(filtered), own, np.full(waiting, force)])
+    device = np.array(chain.state_units(1.0 / period, force))
+    n_delayed = realize_device(chain).A.shape[0] - device.size
+    n_filter = loop.A.shape[0] - device.size - n_delayed
+    # The states are those of the velocity estimate, of the device, and the delayed forces.
+    scale = np.concatenate([np.ones(n_filter), device, np.full(n_delayed, force)])
     A, B = loop.A * scale[:, None] / scale, loop.B * scale[:, None] * unit
     return StateSpace(A, B, loop.C / scale, loop.D * unit, period)
 
 
-def to_control(scene: SceneAnswers, stiffness: Wall = None, virtual_damping: Wall = None) -> control.StateSpace:
+def to_control(scene: SceneAnalysis, stiffness: Wall = None, virtual_damping: Wall = None) -> control.StateSpace:
     """Return the closed loop of a scene and a wall as a model of python-control.
 
-    From a force held on the device (N) to the sensed position (m), exactly discretized: ``scene.state_space``.
+    The input is an external force on the device (N), the output the sensed position (m); see ``scene.state_space``.
 
     Args:
         scene: a `zwidth.Scene`.
-        stiffness: K of the wall in N/m, one number; the scene's own wall where neither is given.
+        stiffness: K of the wall in N/m, one number. Without K and B, the wall of the scene is used.
         virtual_damping: B of the wall in N s/m, one number.
 
     Returns:
         control.StateSpace with ``dt`` the sampling period; states in m, m/s and N.
 
     Raises:
-        InputError: python-control is not installed; it is not said which wall is meant.
+        InputError: python-control is not installed, or it is ambiguous which wall is meant.
 
     References:
         Fuller, Greiner, Moore, Murray, van Paassen, Yorke 2021 (python-control).
@@ -341,16 +359,16 @@ def to_control(scene: SceneAnswers, stiffness: Wall = None, virtual_damping: Wal
     try:
         import control
     except ImportError as error:
-        raise InputError("to_control: python-control is not installed; pip install control") from error
+        raise InputError("to_control: python-control is not installed; run pip install control") from error
     return control.StateSpace(*scene.state_space(stiffness, virtual_damping))
 
 
-def one_wall(alpha: np.ndarray, beta: np.ndarray) -> tuple[float, float]:
+def read_single_wall(alpha: np.ndarray, beta: np.ndarray) -> tuple[float, float]:
     """Return K and B (or alpha and beta) of one wall as floats; raise `InputError` for several walls."""
     alpha, beta = np.broadcast_arrays(alpha, beta)
     if alpha.size != 1:
-        raise InputError(f"stiffness, virtual_damping: got shape {alpha.shape}; one wall of finite numbers is needed")
+        raise InputError(f"stiffness, virtual_damping: got shape {alpha.shape}; pass one wall of finite numbers")
     for name, value in (("stiffness", alpha), ("virtual_damping", beta)):
         if not np.isfinite(value).all():
-            raise InputError(f"{name}: got {value.item():g}; a finite number is needed")
+            raise InputError(f"{name}: got {value.item():g}; pass a finite number")
     return float(alpha.reshape(())), float(beta.reshape(()))

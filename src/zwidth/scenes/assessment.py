@@ -1,4 +1,10 @@
-"""Assessment of one wall: stability, margins, passivity, and the limits of the device."""
+"""Assessment of one wall, and the improvements of a device that increase its maximum stiffness.
+
+`assess` collects stability, margins, passivity and the dominant pole of the wall of a scene, and its distances to the
+stability boundary in K and B, the stiffness and damping of the wall. K_max is the maximum stiffness of the device
+(`zwidth.Scene.max_stiffness`). An *improvement* changes one part or parameter by a step that is available in practice,
+such as half the delay; `limits_of` returns the K_max of each improved scene.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +19,7 @@ from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.parts.checks import Span
 from zwidth.parts.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.scenes.answers import allows_negative
-from zwidth.scenes.base import of_scene
+from zwidth.scenes.base import wrap_function
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
@@ -24,7 +30,7 @@ from zwidth.words.unit_system import LINEAR, UnitSystem
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
 
-# Of the fields below.
+# Units of the fields of `Assessment`, and reasons for a missing value; both for printing.
 _UNITS: dict[str, Any] = {
     **dict.fromkeys(("stable_stiffness", "stiffness_limit", "stiffness_max"), "N/m"),
     **dict.fromkeys(("stable_damping", "virtual_damping_lower", "virtual_damping_upper"), "N s/m"),
@@ -34,8 +40,8 @@ _UNITS: dict[str, Any] = {
 }
 _MISSING = {
     "passivity_margin": "no condition is known for these parts",
-    "delay_margin": "it could not be confirmed",
-    "phase_margin": "no frequency decides it",
+    "delay_margin": "not confirmed by the number of poles",
+    "phase_margin": "no gain crossover determines it",
     **dict.fromkeys(
         ("alpha_max", "beta_at_max", "stiffness_max", "virtual_damping_at_max", "ridge_frequency"), "no wall is stable"
     ),
@@ -47,37 +53,37 @@ Intervals: TypeAlias = tuple[tuple[float, float], ...]
 @shown(missing=_MISSING, **_UNITS)
 @dataclass(frozen=True)
 class Assessment:
-    """What `assess` finds of any scene; SI units unless a symbol is Greek. NaN where a quantity does not exist."""
+    """Results of `assess` for any scene, in SI units except for alpha, beta, delta and d; NaN if undefined."""
 
-    alpha: float  # the wall in units of the mass that its force acts on and of the period
-    beta: float
-    delta: float  # the damping to ground of that mass in the same units
-    d: float  # the delay in periods
-    stable: bool | None  # every pole lies strictly inside the unit circle; None: a measured response leaves it open
-    marginal: bool  # poles on the unit circle, none outside: one at z = 1 (K = 0), or all of a plant without damping
-    spectral_radius: float  # the largest pole magnitude, 1 to rounding where the decay is very slow
-    decay_rate: float  # of the slowest motion, in 1/s, with relative accuracy; negative for a growing one
-    stable_stiffness: Intervals  # every stable interval of K at this B, in N/m
-    stable_damping: Intervals  # every stable interval of B at this K, in N s/m
-    stiffness_limit: float  # the upper end of that interval of K which holds the wall or is the nearest to it
-    virtual_damping_lower: float  # the ends of that interval of B which holds the wall or is the nearest to it
-    virtual_damping_upper: float
-    passive: bool | None  # whatever the hand; with a coupling True is proved and False is not; None without a condition
-    passivity_margin: float  # the device's damping in excess of what a passive wall needs, in N s/m
-    alpha_max: float  # the stiffest stable wall of this device (`zwidth.Scene.max_stiffness`)
-    beta_at_max: float
-    stiffness_max: float  # the same in N/m and N s/m
-    virtual_damping_at_max: float
-    ridge_kind: str  # "smooth", "corner" or "no_damping"; "none" where no wall is stable
-    ridge_frequency: float  # of the pole pair on the unit circle there, in Hz
-    time_constant: float  # of the slowest pole, in s; negative for a growing one, infinite on the circle
-    frequency: float  # at which the slowest pole oscillates, in Hz; 0 for one that does not
-    gain_margin: float  # the factor by which K and B together may grow; below 1 the one to which they must fall
-    phase_margin: float  # in degrees; positive exactly for a stable wall
-    delay_margin: float  # how much more delay the wall bears, in s; NaN where it could not be confirmed
-    modulus_margin: float  # the least distance of the open loop from -1
-    gain_crossover: float  # where the first two are taken, in Hz
-    phase_crossover: float
+    alpha: float  # normalized stiffness K T^2/m, with period T and the mass m that the force of the wall acts on
+    beta: float  # normalized damping B T/m
+    delta: float  # normalized damping of the device, b T/m
+    d: float  # delay in periods
+    stable: bool | None  # all poles lie strictly inside the unit circle; None: undecided by a measured response
+    marginal: bool  # poles on the unit circle, none outside: one at z = 1 (K = 0), or all poles of an undamped plant
+    spectral_radius: float  # largest pole magnitude; rounds to 1 if the decay is very slow
+    decay_rate: float  # decay rate of the dominant pole in 1/s, accurate also if slow; negative for a growing response
+    stable_stiffness: Intervals  # all stable intervals of K at this B, in N/m
+    stable_damping: Intervals  # all stable intervals of B at this K, in N s/m
+    stiffness_limit: float  # upper end of the interval of K that contains the wall or is nearest to it
+    virtual_damping_lower: float  # lower end of the interval of B that contains the wall or is nearest to it
+    virtual_damping_upper: float  # upper end of that interval
+    passive: bool | None  # for any operator; with a coupling only sufficient; None if no condition is known
+    passivity_margin: float  # damping of the device minus that required for a passive wall, in N s/m
+    alpha_max: float  # normalized stiffness of the stiffest stable wall of the device
+    beta_at_max: float  # normalized damping of that wall
+    stiffness_max: float  # K_max, the stiffness of that wall in N/m
+    virtual_damping_at_max: float  # damping of that wall in N s/m
+    ridge_kind: str  # "smooth", "corner" or "no_damping"; "none" if no wall is stable
+    ridge_frequency: float  # frequency in Hz of the pole pair on the unit circle at K_max
+    time_constant: float  # time constant of the dominant pole in s; negative if growing, infinite on the unit circle
+    frequency: float  # frequency of the dominant pole in Hz; 0 if it does not oscillate
+    gain_margin: float  # factor on K and B together that moves a pole onto the unit circle; below 1: a reduction
+    phase_margin: float  # in degrees; positive if and only if the wall is stable
+    delay_margin: float  # additional delay in s up to which the wall is stable; NaN if it was not confirmed
+    modulus_margin: float  # smallest distance of the open loop from -1
+    gain_crossover: float  # frequency of the phase margin, in Hz
+    phase_crossover: float  # frequency of the gain margin, in Hz
     unit_system: UnitSystem = LINEAR
 
     def as_dict(self) -> dict[str, Any]:
@@ -88,16 +94,16 @@ class Assessment:
 _NUMBERS = [field.name for field in fields(Assessment) if field.name != "unit_system"]
 
 
-@of_scene
+@wrap_function
 def assess(scene: SceneOptima) -> Assessment:
-    """Judge the wall of a scene.
+    """Assess the wall of a scene.
 
     Args:
-        scene: device, timing, parts and wall.
+        scene: device, timing, wall and other parts.
 
     Returns:
-        Assessment: stability, distances to the boundary in K and in B, passivity, the stiffest stable wall of the
-        device, the slowest pole, and the margins of control engineering.
+        Assessment: stability, stable intervals of K and B, passivity, the stiffest stable wall of the device, the
+        dominant pole, and gain, phase, delay and modulus margins.
 
     Raises:
         InputError: the scene has no wall.
@@ -113,25 +119,31 @@ def assess(scene: SceneOptima) -> Assessment:
         (True, False)
     """
     # Compute the dominant pole first, because this raises an error if the loop has too many poles.
-    slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
-    stands, best, known = scene.margins(), scene.max_stiffness(), not find_unsupported_reason(**vars(scene.device))
-    margin = float(scene.passivity_margin()) if known else math.nan
+    dominant, period = scene.loop.find_dominant(float(scene.alpha), float(scene.beta)), scene.timing.period
+    margins, best, has_condition = (
+        scene.margins(),
+        scene.max_stiffness(),
+        not find_unsupported_reason(**vars(scene.device)),
+    )
+    margin = float(scene.passivity_margin()) if has_condition else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
-    row, column = (tuple(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
-    lower, upper = nearest_interval(column, scene.wall.virtual_damping)
+    in_stiffness, in_damping = (
+        tuple(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping())
+    )
+    lower, upper = find_nearest_interval(in_damping, scene.wall.virtual_damping)
     stable = bool(scene.is_stable())
     return Assessment(
         **{name: float(value) for name, value in scene.normalized._asdict().items()},
         stable=stable or (None if scene.explain_undecided() else False),
-        marginal=slowest.marginal,
-        spectral_radius=slowest.radius,
-        decay_rate=slowest.rate / period,
-        stable_stiffness=row,
-        stable_damping=column,
-        stiffness_limit=nearest_interval(row, scene.wall.stiffness)[1],
+        marginal=dominant.marginal,
+        spectral_radius=dominant.radius,
+        decay_rate=dominant.rate / period,
+        stable_stiffness=in_stiffness,
+        stable_damping=in_damping,
+        stiffness_limit=find_nearest_interval(in_stiffness, scene.wall.stiffness)[1],
         virtual_damping_lower=lower,
         virtual_damping_upper=upper,
-        passive=margin > 0 if known else None,
+        passive=margin > 0 if has_condition else None,
         passivity_margin=margin,
         alpha_max=float(top[0]),
         beta_at_max=float(top[1]),
@@ -139,44 +151,54 @@ def assess(scene: SceneOptima) -> Assessment:
         virtual_damping_at_max=float(best.virtual_damping),
         ridge_kind=name_kind(best),
         ridge_frequency=float(best.frequency),
-        time_constant=math.inf if slowest.rate == 0 else period / slowest.rate,
-        frequency=slowest.angle / (2.0 * math.pi * period),
-        **{name: float(getattr(stands, name)) for name in _MARGINS},
+        time_constant=math.inf if dominant.rate == 0 else period / dominant.rate,
+        frequency=dominant.angle / (2.0 * math.pi * period),
+        **{name: float(getattr(margins, name)) for name in _MARGINS},
         unit_system=scene.unit_system,
     )
 
 
 def name_kind(wall: StiffestWall) -> str:
-    """The kind of a stiffest wall in words, "none" where there is no such wall."""
+    """Return the kind of a stiffest wall in lower case, such as "smooth"; "none" if no wall is stable."""
     return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
 
 
 def round_margin(
     name: str, margins: Assessment | Margins, stable: bool | None, digits: int = 4, *, decibel: bool = False
 ) -> float:
-    """A margin in few digits, rounded so that a wall bears what is read, or that an unstable one is stable by it."""
+    """Return a margin in few digits, rounded conservatively.
+
+    A change by the rounded margin leaves a stable wall stable, and makes an unstable wall stable.
+
+    Args:
+        name: field of the margin.
+        margins: object with this field.
+        stable: stability of the wall.
+        digits: significant digits.
+        decibel: True to return a gain margin in dB.
+    """
     value = float(getattr(margins, name))
-    # A gain margin may be a factor below 1 of a stable wall, too.
+    # A stable wall may also have a gain margin below 1, if a reduction of the gain makes it unstable.
     outward = name == "gain_margin" and (value > 1.0) != bool(stable)
     return round_safely(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
 
 
-def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
-    """The interval that holds a value or is the nearest to it; NaN where there is none."""
+def find_nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
+    """Return the interval that contains a value or is nearest to it; NaN if there are no intervals."""
     away = [max(low - value, value - high, 0.0) for low, high in intervals]
     return intervals[away.index(min(away))] if away else (math.nan, math.nan)
 
 
 def assess_many(scenes: Iterable[SceneOptima] | Mapping[str, SceneOptima]) -> list[dict[str, Any]]:
-    """Judge the walls of many scenes, one record each; a scene that has no answer leaves the others alone.
+    """Assess the walls of many scenes; an error in one scene does not affect the others.
 
     Args:
         scenes: scenes of any kind, or a mapping of names to scenes.
 
     Returns:
-        A list of dicts with the same keys, a row of a table each: ``scene``, its name or number; ``status`` and
-        ``message`` ("OK" and nothing, or "INVALID_INPUT" and why); every parameter by its dotted path; and what
-        `assess` finds, None where a scene has no such number. ``csv.DictWriter`` writes them as they are.
+        A list of dictionaries with equal keys, one per scene: ``scene``, its name or index; ``status`` and ``message``
+        ("OK" and "", or "INVALID_INPUT" and the reason); all parameters by dotted path; and the fields of `Assessment`.
+        Values that a scene does not have are None. ``csv.DictWriter`` accepts the dictionaries as rows.
 
     References:
         Hulin, Preusche, Hirzinger 2006, sections V to VIII.
@@ -190,26 +212,27 @@ def assess_many(scenes: Iterable[SceneOptima] | Mapping[str, SceneOptima]) -> li
         [('slow', 'OK', False), ('fast', 'OK', True), ('refused', 'INVALID_INPUT', None)]
     """
     named: Any = scenes.items() if isinstance(scenes, Mapping) else enumerate(scenes)
-    records = [_record(name, scene) for name, scene in named]
-    given = [name for record in records for name in record if name not in _NUMBERS]
-    names = list(dict.fromkeys([*given, *_NUMBERS]))
+    records = [_build_record(name, scene) for name, scene in named]
+    parameters = [name for record in records for name in record if name not in _NUMBERS]
+    names = list(dict.fromkeys([*parameters, *_NUMBERS]))
     return [{name: record.get(name) for name in names} for record in records]
 
 
-def _record(name: str | int, scene: SceneOptima) -> dict[str, Any]:
+def _build_record(name: str | int, scene: SceneOptima) -> dict[str, Any]:
+    """Assess one scene for `assess_many`: name, status, parameters and results."""
     head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
     try:
         if not isinstance(scene, SceneOptima):
-            raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed")
+            raise InputError(f"scene: got {scene!r}; pass a zwidth.Scene")
         verdict = assess(scene).as_dict()
     except InputError as error:
         verdict, head = {}, head | {"status": Status.INVALID_INPUT.name, "message": str(error)}
-    own = scene.parameters() if isinstance(scene, SceneOptima) else {}
-    return head | own | verdict
+    values = scene.parameters() if isinstance(scene, SceneOptima) else {}
+    return head | values | verdict
 
 
-# What somebody can buy of a parameter, by its path: the factor on it, and the words.
-_STEPS = {
+# Improvements that are available in practice, by the path of the parameter: the factor on its value, and a description.
+IMPROVEMENTS = {
     "delay": (0.5, "half the delay"),
     "damping": (1.1, "10 % more damping of the device"),
     "velocity.cutoff": (2.0, "a velocity filter twice as fast"),
@@ -234,8 +257,8 @@ class Limit(NamedTuple):
     def spell(self) -> str:
         """Describe the improvement and the increase of the stiffness that it brings."""
         K = with_unit(round_safely(self.stiffness, "below"), find_unit(self, "N/m"))
-        kept = f"; {self.note}" if self.note else ""
-        return f"{self.words}: {K} (x {plain(self.gain, 3)}{kept})"
+        note = f"; {self.note}" if self.note else ""
+        return f"{self.words}: {K} (x {plain(self.gain, 3)}{note})"
 
 
 class Improvement(NamedTuple):
@@ -247,9 +270,9 @@ class Improvement(NamedTuple):
     note: str = ""  # quantity that stays constant
 
 
-@of_scene
+@wrap_function
 def limits_of(scene: SceneOptima) -> list[Limit]:
-    """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
+    """Compute K_max of a scene after improvements of single parts, to find what limits its maximum stiffness.
 
     Each part and parameter of the scene is improved separately, by a step that is available in practice: twice the
     rate, half the delay, 10 % more damping, a filter or an amplifier twice as fast, a window half as long, a coupling
@@ -258,15 +281,15 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
     constant in periods. If twice the cutoff exceeds the Nyquist frequency, the filter is removed instead.
 
     Args:
-        scene: a scene of plain numbers.
+        scene: a scene whose parameters are plain numbers.
 
     Returns:
-        One record each, the largest gain first. What makes the wall softer is listed as well, with a gain below 1: a
-        filter may help as it is. A filter given by its coefficients has no steps, and no rate but its own. NaN where a
-        K_max cannot be computed; those come last.
+        List of `Limit`, one per improvement, the largest gain first. Changes that reduce K_max are included, with a
+        gain below 1, because a filter may also increase K_max. A filter given by its coefficients is not changed and
+        excludes other rates. NaN if K_max cannot be computed; these entries are last.
 
     References:
-        Hulin, Preusche, Hirzinger 2006, section VII (what damping, mass, rate and delay change of a rigid device).
+        Hulin, Preusche, Hirzinger 2006, section VII (influence of damping, mass, rate and delay on a rigid device).
 
     Example:
         >>> import zwidth
@@ -275,17 +298,17 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
         >>> [limit.words for limit in zwidth.limits_of(scene)][:2]
         ['twice the rate', 'half the delay']
     """
-    return compute_gains(scene, _stiffness(scene), _stiffness)
+    return compute_gains(scene, _compute_max_stiffness(scene), _compute_max_stiffness)
 
 
 def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima], float]) -> list[Limit]:
-    """Return all improvements by the increase of the stiffness that ``measure`` computes, largest first, NaN last."""
-    found = []
+    """Return all improvements, sorted by their gain in the stiffness from ``measure``: largest first, NaN last."""
+    limits = []
     for name, words, improved, note in list_improvements(scene):
         stiffness = measure(improved)
-        found.append(Limit(name, words, stiffness, stiffness / now, note))
-    found.sort(key=lambda limit: (not limit.gain >= 0, -limit.gain))
-    return with_units(ResultList(found), scene.unit_system)
+        limits.append(Limit(name, words, stiffness, stiffness / now, note))
+    limits.sort(key=lambda limit: (not limit.gain >= 0, -limit.gain))
+    return with_units(ResultList(limits), scene.unit_system)
 
 
 def describe_islands(scene: SceneOptima) -> list[str]:
@@ -298,18 +321,16 @@ def describe_islands(scene: SceneOptima) -> list[str]:
     for island in scene.islands():
         units = {"K": (island.stiffness, system["N/m"]), "B": (island.virtual_damping, system["N s/m"])}
         ends = (f"{name} from {' to '.join(tell_apart(*ends, u))}" for name, (ends, u) in units.items())
-        lines.append(
-            f"an island of stable walls, {', '.join(ends)}: no stable softer walls lead to it, K_max leaves it out"
-        )
+        lines.append(f"an island of stable walls, {', '.join(ends)}, is not connected to K = 0 and excluded from K_max")
     return lines
 
 
-def _stiffness(scene: SceneOptima) -> float:
-    """K_max in N/m; NaN where there is none or it cannot be computed."""
+def _compute_max_stiffness(scene: SceneOptima) -> float:
+    """Return K_max in N/m; NaN if no wall is stable or K_max cannot be computed."""
     try:
         return float(scene.max_stiffness().stiffness)
     except InputError:
-        # At twice the rate a long delay may be more periods than the model is computed for.
+        # At twice the rate a long delay may have more periods than the model supports.
         return math.nan
 
 
@@ -324,7 +345,7 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
             note = f"the delay stays {present.timing.kept_delay}" if timing.delay else ""
             yield Improvement(name, "twice the rate", _double_rate(present), note)
     values = scene.parameters()
-    for path, (factor, words) in _STEPS.items():
+    for path, (factor, words) in IMPROVEMENTS.items():
         if not (now := values.get(path)):
             continue
         better = max(1, round(factor * now)) if isinstance(now, int) else factor * now
@@ -335,7 +356,7 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
             try:
                 improved.check_parts()
             except InputError:
-                # Beyond half the rate there is no filter.
+                # Remove the filter, because a cutoff above the Nyquist frequency is not possible.
                 improved, words = scene.replace(velocity=BackwardDifference()), "no velocity filter"
         yield Improvement(path.partition(".")[0], words, improved)
     if scene.device.modes:
@@ -362,14 +383,15 @@ def _double_rate(scene: SceneOptima) -> SceneOptima:
     return scene.replace(**changes)
 
 
-def passive_edge(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
-    """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping."""
-    # The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
-    own, units = float(scene.device.damping), scene.units
-    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, directions)
-    # The smallest cosines are rounded zeros.
-    stiffness, damping = np.maximum(np.cos(turn), 0.0) * units.stiffness, np.sin(turn) * units.virtual_damping
-    needed = own - np.asarray(scene.passivity_margin(stiffness, damping))
-    if own == 0:
+def trace_passivity_boundary(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
+    """Return K and B on the boundary of the passive walls with K >= 0, by increasing B; empty if undamped."""
+    # The damping required for passivity is proportional to the distance of (K, B) from the origin. Therefore compute it
+    # for one wall in each direction, and scale the wall until the required damping equals that of the device.
+    device_damping, units = float(scene.device.damping), scene.units
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, directions)
+    # Clip the cosines, because rounding errors may make them negative at the ends.
+    stiffness, damping = np.maximum(np.cos(angle), 0.0) * units.stiffness, np.sin(angle) * units.virtual_damping
+    needed = device_damping - np.asarray(scene.passivity_margin(stiffness, damping))
+    if device_damping == 0:
         return np.empty(0), np.empty(0)
-    return stiffness / needed * own, damping / needed * own
+    return stiffness / needed * device_damping, damping / needed * device_damping

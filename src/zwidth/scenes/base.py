@@ -1,4 +1,14 @@
-"""The parts of a loop as people have them: device, timing, velocity estimate, hand; normalized, with its loop."""
+"""Parts of a scene: device, timing, wall, velocity estimate, operator, safe limit; and its normalized quantities.
+
+`SceneParts` is the base class of `zwidth.Scene`. It checks that the parts fit together, normalizes them (unit of time:
+the sampling period T; unit of mass: the mass m that the force of the wall acts on), and selects the implementation of
+all analyses, `zwidth.scenes.loop`. The normalized quantities are
+
+    alpha = K T^2/m      beta = B T/m      delta = b T/m      d = t_d/T
+
+with K and B the stiffness and damping of the wall, b the damping of the device and t_d its delay. The subclasses in the
+other modules of this package add the analyses; `wrap_methods` makes their results print in the units of the device.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +44,7 @@ Owner = TypeVar("Owner", bound="SceneParts")
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-# What each part may be, and an example.
+# Allowed types of each part, and an example for messages.
 _KINDS = {
     "device": (Device | LinearDevice | MeasuredDevice, "zwidth.Device(mass=0.1, damping=10)"),
     "timing": (Timing, "zwidth.Timing(period=1e-3, delay=1e-3)"),
@@ -55,7 +65,7 @@ class WallSI(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class SceneParts(Part):
-    """What every question of `zwidth.Scene` is about."""
+    """Parts of a `zwidth.Scene`, and quantities derived from them."""
 
     device: Device | LinearDevice | MeasuredDevice
     timing: Timing
@@ -65,68 +75,69 @@ class SceneParts(Part):
     safe_limit: SafeLimit | None = None
 
     def __post_init__(self) -> None:
+        """Check the types and units of the parts, and the operator; raise `InputError` if they do not fit together."""
         if isinstance(self.wall, Velocity):
-            self._move_up()
+            self._shift_parts()
         for name, (kind, example) in _KINDS.items():
             part = getattr(self, name)
             if not isinstance(part, kind):
-                raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {example}")
+                raise InputError(f"{name}: got {part!r}; pass an object such as {example}")
         named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit")}
         check_kind(self.unit_system.rotary, named)
         if self.operator is not None and not isinstance(self.device, Device):
             raise InputError(
-                "operator: a hand holds a body, and of this device no body is known; make the hand a part of it"
+                "operator: allowed only with a zwidth.Device; include the hand in the model of this device"
             )
 
-    def _move_up(self) -> None:
-        """Without a wall the velocity estimate is the third part, and the hand the fourth."""
+    def _shift_parts(self) -> None:
+        """Assign positional arguments passed without a wall: velocity estimate third, operator fourth."""
         estimate, fourth, hand = self.wall, self.velocity, self.operator
         if isinstance(fourth, Operator) and hand is None:
             hand = fourth
         elif fourth != BackwardDifference():
-            raise InputError(f"wall: got {estimate!r}, and {fourth!r} as the velocity as well; name parts that follow")
+            raise InputError(f"wall: got {estimate!r}, but velocity is given too, as {fourth!r}; name the parts")
         moved = {"wall": NoWall(), "velocity": estimate, "operator": hand}
         for name, part in moved.items():
             object.__setattr__(self, name, part)
 
     @cached_property
     def parts_beyond(self) -> tuple[str, ...]:
-        """What makes it more than a rigid mass with the difference of two samples: names of its parts."""
+        """Names of the parts that a rigid mass with the backward difference lacks; `RigidLoop` requires none."""
         hand = self.operator
         grasp = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
-        within = {"velocity": is_plain(self.velocity, self.timing.period), "operator": grasp}
+        basic = {"velocity": is_plain(self.velocity, self.timing.period), "operator": grasp}
         device = () if isinstance(self.device, Device) else ("device",)
-        return device + tuple(name for name in find_parts(self) if not within.get(name))
+        return device + tuple(name for name in find_parts(self) if not basic.get(name))
 
     @cached_property
     def loop(self) -> LinearLoop:
-        """Its loop, normalized, that answers every question about its walls."""
+        """The normalized loop, with the fastest implementation that supports these parts."""
         if isinstance(self.device, MeasuredDevice):
             return MeasuredLoop(self)
         return LinearLoop(make_plain(self)) if self.parts_beyond else RigidLoop(self)
 
     def check_parts(self) -> None:
-        """Raise `InputError` for what its parts refuse only together, such as a cut-off beyond half the rate."""
+        """Raise `InputError` for parts that are valid only separately, such as a cutoff above the Nyquist frequency."""
         _ = self.loop.walls if isinstance(self.loop, MeasuredLoop) else self.loop.roots
 
     @cached_property
     def mass(self) -> Any:
-        """The mass that the wall's force acts on, in kg: the unit of the normalized stiffness."""
-        return self._with_hand("mass")
+        """The mass in kg that the force of the wall acts on, with that of a rigidly coupled operator."""
+        return self._add_rigid_operator("mass")
 
     @cached_property
     def damping(self) -> Any:
-        """The damping to ground of that mass, in N s/m."""
-        return self._with_hand("damping")
+        """The damping to ground of `mass`, in N s/m, with that of a rigidly coupled operator."""
+        return self._add_rigid_operator("damping")
 
-    def _with_hand(self, name: str) -> Any:
-        """A number of the device, with that of a hand that holds it rigidly."""
-        held = self.operator is not None and self.operator.rigid and self.device.coupling is None
-        return getattr(self.device, name) + (getattr(self.operator, name) if held else 0.0)
+    def _add_rigid_operator(self, name: str) -> Any:
+        """Return a parameter of the device, plus that of an operator coupled rigidly to a device without coupling."""
+        is_rigid = self.operator is not None and self.operator.rigid and self.device.coupling is None
+        return getattr(self.device, name) + (getattr(self.operator, name) if is_rigid else 0.0)
 
     @cached_property
     def normalized(self) -> Normalized:
-        """``alpha``, ``beta``, ``delta``, ``d`` of this scene and its wall."""
+        """The normalized parameters ``alpha``, ``beta``, ``delta``, ``d`` of this scene and its wall."""
         return normalize(
             mass=self.mass,
             damping=self.damping,
@@ -153,12 +164,12 @@ class SceneParts(Part):
 
     @cached_property
     def delta(self) -> float:
-        """Normalized damping of the device, with that of a hand held rigidly."""
+        """Normalized damping of the device, with that of a rigidly coupled operator."""
         return self.normalized.delta
 
     @property
-    def own_delta(self) -> float:
-        """The same without the hand: what passivity, which is for any hand, counts on."""
+    def device_delta(self) -> float:
+        """Normalized damping of the device without the operator, used for passivity, which holds for any operator."""
         return self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
 
     @cached_property
@@ -167,12 +178,12 @@ class SceneParts(Part):
         return self.timing.d
 
     @property
-    def whole_delay(self) -> int:
-        """Whole periods of it."""
+    def integer_delay(self) -> int:
+        """Integer part n of the delay in periods."""
         return int(np.floor(self.d))
 
     def to_si(self, *, alpha: ArrayLike = 0.0, beta: ArrayLike = 0.0) -> Physical:
-        """Stiffness in N/m and damping in N s/m of a normalized wall on this device."""
+        """Return stiffness in N/m and damping in N s/m of a normalized wall on this device."""
         return denormalize(
             mass=self.mass, period=self.timing.period, alpha=alpha, beta=beta, delta=self.delta, d=self.d
         )
@@ -190,26 +201,26 @@ class SceneParts(Part):
         return with_units(WallSI(mass / period / period, mass / period), self.unit_system)
 
     def parameters(self) -> dict[str, Any]:
-        """Every number of every part by its dotted path.
+        """Return all numerical parameters of all parts by dotted path.
 
         Returns:
             For example ``{"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 0.0, "velocity.cutoff": 100.0, ...}``;
-            the wall's ``stiffness`` and ``virtual_damping`` come last. What is left out (None) is not listed, nor what
-            is chosen by a word, as ``coupling.sensor``, and the coefficients of a filter.
+            ``stiffness`` and ``virtual_damping`` of the wall come last. Optional parameters that are not given (None),
+            choices such as ``coupling.sensor``, and the coefficients of a filter are not listed.
         """
         return list_parameters(self)
 
     def replace(self, **changes: Any) -> Self:
-        """A new scene with one or several parameters changed; all others stay as they are, in SI units.
+        """Return a new scene with some parameters changed, in SI units; all other parameters stay the same.
 
         A delay given in periods keeps its number of periods if the period changes.
 
         Args:
-            **changes: by dotted path, as ``**{"velocity.cutoff": 50}``, ``period=5e-4`` or ``rate=2000``; or a whole
-                part, as ``operator=zwidth.Operator(mass=0.5)``.
+            **changes: new values by dotted path, such as ``**{"velocity.cutoff": 50}``, ``period=5e-4`` or
+                ``rate=2000``; or a whole part, such as ``operator=zwidth.Operator(mass=0.5)``.
 
         Raises:
-            InputError: no part of this scene has such a parameter, or the value is refused.
+            InputError: no part of this scene has the parameter, or the value is not allowed.
 
         Example:
             >>> import zwidth
@@ -220,30 +231,30 @@ class SceneParts(Part):
         at_rate = {"period", "rate", "delay", "timing"} & changes.keys()
         if at_rate and isinstance(changes.get("device", self.device), MeasuredDevice):
             raise InputError(
-                f"{min(at_rate)}: a measured response holds the rate and the delay that it was measured with; measure "
-                "again at others"
+                f"{min(at_rate)}: cannot change, because a measured response is valid for one rate and delay; "
+                "measure again"
             )
-        made = replace_parameters(self, changes)
-        if made.unit_system != self.unit_system and not {"device", "rotary"} & changes.keys():
+        changed_scene = replace_parameters(self, changes)
+        if changed_scene.unit_system != self.unit_system and not {"device", "rotary"} & changes.keys():
             raise InputError(
-                f"{', '.join(changes)}: these changes make the device {made.unit_system.value}, but its other "
-                "parameters have other units; make a new zwidth.Scene"
+                f"{', '.join(changes)}: these changes make the device {changed_scene.unit_system.value}, but its other "
+                "parameters have other units; create a new zwidth.Scene"
             )
         changed = sorted(changes.keys() - {"wall", "safe_limit", *WALL})
         if self.safe_limit is None or not changed or "safe_limit" in changes:
-            return made
+            return changed_scene
         return replace(
-            made,
+            changed_scene,
             safe_limit=self.safe_limit.warn(
                 f"{' and '.join(changed)} changed after the safe limit was measured; measure again"
             ),
         )
 
 
-def of_scene(
+def wrap_function(
     function: Callable[Concatenate[Owner, Parameters], Result],
 ) -> Callable[Concatenate[Owner, Parameters], Result]:
-    """Wrap a function of a scene: check the scene, and show the result in the units of its device."""
+    """Wrap a function of a scene so that it checks the scene and its result prints in the units of the device."""
 
     @wraps(function)
     def checked(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
@@ -256,7 +267,7 @@ def of_scene(
 def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Collection[str]) -> None:
     """Wrap the public methods of a scene class, except those in ``but``.
 
-    Their results are shown in the units of the device. Methods that are not ``traceable`` raise `InputError` for traced
+    Their results print in the units of the device. Methods that are not ``traceable`` raise `InputError` for traced
     values.
     """
     for name in dir(kind):
@@ -266,6 +277,8 @@ def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Col
 
 
 def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], traceable: bool) -> Callable[..., Result]:
+    """Wrap one method for `wrap_methods`."""
+
     @wraps(method)
     def wrapped(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         if not traceable and (scene.traced_path is not None or is_traced(*args, *kwargs.values())):
@@ -275,18 +288,18 @@ def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], trace
     return wrapped
 
 
-def refuse_traced(question: str, scene: SceneParts, arguments: Mapping[str, Any]) -> None:
-    """Raise `InputError` if JAX traces a parameter of the scene or an argument of the method ``question``."""
+def refuse_traced(method: str, scene: SceneParts, arguments: Mapping[str, Any]) -> None:
+    """Raise `InputError` if JAX traces a parameter of the scene or an argument of the method ``method``."""
     traced = scene.traced_path or next((name for name, value in arguments.items() if is_traced(value)), None)
     if traced is not None:
         raise InputError(
-            f"{traced}: got a value that JAX traces; {question} needs numbers: call it outside of jit, vmap and grad"
+            f"{traced}: got a value traced by JAX; call {method} with plain numbers, outside jit, vmap and grad"
         )
 
 
-def check_scene(scene: object, question: str = "this function") -> None:
+def check_scene(scene: object, method: str = "this function") -> None:
     """Raise `InputError` if an object is not a scene, or if JAX traces one of its parameters."""
     if not isinstance(scene, SceneParts):
         example = "zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3))"
-        raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed, as {example}")
-    refuse_traced(question, scene, {})
+        raise InputError(f"scene: got {scene!r}; pass a zwidth.Scene, such as {example}")
+    refuse_traced(method, scene, {})

@@ -1,4 +1,8 @@
-"""Cautions about a recommended wall: small margins, slow decay, destabilizing grasps, each with its remedy."""
+"""Cautions about a recommended wall: small margins, slow decay and destabilizing grasps, each with its remedy.
+
+A remedy is an option of ``zwidth recommend``, i.e. another requirement, whose wall has no such problem. It is printed
+with this wall and its cost in stiffness.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +59,7 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
             recommendation,
             options,
             lambda improved: all(judge_grasps(improved).values()),
-            "no wall was found that is stable in every grasp",
+            "no wall found that is stable in every grasp",
         )
         cautions.append(f"unstable in the hand ({'; '.join(unstable)}); {advice}")
     return tuple(cautions)
@@ -94,8 +98,8 @@ def judge_grasps(scene: Any) -> dict[str, bool]:
     """
     if not isinstance(scene.device, Device):
         return {}
-    held = list_grasps(scene.unit_system.rotary)
-    hands = [*held, *([("released", None)] if scene.operator is not None else [])]
+    grasps = list_grasps(scene.unit_system.rotary)
+    hands = [*grasps, *([("released", None)] if scene.operator is not None else [])]
     labels: dict[str, bool] = {}
     for name, grasp in hands:
         labels[name] = labels.get(name, True) and bool(scene.replace(operator=grasp).is_stable())

@@ -10,8 +10,8 @@ import numpy as np
 
 from zwidth.parts.checks import check_limit, check_number
 from zwidth.parts.wall import VirtualWall, resolve_wall
-from zwidth.scenes.answers import one_wall
-from zwidth.scenes.base import of_scene
+from zwidth.scenes.answers import read_single_wall
+from zwidth.scenes.base import wrap_function
 from zwidth.scenes.remedies import search_remedies
 from zwidth.scenes.stabilization import Remedy, stabilize
 from zwidth.scenes.stiffest import SceneOptima
@@ -136,7 +136,7 @@ class Diagnosis:
         return to_json(values | {"remedies": remedies})
 
 
-@of_scene
+@wrap_function
 def diagnose(
     scene: SceneOptima,
     stiffness: float | str | None = None,
@@ -187,7 +187,7 @@ def diagnose(
         'quantization'
     """
     units = scene.unit_system
-    K, B = one_wall(*map(np.asarray, resolve_wall(scene.wall, stiffness, virtual_damping, units)))
+    K, B = read_single_wall(*map(np.asarray, resolve_wall(scene.wall, stiffness, virtual_damping, units)))
     sliding = check_number("coulomb", coulomb, units["N"])
     hardware = Hardware(
         check_number("resolution", resolution, units["m"]),
@@ -218,7 +218,7 @@ def diagnose(
 
 def _find_dominant(scene: Any) -> Any:
     """Return the dominant pole of the loop of a scene with its wall."""
-    return scene.loop.slowest(float(scene.alpha), float(scene.beta))
+    return scene.loop.find_dominant(float(scene.alpha), float(scene.beta))
 
 
 def _find_cause(experiment: Experiment, worst: SustainedMotion, dominant: Any) -> Cause:

@@ -1,8 +1,14 @@
-"""The loop of a scene, normalized: every question about its walls under one name, answered by two kernels.
+"""Normalized loop of a scene with one interface for all analyses of its walls, and two implementations.
 
-`LinearLoop` answers of any linear loop, by its roots and by the boundary of its walls, which is laid out once.
-`RigidLoop` is the loop of a rigid mass with the difference of two samples: where there is a closed form it answers by
-that, and lays nothing out. A scene picks its loop once (`zwidth.Scene.loop`); above, nobody asks which one it is.
+`LinearLoop` supports every linear loop. It computes with the poles and zeros of the loop without a wall, and with the
+stability boundary in the plane of alpha and beta, which it traces once (docs/theory/scenes.md). `RigidLoop` supports a
+rigid mass with the backward difference and replaces most methods by closed forms (docs/theory/one-crossover.md).
+`zwidth.scenes.measured_loop.MeasuredLoop` supports a measured frequency response. `zwidth.Scene.loop` selects the
+implementation once; its callers do not depend on which one is selected.
+
+Walls are given by their normalized stiffness alpha and damping beta, angles are w = omega T, and the period T is the
+unit of time. A wall is *connected to K = 0* if a path of stable walls leads from it to alpha = 0; a piece of the stable
+set that is not connected to K = 0 is an *island*. The *ridge* is the stiffest stable wall connected to K = 0.
 """
 
 from __future__ import annotations
@@ -54,87 +60,91 @@ from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.xp import is_jax, is_traced, namespace, nan_beyond
 
-# Largest log|z| of a lossless loop whose poles count as on the unit circle. A rounding error of 1e-16 moves a double
+# Largest log|z| of poles that count as on the unit circle, in a lossless loop. A rounding error of 1e-16 moves a double
 # pole by its square root, about 1e-8.
-_ON_CIRCLE = 1e-7
+ON_CIRCLE = 1e-7
 
 
-class SlowestMotion(NamedTuple):
-    """The slowest motion of a loop with one wall."""
+class DominantPole(NamedTuple):
+    """The dominant pole of a loop with one wall."""
 
-    marginal: bool  # poles on the unit circle, none outside: one at z = 1, or all of a plant without damping
-    radius: float  # the spectral radius
-    rate: float  # -log(radius) per period, with relative accuracy
-    angle: float  # of the slowest pole, per period
+    marginal: bool  # poles on the unit circle, none outside: one at z = 1, or all poles of an undamped plant
+    radius: float  # spectral radius
+    rate: float  # decay rate -log(radius) per period, accurate in relative terms also if the radius rounds to 1
+    angle: float  # angle of the dominant pole, in rad per period
 
 
 @dataclass(frozen=True, eq=False)
 class LinearLoop:
-    """The loop of any scene with a linear velocity estimate; alpha and beta are arrays of one shape."""
+    """Loop of any scene with a model; alpha and beta are arrays of equal shape unless stated otherwise."""
 
     scene: Any
-    # Cache of the stiffest walls, by "negative damping allowed".
+    # Cache of the ridge, by whether negative damping is allowed.
     _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
-    # Number of random devices in an interactive computation; one maximum stiffness takes some 10 to 50 ms.
+    # Default number of random devices for tolerances; the maximum stiffness of one device takes 10 to 50 ms.
     draws: ClassVar[int] = 200
     # True if the methods that take walls work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
-    # Largest window and delay in a search, in periods; its run time increases with their square.
+    # Largest window and delay that other modules search, in periods; the run time increases with their square.
     most_periods: ClassVar[float] = 128
 
     @cached_property
     def chain(self) -> AnyChain:
-        """Its masses, springs and dampers, or its linear system."""
-        # A search of numbers: what JAX traces is refused by name.
+        """The masses, springs and dampers of the loop, or its linear system."""
+        # Raise an error with the name of a traced parameter, because the analyses need plain numbers.
         for path, value in list_parameters(self.scene).items():
             as_float64(path, value)
         return chain_of(self.scene)
 
     @cached_property
     def roots(self) -> LoopRoots:
-        """The loop without a wall, by roots."""
+        """Poles and zeros of the loop without a wall."""
         return find_roots(self.chain)
 
     @cached_property
     def boundary(self) -> Boundary:
-        """The boundary of its walls, laid out once."""
+        """The stability boundary, traced once."""
         return Boundary.trace(self.roots)
 
     @cached_property
-    def _in_powers(self) -> tuple[LoopRoots, int]:
-        """The loop of which its own has the k-th roots as poles, and k: they come k at a time, and so would edges."""
+    def _contracted(self) -> tuple[LoopRoots, int]:
+        """The loop whose poles are the k-th powers of the poles of this loop, and the largest such k; usually k = 1.
+
+        If k > 1, groups of k poles of this loop reach the unit circle together, so k edges of its stable set would
+        coincide. The stable set is therefore computed from the loop in z^k.
+        """
         return self.roots.contract_powers()
 
     @cached_property
-    def border(self) -> StableSet:
-        """The edge of its stable set."""
-        roots, k = self._in_powers
+    def stable_set(self) -> StableSet:
+        """The stable set, by its pieces and their edges."""
+        roots, k = self._contracted
         return StableSet(self.boundary if k == 1 else Boundary.trace(roots))
 
     @cached_property
     def poles_sought(self) -> int:
-        """How many poles a spectral radius is computed from."""
+        """Number of poles from which a spectral radius is computed."""
         return self.roots.order
 
     def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """Whether walls are stable; the two need only broadcast."""
+        """Return whether walls are stable; alpha and beta may broadcast."""
         check_scalars({"alpha": alpha, "beta": beta})
         return label_walls(self.boundary, *nan_beyond(WALL_RANGE, alpha, beta))[()]
 
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod, exact: tuple[np.ndarray, np.ndarray]
     ) -> Stability:
-        """Return label, status and method of each wall; ``exact`` are the walls in SI units, for "certified"."""
-        # Device and delay were checked as the parts of the scene.
+        """Return label, status and method of each wall; ``exact`` is (K, B) in SI units, for the certified method."""
+        # Pass zeros for delta and d, because the parts of the scene were checked when they were created.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         if method == "certified":
             from zwidth.loops.linear.certified import decide_walls
 
-            stable, proved = decide_walls(self.scene, *exact)
+            stable, certified_status = decide_walls(self.scene, *exact)
             inside = status == Status.OK
-            stable, status = stable & inside, np.where(inside, proved, status)
+            stable, status = stable & inside, np.where(inside, certified_status, status)
             used = Method.CERTIFIED
         elif method == "companion":
             with np.errstate(invalid="ignore"):
@@ -146,64 +156,67 @@ class LinearLoop:
         return Stability(stable[()], status[()], np.full(stable.shape, used, np.int32)[()])
 
     def poles(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """All poles, along a new last axis."""
+        """Return all poles, along a new last axis."""
         return 1.0 + compute_poles_minus_one(self.roots, alpha, beta)
 
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """The spectral radius, below 1 exactly where a wall is stable; NaN where one is out of range."""
+        """Return the spectral radius, which is below 1 if and only if a wall is stable; NaN if out of range."""
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         stable = label_walls(self.boundary, alpha, beta).reshape(-1)
-        found = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)
-        return found.reshape(alpha.shape)[()]
+        radius = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)
+        return radius.reshape(alpha.shape)[()]
 
-    def slowest(self, alpha: float, beta: float) -> SlowestMotion:
-        """The slowest motion of one wall."""
+    def find_dominant(self, alpha: float, beta: float) -> DominantPole:
+        """Return the dominant pole of the loop with one wall."""
         if is_marginal(self.roots, alpha, beta):
-            return SlowestMotion(True, 1.0, 0.0, 0.0)
+            return DominantPole(True, 1.0, 0.0, 0.0)
         wall = np.array([alpha]), np.array([beta])
         zeta = compute_poles_minus_one(self.roots, *wall)[0]
-        slowest = zeta[np.argmax(log_modulus(zeta))]
-        turn = abs(np.arctan2(slowest.imag, 1.0 + slowest.real))
-        if self.boundary.are_lossless(wall[1])[0] and log_modulus(slowest) <= _ON_CIRCLE:
-            return SlowestMotion(True, 1.0, 0.0, float(turn))
-        return SlowestMotion(False, float(self.radius(*wall)[0]), -float(log_modulus(slowest)), float(turn))
+        dominant = zeta[np.argmax(log_modulus(zeta))]
+        angle = abs(np.arctan2(dominant.imag, 1.0 + dominant.real))
+        if self.boundary.are_lossless(wall[1])[0] and log_modulus(dominant) <= ON_CIRCLE:
+            return DominantPole(True, 1.0, 0.0, float(angle))
+        return DominantPole(False, float(self.radius(*wall)[0]), -float(log_modulus(dominant)), float(angle))
 
-    def row(self, beta: np.ndarray) -> np.ndarray:
-        """The stable intervals of alpha at each damping: shape (rows, intervals, 2), NaN where a row has fewer."""
+    def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
+        """Return the stable intervals of alpha for each beta, shape (n, intervals, 2); NaN if a beta has fewer."""
         return np.stack(find_stable_intervals(self.boundary, *nan_beyond(WALL_RANGE, beta))[:2], -1)
 
-    def column(self, alpha: float) -> np.ndarray:
-        """The stable intervals of beta at a stiffness: shape (intervals, 2)."""
+    def find_stable_beta(self, alpha: float) -> np.ndarray:
+        """Return the stable intervals of beta for one alpha, shape (intervals, 2)."""
         return find_stable_dampings(self.boundary, float(*nan_beyond(WALL_RANGE, alpha)))
 
-    def dampers(self) -> np.ndarray:
-        """Return the beta intervals, shape (n, 2), in which all poles of a damper but z = 1 lie inside the circle."""
+    def find_damper_intervals(self) -> np.ndarray:
+        """Return the intervals of beta, shape (n, 2), in which a wall with alpha = 0 is stable but for a pole at z = 1.
+
+        This pole exists unless the device has a spring to ground; all other poles lie inside the unit circle.
+        """
         damper = self.roots.as_damper()
         if damper is None:
-            return LinearLoop.column(self, 0.0)
+            return LinearLoop.find_stable_beta(self, 0.0)
         intervals = find_stable_intervals(Boundary.trace(damper), np.zeros(1))
         return np.stack([intervals.low[0], intervals.high[0]], -1)
 
     def explain(self, alpha: float, beta: float) -> list[str]:
-        """What keeps a wall undecided, a sentence each: nothing, where there is a model."""
+        """Return the reasons for an undecided wall: none, because the stability of a model is always decided."""
         return []
 
     def explain_limit(self) -> str:
         """Return the reason for an undecided stiffest wall: "", because the stability of a model is always decided."""
         return ""
 
-    def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
-        """Those above ``least`` whose walls lie in a piece of the stable set with soft walls."""
-        column = np.maximum(self.column(alpha), least).tolist()
-        return [(low, high) for low, high in column if low < high and self.holds_softly(alpha, 0.5 * (low + high))]
+    def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:
+        """Return the stable intervals of beta >= ``least`` for one alpha whose walls are connected to K = 0."""
+        intervals = np.maximum(self.find_stable_beta(alpha), least).tolist()
+        return [(low, high) for low, high in intervals if low < high and self.is_connected(alpha, 0.5 * (low + high))]
 
-    def holds_softly(self, alpha: float, beta: float) -> bool:
-        """Whether a path of stable walls leads from soft ones to a stable wall."""
-        return self.border.is_in_main(alpha, beta)
+    def is_connected(self, alpha: float, beta: float) -> bool:
+        """Return whether a stable wall is connected to K = 0."""
+        return self.stable_set.is_in_main(alpha, beta)
 
     def islands(self, least: float) -> list[Island]:
-        """The pieces of the stable set without soft walls, with dampings above ``least``."""
-        return self.border.islands(least)
+        """Return the islands that contain walls with beta > ``least``."""
+        return self.stable_set.islands(least)
 
     def critical_walls(self, w: Array) -> tuple[Array, Array]:
         """Return alpha and beta of the walls that have a pole pair on the unit circle at the angles w in (0, pi)."""
@@ -212,12 +225,12 @@ class LinearLoop:
 
     def least_stiffness(self, least: float) -> float | None:
         """Return the alpha below which no wall is stable, for a device unstable without a wall; None for others."""
-        softest = self.border.find_softest(least) if self.roots.device_is_unstable else 0.0
+        softest = self.stable_set.find_softest(least) if self.roots.device_is_unstable else 0.0
         return softest if softest > 0 else None
 
     def outlines(self) -> list[Outline]:
-        """Closed outlines of the stable set, the largest first."""
-        return self.border.outlines()
+        """Return closed outlines of the stable set, the largest first."""
+        return self.stable_set.outlines()
 
     def stiffest(self, negative: bool) -> RidgePoint:
         """Return the stiffest stable wall, with beta >= 0 unless ``negative``."""
@@ -225,50 +238,55 @@ class LinearLoop:
             from zwidth.loops.linear.traced_ridge import trace_stiffest
 
             return trace_stiffest(self.scene, negative)
-        found, status = self.ridge(negative)
-        if found is None:
+        ridge, status = self.ridge(negative)
+        if ridge is None:
             nan = np.float64(math.nan)
             return RidgePoint(nan, nan, nan, np.int32(RidgeKind.NONE), np.int32(status))
-        alpha, beta, omega = map(np.float64, (found.alpha, found.beta, found.omega))
-        return RidgePoint(alpha, beta, omega, np.int32(found.kind), np.int32(status))
+        alpha, beta, omega = map(np.float64, (ridge.alpha, ridge.beta, ridge.omega))
+        return RidgePoint(alpha, beta, omega, np.int32(ridge.kind), np.int32(status))
 
     def ridge(self, negative: bool) -> tuple[RidgeSolution | None, Status]:
         """Return the stiffest wall with its active constraints, None if there is none, and a status; not traceable."""
-        border = self.border
+        stable_set = self.stable_set
         if negative not in self._ridges:
             try:
-                found, k = find_ridge(border, negative), self._in_powers[1]
-                self._ridges[negative] = found and found._replace(w1=found.w1 / k, w2=found.w2 / k)
+                ridge, k = find_ridge(stable_set, negative), self._contracted[1]
+                # Convert angles of the loop in z^k to angles in z.
+                self._ridges[negative] = ridge and ridge._replace(w1=ridge.w1 / k, w2=ridge.w2 / k)
             except (ArithmeticError, ZwidthError):
                 return None, Status.NOT_CONVERGED
-        found = self._ridges[negative]
-        return found, Status.NO_BOUNDARY if found is None else Status.OK
+        ridge = self._ridges[negative]
+        return ridge, Status.NO_BOUNDARY if ridge is None else Status.OK
 
     def sensitivities(self, negative: bool) -> SceneSensitivities:
-        """What a little more of each parameter of the scene buys of the stiffest wall, in SI units."""
+        """Return the derivative of K_max with respect to each parameter of the scene, in SI units."""
         return compute_sensitivities(self.scene, *self.ridge(negative))
 
     def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> Array:
-        """``L = (alpha + beta F) G`` at angles."""
+        """Return the open loop ``L = (alpha + beta F) G`` at angles w; F is the velocity estimate, G the plant."""
         return open_loop_response(self.roots, alpha, beta, circle(w)).value
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
-        """Margins, in periods and radians a period; those that are not wanted may be NaN."""
+        """Return the margins, with times in periods and angles in rad per period; unwanted ones may be NaN."""
         return compute_margins(self.chain, self.boundary, alpha, beta, wanted)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """The device's own damping in excess of what passive walls need."""
+        """Return the damping of the device in excess of what passivity of the wall requires, in units of m/T."""
         condition = PassivityCondition.derive(self.chain.estimate, self.scene.d)
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
-        return compute_passivity_margins(condition, alpha, beta, self.scene.own_delta)[()]
+        return compute_passivity_margins(condition, alpha, beta, self.scene.device_delta)[()]
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:
-        """The scene with each of the values drawn of some of its parameters."""
+        """Return variants of the scene, one for each of the values in ``drawn``, given by dotted path."""
         return Variants(self.scene, drawn)
 
 
 class RigidLoop(LinearLoop):
-    """The loop of a rigid mass with the difference of two samples: closed forms of delta and d."""
+    """Loop of a rigid mass with the backward difference: closed forms in alpha, beta, delta and d.
+
+    The normalized damping of the device is ``delta = b T/m``, the delay in periods d. Methods without docstring are
+    described in `LinearLoop`.
+    """
 
     draws = 10_000
     most_periods = math.inf
@@ -292,23 +310,25 @@ class RigidLoop(LinearLoop):
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         return spectral_radius(alpha, beta, self.scene.delta, self.scene.d)
 
-    def slowest(self, alpha: float, beta: float) -> SlowestMotion:
+    def find_dominant(self, alpha: float, beta: float) -> DominantPole:
         with np.errstate(all="ignore"):
-            slowest = find_dominant_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
-        # A row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
-        return SlowestMotion(alpha == 0 and bool(self.row(np.array([beta])).size), *slowest)
+            dominant = find_dominant_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
+        # If walls with slightly larger K are stable, a wall with K = 0 has one pole at z = 1 and no pole outside.
+        return DominantPole(alpha == 0 and bool(self.find_stable_alpha(np.array([beta])).size), *dominant)
 
-    def row(self, beta: np.ndarray) -> np.ndarray:
+    def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
         end = np.asarray(boundary_point(self.scene.delta, self.scene.d, beta=beta).alpha)
         return np.stack([0.0 * end, end], -1)[:, None][:, : int(np.isfinite(end).any())]
 
-    def column(self, alpha: float) -> np.ndarray:
-        at = np.array([alpha])
-        ends = [boundary_point(self.scene.delta, self.scene.d, alpha=at, side=side).beta for side in ("lower", "upper")]
-        column = np.stack(ends, -1)
-        return column[column[:, 0] < column[:, 1]]
+    def find_stable_beta(self, alpha: float) -> np.ndarray:
+        one = np.array([alpha])
+        ends = [
+            boundary_point(self.scene.delta, self.scene.d, alpha=one, side=side).beta for side in ("lower", "upper")
+        ]
+        interval = np.stack(ends, -1)
+        return interval[interval[:, 0] < interval[:, 1]]
 
-    def holds_softly(self, alpha: float, beta: float) -> bool:
+    def is_connected(self, alpha: float, beta: float) -> bool:
         return True
 
     def islands(self, least: float) -> list[Island]:
@@ -325,19 +345,19 @@ class RigidLoop(LinearLoop):
 
     def stiffest(self, negative: bool) -> RidgePoint:
         delta, d = self.scene.delta, self.scene.d
-        found = alpha_max(delta, d)
-        xp, below = namespace(found.alpha), found.beta < 0
-        # Asked for only where it counts, unless a trace hides whether it does.
+        ridge = alpha_max(delta, d)
+        xp, below = namespace(ridge.alpha), ridge.beta < 0
+        # Compute the stiffest wall with B = 0 only if the ridge has B < 0, or if a tracer hides the sign of B.
         if negative or not (is_traced(below) or below):
-            return found
-        row = boundary_point(delta, d, beta=0.0 * delta)
-        kind = xp.where(row.status == Status.OK, int(RidgeKind.NO_DAMPING), int(RidgeKind.NONE))
-        end = RidgePoint(row.alpha, 0.0 * row.alpha, row.omega, kind, row.status)
-        return RidgePoint(*(xp.where(below, there, here) for there, here in zip(end, found, strict=True)))
+            return ridge
+        limit = boundary_point(delta, d, beta=0.0 * delta)
+        kind = xp.where(limit.status == Status.OK, int(RidgeKind.NO_DAMPING), int(RidgeKind.NONE))
+        undamped = RidgePoint(limit.alpha, 0.0 * limit.alpha, limit.omega, kind, limit.status)
+        return RidgePoint(*(xp.where(below, first, second) for first, second in zip(undamped, ridge, strict=True)))
 
     def sensitivities(self, negative: bool) -> SceneSensitivities:
-        found = differentiate_rigid(make_plain(self.scene), negative)
-        return super().sensitivities(negative) if found is None else found
+        closed_form = differentiate_rigid(make_plain(self.scene), negative)
+        return super().sensitivities(negative) if closed_form is None else closed_form
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
         device = self.scene.delta, self.scene.d
@@ -348,37 +368,39 @@ class RigidLoop(LinearLoop):
             return margins_kernel(*walls, with_delay=False, with_modulus="modulus_margin" in wanted)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        return passivity_margin(alpha, beta, self.scene.own_delta, self.scene.d)
+        return passivity_margin(alpha, beta, self.scene.device_delta, self.scene.d)
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:
         return RigidVariants(self.scene, drawn) if set(drawn) <= set(RIGID_PARAMETERS) else super().vary(drawn)
 
 
 def make_plain(scene: AnyScene) -> AnyScene:
-    """The scene with floats in place of JAX's own numbers that nothing traces."""
+    """Return the scene with JAX numbers that are not traced converted to floats."""
     numbers = list_parameters(scene).items()
-    held = {path: float(value) for path, value in numbers if is_jax(value) and not is_traced(value)}
-    return replace_parameters(scene, held) if held else scene
+    floats = {path: float(value) for path, value in numbers if is_jax(value) and not is_traced(value)}
+    return replace_parameters(scene, floats) if floats else scene
 
 
 def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None:
     """Return the sensitivities of a rigid device in closed form; None if its ridge needs a negative damping."""
     values = scene.delta, scene.d
-    found = evaluate(slopes_kernel, {"delta": scene.delta, "d": scene.d}, classify_delays(scene.d))
-    if not negative and found.point.beta < 0:
+    slopes = evaluate(slopes_kernel, {"delta": scene.delta, "d": scene.d}, classify_delays(scene.d))
+    if not negative and slopes.point.beta < 0:
         return None
     with np.errstate(invalid="ignore"):
-        stiffness, *slopes = stiffness_slopes(found, scene.mass, scene.timing.period, *values)
-    per = dict(zip(("mass", "damping", "period", "delay"), slopes, strict=True))
+        stiffness, *derivatives = stiffness_slopes(slopes, scene.mass, scene.timing.period, *values)
+    per = dict(zip(("mass", "damping", "period", "delay"), derivatives, strict=True))
     if scene.timing.in_periods and scene.timing.d:
-        # A delay given in periods grows with T. Chain rule: dK/dT at fixed d is dK/dT at fixed t_d + d dK/dt_d.
+        # If the delay is given in periods, t_d = d T increases with T. By the chain rule, dK/dT at constant d is dK/dT
+        # at constant t_d plus d dK/dt_d.
         per["period"] = per["period"] + scene.timing.d * per["delay"]
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
-        # The derivative with respect to the stiffness of the operator has no closed form.
+        # The derivative in the stiffness of the operator has no closed form, so differentiate the conditions at the
+        # ridge implicitly.
         ridge = scene.loop.ridge(negative)[0]
         per["operator.stiffness"] = (
             math.nan if ridge is None else differentiate_stiffness(scene, ridge, "operator.stiffness")
         )
-    per = {path: float(slope) for path, slope in per.items()}
-    return SceneSensitivities(np.float64(stiffness), per, found.point.status)
+    per = {path: float(derivative) for path, derivative in per.items()}
+    return SceneSensitivities(np.float64(stiffness), per, slopes.point.status)

@@ -1,16 +1,25 @@
-"""A measured response as a curve, how far from it the true one may be, and which walls it decides.
+"""Stability of walls on a measured frequency response with error bounds, by a robust Nyquist test.
 
-With ``u = |z - 1|^2`` and ``S = u G`` the closed loop is decided by ``X = u (1 + H G) = u + alpha S + beta F S``, which
-winds around 0 as ``1 + H G`` does, and stays of one size where the device moves like a mass (docs/theory/measured.md,
-M2 to M8).
+A device is given by its response G at measured frequencies, the *lines*, with a bound of the error at each line. The
+wall is H = alpha + beta F with the velocity estimate F; the angle w = omega T is the frequency times the period. The
+closed loop is stable if 1 + H G does not wind around 0 (docs/theory/measured.md, M1). With
 
-Along a row or a column of the plane a wall is decided (M9) where X stays away from 0 for every curve within the radius:
-at each point
+    u = |z - 1|^2      S = u G      X = u (1 + H G) = u + alpha S + beta F S
 
-    |X|^2 > rho^2 |alpha + beta F|^2 + (|step before|^2 + |step behind|^2)/4
+X has the same winding number (M2). S is nearly constant while the device moves like a mass, so `ResponseCurve`
+interpolates S between the lines, and bounds its distance rho from the true S: by the error of the lines (``band``, M3)
+and by resonances that may hide between them (``gap``, M5 and M6). It also bounds |G| below the first and above the last
+line (M7, M8).
 
-a quadratic in alpha and beta. What is not decided is therefore a union of intervals in closed form; between them the
-curve winds around 0 equally often for every wall, which one wall in the middle tells.
+A wall is *decided* if X stays away from 0 for every response within these bounds. With H at a point of the curve and
+the chords from the point before and to the point after it, this holds (M4) if at each point
+
+    |X|^2 > rho^2 |H|^2 + (|chord before|^2 + |chord after|^2)/4
+
+which is a quadratic inequality in alpha and beta. On a line of constant alpha or beta, the undecided walls are
+therefore a union of intervals in closed form (M9). All walls between two of these intervals have the same winding
+number, which `DecidedWalls` computes for the wall in the middle. Quantities are in units of the period and of the mass
+of the scene.
 """
 
 from __future__ import annotations
@@ -26,254 +35,313 @@ from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 
-# The least damping ratio that a resonance between two lines is taken to have.
-LEAST_DAMPING_RATIO = 0.005
-# What a resonance half-way between two lines, d apart, adds at its top, over the second difference that it leaves at
-# them: d/(2 zeta f) times 1/(2 + 2/3).
-_SEEN = 16.0 / 3.0
-# Of a smooth curve a chord misses an eighth of the second difference; twice that.
-_SMOOTH = 0.25
-# A turn of the response between two lines, in rad, beyond which nothing between them is known.
-MOST_TURN = 0.5
-# By what share of itself the curve may change between points, and how many are laid between two lines at most.
-_STEP, _MOST = 0.005, 32
-# By what the first line's phase may miss those of a mass, a damper or a spring, told apart by so many lines or more.
-_PHASE, _FIRST = 0.8, 4
-# Beyond the last line the response is at most so many times that of the lines from this share of the band on, unless it
-# has risen there by so much against a mass: then a resonance is in sight, and nothing is known.
-_BEYOND, _LAST, _RISEN = 2.0, 0.8, 1.2
-_ACROSS = 65
+# Interpolation between lines (M5, M6)
+LEAST_DAMPING_RATIO = 0.005  # smallest damping ratio zeta of a resonance between two lines (assumption A1)
+# A resonance at frequency f in the middle of two lines, d apart, that changes the second difference of S by D has a
+# peak of D d/(16/3 zeta f).
+RESONANCE_FACTOR = 16.0 / 3.0
+SMOOTH_FACTOR = 0.25  # error of a chord of a smooth curve over its second difference: 1/8, doubled for safety
+MAX_TURN = 0.5  # rad; if the phase changes by more between two lines, S may be anywhere between both
+MAX_STEP = 0.005  # relative change of the curve between two interpolated points
+MAX_POINTS = 32  # interpolated points between two lines
+
+# Extrapolation below the first and above the last line (M7, M8)
+PHASE_TOLERANCE = 0.8  # rad; deviation of the phase of the first line from that of a mass, a damper or a spring
+N_FIRST = 4  # lines from which the low-frequency asymptote is identified, at least
+EXTRAPOLATION_FACTOR = 2.0  # bound of |G| above the last line, over its root mean square at the last lines
+LAST_SHARE = 0.8  # the last lines start at this share of the highest frequency
+# If |S| increases by more than this factor over the last lines, a resonance may follow above them, and |G| has no
+# bound there.
+MAX_RISE = 1.2
+N_EXTRAPOLATED = 65  # angles below the first and above the last line at which |F| is bounded
 
 
 @dataclass(frozen=True)
 class ResponseCurve:
-    """Points of the curve, laid so densely that chords serve; in units of the period and of the scene's mass."""
+    """Points of the interpolated response, dense enough for linear interpolation, with error bounds."""
 
-    w: np.ndarray
+    w: np.ndarray  # angles
     u: np.ndarray  # |z - 1|^2
     S: np.ndarray  # u G
-    F: np.ndarray  # the velocity estimate
-    band: np.ndarray  # radius of S by the deviation of the lines
-    gap: np.ndarray  # radius of S by what may be between the lines
-    weakest: float  # |G| at the first line, at least, and below it
-    strongest: float  # |G| beyond the last line, at most
-    slow: float  # |F| below the first line, at most
-    fast: float  # |F| beyond the last line, at most
-    odd: bool  # whether the first line moves like neither mass, damper nor spring
+    F: np.ndarray  # velocity estimate
+    band: np.ndarray  # bound of the error of S due to the error of the lines
+    gap: np.ndarray  # bound of the error of S due to the interpolation between the lines
+    min_G: float  # lower bound of |G| at and below the first line
+    max_G: float  # upper bound of |G| above the last line
+    max_F_below: float  # upper bound of |F| below the first line
+    max_F_above: float  # upper bound of |F| above the last line
+    no_asymptote: bool  # True if the first line does not belong to a mass, a damper or a spring
 
     @property
     def radius(self) -> np.ndarray:
-        """How far S may be from the curve."""
+        """Bound rho of the distance of the true S from the curve."""
         return self.band + self.gap
 
-    def at(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """S and F at other angles, by straight lines; NaN beyond the ends."""
+    def evaluate(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return S and F at other angles by linear interpolation; NaN outside the measured range."""
 
-        def between(values: np.ndarray) -> np.ndarray:
+        def interpolate(values: np.ndarray) -> np.ndarray:
+            """Interpolate real values at the angles w."""
             return np.interp(w, self.w, values, np.nan, np.nan)
 
         parts = (self.S, self.F)
-        S, F = (between(np.real(part)) + 1j * between(np.imag(part)) for part in parts)
+        S, F = (interpolate(np.real(part)) + 1j * interpolate(np.imag(part)) for part in parts)
         return S, F
 
     @classmethod
-    def lay_out(cls, device: Any, period: float, stiffness: float, estimate: Estimate) -> ResponseCurve:
-        """The curve of a `MeasuredDevice` at a period, its response times the unit of stiffness."""
+    def interpolate(cls, device: Any, period: float, stiffness: float, estimate: Estimate) -> ResponseCurve:
+        """Interpolate the response of a `MeasuredDevice`.
+
+        Args:
+            device: frequencies in Hz, response in m/N, and its deviation, the bound of the error (None for 0).
+            period: sampling period in s.
+            stiffness: unit of alpha in N/m, which makes the response dimensionless.
+            estimate: the velocity estimate.
+        """
         w = 2.0 * np.pi * device.frequency * period
         if w[-1] >= np.pi:
             raise InputError(
-                f"frequency: got {device.frequency[-1]:g} Hz at a period of {period:g} s; a controller sees less than "
-                f"half its rate, {0.5 / period:g} Hz: leave the lines above out, or correct the period"
+                f"frequency: got {device.frequency[-1]:g} Hz at a period of {period:g} s; it must be less than half "
+                f"the rate, {0.5 / period:g} Hz: remove the lines above, or correct the period"
             )
         G = device.response * stiffness
         r = np.zeros(w.size) if device.deviation is None else device.deviation * stiffness
-        u = _square(w)
+        u = _compute_u(w)
         S, R = u * G, u * r
-        E = _gaps(w, S)
-        # By what share the curve changes from line to line, beyond what its deviation explains.
+        E = _bound_gaps(w, S)
+        # Relative change of S from line to line that the errors of the lines do not explain.
         change = np.maximum(np.abs(np.diff(S)) - 2.0 * (R[1:] + R[:-1]), 0.0)
         change = change / (np.maximum(np.abs(S[1:]), np.abs(S[:-1])) + 1e-300)
-        count = np.maximum(2.0 * np.diff(w) / w[1:], change) / _STEP
-        count = np.clip(np.ceil(count), 1, _MOST).astype(int)
+        count = np.maximum(2.0 * np.diff(w) / w[1:], change) / MAX_STEP
+        count = np.clip(np.ceil(count), 1, MAX_POINTS).astype(int)
         line = np.repeat(np.arange(w.size - 1), count)
         share = (np.arange(line.size) - np.repeat(np.cumsum(count) - count, count)) / count[line]
         step = np.diff(w)[line]
-        at = np.append(w[line] + share * step, w[-1])
+        angles = np.append(w[line] + share * step, w[-1])
         slope = np.gradient(S, w)
-        # Cubic between two lines, with the slopes of their neighbors.
+        # Cubic Hermite interpolation between two lines, with finite differences as derivatives.
         t = share
         inner = (1 + 2 * t) * (1 - t) ** 2 * S[line] + t * (1 - t) ** 2 * step * slope[line]
         inner += t * t * (3 - 2 * t) * S[line + 1] + t * t * (t - 1) * step * slope[line + 1]
-        F = estimate.jet(circle(at)).value
+        F = estimate.jet(circle(angles)).value
         band, gap = np.append(np.maximum(R[:-1], R[1:])[line], R[-1]), np.append(E[line], E[-1])
         starts = np.flatnonzero(share == 0)[1:]
+        # At a line itself the larger bound of both adjacent intervals applies.
         for values in (band, gap):
             values[starts] = np.maximum(values[starts], values[starts - 1])
-        below, above = np.linspace(0.0, w[0], _ACROSS), np.linspace(w[-1], np.pi, _ACROSS)
-        slow, fast = (float(np.abs(estimate.jet(circle(part)).value).max()) for part in (below, above))
+        below, above = np.linspace(0.0, w[0], N_EXTRAPOLATED), np.linspace(w[-1], np.pi, N_EXTRAPOLATED)
+        max_below, max_above = (float(np.abs(estimate.jet(circle(part)).value).max()) for part in (below, above))
         return cls(
-            at, _square(at), np.append(inner, S[-1]), F, band, gap,
-            float(abs(G[0]) - r[0]), _bound_beyond(w, np.abs(G), r), slow, fast,
-            _is_odd(w, G, r),
+            angles, _compute_u(angles), np.append(inner, S[-1]), F, band, gap,
+            float(abs(G[0]) - r[0]), _bound_above(w, np.abs(G), r), max_below, max_above,
+            _lacks_asymptote(w, G, r),
         )  # fmt: skip
 
 
-def _square(w: np.ndarray) -> np.ndarray:
-    """``|z - 1|^2``."""
+def _compute_u(w: np.ndarray) -> np.ndarray:
+    """Return ``u = |z - 1|^2``."""
     return 4.0 * np.sin(0.5 * w) ** 2
 
 
-def _is_odd(w: np.ndarray, G: np.ndarray, r: np.ndarray) -> bool:
-    """Whether the first line moves like neither mass, damper nor spring: a quarter turn behind for each power of w."""
-    few = min(w.size, max(_FIRST, int(np.sum(w <= 1.5 * w[0]))))
+def _lacks_asymptote(w: np.ndarray, G: np.ndarray, r: np.ndarray) -> bool:
+    """Return whether the first line does not belong to a mass, a damper or a spring (assumption A2 fails).
+
+    For |G| proportional to w^p near the first line, its phase must be p pi/2, with p between -2 and 0. A long delay is
+    detected by the derivative of the phase, because a delay by multiples of 2 pi does not change the phase itself.
+
+    Args:
+        w: angles of the lines.
+        G: response.
+        r: bound of the error of the response.
+    """
+    few = min(w.size, max(N_FIRST, int(np.sum(w <= 1.5 * w[0]))))
     if r[0] >= abs(G[0]) or not np.all(G[:few]):
         return True
     power = np.polyfit(np.log(w[:few]), np.log(np.abs(G[:few])), 1)[0]
     phase, uncertain = np.angle(1j * G[0]) - 0.5 * np.pi, np.arcsin(np.minimum(r[:few] / np.abs(G[:few]), 1.0))
-    away = abs(phase - 0.5 * np.pi * np.clip(power, -2.0, 0.0)) + uncertain[0]
-    # Whole turns of a long delay are in no phase, but in how it turns from line to line.
-    share = w[:few] - np.mean(w[:few])
-    share *= w[0] / np.sum(share**2)
-    turned = abs(share @ np.unwrap(np.angle(G[:few]))) + np.abs(share) @ uncertain
-    return bool(max(away, turned) > _PHASE)
+    deviation = abs(phase - 0.5 * np.pi * np.clip(power, -2.0, 0.0)) + uncertain[0]
+    # Phase of a delay at the first line, from the least-squares slope of the unwrapped phase over the first lines.
+    weights = w[:few] - np.mean(w[:few])
+    weights *= w[0] / np.sum(weights**2)
+    delay_phase = abs(weights @ np.unwrap(np.angle(G[:few]))) + np.abs(weights) @ uncertain
+    return bool(max(deviation, delay_phase) > PHASE_TOLERANCE)
 
 
-def _bound_beyond(w: np.ndarray, size: np.ndarray, r: np.ndarray) -> float:
-    """The largest |G| beyond the last line, by means that noise only raises; infinite with a resonance in sight."""
-    last = np.flatnonzero(w >= _LAST * w[-1])
-    u, few = _square(w), max(1, last.size // 4)
+def _bound_above(w: np.ndarray, size: np.ndarray, r: np.ndarray) -> float:
+    """Return the bound of |G| above the last line (assumption A3); infinite if |S| rises towards a resonance.
+
+    The bound uses root mean squares, because noise can only increase them.
+
+    Args:
+        w: angles of the lines.
+        size: |G|.
+        r: bound of the error of G.
+    """
+    last = np.flatnonzero(w >= LAST_SHARE * w[-1])
+    u, few = _compute_u(w), max(1, last.size // 4)
     first, final = (float(np.median((u * size)[part])) for part in (last[:few], last[-few:]))
-    room = float(np.median((u * r)[last]))
-    if final - room > _RISEN * (first + room):
+    error = float(np.median((u * r)[last]))
+    if final - error > MAX_RISE * (first + error):
         return np.inf
     halves = (part for part in np.array_split(last, 2) if part.size)
-    return _BEYOND * max(float(np.sqrt(np.mean(size[part] ** 2))) for part in halves)
+    return EXTRAPOLATION_FACTOR * max(float(np.sqrt(np.mean(size[part] ** 2))) for part in halves)
 
 
-def _gaps(w: np.ndarray, S: np.ndarray) -> np.ndarray:
-    """How far the true curve may be from the interpolated one between each two lines."""
+def _bound_gaps(w: np.ndarray, S: np.ndarray) -> np.ndarray:
+    """Return the bound of the interpolation error of S between each two lines (M6), shape (lines - 1,)."""
     step, chord = np.diff(w), np.diff(S)
-    bend = np.abs(2.0 * np.diff(chord / step) / (step[1:] + step[:-1]))
-    bend = np.maximum(np.append(bend[:1], bend), np.append(bend, bend[-1:])) * step**2
-    share = 2.0 * step / (w[1:] + w[:-1])
-    gap = bend * np.maximum(_SMOOTH, share / (_SEEN * LEAST_DAMPING_RATIO))
+    # Second derivative of S at the inner lines, and the larger second difference of both ends of each interval.
+    curvature = np.abs(2.0 * np.diff(chord / step) / (step[1:] + step[:-1]))
+    difference = np.maximum(np.append(curvature[:1], curvature), np.append(curvature, curvature[-1:])) * step**2
+    relative_step = 2.0 * step / (w[1:] + w[:-1])
+    gap = difference * np.maximum(SMOOTH_FACTOR, relative_step / (RESONANCE_FACTOR * LEAST_DAMPING_RATIO))
     with np.errstate(all="ignore"):
         turn = np.abs(np.angle(S[1:] / S[:-1]))
-    return np.where(turn > MOST_TURN, np.maximum(gap, np.abs(chord)), gap)
+    return np.where(turn > MAX_TURN, np.maximum(gap, np.abs(chord)), gap)
 
 
-# rho |H| changes by so little from a point to the next.
-_ROOM = 1.02
-# Decided intervals that are shorter than this share of where they are say nothing.
-_LEAST = 1e-9
-_TINY = 1e-300
-# Rows or columns, times points of the curve, that are looked at together.
-_BLOCK = 1 << 15
+RADIUS_FACTOR = 1.02  # factor on rho^2 |H|^2, which covers the change of rho |H| between two points of the curve
+MIN_WIDTH = 1e-9  # decided intervals shorter than this, relative to their upper end, are dropped as rounding errors
+TINY = 1e-300  # replaces zero denominators
+BATCH_SIZE = 1 << 15  # lines of constant alpha or beta per batch, times points of the curve; bounds the memory
 
 
-class Decided(NamedTuple):
-    """Decided intervals of alpha or beta, ascending: (lines of the plane, intervals), NaN where one has fewer."""
+class DecidedIntervals(NamedTuple):
+    """Decided intervals of alpha or beta, ascending: shape (lines, intervals), NaN if a line has fewer.
+
+    Here a line is a line of constant beta or alpha.
+    """
 
     low: np.ndarray
     high: np.ndarray
-    stable: np.ndarray
+    stable: np.ndarray  # True if the walls of the interval are stable, False if they are unstable
 
 
 @dataclass(frozen=True)
 class DecidedWalls:
-    """What one curve decides."""
+    """The walls that are decided by a measured response."""
 
     curve: ResponseCurve
 
     @cached_property
     def _forms(self) -> np.ndarray:
-        """A symmetric form in (1, alpha, beta) for each point, positive where a wall passes it."""
+        """Symmetric matrices of quadratic forms in (1, alpha, beta), shape (3, 3, points).
+
+        The form of a point is positive for the walls that satisfy the inequality of M4 there.
+        """
         c = self.curve
         X = np.stack([c.u + 0j, c.S, c.F * c.S])
         H = np.stack([0 * c.F, 1 + 0 * c.F, c.F])
         step = _gram(np.diff(X, axis=1))
         steps = np.pad(step, ((0, 0), (0, 0), (1, 0))) + np.pad(step, ((0, 0), (0, 0), (0, 1)))
-        return _gram(X) - _ROOM * c.radius**2 * _gram(H) - 0.25 * steps
+        return _gram(X) - RADIUS_FACTOR * c.radius**2 * _gram(H) - 0.25 * steps
 
-    def rows(self, beta: np.ndarray) -> Decided:
-        """Decided intervals of alpha at dampings."""
-        return self._intervals(1, beta, *self.ends(beta))
+    def decide_alpha(self, beta: np.ndarray) -> DecidedIntervals:
+        """Return the decided intervals of alpha for each beta."""
+        return self._find_intervals(1, beta, *self.bound_alpha(beta))
 
-    def columns(self, alpha: np.ndarray) -> Decided:
-        """Decided intervals of beta at stiffnesses."""
+    def decide_beta(self, alpha: np.ndarray) -> DecidedIntervals:
+        """Return the decided intervals of beta for each alpha."""
         c = self.curve
-        most = np.minimum((alpha - 1.0 / max(c.weakest, _TINY)) / c.slow, (1.0 / c.strongest - alpha) / c.fast)
-        return self._intervals(2, alpha, -most, most)
+        most = np.minimum((alpha - 1.0 / max(c.min_G, TINY)) / c.max_F_below, (1.0 / c.max_G - alpha) / c.max_F_above)
+        return self._find_intervals(2, alpha, -most, most)
 
-    def ends(self, beta: Any) -> tuple[Any, Any]:
-        """Between which alpha the walls of rows are decided below the first line, and beyond the last one."""
+    def bound_alpha(self, beta: Any) -> tuple[Any, Any]:
+        """Return the ends of the alpha that are decided outside the measured range.
+
+        Below the first line |H G| > 1 is required (M7), above the last line |H G| < 1 (M8). If the lower end exceeds
+        the upper end, no wall of this beta is decided.
+        """
         c = self.curve
-        return np.abs(beta) * c.slow + 1.0 / max(c.weakest, _TINY), 1.0 / c.strongest - np.abs(beta) * c.fast
+        return np.abs(beta) * c.max_F_below + 1.0 / max(c.min_G, TINY), 1.0 / c.max_G - np.abs(beta) * c.max_F_above
 
-    def _intervals(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> Decided:
-        """Of rows or columns, so many at a time."""
-        together = max(1, _BLOCK // self.curve.w.size)
-        low, high, stable = collect_by_line(partial(self._some, free), together, fixed, least, most)
-        return Decided(low, high, stable == 1)
+    def _find_intervals(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> DecidedIntervals:
+        """Return the decided intervals on lines of constant alpha or beta, computed in batches.
 
-    def _some(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, ...]:
-        """One after another: the row or column that each interval is of, its ends, and whether its walls are stable."""
+        Args:
+            free: index of the variable along the lines: 1 for alpha, 2 for beta.
+            fixed: value of the other variable on each line.
+            least: lower end of the free variable on each line, from the bounds outside the measured range.
+            most: the upper end.
+        """
+        batch = max(1, BATCH_SIZE // self.curve.w.size)
+        low, high, stable = collect_by_line(partial(self._list_intervals, free), batch, fixed, least, most)
+        return DecidedIntervals(low, high, stable == 1)
+
+    def _list_intervals(
+        self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Return all decided intervals of one batch, arguments as in `_find_intervals`.
+
+        Returns:
+            Index of the line of each interval, its lower and upper end, and the stability of its walls.
+        """
+        # Along a line the form of a point is a x^2 + 2 half x + c, with x the free variable.
         M, other, across = self._forms, 3 - free, fixed[:, None]
         a = M[free, free]
         half = M[0, free] + across * M[free, other]
         c = M[0, 0] + 2.0 * across * M[0, other] + across * across * M[other, other]
-        spread = half * half - a * c
-        # Between its ends a point decides nothing, or, where its form opens downwards, outside of them.
-        met, outer = spread >= 0, a <= 0
-        known = (least < most) & ~np.any(outer & (spread <= 0), 1) & (not self.curve.odd)
-        line, point = np.nonzero(met & known[:, None])
+        discriminant = half * half - a * c
+        # Walls between the two roots are undecided at a point if a > 0; walls outside them are undecided if a <= 0.
+        has_roots, outer = discriminant >= 0, a <= 0
+        # On unusable lines no wall is decided, because of one point or of the bounds outside the measured range.
+        usable = (least < most) & ~np.any(outer & (discriminant <= 0), 1) & (not self.curve.no_asymptote)
+        line, point = np.nonzero(has_roots & usable[:, None])
         half, c, a = half[line, point], c[line, point], a[point]
         with np.errstate(all="ignore"):
-            larger = -(half + np.where(half < 0, -1.0, 1.0) * np.sqrt(spread[line, point]))
-            ends = larger / np.where(a == 0, _TINY, a), c / larger
-        unknown = np.isnan(ends[0] + ends[1])
-        low, high = np.where(unknown, -np.inf, np.minimum(*ends)), np.where(unknown, np.inf, np.maximum(*ends))
+            # The sum in ``larger`` has no cancellation; the second root follows from the product c/a of both.
+            larger = -(half + np.where(half < 0, -1.0, 1.0) * np.sqrt(discriminant[line, point]))
+            ends = larger / np.where(a == 0, TINY, a), c / larger
+        invalid = np.isnan(ends[0] + ends[1])
+        low, high = np.where(invalid, -np.inf, np.minimum(*ends)), np.where(invalid, np.inf, np.maximum(*ends))
         outer = outer[point]
         np.maximum.at(least := least.copy(), line[outer], low[outer])
         np.minimum.at(most := most.copy(), line[outer], high[outer])
         order = np.lexsort((low[~outer], line[~outer]))
-        both = arrange_by_line(fixed.size, line[~outer][order], np.stack([low, high], -1)[~outer][order])
-        low, high = np.moveaxis(both, -1, 0)
-        reached = np.fmax.accumulate(np.column_stack([least, high]), 1)
+        undecided = arrange_by_line(fixed.size, line[~outer][order], np.stack([low, high], -1)[~outer][order])
+        low, high = np.moveaxis(undecided, -1, 0)
+        # The decided intervals are the gaps between the union of the undecided intervals, sorted by their lower ends.
+        gap_low = np.fmax.accumulate(np.column_stack([least, high]), 1)
         low = np.minimum(np.where(np.isnan(low), -np.inf, low), most[:, None])
-        after = np.column_stack([low, most])
-        line, gap = np.nonzero((after > reached + _LEAST * np.abs(after)) & known[:, None])
-        low, high = reached[line, gap], after[line, gap]
+        gap_high = np.column_stack([low, most])
+        line, gap = np.nonzero((gap_high > gap_low + MIN_WIDTH * np.abs(gap_high)) & usable[:, None])
+        low, high = gap_low[line, gap], gap_high[line, gap]
+        # One wall in each interval, ordered as (alpha, beta).
         walls = (0.5 * (low + high), fixed[line])[:: 1 if free == 1 else -1]
-        return line, low, high, self._turn(*walls) == 0
+        return line, low, high, self._count_windings(*walls) == 0
 
-    def _turn(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """How often the curves of decided walls wind around 0, from z = 1 to z = -1 and back."""
+    def _count_windings(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """Return the winding numbers of X around 0 for decided walls; a wall is stable if it is 0.
+
+        This is the argument of X at z = -1 divided by 2 pi, continued along the curve from its asymptote at z = 1 (M1).
+        """
         c = self.curve
         X = c.u + (alpha[:, None] + beta[:, None] * c.F) * c.S
-        # Below the first line |L| > 1: 1 + L turns as L does, which is there the phase of a mass, a damper or a spring.
+        # Below the first line |L| > 1, so arg(1 + L) changes as arg L does. Therefore continue arg L from the phase of
+        # a mass, a damper or a spring, between -pi and 0, and add arg(1 + 1/L).
         L = X[:, 0] / c.u[0] - 1.0
         first = np.angle(1j * L) - 0.5 * np.pi + np.angle(1.0 + 1.0 / L)
-        # Whole turns are where X, which never turns by half a turn from a point to the next, passes the negative axis.
+        # Count the crossings of the negative real axis, with their direction. Between two points the argument of X
+        # changes by less than pi.
         upper = np.imag(X) >= 0
         wall, k = np.nonzero(upper[:, 1:] != upper[:, :-1])
-        up = np.where(upper[wall, k], 1.0, -1.0)
-        passed = up * np.imag(X[wall, k].conj() * X[wall, k + 1]) > 0
-        turns = np.bincount(wall[passed], up[passed], alpha.size)
+        direction = np.where(upper[wall, k], 1.0, -1.0)
+        crosses = direction * np.imag(X[wall, k].conj() * X[wall, k + 1]) > 0
+        turns = np.bincount(wall[crosses], direction[crosses], alpha.size)
         return np.round((first + np.angle(X[:, -1]) - np.angle(X[:, 0])) / (2.0 * np.pi) + turns)
 
-    def doubts(self, alpha: float, beta: float) -> np.ndarray:
-        """At which points a wall is not decided."""
+    def find_undecided_points(self, alpha: float, beta: float) -> np.ndarray:
+        """Return a mask of the points of the curve at which a wall is undecided."""
         wall = np.array([1.0, alpha, beta])
         return np.einsum("i,ijk,j->k", wall, self._forms, wall) <= 0
 
-    def binding(self, alpha: float, beta: float) -> int:
-        """The point that is nearest to leave a wall undecided."""
+    def find_critical_point(self, alpha: float, beta: float) -> int:
+        """Return the index of the point with the smallest relative excess in the inequality of M4."""
         wall, c = np.array([1.0, alpha, beta]), self.curve
         size = np.abs(c.u) ** 2 + np.abs((alpha + beta * c.F) * c.S) ** 2
         return int(np.argmin(np.einsum("i,ijk,j->k", wall, self._forms, wall) / size))
 
 
 def _gram(parts: np.ndarray) -> np.ndarray:
-    """``Re(conj(x_i) x_j)`` of each point."""
+    """Return the Gram matrices ``Re(conj(x_i) x_j)`` of each point, shape (3, 3, points)."""
     return np.einsum("ik,jk->ijk", parts.conj(), parts).real

@@ -1,4 +1,11 @@
-"""The loop of a measured device: what samples of its response answer of `zwidth.scenes.loop.LinearLoop`."""
+"""Loop of a measured device: the analyses of `zwidth.scenes.loop.LinearLoop` that need no model of the device.
+
+A wall is stable or unstable only if every frequency response within the error bounds agrees (`measured_curve`,
+docs/theory/measured.md); otherwise it is undecided. *Lines* are the measured frequencies; alpha and beta are the
+normalized stiffness and damping of a wall, L is the open loop, and angles are w = omega T with the period T. A wall
+counts as connected to K = 0 if it is stable and no softer wall of the same damping is certainly unstable. The stiffest
+wall is searched on lines of constant beta, and refined by golden-section search.
+"""
 
 from __future__ import annotations
 
@@ -15,107 +22,119 @@ from zwidth.loops.linear.margins import select_gain_margin, select_phase_margin
 from zwidth.loops.linear.rows import Island, arrange_by_line
 from zwidth.loops.rigid.verdict import StabilityMethod
 from zwidth.parts.chain import AnyChain
-from zwidth.scenes.loop import LinearLoop, SlowestMotion
-from zwidth.scenes.measured_curve import Decided, DecidedWalls, ResponseCurve
+from zwidth.scenes.loop import DominantPole, LinearLoop
+from zwidth.scenes.measured_curve import DecidedIntervals, DecidedWalls, ResponseCurve
 from zwidth.words.errors import InputError
 from zwidth.words.results import Margins, RidgePoint, Stability
 from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array
 
-# Rows on each side of beta = 0, denser towards it, and again across those with stable walls; steps to the highest row.
-_ROWS, _DENSER, _AGAIN = 60, 5.0, 49
-_STEPS = 30
-_INSIDE = 1e-9
+# Search for the stiffest wall over beta
+N_SIDE = 60  # values of beta on each side of beta = 0
+DENSITY = 5.0  # argument of sinh at the largest beta; larger values place more of them close to beta = 0
+N_REFINED = 49  # further values of beta in the range with stable walls
+SEARCH_STEPS = 30  # steps of the golden-section search for the best beta
+INSIDE = 1e-9  # relative distance of the stiffest wall below the end of its decided interval
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredLoop(LinearLoop):
-    """Verdicts that hold for every response within the deviation; alpha and beta are arrays of one shape."""
+    """Loop of a measured device; results hold for every response within the error bounds."""
 
-    # At no other rate is the response known.
-    most_periods = 0.0
+    most_periods = 0.0  # prevents searches over the rate, because the response is valid for one rate only
 
     @cached_property
     def chain(self) -> AnyChain:
-        """Refused, and with it every question that poles or matrices answer."""
+        """Not available: raises `InputError`, also for all analyses that need poles or state-space matrices."""
         raise InputError(
-            "device: poles, motions, passivity and sensitivities need a model, and a response is none; fit one "
-            "to a log (zwidth.fit_log), or ask for stability, rows, columns, the stiffest wall, outlines and margins"
+            "device: poles, responses in time, passivity and sensitivities need a model instead of a measured "
+            "response; fit one with zwidth.fit_log"
         )
 
     @cached_property
     def walls(self) -> DecidedWalls:
-        """Which walls its curve decides."""
+        """The walls that the measured response decides."""
         timing, device = self.scene.timing, self.scene.device
         if timing.delay != 0:
             raise InputError(
-                f"delay: got {timing.delay:g} s with a measured response, which holds every delay already; leave it out"
+                f"delay: got {timing.delay:g} s with a measured response, which includes all delays; omit the delay"
             )
         estimate = self.scene.velocity.estimate(timing.period)
         unit = device.mass / timing.period**2
-        return DecidedWalls(ResponseCurve.lay_out(device, timing.period, unit, estimate))
+        return DecidedWalls(ResponseCurve.interpolate(device, timing.period, unit, estimate))
 
     @cached_property
     def nominal(self) -> MeasuredLoop:
-        """The same without the deviation: what the measured curve itself says."""
+        """The loop of the measured response without the errors of its lines."""
         loop = MeasuredLoop(self.scene)
         curve = self.walls.curve
         vars(loop)["walls"] = DecidedWalls(replace(curve, band=0.0 * curve.band))
         return loop
 
     def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """Whether walls are stable, for every response in the band."""
+        """Return whether walls are stable for every response within the error bounds."""
         return self.decide(alpha, beta, "auto", (alpha, beta)).stable
 
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod = "auto", exact: Any = ()
     ) -> Stability:
-        """Labels with status; UNDECIDED where lines are too far apart, too uncertain, or end too early."""
+        """Return labels and status; UNDECIDED if lines are too far apart or too uncertain, or their range too narrow.
+
+        The argument ``exact`` of the base class is ignored.
+        """
         if method not in ("auto", "crossover"):
-            raise InputError(f"method: got {method!r}, which needs a model; a measured response decides by 'crossover'")
+            raise InputError(f"method: got {method!r}, which needs a model; use 'crossover' for a measured response")
         alpha, beta = np.broadcast_arrays(alpha, beta)
         a, b = alpha.reshape(-1), beta.reshape(-1)
-        known = np.isfinite(a) & np.isfinite(b)
+        finite = np.isfinite(a) & np.isfinite(b)
         stable, status = np.zeros(a.size, bool), np.full(a.size, np.int32(Status.INVALID_INPUT))
-        status[known] = Status.UNDECIDED
-        a, b = a[known], b[known]
-        (rows, of_row), (columns, of_column) = (np.unique(values, return_inverse=True) for values in (b, a))
-        by_row = rows.size <= columns.size
-        decided, line = (self.walls.rows(rows), of_row) if by_row else (self.walls.columns(columns), of_column)
-        value, held = a if by_row else b, np.zeros((2, a.size), bool)
-        for low, high, sure in zip(*(part.T for part in decided), strict=True):
+        status[finite] = Status.UNDECIDED
+        a, b = a[finite], b[finite]
+        (betas, beta_index), (alphas, alpha_index) = (np.unique(values, return_inverse=True) for values in (b, a))
+        # Use lines of constant beta or of constant alpha, whichever are fewer.
+        along_alpha = betas.size <= alphas.size
+        decided, line = (
+            (self.walls.decide_alpha(betas), beta_index)
+            if along_alpha
+            else (self.walls.decide_beta(alphas), alpha_index)
+        )
+        value, labels = a if along_alpha else b, np.zeros((2, a.size), bool)
+        for low, high, interval_stable in zip(*(part.T for part in decided), strict=True):
             inside = (value > low[line]) & (value < high[line])
-            held |= inside & np.stack([sure[line], inside])
-        stable[known] = held[0]
-        status[np.flatnonzero(known)[held[1]]] = Status.OK
+            labels |= inside & np.stack([interval_stable[line], inside])
+        stable[finite] = labels[0]
+        status[np.flatnonzero(finite)[labels[1]]] = Status.OK
         shape, used = alpha.shape, np.full(alpha.shape, Method.CROSSOVER, np.int32)
         return Stability(stable.reshape(shape)[()], status.reshape(shape)[()], used[()])
 
-    def slowest(self, alpha: float, beta: float) -> SlowestMotion:
-        """Not known without a model: NaN."""
-        return SlowestMotion(False, np.nan, np.nan, np.nan)
+    def find_dominant(self, alpha: float, beta: float) -> DominantPole:
+        """Return NaN, because a measured response does not contain the poles."""
+        return DominantPole(False, np.nan, np.nan, np.nan)
 
-    def row(self, beta: np.ndarray) -> np.ndarray:
-        """The intervals of alpha that are surely stable: shape (rows, intervals, 2), NaN where a row has fewer."""
-        return _only(self.walls.rows(beta), True)
+    def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
+        """Return the certainly stable intervals of alpha, shape (n, intervals, 2); NaN if a beta has fewer."""
+        return _select_stable(self.walls.decide_alpha(beta), True)
 
-    def column(self, alpha: float) -> np.ndarray:
-        """The intervals of beta that are surely stable: shape (intervals, 2)."""
-        return _only(self.walls.columns(np.array([alpha])), True)[0]
+    def find_stable_beta(self, alpha: float) -> np.ndarray:
+        """Return the certainly stable intervals of beta for one alpha, shape (intervals, 2)."""
+        return _select_stable(self.walls.decide_beta(np.array([alpha])), True)[0]
 
-    def soft_rows(self, beta: np.ndarray) -> np.ndarray:
-        """The surely stable intervals of alpha below all walls of rows that are surely unstable; as `row` has them."""
-        found = self.walls.rows(beta)
-        first = np.min(found.low, 1, where=~(found.stable | np.isnan(found.low)), initial=np.inf)
-        return _only(found, found.low < first[:, None])
+    def _find_connected_alpha(self, beta: np.ndarray) -> np.ndarray:
+        """Return the stable intervals of alpha below all certainly unstable walls of the same beta.
 
-    def holds_softly(self, alpha: float, beta: float) -> bool:
-        """Whether a wall is surely stable, and no softer one of its damping surely unstable."""
-        ends = self.soft_rows(np.array([beta]))[0]
+        The shape is that of `find_stable_alpha`.
+        """
+        intervals = self.walls.decide_alpha(beta)
+        unstable = np.min(intervals.low, 1, where=~(intervals.stable | np.isnan(intervals.low)), initial=np.inf)
+        return _select_stable(intervals, intervals.low < unstable[:, None])
+
+    def is_connected(self, alpha: float, beta: float) -> bool:
+        """Return whether a wall is certainly stable and no softer wall of the same beta is certainly unstable."""
+        ends = self._find_connected_alpha(np.array([beta]))[0]
         return bool(np.any((ends[:, 0] < alpha) & (alpha < ends[:, 1])))
 
     def islands(self, least: float) -> list[Island]:
-        """None is named: between stable walls that softer ones do not lead to others may be undecided."""
+        """Return an empty list: undecided walls may connect the pieces of the stable set to K = 0."""
         return []
 
     def least_stiffness(self, least: float) -> None:
@@ -123,35 +142,39 @@ class MeasuredLoop(LinearLoop):
 
     @cached_property
     def _tops(self) -> tuple[np.ndarray, np.ndarray]:
-        """Dampings of rows across the plane, and the stiffest wall of each, 0 where there is none."""
-        # No row with more damping has decided walls.
-        low, high = self.walls.ends(0.0)
-        most = max((high - low) / (self.walls.curve.slow + self.walls.curve.fast), 1e-300)
-        side = most * np.sinh(_DENSER * np.arange(1, _ROWS + 1) / _ROWS) / np.sinh(_DENSER)
+        """Values of beta, and the largest alpha of the stable walls connected to K = 0 for each; 0 if none exists."""
+        # For larger |beta| no wall is decided.
+        low, high = self.walls.bound_alpha(0.0)
+        most = max((high - low) / (self.walls.curve.max_F_below + self.walls.curve.max_F_above), 1e-300)
+        side = most * np.sinh(DENSITY * np.arange(1, N_SIDE + 1) / N_SIDE) / np.sinh(DENSITY)
         beta = np.concatenate([-side[::-1], [0.0], side])
         top = self._find_tops(beta)
-        held = np.flatnonzero(top > 0)
-        if held.size:
-            ends = beta[[max(held[0] - 1, 0), min(held[-1] + 1, beta.size - 1)]]
-            new = np.setdiff1d(np.linspace(ends[0], ends[1], _AGAIN), beta)
+        stable = np.flatnonzero(top > 0)
+        if stable.size:
+            ends = beta[[max(stable[0] - 1, 0), min(stable[-1] + 1, beta.size - 1)]]
+            new = np.setdiff1d(np.linspace(ends[0], ends[1], N_REFINED), beta)
             top = np.append(top, self._find_tops(new))
             order = np.argsort(np.append(beta, new))
             beta, top = np.append(beta, new)[order], top[order]
         return beta, top
 
     def _find_tops(self, beta: np.ndarray) -> np.ndarray:
-        return np.nanmax(self.soft_rows(beta)[:, :, 1], 1, initial=0.0)
+        """Return the largest alpha of the stable walls connected to K = 0 for each beta; 0 if none exists."""
+        return np.nanmax(self._find_connected_alpha(beta)[:, :, 1], 1, initial=0.0)
 
     def outlines(self) -> list[Outline]:
-        """The stiffest surely stable wall of each damping and the softest, a closed curve for pictures, if any is."""
+        """Return one closed outline of the stable walls connected to K = 0, for figures; none if no wall is stable.
+
+        It joins the softest and the stiffest stable wall of each beta; undecided walls between them are inside it.
+        """
         beta, top = self._tops
         beta, top = beta[top > 0], top[top > 0]
-        low = self.soft_rows(beta)[:, 0, 0] if beta.size else beta
+        low = self._find_connected_alpha(beta)[:, 0, 0] if beta.size else beta
         walls = np.concatenate([low, top[::-1], low[:1]]), np.concatenate([beta, beta[::-1], beta[:1]])
         return [Outline(*walls, False, False)] if beta.size else []
 
     def stiffest(self, negative: bool) -> RidgePoint:
-        """The stiffest wall that `holds_softly`, with beta >= 0 unless negative ones count."""
+        """Return the stiffest wall that `is_connected`, with beta >= 0 unless ``negative``."""
         beta, top = self._tops
         top = np.where((beta < 0) & (not negative), 0.0, top)
         best = int(np.argmax(top))
@@ -162,93 +185,103 @@ class MeasuredLoop(LinearLoop):
         low, middle, high, cost = (
             np.array([end]) for end in (low if negative else max(low, 0.0), middle, high, -top[best])
         )
-        found = minimize_golden_section(lambda beta: -self._find_tops(beta), low, middle, high, cost, _STEPS)
-        middle, value = float(found[0][0]), -float(found[1][0])
-        # Just inside: the end itself is not decided.
-        value *= 1.0 - _INSIDE
-        omega = self.walls.curve.w[self.walls.binding(value, middle)]
+        minimum = minimize_golden_section(lambda beta: -self._find_tops(beta), low, middle, high, cost, SEARCH_STEPS)
+        middle, value = float(minimum[0][0]), -float(minimum[1][0])
+        # Stay below the end of the open interval, because the end itself is undecided.
+        value *= 1.0 - INSIDE
+        omega = self.walls.curve.w[self.walls.find_critical_point(value, middle)]
         return RidgePoint(np.float64(value), np.float64(middle), np.float64(omega), kind, np.int32(Status.OK))
 
     def explain(self, alpha: float, beta: float) -> list[str]:
-        """What keeps a wall undecided, a sentence each with the frequencies to measure; empty where it is decided."""
+        """Return the reasons for an undecided wall, each with the frequencies to measure; empty if it is decided."""
         wall = np.array([alpha]), np.array([beta])
         if self.decide(*wall, "auto", wall).status[0] == Status.OK:
             return []
         c, hertz = self.walls.curve, 1.0 / (2.0 * np.pi * self.scene.timing.period)
-        first, last, said = c.w[0] * hertz, c.w[-1] * hertz, []
-        if c.odd:
-            said.append(f"the first line, {first:.4g} Hz, is uncertain, or no mass, damper or spring; begin lower")
-        if not alpha > self.walls.ends(beta)[0]:
-            said.append(f"this wall is too soft for the first line; measure below {first:.4g} Hz")
-        if not alpha < self.walls.ends(beta)[1]:
-            said.append(f"this wall answers beyond the last line; measure above {last:.4g} Hz")
-        doubts = self.walls.doubts(alpha, beta)
-        for by_gap, remedy in ((True, "lines there are too far apart; measure more"), (False, "more force, or longer")):
-            places = np.flatnonzero(doubts & ((c.gap > c.band) == by_gap))
-            if places.size:
-                ends = c.w[places[[0, -1]]] * hertz
-                where = "measure anew from {:.4g} to {:.4g} Hz".format(*ends)
-                said.append(f"{where}: {remedy}" if by_gap else f"the deviation is too large; {where}, with {remedy}")
-        return said
+        first, last, reasons = c.w[0] * hertz, c.w[-1] * hertz, []
+        if c.no_asymptote:
+            reasons.append(
+                f"the response at {first:.4g} Hz is uncertain, or not that of a mass, damper or spring; "
+                "measure lower frequencies"
+            )
+        if not alpha > self.walls.bound_alpha(beta)[0]:
+            reasons.append(f"this wall is too soft for the measured range; measure below {first:.4g} Hz")
+        if not alpha < self.walls.bound_alpha(beta)[1]:
+            reasons.append(f"the loop gain above the measured range is too large; measure above {last:.4g} Hz")
+        undecided = self.walls.find_undecided_points(alpha, beta)
+        for by_gap, remedy in (
+            (True, "finer frequency spacing"),
+            (False, "more force or for longer"),
+        ):
+            points = np.flatnonzero(undecided & ((c.gap > c.band) == by_gap))
+            if points.size:
+                ends = c.w[points[[0, -1]]] * hertz
+                band = "measure again from {:.4g} to {:.4g} Hz".format(*ends)
+                reasons.append(
+                    f"{band} with {remedy}" if by_gap else f"the deviation is too large; {band} with {remedy}"
+                )
+        return reasons
 
     def explain_limit(self) -> str:
         """Return the reason why no wall is decided, from the wall with the fewest undecided frequencies."""
-        rows = [(*self.walls.ends(beta), beta) for beta in self._tops[0].tolist()]
+        rows = [(*self.walls.bound_alpha(beta), beta) for beta in self._tops[0].tolist()]
         walls = [(0.5 * (low + high), beta) for low, high, beta in rows if low < high]
         count = f"the {self.scene.device.frequency.size} frequencies of the response decide the stability of no wall"
         if not walls:
             return f"{count}: extend the frequency range or reduce the deviation"
-        alpha, beta = min(walls, key=lambda wall: np.count_nonzero(self.walls.doubts(*wall)))
+        alpha, beta = min(walls, key=lambda wall: np.count_nonzero(self.walls.find_undecided_points(*wall)))
         return "; ".join([count, *self.explain(float(alpha), float(beta))])
 
     def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """``L = (alpha + beta F) G`` at angles between the first line and the last; NaN at others."""
-        S, F = self.walls.curve.at(w)
+        """Return ``L = (alpha + beta F) G`` at angles between the first and the last line; NaN at other angles."""
+        S, F = self.walls.curve.evaluate(w)
         return (alpha + beta * F) * S / (4.0 * np.sin(0.5 * w) ** 2)
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
-        """Margins on the measured curve in periods and radians a period; NaN for walls that are not surely decided.
+        """Return the margins on the measured curve, in periods and rad per period; NaN for undecided walls.
 
-        The delay margin is that of a pure delay, phase over frequency; where no line shows what more gain brings to the
-        circle, the gain margin is the factor below which it is not beyond them.
+        The delay margin is the smallest phase over frequency at a gain crossover. If the measured range contains no
+        phase crossover that limits an increase of the gain, the gain margin is a lower bound: up to this factor none
+        exists above the range.
         """
         decided = self.decide(alpha, beta, "auto", (alpha, beta))
         out = np.full((len(Margins._fields), *np.shape(alpha)), np.nan)
-        for place in np.ndindex(np.shape(alpha)):
-            if np.asarray(decided.status)[place] == Status.OK:
-                stable = bool(np.asarray(decided.stable)[place])
-                out[(slice(None), *place)] = self._margins_of(float(alpha[place]), float(beta[place]), stable)
+        for index in np.ndindex(np.shape(alpha)):
+            if np.asarray(decided.status)[index] == Status.OK:
+                stable = bool(np.asarray(decided.stable)[index])
+                out[(slice(None), *index)] = self._compute_margins(float(alpha[index]), float(beta[index]), stable)
         return Margins(*(part[()] for part in out))
 
-    def _margins_of(self, alpha: float, beta: float, stable: bool) -> Margins:
-        """The nearest crossovers of one wall, between points of the curve by straight lines."""
+    def _compute_margins(self, alpha: float, beta: float, stable: bool) -> Margins:
+        """Return the margins of one wall, by linear interpolation between the points of the curve."""
         c = self.walls.curve
         L = (alpha + beta * c.F) * c.S / c.u
         with np.errstate(all="ignore"):
-            k, share = _zeros(L.imag)
-            at, real = c.w[k] + share * np.diff(c.w)[k], L.real[k] + share * np.diff(L.real)[k]
-            places, sizes = at[real < 0], -real[real < 0]
+            k, share = _find_zeros(L.imag)
+            w, real = c.w[k] + share * np.diff(c.w)[k], L.real[k] + share * np.diff(L.real)[k]
+            crossovers, sizes = w[real < 0], -real[real < 0]
             if stable and not np.any(sizes < 1.0):
-                # What more gain brings to the circle is beyond the last line, and not before L may be so large there.
-                most = c.strongest * (abs(alpha) + abs(beta) * c.fast)
-                places, sizes = np.append(places, c.w[-1]), np.append(sizes, most)
-            k, share = _zeros(np.log(np.abs(L)))
-            at = c.w[k] + share * np.diff(c.w)[k]
+                # No phase crossover with |L| < 1 was measured. Above the last line |L| is at most ``most``, so a factor
+                # below 1/most moves no pole onto the unit circle there.
+                most = c.max_G * (abs(alpha) + abs(beta) * c.max_F_above)
+                crossovers, sizes = np.append(crossovers, c.w[-1]), np.append(sizes, most)
+            k, share = _find_zeros(np.log(np.abs(L)))
+            w = c.w[k] + share * np.diff(c.w)[k]
             turns: Any = np.angle(-L[k]) + share * np.angle(L[k + 1] / L[k])
-            gain, phase_at = select_gain_margin(stable, places, sizes)
-            phase, gain_at = select_phase_margin(stable, at, turns)
-            delay = float(np.min(np.mod(turns, 2.0 * np.pi) / at, initial=np.inf)) if stable else 0.0
+            gain, phase_w = select_gain_margin(stable, crossovers, sizes)
+            phase, gain_w = select_phase_margin(stable, w, turns)
+            delay = float(np.min(np.mod(turns, 2.0 * np.pi) / w, initial=np.inf)) if stable else 0.0
         closest = int(np.argmin(np.abs(1.0 + L)))
-        return Margins(gain, phase, delay, float(abs(1.0 + L[closest])), phase_at, gain_at, float(c.w[closest]))
+        return Margins(gain, phase, delay, float(abs(1.0 + L[closest])), phase_w, gain_w, float(c.w[closest]))
 
 
-def _only(found: Decided, held: np.ndarray | bool) -> np.ndarray:
-    """Stable intervals of each line of the plane, of those some: (lines, intervals, 2), NaN where one has fewer."""
-    line, k = np.nonzero(found.stable & held)
-    return arrange_by_line(len(found.low), line, np.stack([found.low[line, k], found.high[line, k]], -1))
+def _select_stable(intervals: DecidedIntervals, mask: np.ndarray | bool) -> np.ndarray:
+    """Return the intervals that are stable and selected by a mask: shape (lines, intervals, 2); NaN if fewer."""
+    line, k = np.nonzero(intervals.stable & mask)
+    return arrange_by_line(len(intervals.low), line, np.stack([intervals.low[line, k], intervals.high[line, k]], -1))
 
 
-def _zeros(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Before which zeros values stand, and at what share of the step each lies."""
+def _find_zeros(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the values before each sign change, and the position of the zero in the step, 0 to 1."""
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
     return k, values[k] / (values[k] - values[k + 1])

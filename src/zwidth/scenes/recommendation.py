@@ -1,4 +1,10 @@
-"""Recommended wall of a device: the stiffest with the required margins, its cautions, and useful improvements."""
+"""Recommended wall of a device: the stiffest that satisfies requirements, with cautions and useful improvements.
+
+The requirements (`wall_search.Wanted`) limit the stiffness K relative to the maximum stiffness K_max of the device, the
+margins, the passivity, and the stability in reference grasps, which are models of a hand. The *safe limit* of a scene
+bounds K and the damping B to walls that measurements of the device support. The *active* requirement is the one that
+excludes every stiffer wall.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +28,14 @@ from zwidth.scenes.assessment import (
     assess,
     compute_gains,
     describe_islands,
+    find_nearest_interval,
     name_kind,
-    nearest_interval,
     round_margin,
 )
 from zwidth.scenes.cautions import judge_grasps, list_cautions
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.scenes.wall_code import write_wall
-from zwidth.scenes.wall_search import COARSE, Grasps, Wanted, choose_wall, list_held, measure_slack
+from zwidth.scenes.wall_search import COARSE, Grasps, Wanted, choose_wall, list_grasped_scenes, measure_slack
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import WALL
@@ -92,16 +98,18 @@ class Recommendation:
         The digits are the fewest, at least 4, with which the rounded wall still satisfies the requirements. K is
         rounded down. More than 4 digits are needed if only a narrow range of B satisfies them.
         """
-        held = list_held(self.scene, self.wanted)
-        slack, verdict = measure_slack(self.scene, self.wanted, held), self.verdict
+        grasped = list_grasped_scenes(self.scene, self.wanted)
+        slack, verdict = measure_slack(self.scene, self.wanted, grasped), self.verdict
         ends = (math.nan, math.nan)
         if verdict is not None:
             ends = verdict.virtual_damping_lower, verdict.virtual_damping_upper
 
         def rounded(digits: int) -> tuple[float, float]:
+            """Return K rounded down and B rounded."""
             return round_safely(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
 
         def holds(digits: int) -> bool:
+            """Return whether the wall with this number of digits is stable and satisfies the requirements."""
             wall = rounded(digits)
             if not (self.scene.is_stable(*wall) and all(spare >= 0 for spare in slack(*wall).values())):
                 return False
@@ -125,7 +133,7 @@ class Recommendation:
         The stiffness of each is that of the wall recommended for the improved device, accurate to about 0.2 %. The list
         is empty if the safe limit is active, because then only a new measurement allows a stiffer wall.
         """
-        if self.status != Status.OK or self.is_held_back:
+        if self.status != Status.OK or self.is_at_safe_limit:
             return []
         steps = compute_gains(self.scene.replace(wall=NoWall()), self.stiffness, self._choose_again)
         return [step for step in steps if step.gain > 1.0]
@@ -137,7 +145,7 @@ class Recommendation:
             near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
             return choose_wall(improved, self.wanted, top, near, COARSE).stiffness
         except InputError:
-            # Doubling the rate may turn a long delay into more periods than the model supports.
+            # At twice the rate a long delay may have more periods than the model supports.
             return math.nan
 
     @cached_property
@@ -181,9 +189,9 @@ class Recommendation:
         if verdict is None:
             return (f"no wall: {self.reason}",)
         # Compute the range for the printed K, because a negative lower end is sensitive to the rounding of K.
-        column = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
+        intervals = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
         lower, upper = tell_apart(
-            *nearest_interval(column, self.virtual_damping), self.unit_system["N s/m"], self.read[2]
+            *find_nearest_interval(intervals, self.virtual_damping), self.unit_system["N s/m"], self.read[2]
         )
         room = f"B from {lower} to {upper} is stable at this K"
         margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
@@ -204,11 +212,13 @@ class Recommendation:
 
     def spell_requirement(self) -> str:
         """Return, in words, the active requirement, which limits the stiffness."""
-        bounded = ", with B limited by the safe limit" if self.limited_by != "safe_limit" and self.is_held_back else ""
+        bounded = (
+            ", with B limited by the safe limit" if self.limited_by != "safe_limit" and self.is_at_safe_limit else ""
+        )
         return f"limited by {self.wanted.spell(self.limited_by)}{bounded}"
 
     @property
-    def is_held_back(self) -> bool:
+    def is_at_safe_limit(self) -> bool:
         """True if the safe limit is active: K or B of the wall lies on it."""
         limit = None if self.wanted.beyond_safe else self.scene.safe_limit
         ends = None if limit is None else limit.dampings(self.stiffness)

@@ -1,7 +1,9 @@
-"""Find the largest stiffness that every rigid device with parameters in given intervals can render.
+"""Maximum stiffness and the stiffest wall for all rigid devices with parameters in given intervals.
 
-A pattern search over the box of devices finds the device with the smallest limit. It starts from the best device of a
-grid that contains all vertices of the box.
+A device has the parameters m, b, T, t_d: mass, damping, sampling period and delay. The intervals of the four parameters
+form a box of devices. The *limit* of a device is its maximum stiffness K_max or, for a wall with damping B, the largest
+stable stiffness at this B. A pattern search over the box finds the weakest device, which has the smallest limit. It
+starts from the weakest device of a grid that contains all vertices of the box.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import is_traced
 
-_NAMES = ("mass", "damping", "period", "delay")
+_NAMES = ("mass", "damping", "period", "delay")  # parameters of a device, in this order
 BELOW = 1e-6  # relative distance of a reported stiffness below the limit of the weakest device; covers rounding errors
 STARTS = 5  # values per uncertain parameter in the grid of starting devices
 SEARCH_STEPS = 60  # steps of the pattern search; each moves the pattern or halves it
@@ -80,7 +82,8 @@ def robust_max_stiffness(
         mass: m in kg, > 0: an `Interval`, or an exact value; likewise the other arguments.
         damping: b in N s/m, >= 0.
         period: T in s, > 0.
-        delay: t_d in s, >= 0, held. All broadcast, the ends of intervals too; each entry is one box.
+        delay: t_d in s, >= 0; need not be a multiple of T. All arguments and ends of intervals broadcast; each entry is
+            one box.
 
     Returns:
         RobustStiffness of the broadcast shape: ``stiffness`` in N/m, 1e-6 below ``attained``; ``attained``, K_max of
@@ -89,15 +92,15 @@ def robust_max_stiffness(
         arrays.
 
     Raises:
-        InputError: an argument is a tuple or a list of two ends, a number out of range, no real number, or traced; ends
-            are out of order; or shapes do not broadcast.
+        InputError: an argument is a tuple or list instead of an `Interval`, out of range, not a real number, or traced
+            by JAX; the ends of an interval are out of order; or shapes do not broadcast.
 
     Numerics:
-        Pattern search, started from the best device of a grid with 5 values per uncertain parameter. The minimum is
-        found by search, not proved. Some 10 to 100 ms per box.
+        Pattern search, started from the weakest device of a grid with 5 values per uncertain parameter. The minimum is
+        not certified. Run time 10 to 100 ms per box.
 
     References:
-        Hulin, Preusche, Hirzinger 2006, section VII; docs/theory/one-lobe.md (rows and columns).
+        Hulin, Preusche, Hirzinger 2006, section VII; docs/theory/one-lobe.md.
 
     Example:
         >>> from zwidth import Interval, robust_max_stiffness
@@ -105,7 +108,7 @@ def robust_max_stiffness(
         >>> print(worst.is_vertex, worst.mass, f"{worst.stiffness:.0f} N/m")
         True 0.08 17051 N/m
     """
-    return RobustStiffness(*_each_box(_worst, RobustStiffness._fields, (mass, damping, period, delay)))
+    return RobustStiffness(*_solve_boxes(_find_weakest_device, RobustStiffness._fields, (mass, damping, period, delay)))
 
 
 @accept_units
@@ -133,23 +136,32 @@ def robust_wall(*, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain,
         >>> print(f"{wall.stiffness:.0f} N/m, {wall.virtual_damping:.1f} N s/m")
         17051 N/m, 33.1 N s/m
     """
-    return RobustWall(*_each_box(_wall, RobustWall._fields, (mass, damping, period, delay)))
+    return RobustWall(*_solve_boxes(_find_wall, RobustWall._fields, (mass, damping, period, delay)))
 
 
-def _each_box(
-    answer: Callable[[np.ndarray, np.ndarray], tuple], names: tuple[str, ...], given: tuple[Uncertain, ...]
+def _solve_boxes(
+    solve: Callable[[np.ndarray, np.ndarray], tuple], names: tuple[str, ...], parameters: tuple[Uncertain, ...]
 ) -> list[np.ndarray]:
-    """Check the intervals, and apply ``answer`` to each box."""
+    """Check the intervals, and solve each box.
+
+    Args:
+        solve: maps the lower and upper ends of the parameters of one box, shape (4,) each, to a tuple of results.
+        names: names of the results.
+        parameters: mass, damping, period and delay: intervals or exact values, which broadcast.
+
+    Returns:
+        One array per result, of the broadcast shape; NaN and a status for invalid boxes.
+    """
     ends = []
-    for name, value in zip(_NAMES, given, strict=True):
+    for name, value in zip(_NAMES, parameters, strict=True):
         if isinstance(value, tuple | list) and not isinstance(value, Interval):
             raise InputError(
                 f"{name}: got {value!r}; write Interval(low, high) for an uncertain quantity, or a NumPy array for "
-                "several known ones"
+                "several exact values"
             )
         pair = value if isinstance(value, Interval) else Interval(value, value)
         if is_traced(*pair):
-            raise InputError(f"{name}: got a traced value; call the search outside JAX transformations")
+            raise InputError(f"{name}: got a value traced by JAX; pass plain numbers, outside jit, vmap and grad")
         for end in pair:
             normalize(**({"mass": 1.0, "period": 1.0} | {name: end}))
         low, high = (as_float64(name, end) for end in pair)
@@ -157,26 +169,26 @@ def _each_box(
             raise InputError(f"{name}: got {value!r}; the first number must not be greater than the second")
         ends += [low, high]
     join_shapes(zip(map(str, np.repeat(_NAMES, 2)), map(np.shape, ends), strict=True))
-    columns = np.broadcast_arrays(*ends)
-    shape = columns[0].shape
-    rows = np.stack([column.ravel() for column in columns], axis=-1)
+    broadcast = np.broadcast_arrays(*ends)
+    shape = broadcast[0].shape
+    boxes = np.stack([end.ravel() for end in broadcast], axis=-1)
     results = []
     with np.errstate(all="ignore"):
-        for row in rows:
-            low, high = row[0::2], row[1::2]
-            status = _box_status(low, high)
-            results.append(answer(low, high) if status == Status.OK else (*[np.nan] * (len(names) - 1), status))
-    found = zip(*results, strict=True) if results else [()] * len(names)
+        for box in boxes:
+            low, high = box[0::2], box[1::2]
+            status = _check_box(low, high)
+            results.append(solve(low, high) if status == Status.OK else (*[np.nan] * (len(names) - 1), status))
+    columns = zip(*results, strict=True) if results else [()] * len(names)
     # NaN in ``is_vertex`` means that the box is invalid.
     types = {"is_vertex": lambda values: np.equal(values, True), "status": lambda values: np.array(values, np.int32)}
-    arrays = (types.get(name, np.array)(values) for name, values in zip(names, found, strict=True))
+    arrays = (types.get(name, np.array)(values) for name, values in zip(names, columns, strict=True))
     return [np.asarray(array).reshape(shape)[()] for array in arrays]
 
 
-def _box_status(low: np.ndarray, high: np.ndarray) -> Status:
-    """Return the first fault of a box in the order of `Status`, or OK."""
-    found = quantity_status(**dict(zip(_NAMES, np.stack([low, high], -1), strict=True)))
-    return Status(min(found[found > 0].tolist(), default=0)) if np.all(low <= high) else Status.INVALID_INPUT
+def _check_box(low: np.ndarray, high: np.ndarray) -> Status:
+    """Return the status of a box: the lowest code of its errors, or OK."""
+    codes = quantity_status(**dict(zip(_NAMES, np.stack([low, high], -1), strict=True)))
+    return Status(min(codes[codes > 0].tolist(), default=0)) if np.all(low <= high) else Status.INVALID_INPUT
 
 
 def _normalize_devices(devices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -185,7 +197,7 @@ def _normalize_devices(devices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return mass / period / period, damping * period / mass, delay / period
 
 
-def _stiffest(devices: np.ndarray) -> np.ndarray:
+def _compute_max_stiffness(devices: np.ndarray) -> np.ndarray:
     """Return K_max of each device."""
     mass, damping, period, delay = devices.T
     return np.asarray(max_stiffness(mass=mass, damping=damping, period=period, delay=delay))
@@ -200,7 +212,7 @@ def _stable_dampings(stiffness: float, devices: np.ndarray) -> tuple[np.ndarray,
 
 
 def _find_lowest(cost: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the device with the lowest cost that a pattern search finds in a box, shape (1, 4).
+    """Return the device with the lowest cost (its limit) that a pattern search finds in a box, shape (1, 4).
 
     A pattern is a center and its neighbors, one step away along any of the uncertain parameters. It moves to the
     neighbor with the lowest cost; if no neighbor improves on the center, the step is halved.
@@ -210,10 +222,11 @@ def _find_lowest(cost: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high
     moves[:, free] = np.array(list(product((-1.0, 0.0, 1.0), repeat=free.size)))
 
     def values(shares: np.ndarray) -> np.ndarray:
-        costs = cost(_devices(shares, low, high))
+        """Return the costs of devices at relative positions in the box; infinite for NaN."""
+        costs = cost(_place_devices(shares, low, high))
         return np.where(np.isnan(costs), np.inf, costs)
 
-    trials = _grid(low, high, STARTS)
+    trials = _build_grid(low, high, STARTS)
     best, value, step = trials[0], np.inf, 0.5
     for _ in range(SEARCH_STEPS):
         reached = values(trials)
@@ -222,64 +235,68 @@ def _find_lowest(cost: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high
         else:
             step *= 0.5
         trials = np.clip(best + step * moves, 0.0, 1.0)
-    # Move to an end of an interval that only rounding errors keep the device from.
+    # Replace positions close to the end of an interval by the end, unless this increases the cost, because rounding
+    # errors may keep the search from reaching the end.
     ends = np.where(best < AT_END, 0.0, np.where(best > 1.0 - AT_END, 1.0, best))
-    return _devices((ends if values(ends[None])[0] <= value * (1.0 + AT_END) else best)[None], low, high)
+    return _place_devices((ends if values(ends[None])[0] <= value * (1.0 + AT_END) else best)[None], low, high)
 
 
-def _devices(shares: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _place_devices(shares: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the devices at relative positions in a box; 0 and 1 are exactly its ends."""
     inside = np.clip(low + shares * (high - low), low, high)
     return np.where(shares == 0.0, low, np.where(shares == 1.0, high, inside))
 
 
-def _grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
+def _build_grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
     """Return a grid of relative positions with ``count`` values for each uncertain parameter."""
     axes = [np.linspace(0.0, 1.0, count) if b > a else np.zeros(1) for a, b in zip(low, high, strict=True)]
     return np.array(list(product(*axes)))
 
 
-def _worst(low: np.ndarray, high: np.ndarray) -> tuple:
+def _find_weakest_device(low: np.ndarray, high: np.ndarray) -> tuple:
     """Return the fields of `robust_max_stiffness` for one box."""
-    device = _find_lowest(_stiffest, low, high)
-    attained = float(_stiffest(device)[0])
+    device = _find_lowest(_compute_max_stiffness, low, high)
+    attained = float(_compute_max_stiffness(device)[0])
     is_vertex = bool(np.all((device == low) | (device == high)))
     return attained * (1.0 - BELOW), attained, *device[0], is_vertex, Status.OK
 
 
-def _best_wall(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
+def _find_common_limit(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
     """Return the limit of walls that are stable on all of ``devices``, and a function from K to the B to set."""
 
     def common(stiffness: float) -> tuple[float, float]:
+        """Return the ends of the interval of B that is stable on all devices at one K; empty if they are reversed."""
         lower, upper = _stable_dampings(stiffness, devices)
         return float(np.max(lower)), float(np.min(upper))
 
     def suits(stiffness: np.ndarray) -> np.ndarray:
+        """Return whether some B is stable on all devices."""
         lower, upper = common(float(stiffness))
         return np.asarray(lower < upper)
 
     # Round up, because no wall reaches the limit.
-    limit = float(np.nextafter(bisect(suits, np.float64(0.0), np.min(_stiffest(devices))), np.inf))
+    limit = float(np.nextafter(bisect(suits, np.float64(0.0), np.min(_compute_max_stiffness(devices))), np.inf))
     return limit, lambda stiffness: 0.5 * float(np.add(*common(stiffness)))
 
 
-def _wall(low: np.ndarray, high: np.ndarray) -> tuple:
+def _find_wall(low: np.ndarray, high: np.ndarray) -> tuple:
     """Return the fields of `robust_wall` for one box."""
-    devices = _devices(_grid(low, high, 2), low, high)
-    limit, middle = _best_wall(devices)
+    devices = _place_devices(_build_grid(low, high, 2), low, high)
+    limit, middle = _find_common_limit(devices)
     for _ in range(ROUNDS):
         stiffness = limit * (1.0 - BELOW)
-        # Search with the damping as printed, because users set that one.
+        # Search with the rounded damping, because this is the one that users set.
         damping = float(f"{middle(stiffness):.{DIGITS}g}")
 
-        def row_end(candidates: np.ndarray, damping: float = damping) -> np.ndarray:
+        def find_limits(candidates: np.ndarray, damping: float = damping) -> np.ndarray:
+            """Return the largest stable stiffness of each device at this damping; 0 if none is stable."""
             spring, delta, d = _normalize_devices(candidates)
             ends = boundary_point(delta, d, beta=damping / spring / candidates[:, 2])
             return np.where(ends.status == Status.OK, np.asarray(ends.alpha) * spring, 0.0)
 
-        weakest = _find_lowest(row_end, low, high)
-        if row_end(weakest)[0] > stiffness:
+        weakest = _find_lowest(find_limits, low, high)
+        if find_limits(weakest)[0] > stiffness:
             return stiffness, damping, limit, Status.OK
         devices = np.concatenate([devices, weakest])
-        limit, middle = _best_wall(devices)
+        limit, middle = _find_common_limit(devices)
     return np.nan, np.nan, limit, Status.UNDECIDED

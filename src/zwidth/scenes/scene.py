@@ -1,4 +1,8 @@
-"""A whole loop as people have it: device, timing, velocity estimate, hand; and every question about its walls."""
+"""The public class `Scene`: device, timing, velocity estimate, operator and wall, with all analyses as methods.
+
+The parts are checked in `zwidth.scenes.base`; the analyses are in `zwidth.scenes.answers` (one wall), `stiffest`
+(optimal walls) and `recommendation`. This module adds the stability boundary, the stable region and the simulation.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +22,15 @@ from zwidth.words.xp import is_traced, namespace
 
 @dataclass(frozen=True, repr=False)
 class Scene(SceneAdvice):
-    """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
+    """A control loop that renders a virtual wall: device, timing, wall, velocity estimate and operator.
 
     Args:
-        device: mass and damping, rigid or with a coupling, modes and an actuator; or its measured response.
-        timing: period and delay.
-        wall: the wall that `zwidth.assess` judges, and that the questions below mean where no other is named. It may be
-            left out.
-        velocity: how the velocity is estimated; the backward difference by default.
-        operator: the hand, None where nobody holds the device.
+        device: mass and damping, rigid or with a coupling, modes and an actuator; or a linear system; or a measured
+            frequency response.
+        timing: sampling period and delay.
+        wall: the wall that `zwidth.assess` evaluates, and the default wall of the methods below. It may be omitted.
+        velocity: velocity estimate; the backward difference by default.
+        operator: the hand that holds the device; None for a released device.
         safe_limit: stiffest wall that measurements of the device support, usually set by a fit. `recommend` respects
             it; stability and maximum stiffness do not depend on it.
 
@@ -45,10 +49,10 @@ class Scene(SceneAdvice):
     """
 
     def boundary(self, omega: ArrayLike) -> WallSI:
-        """The walls that put a pole pair on the unit circle at a frequency.
+        """Return the walls that have a pole pair on the unit circle at a given frequency.
 
         Args:
-            omega: in rad/s, between 0 and half the sampling rate, ``pi/T``.
+            omega: angular frequency in rad/s, between 0 and the Nyquist frequency ``pi/T``.
 
         Returns:
             ``stiffness`` in N/m and ``virtual_damping`` in N s/m; NaN for other frequencies.
@@ -57,15 +61,15 @@ class Scene(SceneAdvice):
         self._check_traceable(w, *self.units)
         inside, units = (w > 0) & (w < np.pi), self.units
         alpha, beta = self.loop.critical_walls(namespace(w).where(inside, w, 1.0))
-        numbers = alpha * units.stiffness, beta * units.virtual_damping
-        return WallSI(*(namespace(inside, part).where(inside, part, np.nan)[()] for part in numbers))
+        walls = alpha * units.stiffness, beta * units.virtual_damping
+        return WallSI(*(namespace(inside, part).where(inside, part, np.nan)[()] for part in walls))
 
     def stable_region(self) -> list[Outline]:
-        """Closed outlines of the stable set, the largest first, islands and holes told apart.
+        """Return closed outlines of the stable set, the largest first.
 
         Returns:
-            A list of outlines with ``stiffness`` in N/m, ``virtual_damping`` in N s/m, ``hole`` and ``island``, as
-            `islands` means it.
+            A list of outlines with ``stiffness`` in N/m and ``virtual_damping`` in N s/m; ``hole`` is True if unstable
+            walls lie inside, ``island`` if the outline belongs to one of the `islands`.
         """
         units = self.units
         return ResultList(
@@ -74,7 +78,7 @@ class Scene(SceneAdvice):
         )
 
     simulate = simulate
-    """A method: `zwidth.simulate` of this scene, with all its arguments."""
+    """Method that calls `zwidth.simulate` with this scene and all other arguments."""
 
 
 # Methods that work inside jit, vmap and grad: all for a rigid scene with the backward difference; for other scenes
@@ -93,5 +97,5 @@ TRACEABLE = (
     "spectral_radius",
     "to_si",
 )
-# The two exceptions are traceable and return numbers without units; a wrapper would slow down single verdicts.
+# Both exceptions are traceable and return numbers without units; a wrapper would slow down tests of single walls.
 wrap_methods(Scene, traceable=TRACEABLE, but=("is_stable", "normalize_walls"))

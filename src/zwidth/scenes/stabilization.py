@@ -1,4 +1,10 @@
-"""Remedies: ranges of single parameters in which the wall of a scene is stable, or in which an oscillation stops."""
+"""Remedies: ranges of single parameters in which the wall of a scene is stable, or in which an oscillation stops.
+
+`stabilize` returns the ranges of a scene with an unstable wall; K and B are its stiffness and damping. The stable
+intervals of K and B are exact. Other parameters are tried at values from the present one to the end of a search range,
+in the direction that usually stabilizes; the ends of the stable range are then found by bisection. Ranges in which a
+limit cycle stops are found by simulation in `zwidth.scenes.remedies`.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.scenes.assessment import nearest_interval
-from zwidth.scenes.base import of_scene
+from zwidth.scenes.assessment import find_nearest_interval
+from zwidth.scenes.base import wrap_function
 from zwidth.scenes.stiffest import SceneOptima
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import count_digits, round_safely, tell_apart, with_unit
@@ -62,16 +68,16 @@ class Remedy(NamedTuple):
     def spell(self, digits: int = 4) -> str:
         """Return the range in words, both ends rounded into the range."""
         name, unit = NAMES.get(self.parameter, self.parameter), find_unit(self, FIELDS[self.parameter].unit)
-        kept = f" ({self.note})" if self.note else ""
+        note = f" ({self.note})" if self.note else ""
         if self.parameter == "velocity.samples":
             return f"{name} of at most {self.high:g} samples"
         if self.parameter == "resolution" and unit == "rad":
-            kept = f" (at least {count_steps(self.high):,} counts per turn)"
+            note = f" (at least {count_steps(self.high):,} counts per turn)"
         if self.high == math.inf:
-            return f"{name} at least {with_unit(round_safely(self.low, 'above', digits), unit, digits)}{kept}"
+            return f"{name} at least {with_unit(round_safely(self.low, 'above', digits), unit, digits)}{note}"
         if self.low == -math.inf:
-            return f"{name} at most {with_unit(round_safely(self.high, 'below', digits), unit, digits)}{kept}"
-        return f"{name} from {' to '.join(tell_apart(self.low, self.high, unit, digits))}{kept}"
+            return f"{name} at most {with_unit(round_safely(self.high, 'below', digits), unit, digits)}{note}"
+        return f"{name} from {' to '.join(tell_apart(self.low, self.high, unit, digits))}{note}"
 
 
 def count_steps(resolution: float) -> int:
@@ -79,7 +85,7 @@ def count_steps(resolution: float) -> int:
     return math.ceil(2.0 * math.pi / resolution - 1e-6)
 
 
-@of_scene
+@wrap_function
 def stabilize(scene: SceneOptima) -> list[Remedy]:
     """Return the ranges of single parameters in which the wall of a scene is stable.
 
@@ -91,10 +97,10 @@ def stabilize(scene: SceneOptima) -> list[Remedy]:
     row, column = (list(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
     ranges = []
     if row:
-        low, high = _round_inwards(*nearest_interval(tuple(row), K))
+        low, high = _round_inwards(*find_nearest_interval(tuple(row), K))
         ranges.append(Remedy("stiffness", low if low > 0 or low >= K else -math.inf, high))
     if column:
-        ranges.append(Remedy("virtual_damping", *_round_inwards(*nearest_interval(tuple(column), B))))
+        ranges.append(Remedy("virtual_damping", *_round_inwards(*find_nearest_interval(tuple(column), B))))
     values = {**scene.parameters(), "rate": 1.0 / scene.timing.period}
     for path, (direction, factor) in DIRECTIONS.items():
         if path in values and (path != "delay" or values[path] > 0):
@@ -106,6 +112,7 @@ def _round_inwards(low: float, high: float) -> tuple[float, float]:
     """Return the ends of an open stable interval, rounded to stable values with the fewest digits, at least 4."""
 
     def shorten(digits: int) -> tuple[float, float]:
+        """Round both ends into the interval."""
         return round_safely(low, "above", digits), round_safely(high, "below", digits)
 
     return shorten(count_digits(lambda digits: shorten(digits)[0] < shorten(digits)[1]))
@@ -133,8 +140,8 @@ def _search(scene: SceneOptima, path: str, present: float, direction: int, facto
         return []
     first = stable.index(True)
     near = _bisect(holds, values[first], values[first - 1]) if first else present
-    beyond = stable.index(False, first) if False in stable[first:] else None
-    far = _bisect(holds, values[beyond - 1], values[beyond]) if beyond else None
+    after = stable.index(False, first) if False in stable[first:] else None
+    far = _bisect(holds, values[after - 1], values[after]) if after else None
     note = f"the delay stays {scene.timing.kept_delay}" if path == "rate" and scene.timing.delay else ""
     if direction > 0:
         return [Remedy(path, near, math.inf if far is None else far, note)]

@@ -1,4 +1,13 @@
-"""What is best on a scene: its stiffest wall, what buys more, what a stiffness requires, the damping that suits it."""
+"""Optimal walls of a scene: the stiffest wall, its sensitivities, parameters for a required K_max, the best damping.
+
+K and B are the stiffness and damping of a wall. K_max is the stiffness of the stiffest stable wall that is *connected
+to K = 0*, i.e. that a path of stable walls connects to K = 0. The *surplus* of a parameter value is ``log(K_max/K)``
+for a required stiffness K: the value is sufficient if the surplus is nonnegative. `SceneOptima.required` samples the
+surplus on a grid, refines extrema between grid points that may reach zero, and finds each sign change by Brent's method
+(Brent 1973). `SceneOptima.best_damping` minimizes the spectral radius, or maximizes the modulus margin, by a global
+one-dimensional search. The computations in alpha and beta (K and B in units of m/T^2 and m/T, with the mass m of the
+device and the period T) are those of `zwidth.scenes.loop`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +23,7 @@ from zwidth.loops.linear.margins import OpenLoop
 from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.parts.checks import read_texts
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.answers import SceneAnswers, allows_negative
+from zwidth.scenes.answers import SceneAnalysis, allows_negative
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import FIELDS, WALL
 from zwidth.words.showing import shown
@@ -23,13 +32,14 @@ from zwidth.words.types import Array
 from zwidth.words.units import to_float
 from zwidth.words.xp import is_jax, is_traced
 
-# By what share a row may end below the stiffest wall that is on it.
-_ROUNDED = 1e-6
+# Relative tolerance by which the stable interval of K may end below K_max at the damping of the stiffest wall; covers
+# the error of K_max.
+STIFFNESS_TOLERANCE = 1e-6
 
 
 @shown(frequency="Hz", kind=RidgeKind)
 class StiffestWall(NamedTuple):
-    """The stiffest stable wall: N/m, N s/m, Hz, and the codes of `zwidth.RidgeKind` and `zwidth.Status`."""
+    """The stiffest stable wall in SI units, with codes of `zwidth.RidgeKind` and `zwidth.Status`."""
 
     stiffness: Array
     virtual_damping: Array
@@ -38,7 +48,7 @@ class StiffestWall(NamedTuple):
     status: Array
 
 
-def explain_missing(scene: SceneAnswers, status: Any) -> str:
+def explain_missing(scene: SceneAnalysis, status: Any) -> str:
     """Return the reason why a scene has no stiffest wall, from the status of the search."""
     if status == Status.NO_BOUNDARY:
         return "no stiffness is stable at any damping"
@@ -46,47 +56,46 @@ def explain_missing(scene: SceneAnswers, status: Any) -> str:
     return explained or Status(int(status)).message
 
 
-def choose_damping(scene: SceneAnswers, top: StiffestWall, stiffness: float) -> float:
-    """A damping with which a softer wall than the stiffest is stable, where it can be so without leaving its piece."""
-    # That of the stiffest wall, if all walls of that damping between the two are stable; else the middle of the widest
-    # interval of dampings.
+def choose_damping(scene: SceneAnalysis, top: StiffestWall, stiffness: float) -> float:
+    """Return a damping in N s/m for a wall that is softer than the stiffest wall ``top``.
+
+    This is the damping of ``top`` if all walls with this damping between the two stiffnesses are stable. Otherwise it
+    is the middle of the widest stable interval that is connected to K = 0, if one exists.
+    """
     damping = float(top.virtual_damping)
-    row = scene.stable_stiffness(damping)
-    if np.any((row[:, 0] < stiffness) & (row[:, 1] > (1.0 - _ROUNDED) * top.stiffness)):
+    intervals = scene.stable_stiffness(damping)
+    if np.any((intervals[:, 0] < stiffness) & (intervals[:, 1] > (1.0 - STIFFNESS_TOLERANCE) * top.stiffness)):
         return damping
-    column = soft_dampings(scene, stiffness)
-    low, high = max(column, key=lambda ends: ends[1] - ends[0], default=(math.nan, math.nan))
-    return 0.5 * (low + high) * scene.units.virtual_damping if column else damping
+    connected = find_connected_dampings(scene, stiffness)
+    low, high = max(connected, key=lambda ends: ends[1] - ends[0], default=(math.nan, math.nan))
+    return 0.5 * (low + high) * scene.units.virtual_damping if connected else damping
 
 
-def soft_dampings(
-    scene: SceneAnswers, stiffness: float, negative_damping: bool | None = None
+def find_connected_dampings(
+    scene: SceneAnalysis, stiffness: float, negative_damping: bool | None = None
 ) -> list[tuple[float, float]]:
-    """The intervals of beta with which walls of a stiffness are stable in a piece with soft walls."""
+    """Return the intervals of beta in which walls of a stiffness in N/m are stable and connected to K = 0."""
     least = -math.inf if allows_negative(scene, negative_damping) else 0.0
-    return scene.loop.soft_column(stiffness / scene.units.stiffness, least)
+    return scene.loop.find_connected_beta(stiffness / scene.units.stiffness, least)
 
 
-# How far the range reaches to both sides of the present value where none is given, and its points.
-_REACH, _POINTS = 30.0, 25
-# Delays so long are looked at, in periods, where none longer is there.
-_MOST_PERIODS = 1000.0
-# Closer than that a value and the present one are the same.
-_SAME = 1e-9
-# By what share of the value both sides of a crossing are proved, the closest that tells them apart.
-_BESIDE = (1e-11, 1e-9, 1e-7, 1e-5)
-
-# How close, in logarithms, its highest and lowest values are sought.
-_TURN = {"xatol": 1e-6}
-
-# The logarithm of a stiffness that counts as none.
-_HARDLY_ANY = 60.0
+# Search of `SceneOptima.required` for the parameter value at which K_max reaches a stiffness
+REACH = 30.0  # default range: from the present value divided by this factor to the present value times it
+N_POINTS = 25  # grid points in the range, geometrically spaced
+MAX_PERIODS = 1000.0  # longest delay of the default range, in periods, unless the present delay is longer
+SAME_VALUE = 1e-9  # relative distance from the present value below which a grid point is dropped in favor of that value
+# Relative distances from a crossing at which the surplus is evaluated. The smallest distance with different signs on
+# both sides confirms the crossing.
+CONFIRMATION_DISTANCES = (1e-11, 1e-9, 1e-7, 1e-5)
+# Options of the minimizer of SciPy: absolute tolerance of the logarithm of the parameter at an extremum.
+EXTREMUM_OPTIONS = {"xatol": 1e-6}
+NO_STIFFNESS = 60.0  # negative of the surplus if no wall is stable; K_max then counts as exp(-60) times the required K
 
 Side = Literal["above", "below", "everywhere", "nowhere"]
 
 
 class Crossing(NamedTuple):
-    """A value of a parameter at which K_max passes the wanted stiffness, and on which side of it there is enough."""
+    """A parameter value at which K_max equals the required stiffness, and the side on which K_max is sufficient."""
 
     value: float
     enough: Side
@@ -94,7 +103,7 @@ class Crossing(NamedTuple):
 
 @shown()
 class RequiredValue(NamedTuple):
-    """The value to choose, the side on which there is enough, and every crossing in the range, ascending."""
+    """Required value of a parameter, the side on which K_max is sufficient, and all crossings found, ascending."""
 
     value: float
     enough: Side
@@ -103,33 +112,36 @@ class RequiredValue(NamedTuple):
     status: Status
 
 
-def _read_stiffness(given: Any, unit: str) -> float:
+def _read_stiffness(value: Any, unit: str) -> float:
     """Return a required stiffness in its SI unit."""
-    stiffness = read_texts("stiffness", given, unit)
+    stiffness = read_texts("stiffness", value, unit)
     if not (isinstance(stiffness, int | float | np.number) and math.isfinite(to_float(stiffness)) and stiffness > 0):
         raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in {unit})")
     return float(stiffness)
 
 
-def _present_value(scene: SceneAnswers, parameter: str) -> float:
-    known = {path: value for path, value in scene.parameters().items() if path not in WALL}
-    known["rate"] = 1.0 / known["period"]
-    if not isinstance(parameter, str) or parameter not in known:
-        raise InputError(f"parameter: {describe_choice(parameter, tuple(known))}")
-    if isinstance(known[parameter], int | np.integer):
-        raise InputError(f"parameter: got {parameter!r}, a whole number; try its few values one by one")
-    return float(known[parameter])
+def _get_present_value(scene: SceneAnalysis, parameter: str) -> float:
+    """Return the present value of a parameter; raise `InputError` if it cannot be varied continuously."""
+    values = {path: value for path, value in scene.parameters().items() if path not in WALL}
+    values["rate"] = 1.0 / values["period"]
+    if not isinstance(parameter, str) or parameter not in values:
+        raise InputError(f"parameter: {describe_choice(parameter, tuple(values))}")
+    if isinstance(values[parameter], int | np.integer):
+        raise InputError(f"parameter: got {parameter!r}, which must be an integer; evaluate its values one by one")
+    return float(values[parameter])
 
 
-def _range(scene: SceneAnswers, parameter: str, now: float, within: tuple[Any, Any] | None) -> tuple[float, float]:
+def _choose_range(
+    scene: SceneAnalysis, parameter: str, now: float, within: tuple[Any, Any] | None
+) -> tuple[float, float]:
     """Return the range of a parameter to search: ``within`` if given, otherwise around the present value ``now``."""
     if within is None:
         timing = scene.timing
         if not now > 0:
-            raise InputError(f"within: {parameter} is 0 now; give the range to search, as within=(0.1, 10)")
+            raise InputError(f"within: {parameter} is 0 now; pass the range to search, such as within=(0.1, 10)")
         # The run time increases with the square of the delay in periods; a cutoff is below the Nyquist frequency.
         fixed = 0.0 if timing.in_periods else timing.delay
-        longest = max(float(timing.delay / timing.period), _MOST_PERIODS)
+        longest = max(float(timing.delay / timing.period), MAX_PERIODS)
         ends = {
             "delay": (0.0, longest * timing.period),
             "period": (fixed / longest, math.inf),
@@ -137,41 +149,47 @@ def _range(scene: SceneAnswers, parameter: str, now: float, within: tuple[Any, A
             "velocity.cutoff": (0.0, 0.499 / (getattr(scene.velocity, "coded_period", None) or timing.period)),
         }
         low, high = ends.get(parameter, (0.0, math.inf))
-        return max(now / _REACH, float(low)), min(now * _REACH, float(high))
+        return max(now / REACH, float(low)), min(now * REACH, float(high))
     low, high = (to_float(end) for end in read_texts("within", within, scene.unit_system[FIELDS[parameter].unit]))
     if not 0 < low < high < math.inf:
-        raise InputError(f"within: got {within!r}; two finite numbers with 0 < low < high are needed")
+        raise InputError(f"within: got {within!r}; pass two finite numbers with 0 < low < high")
     return low, high
 
 
-def _find_turns(surplus: Callable[[float], float], grid: list[float], values: list[float]) -> list[float]:
-    """Where K_max is highest between values that all have too little, and lowest between values that have enough."""
+def _find_extrema(surplus: Callable[[float], float], grid: list[float], values: list[float]) -> list[float]:
+    """Return the local maxima of negative surplus and the local minima of nonnegative surplus, between grid points.
+
+    At such an extremum the surplus may change its sign, which the grid points around it do not show.
+    """
     from scipy.optimize import minimize_scalar
 
-    found = []
+    extrema = []
     for k in range(1, len(grid) - 1):
-        side = 1.0 if values[k] >= 0 else -1.0
-        if side * values[k - 1] > side * values[k] < side * values[k + 1]:
+        sign = 1.0 if values[k] >= 0 else -1.0
+        if sign * values[k - 1] > sign * values[k] < sign * values[k + 1]:
             ends = math.log(grid[k - 1]), math.log(grid[k + 1])
-            turn = minimize_scalar(
-                lambda x, side=side: side * surplus(math.exp(x)), bounds=ends, method="bounded", options=_TURN
+            extremum = minimize_scalar(
+                lambda x, sign=sign: sign * surplus(math.exp(x)),
+                bounds=ends,
+                method="bounded",
+                options=EXTREMUM_OPTIONS,
             )
-            found.append(math.exp(turn.x))
-    return found
+            extrema.append(math.exp(extremum.x))
+    return extrema
 
 
-def _cross(surplus: Callable[[float], float], low: float, high: float) -> Crossing | None:
-    """The crossing between two values, proved by a value on each side of it; None where it cannot be."""
+def _find_crossing(surplus: Callable[[float], float], low: float, high: float) -> Crossing | None:
+    """Return the crossing between two values, confirmed by the sign of the surplus on both sides; None if it fails."""
     from scipy.optimize import brentq
 
     try:
         root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
     except ValueError:
-        # On the way there is a value whose K_max cannot be computed.
+        # Brent's method evaluated a value at which K_max cannot be computed.
         return None
-    place = math.exp(cast("float", root))
-    for share in _BESIDE:
-        ends = place * (1.0 - share), place * (1.0 + share)
+    value = math.exp(cast("float", root))
+    for distance in CONFIRMATION_DISTANCES:
+        ends = value * (1.0 - distance), value * (1.0 + distance)
         below, above = (surplus(end) >= 0 for end in ends)
         if below != above:
             return Crossing(ends[1], "above") if above else Crossing(ends[0], "below")
@@ -180,13 +198,12 @@ def _cross(surplus: Callable[[float], float], low: float, high: float) -> Crossi
 
 Goal = Literal["fast", "robust"]
 
-# Samples across a column.
-_SAMPLES = 66
+N_SAMPLES = 66  # values of B at which `best_damping` evaluates each stable interval before it refines the minima
 
 
 @shown()
 class BestDamping(NamedTuple):
-    """A virtual damping in N s/m, the spectral radius and the modulus margin there, and the `zwidth.Status`."""
+    """An optimal virtual damping in N s/m, with spectral radius, modulus margin and the code of `zwidth.Status`."""
 
     virtual_damping: float
     spectral_radius: float
@@ -194,35 +211,35 @@ class BestDamping(NamedTuple):
     status: Status
 
 
-class SceneOptima(SceneAnswers):
-    """The questions of `zwidth.Scene` that look for a wall, or for a device that bears it."""
+class SceneOptima(SceneAnalysis):
+    """The methods of `zwidth.Scene` that search for a wall, or for a parameter value that a wall requires."""
 
     def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
         """Return the stiffest stable wall connected to K = 0, and the kind of its optimum.
 
         K_max is ``sup {K : some B is stable}`` over the pieces of the stable set that are connected to K = 0 by paths
         of stable walls. All other pieces are `islands`. If the device is unstable without a wall, no piece may be
-        connected to K = 0; then the piece with the softest stable walls counts. With parts the stable set may be
-        inclined near its tip, so that no softer wall is stable at the damping of the stiffest; `recommend` returns a
-        wall to set.
+        connected to K = 0; then the piece with the softest stable walls counts. With filters or flexible parts, the
+        stable set may be inclined near its tip, so that no softer wall is stable at the damping of the stiffest;
+        `recommend` returns a wall for use.
 
         Args:
-            negative_damping: whether walls with B < 0 count. By default they count only for a `Device` with the
+            negative_damping: True if walls with B < 0 count. By default they count only for a `Device` with the
                 backward difference. With a filter a negative B is a lead compensator; with a `LinearDevice` or a
                 `MeasuredDevice` it would cancel damping of the model, which is unsafe. The pieces of the stable set do
                 not depend on this argument: a path may lead through B < 0.
 
         Returns:
             ``stiffness`` in N/m; ``virtual_damping`` in N s/m; ``frequency`` in Hz of the pole pair on the unit circle,
-            of the higher one at a corner; ``kind``, a code of `zwidth.RidgeKind`; ``status`` of `zwidth.Status`, with
-            NaN where it is not 0: NO_BOUNDARY where no such wall with K > 0 is stable.
+            at a corner that of the higher one; ``kind``, a code of `zwidth.RidgeKind`; ``status``, a code of
+            `zwidth.Status`. Unless it is 0, all values are NaN; NO_BOUNDARY: no such wall with K > 0 is stable.
 
         Numerics:
-            Closed form for a rigid device. Otherwise the highest point of all edges of the stable set, about 1e-13
-            relative (a mode that decays by less than 1e-3 in a period costs digits, but for one without damping),
-            refused where rows of the plane contradict it. Inside a JAX transformation it is finished by optimistix,
-            with implicit derivatives in every parameter of every part. The delay and, with one, the period must be
-            plain numbers there (`TracedDelayError`).
+            Closed form for a rigid device. Otherwise the highest point of all edges of the stable set, with a relative
+            error of about 1e-13 (larger for modes that decay by less than 1e-3 per period, except undamped ones).
+            NOT_CONVERGED if lines of constant B contradict the result. Inside a JAX transformation optimistix refines
+            the solution, with implicit derivatives in every parameter of every part. There the delay, and with a delay
+            also the period, must be plain numbers (`TracedDelayError`).
 
         Example:
             >>> import zwidth
@@ -234,28 +251,27 @@ class SceneOptima(SceneAnswers):
         alpha, beta, omega, kind, status = self.loop.stiffest(allows_negative(self, negative_damping))
         mass, period = (value if is_traced(value) else float(value) for value in (self.mass, self.timing.period))
         rate = mass / period
-        # In the order of `zwidth.max_stiffness`, for the same last digit.
+        # Multiply in the same order as `zwidth.max_stiffness`, so that both results agree to the last digit.
         values = (alpha * rate / period, beta * rate, omega / (2.0 * math.pi * period), kind, status)
         return StiffestWall(*(value if is_jax(value) else np.asarray(value)[()] for value in values))
 
     def sensitivities(self, *, negative_damping: bool | None = None) -> SceneSensitivities:
-        """What a little more of every parameter of every part buys.
+        """Return the derivatives of K_max with respect to every parameter of every part.
 
         Args:
             negative_damping: as for `max_stiffness`.
 
         Returns:
             ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
-            "operator.mass", ...) in N/m per SI unit, each with all others held fixed (the delay in seconds or in
-            periods, as it was given); ``status``, NOT_CONVERGED if a derivative is NaN; without a K_max all
-            are NaN. Whole numbers and coefficients of a filter have no derivative. At a value of zero, and at an
-            integer delay of a linear system without inertia, the derivatives are one-sided, for an increase; for all
-            others both sides agree.
+            "operator.mass", ...) in N/m per SI unit, each with all other parameters constant (the delay in the unit in
+            which it was given, seconds or periods); ``status``, NOT_CONVERGED if a derivative is NaN. Without a K_max
+            all derivatives are NaN. Integers and coefficients of a filter have no derivative. For a value of zero, and
+            at an integer delay of a linear system without inertia, the derivative is one-sided, for an increase.
 
         Numerics:
-            Closed form for a rigid device; otherwise implicit derivatives of the conditions that bind, some ms a
-            parameter: right to 1e-6, or where one is nearly 0, to 1e-11 of K_max over the parameter (1e-9 beside a
-            spring ten million times as stiff as the wall).
+            Closed form for a rigid device. Otherwise implicit derivatives of the active constraints, some ms per
+            parameter, with a relative error of 1e-6; if a derivative is nearly 0, the absolute error is 1e-11 times
+            K_max over the parameter (1e-9 with a spring ten million times as stiff as the wall).
 
         Example:
             >>> import zwidth
@@ -273,25 +289,26 @@ class SceneOptima(SceneAnswers):
         within: tuple[Any, Any] | None = None,
         negative_damping: bool | None = None,
     ) -> RequiredValue:
-        """The value of one parameter at which K_max reaches a wanted stiffness, all others as they are.
+        """Return the value of one parameter at which K_max reaches a required stiffness, all others unchanged.
 
         Args:
-            parameter: its dotted path, such as "damping", "velocity.cutoff" or "rate".
-            stiffness: wanted, in N/m, > 0.
-            within: the range that is searched, 0 < low < high; by default a thirtieth to 30 times the present value,
-                where the delay is no longer than 1,000 periods or than it is.
+            parameter: dotted path, such as "damping", "velocity.cutoff" or "rate".
+            stiffness: required K_max in N/m, > 0.
+            within: range to search, 0 < low < high. By default from 1/30 to 30 times the present value, limited to
+                delays of at most 1,000 periods or the present delay.
             negative_damping: as for `max_stiffness`.
 
         Returns:
-            ``value``, the nearest to the present one, itself enough; ``enough``, the side of it on which there is
-            enough ("above", "below"), or "everywhere" in the range (then ``value`` is the present one, or the end next
-            to it), or "nowhere"; ``crossings``, all that were found, each proved by a K_max on either side; ``range``;
-            ``status``, UNREACHABLE with NaN where the range never reaches the stiffness.
+            ``value``, the sufficient value closest to the present one; ``enough``, the side of it on which K_max is
+            sufficient ("above" or "below"), "everywhere" if it is in the whole range (``value`` is then the present
+            value, or the closest end of the range), or "nowhere"; ``crossings``, all crossings found, each confirmed by
+            K_max on both sides; ``range``, the range searched; ``status``, UNREACHABLE with NaN if K_max is below the
+            required stiffness in the whole range.
 
         Numerics:
-            The present value and 25 across the range, and where K_max turns between them without passing the stiffness
-            the place where it does; then each crossing to 1e-11 relative. Peaks and dips narrower than the values are
-            apart are not seen.
+            K_max is computed at the present value, at 25 values across the range, and at extrema between them that may
+            reach the stiffness. Crossings are then found to a relative error of 1e-11. Peaks and dips narrower than the
+            distance of these values may be missed.
 
         Example:
             >>> import zwidth
@@ -301,29 +318,31 @@ class SceneOptima(SceneAnswers):
             18.62 N s/m or above
         """
         stiffness = _read_stiffness(stiffness, self.unit_system["N/m"])
-        now = _present_value(self, parameter)
-        low, high = _range(self, parameter, now, within)
+        now = _get_present_value(self, parameter)
+        low, high = _choose_range(self, parameter, now, within)
 
         def surplus(value: float) -> float:
-            """How K_max compares with the wanted stiffness, in logarithms; NaN where it cannot be computed."""
+            """Return the logarithm of K_max over the required stiffness; NaN if K_max cannot be computed."""
             wall = self.replace(**{parameter: value}).max_stiffness(negative_damping=negative_damping)
             if wall.status == Status.NO_BOUNDARY:
-                return -_HARDLY_ANY
+                return -NO_STIFFNESS
             return math.log(wall.stiffness / stiffness) if wall.status == Status.OK else math.nan
 
-        tried, known = np.geomspace(low, high, _POINTS), {}
+        tried, surpluses = np.geomspace(low, high, N_POINTS), {}
         if low <= now <= high:
-            tried = np.append(tried[np.abs(tried / now - 1.0) > _SAME], now)
+            tried = np.append(tried[np.abs(tried / now - 1.0) > SAME_VALUE], now)
         for value in tried.tolist():
-            # The range ends where values are refused, as for a cut-off at half the sampling rate.
+            # Skip values that are not allowed, such as a cutoff above the Nyquist frequency.
             with suppress(InputError):
-                known[value] = surplus(value)
-        if not known:
-            raise InputError(f"within: {parameter} cannot have any value from {low:g} to {high:g}")
-        grid = sorted(known)
-        known |= {turn: surplus(turn) for turn in _find_turns(surplus, grid, [known[value] for value in grid])}
-        grid = sorted(known)
-        values = [known[value] for value in grid]
+                surpluses[value] = surplus(value)
+        if not surpluses:
+            raise InputError(f"within: {parameter} has no allowed value from {low:g} to {high:g}")
+        grid = sorted(surpluses)
+        surpluses |= {
+            value: surplus(value) for value in _find_extrema(surplus, grid, [surpluses[value] for value in grid])
+        }
+        grid = sorted(surpluses)
+        values = [surpluses[value] for value in grid]
         low, high = grid[0], grid[-1]
         enough = [value >= 0 for value in values]
         if not any(enough):
@@ -331,40 +350,41 @@ class SceneOptima(SceneAnswers):
             return RequiredValue(math.nan, "nowhere", (), (low, high), status)
         if all(enough):
             return RequiredValue(min(max(now, low), high), "everywhere", (), (low, high), Status.OK)
-        found = tuple(
-            _cross(surplus, grid[k], grid[k + 1])
+        crossings = tuple(
+            _find_crossing(surplus, grid[k], grid[k + 1])
             for k in range(len(grid) - 1)
             if (values[k] >= 0) != (values[k + 1] >= 0) and not math.isnan(values[k] + values[k + 1])
         )
-        proved = tuple(crossing for crossing in found if crossing is not None)
-        if not proved or len(proved) < len(found):
-            return RequiredValue(math.nan, "nowhere", proved, (low, high), Status.NOT_CONVERGED)
+        confirmed = tuple(crossing for crossing in crossings if crossing is not None)
+        if not confirmed or len(confirmed) < len(crossings):
+            return RequiredValue(math.nan, "nowhere", confirmed, (low, high), Status.NOT_CONVERGED)
         middle = now if now > 0 else low
-        best = min(proved, key=lambda crossing: abs(math.log(crossing.value / middle)))
+        best = min(confirmed, key=lambda crossing: abs(math.log(crossing.value / middle)))
         ends = sorted((middle, best.value))
-        if any(ends[0] <= value <= ends[1] and math.isnan(known[value]) for value in grid):
-            # A nearer crossing may hide where K_max could not be computed.
-            return RequiredValue(math.nan, "nowhere", proved, (low, high), Status.NOT_CONVERGED)
-        return RequiredValue(best.value, best.enough, proved, (low, high), Status.OK)
+        if any(ends[0] <= value <= ends[1] and math.isnan(surpluses[value]) for value in grid):
+            # K_max could not be computed between the present value and the crossing, so a closer one may exist.
+            return RequiredValue(math.nan, "nowhere", confirmed, (low, high), Status.NOT_CONVERGED)
+        return RequiredValue(best.value, best.enough, confirmed, (low, high), Status.OK)
 
     def best_damping(
         self, stiffness: float | str | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None
     ) -> BestDamping:
-        """The virtual damping that suits a stiffness best.
+        """Return the optimal virtual damping for one stiffness.
 
         Args:
-            stiffness: K in N/m, > 0; that of the scene's own wall where left out.
-            goal: "fast", the smallest spectral radius, with which the wall settles fastest; "robust", the largest
-                modulus margin, with which it bears the largest unknown change of the loop at every frequency.
-            negative_damping: as for `max_stiffness`, as is the piece of the stable set that is meant.
+            stiffness: K in N/m, > 0; by default that of the wall of the scene.
+            goal: "fast" minimizes the spectral radius, so that the wall settles fastest; "robust" maximizes the modulus
+                margin, i.e. the largest unmodeled change of the loop at any frequency with which it stays stable.
+            negative_damping: as for `max_stiffness`. Only dampings whose walls are connected to K = 0 are considered.
 
         Returns:
-            ``virtual_damping`` in N s/m; ``spectral_radius`` and ``modulus_margin`` there; ``status``, NO_BOUNDARY with
-            NaN where no damping is stable in that piece.
+            ``virtual_damping`` in N s/m, with its ``spectral_radius`` and ``modulus_margin``; ``status``, NO_BOUNDARY
+            with NaN if no such damping is stable.
 
         Numerics:
-            Samples across the stable dampings, then golden section round the three lowest dips: the optimum is usually
-            a kink, where poles meet. The radius is right to about 1e-8 where two poles meet; 0.1 to 1 s.
+            Samples in the stable intervals of B, then golden-section search around the three lowest minima, because the
+            optimum is usually a kink at which poles meet. The spectral radius is accurate to about 1e-8 if two poles
+            meet. Run time 0.1 to 1 s.
 
         References:
             Hulin, Preusche, Hirzinger 2006, section VIII. Landau 1990 (modulus margin).
@@ -383,17 +403,19 @@ class SceneOptima(SceneAnswers):
         units = self.units
 
         def radius(beta: Any) -> np.ndarray:
+            """Return the spectral radius of walls with this stiffness."""
             return self.spectral_radius(stiffness, beta * units.virtual_damping)
 
         @np.vectorize
         def margin(beta: float) -> float:
+            """Return the modulus margin of a wall with this stiffness."""
             loop = self.loop
             wall = OpenLoop.tabulate(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
             return wall.find_least_distance()[0]
 
         cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)
-        columns = soft_dampings(self, stiffness, negative_damping)
-        if not columns:
+        intervals = find_connected_dampings(self, stiffness, negative_damping)
+        if not intervals:
             return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
-        _, best = min(find_global_minimum(cost, *ends, _SAMPLES) for ends in columns)
+        _, best = min(find_global_minimum(cost, *ends, N_SAMPLES) for ends in intervals)
         return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)

@@ -1,6 +1,14 @@
-"""How stiff the wall of a rigid device can be, and what a little more of each property buys: arrays, also inside JAX.
+"""Maximum stiffness of a rigid device and its derivatives, in SI units, for arrays and inside JAX transformations.
 
-The same of one scene, rigid or not, and what a wanted stiffness requires: `zwidth.Scene`.
+The device has mass m, damping b, sampling period T and delay t_d, and uses the backward difference. With the normalized
+damping ``delta = b T/m``, the delay ``d = t_d/T`` in periods, and the largest stable normalized stiffness
+``a = alpha_max(delta, d)`` (`loops.rigid.ridge`), the maximum stiffness is ``K_max = a m/T^2``, and by the chain rule
+
+    dK/dm = (a - delta a_delta)/T^2                     dK/db = a_delta/T
+    dK/dT = (delta a_delta - d a_d - 2 a) m/T^3         dK/dt_d = a_d m/T^3
+
+with a_delta and a_d the partial derivatives of a. `zwidth.Scene` has the same for one scene with any parts, and
+searches for the parameter that a required stiffness needs.
 """
 
 from __future__ import annotations
@@ -20,8 +28,8 @@ from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import namespace
 
 
-def checked_device(**quantities: ArrayLike) -> Normalized:
-    """The normalized device; raises `InputError` also where a scalar delta or d is beyond the range of the model."""
+def normalize_device(**quantities: ArrayLike) -> Normalized:
+    """Return the normalized device; raise `InputError` if a quantity, or a scalar delta or d, is out of range."""
     device = normalize(**quantities)
     check_scalars({"delta": device.delta, "d": device.d})
     return device
@@ -29,22 +37,21 @@ def checked_device(**quantities: ArrayLike) -> Normalized:
 
 @accept_units
 def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike, delay: ArrayLike = 0.0) -> Array:
-    """Return the stiffness below which some virtual damping makes the wall stable.
+    """Return the maximum stiffness: the supremum of K for which some virtual damping makes the wall stable.
 
-    ``K_max = alpha_max(b T/m, t_d/T) m/T^2``, in N/m, for a held delay.
+    ``K_max = alpha_max(b T/m, t_d/T) m/T^2``, in N/m. A fractional delay is exact, with a zero-order hold.
 
     Args:
         mass: m in kg, > 0.
         damping: b, the physical damping of the device, in N s/m, >= 0.
         period: T in s, > 0.
-        delay: t_d in s, >= 0, whole periods or not. All four broadcast.
+        delay: t_d in s, >= 0; need not be a multiple of T. All four broadcast.
 
     Returns:
-        Array of the broadcast shape, in N/m; an entry of an array that is out of range gives NaN.
+        Array of the broadcast shape, in N/m; NaN for entries of arrays that are out of range.
 
     Numerics:
-        About 1e-15 relative. Traceable, with first and second derivatives. How it moves with each quantity stands in
-        `scenes.stiffness`.
+        Relative error about 1e-15. Traceable by JAX, with first and second derivatives.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -54,23 +61,24 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
         >>> print(f"{max_stiffness(mass=0.1, damping=10, period=1e-3, delay=1e-3):.0f} N/m")
         19865 N/m
     """
-    device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
+    device = normalize_device(mass=mass, damping=damping, period=period, delay=delay)
     arguments = {"mass": mass, "period": period, "delta": device.delta, "d": device.d}
-    return evaluate(max_stiffness_kernel, arguments, classify_delays(device.d), slopes=move_max_stiffness)
+    return evaluate(max_stiffness_kernel, arguments, classify_delays(device.d), slopes=differentiate_max_stiffness)
 
 
 def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
+    """Compute K_max from mass and period in SI units and the normalized damping and delay, for one class of delays."""
     return ridge_kernel(delta, d, kind).alpha * (mass / period) / period
 
 
-def move_max_stiffness(
+def differentiate_max_stiffness(
     mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses
 ) -> tuple[Array, tuple[Array, ...]]:
     """Return `max_stiffness_kernel` and its derivatives with respect to mass, period, delta and d."""
-    found = slopes_kernel(delta, d, kind)
+    slopes = slopes_kernel(delta, d, kind)
     scale = (mass / period) / period
-    value = found.point.alpha * scale
-    return value, (value / mass, -2.0 * value / period, found.by_delta * scale, found.by_d * scale)
+    value = slopes.point.alpha * scale
+    return value, (value / mass, -2.0 * value / period, slopes.by_delta * scale, slopes.by_d * scale)
 
 
 @shown(
@@ -81,7 +89,7 @@ def move_max_stiffness(
     per_delay="N/m per s",
 )
 class Sensitivities(NamedTuple):
-    """K_max in N/m and its derivatives: per kg, per N s/m, per s of period and per s of delay."""
+    """Maximum stiffness and its derivatives with respect to mass, damping, period and delay, in SI units."""
 
     stiffness_max: Array
     per_mass: Array
@@ -95,24 +103,24 @@ class Sensitivities(NamedTuple):
 def sensitivities(
     *, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike, delay: ArrayLike = 0.0
 ) -> Sensitivities:
-    """Return the stiffest stable wall and what it gains per unit of mass, damping, period and delay.
+    """Return the maximum stiffness and its derivatives with respect to mass, damping, period and delay.
 
     With ``a = alpha_max(delta, d)``: ``dK/dm = (a - delta a_delta)/T^2``, ``dK/db = a_delta/T``,
-    ``dK/dT = (delta a_delta - d a_d - 2 a) m/T^3``, ``dK/dt_d = a_d m/T^3``; each with the other three held fixed.
+    ``dK/dT = (delta a_delta - d a_d - 2 a) m/T^3``, ``dK/dt_d = a_d m/T^3``, each with the other three constant.
 
     Args:
         mass: m in kg, > 0.
         damping: b in N s/m, >= 0.
         period: T in s, > 0.
-        delay: t_d in s, >= 0, held. All four broadcast.
+        delay: t_d in s, >= 0; need not be a multiple of T. All four broadcast.
 
     Returns:
         Sensitivities of the broadcast shape: ``stiffness_max`` in N/m, ``per_mass`` in N/m per kg, ``per_damping``
-        in N/m per N s/m, ``per_period`` and ``per_delay`` in N/m per s; ``status``, with NaN where it is not 0.
+        in N/m per N s/m, ``per_period`` and ``per_delay`` in N/m per s; ``status``, 0 if all are valid, else with NaN.
 
     Numerics:
-        Exact derivatives, about 1e-14. Both sides agree at whole d > 0; at zero damping and zero delay they are those
-        from the right. Traceable.
+        Analytic derivatives, relative error about 1e-14. They are continuous at integer d > 0, and derivatives from the
+        right at zero damping and at zero delay. Traceable by JAX.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -123,17 +131,19 @@ def sensitivities(
         >>> print(f"{gain.per_damping:.0f} N/m per N s/m")
         572 N/m per N s/m
     """
-    device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
-    given = {"mass": mass, "damping": damping, "period": period, "delay": delay}
-    arguments = given | {"delta": device.delta, "d": device.d}
+    device = normalize_device(mass=mass, damping=damping, period=period, delay=delay)
+    quantities = {"mass": mass, "damping": damping, "period": period, "delay": delay}
+    arguments = quantities | {"delta": device.delta, "d": device.d}
     return evaluate(_sensitivities_kernel, arguments, classify_delays(device.d))
 
 
 def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensitivities:
+    """Compute the fields of `sensitivities` for one class of delays."""
     xp = namespace(mass, delta, d)
-    # If traced, compute the derivatives in delta and d once, not again for each quantity.
-    found = slopes_kernel(delta, d, kind) if xp is np else compile_traced(slopes_kernel, (kind,))(delta, d)
-    # Array entries out of range are NaN in delta or d; compute their status from the quantities.
-    given = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
-    status = xp.where(given == Status.OK, found.point.status, given).astype(np.int32)
-    return Sensitivities(*stiffness_slopes(found, mass, period, delta, d), status)
+    # If JAX traces the quantities, compile this part separately, so that the derivatives in delta and d are computed
+    # once and not again for each quantity.
+    slopes = slopes_kernel(delta, d, kind) if xp is np else compile_traced(slopes_kernel, (kind,))(delta, d)
+    # Entries of arrays that are out of range are NaN in delta or d; their status follows from the quantities.
+    input_status = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
+    status = xp.where(input_status == Status.OK, slopes.point.status, input_status).astype(np.int32)
+    return Sensitivities(*stiffness_slopes(slopes, mass, period, delta, d), status)

@@ -12,21 +12,21 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from zwidth.parts.checks import check_whole
-from zwidth.scenes.base import of_scene
+from zwidth.scenes.base import wrap_function
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import WALL
 from zwidth.words.showing import shown
 
-# Of the interval in which the share of all devices lies.
-_CONFIDENCE = 0.95
-_MOST_SAMPLES = 1_000_000
+CONFIDENCE = 0.95  # confidence level of the interval of a share
+MAX_SAMPLES = 1_000_000  # largest number of drawn devices; bounds the memory
 
 
 class Tolerance(NamedTuple):
-    """How far a parameter lies from its nominal value, as a share of it.
+    """Tolerance of a parameter, relative to its nominal value.
 
-    Uniform: anywhere from ``(1 - share)`` to ``(1 + share)`` times it. Normal: ``share`` is the standard deviation.
+    Uniform: between ``(1 - share)`` and ``(1 + share)`` times the nominal value. Normal: ``share`` is the standard
+    deviation.
     """
 
     share: float
@@ -38,119 +38,126 @@ class Tolerance(NamedTuple):
 )
 @dataclass(frozen=True)
 class ToleranceEstimate:
-    """What `simulate_tolerances` finds; of a share the interval holds the true one with 95 % confidence."""
+    """Results of `simulate_tolerances`."""
 
-    samples: int
-    stable: float  # the share of devices on which the wall of the scene is stable
-    stable_low: float
-    stable_high: float
-    reliability: float  # the share for which the next two hold
+    samples: int  # number of drawn devices
+    stable: float  # share of drawn devices on which the wall of the scene is stable
+    stable_low: float  # lower end of the 95 % confidence interval of the share of all devices
+    stable_high: float  # upper end of that interval
+    reliability: float  # share of devices to which the next two fields apply
     stiffness: float  # in N/m: upper end of K at which that share of devices is stable, at the wall's damping B
-    stiffness_max: float  # the same where each device has the damping that suits it best; NaN for a scene with parts
-    drawn: dict[str, np.ndarray]  # what was drawn, by parameter
-    labels: np.ndarray  # whether each device bears the wall
+    stiffness_max: float  # the same if each device has its best B; NaN unless the scene is rigid
+    drawn: dict[str, np.ndarray]  # drawn values by parameter
+    labels: np.ndarray  # stability of the wall on each device, bool
 
 
-@of_scene
+@wrap_function
 def simulate_tolerances(
     scene: Scene, tolerances: dict[str, Any], *, samples: int = 10_000, seed: int = 0, reliability: float = 0.99
 ) -> ToleranceEstimate:
-    """Draw devices within tolerances and judge the scene's wall on each of them.
+    """Draw devices within tolerances, and decide the stability of the wall of a scene on each of them.
 
-    The parameters are independent of each other; all that is not named is exact. A delay given in periods keeps its
+    The parameters are drawn independently; parameters without a tolerance are exact. A delay given in periods keeps its
     number of periods.
 
     Args:
-        scene: nominal device, timing, parts, and the wall.
-        tolerances: by dotted path as in ``scene.parameters()``: a `Tolerance`, or its share, as ``{"mass": 0.1}``.
-        samples: how many devices are drawn, up to 1,000,000. A rigid scene takes some microseconds a device, a scene
-            with parts some 10 to 100 ms.
-        seed: of the draws; equal seeds give equal devices.
-        reliability: the share of devices that must bear the stiffnesses returned, between 0 and 1.
+        scene: nominal device, timing, other parts, and the wall.
+        tolerances: a `Tolerance` or its share by dotted path, as in ``scene.parameters()``; e.g. ``{"mass": 0.1}``.
+        samples: number of drawn devices, up to 1,000,000. A rigid scene takes some microseconds per device, any other
+            scene 10 to 100 ms.
+        seed: seed of the random numbers; equal seeds draw equal devices.
+        reliability: share of devices on which the returned stiffnesses must be stable, between 0 and 1.
 
     Returns:
         ToleranceEstimate.
 
     Raises:
-        InputError: an unknown parameter, a share that is not between 0 and 1 (normal: up to 1/3), or a parameter that
-            is 0 and has no share.
+        InputError: unknown parameter, a share not between 0 and 1 (normal: up to 1/3), or a parameter that is 0, for
+            which a relative tolerance has no effect.
 
     References:
-        Clopper and Pearson 1934, Biometrika 26, 404-413 (the interval of a share).
+        Clopper and Pearson 1934, Biometrika 26, 404-413 (confidence interval of a share).
 
     Example:
         >>> import zwidth
         >>> wall = zwidth.VirtualWall("17 kN/m", "40 N s/m")
         >>> scene = zwidth.Scene(zwidth.Device("100 g", 10), zwidth.Timing("1 ms", "1 ms"), wall)
-        >>> found = zwidth.simulate_tolerances(scene, {"mass": 0.2, "damping": 0.3})
-        >>> print(f"{100 * found.stable:.0f} % bear it, 99 % bear {found.stiffness / 1e3:.1f} kN/m")
-        91 % bear it, 99 % bear 15.6 kN/m
+        >>> estimate = zwidth.simulate_tolerances(scene, {"mass": 0.2, "damping": 0.3})
+        >>> print(f"stable on {100 * estimate.stable:.0f} %; 99 %: up to {estimate.stiffness / 1e3:.1f} kN/m")
+        stable on 91 %; 99 %: up to 15.6 kN/m
     """
-    count = check_whole("samples", samples, 1, _MOST_SAMPLES)
+    count = check_whole("samples", samples, 1, MAX_SAMPLES)
     if not 0 < reliability < 1:
-        raise InputError(f"reliability: got {reliability!r}; a share between 0 and 1 is needed, as 0.99")
+        raise InputError(f"reliability: got {reliability!r}; pass a share between 0 and 1, such as 0.99")
     drawn = _draw(scene, tolerances, count, check_whole("seed", seed, 0, 2**63 - 1))
     wall, variants = scene.wall, scene.loop.vary(drawn)
     labels = variants.labels(wall.stiffness, wall.virtual_damping)
-    limits = variants.row_ends(np.array([wall.virtual_damping]))[:, 0]
+    limits = variants.find_stiffness_limits(np.array([wall.virtual_damping]))[:, 0]
     stable = int(np.count_nonzero(labels))
-    low, high = _interval(stable, count)
+    low, high = _compute_confidence_interval(stable, count)
     return ToleranceEstimate(
         count,
         stable / count,
         low,
         high,
         reliability,
-        borne_by(limits, reliability),
-        np.nan if variants.searched else borne_by(variants.stiffest()[0], reliability),
+        compute_stiffness_quantile(limits, reliability),
+        np.nan if variants.searched else compute_stiffness_quantile(variants.stiffest()[0], reliability),
         drawn,
         labels,
     )
 
 
 def _draw(scene: Scene, tolerances: dict[str, Any], count: int, seed: int) -> dict[str, np.ndarray]:
-    own = scene.parameters()
-    nominal = {name: value for name, value in own.items() if isinstance(value, float) and name not in WALL}
+    """Check the tolerances, and return ``count`` random values of each parameter with a tolerance."""
+    parameters = scene.parameters()
+    nominal = {name: value for name, value in parameters.items() if isinstance(value, float) and name not in WALL}
     generator = np.random.default_rng(seed)
     drawn = {}
-    for name, given in tolerances.items():
+    for name, tolerance in tolerances.items():
         if name not in nominal:
             raise InputError(f"tolerances: {describe_choice(name, tuple(nominal))}")
-        share, distribution = given if isinstance(given, Tolerance) else Tolerance(given)
+        share, distribution = tolerance if isinstance(tolerance, Tolerance) else Tolerance(tolerance)
         check_choice(f"tolerances: {name}", distribution, ("uniform", "normal"))
         most = 1 / 3 if distribution == "normal" else 1.0
         if isinstance(share, bool | str) or not np.isreal(share) or not 0 < share < most:
-            raise InputError(f"tolerances: {name}: got {share!r}; a share between 0 and {most:.3g} is needed, as 0.1")
+            raise InputError(f"tolerances: {name}: got {share!r}; pass a share between 0 and {most:.3g}, such as 0.1")
         if nominal[name] == 0:
-            raise InputError(f"tolerances: {name} is 0, and so is any share of it; give it a value, or leave it out")
-        drawn[name] = nominal[name] * _factors(generator, float(share), distribution, count)
+            raise InputError(f"tolerances: {name} is 0, so a relative tolerance has no effect; set a value, or omit it")
+        drawn[name] = nominal[name] * _draw_factors(generator, float(share), distribution, count)
     if scene.timing.in_periods and {"delay", "period"} <= drawn.keys():
         drawn["delay"] = drawn["delay"] * (drawn["period"] / nominal["period"])
     return drawn
 
 
-def _factors(generator: np.random.Generator, share: float, distribution: str, count: int) -> np.ndarray:
+def _draw_factors(generator: np.random.Generator, share: float, distribution: str, count: int) -> np.ndarray:
+    """Return ``count`` random factors on the nominal value of a parameter, all positive."""
     if distribution == "uniform":
         return generator.uniform(1.0 - share, 1.0 + share, count)
     factors = generator.normal(1.0, share, count)
     while np.any(bad := factors <= 0):
-        # No mass is negative: what three standard deviations or more would make so is drawn again.
+        # Draw again values at least three standard deviations below the mean, because parameters must be positive.
         factors[bad] = generator.normal(1.0, share, np.count_nonzero(bad))
     return factors
 
 
-def borne_by(limits: np.ndarray, share: float) -> float:
-    """The stiffness up to which a share of the devices is stable; 0 where too few are stable at all."""
+def compute_stiffness_quantile(limits: np.ndarray, share: float) -> float:
+    """Return the stiffness up to which at least ``share`` of the devices is stable; 0 if too few are stable.
+
+    Args:
+        limits: largest stable stiffness of each device; NaN if none is stable.
+        share: required share of stable devices.
+    """
     ordered = np.sort(np.where(np.isnan(limits), 0.0, limits))
-    # The tolerance keeps 1 - 0.99 of 100 devices at one device.
+    # Add 1e-9 before rounding down, because e.g. (1 - 0.9) 10 is slightly below 1 in floating point.
     return float(ordered[int(np.floor((1.0 - share) * ordered.size + 1e-9))])
 
 
-def _interval(stable: int, count: int) -> tuple[float, float]:
-    """Clopper and Pearson's interval of a share."""
+def _compute_confidence_interval(stable: int, count: int) -> tuple[float, float]:
+    """Return the Clopper-Pearson confidence interval of the share of stable devices."""
     from scipy.special import betaincinv
 
-    rest = (1.0 - _CONFIDENCE) / 2.0
+    rest = (1.0 - CONFIDENCE) / 2.0
     low = betaincinv(stable, count - stable + 1, rest) if stable else 0.0
     high = betaincinv(stable + 1, count - stable, 1.0 - rest) if stable < count else 1.0
     return float(low), float(high)

@@ -1,11 +1,15 @@
-"""A wall with its velocity estimate as the difference equations of a control loop, in C or in Python.
+"""Source code of a wall with its velocity estimate for a control loop, in C or in Python.
 
-The estimate is a difference over a window and first- and second-order sections in powers of ``zeta = z - 1``: a filter
-that is slow beside the period keeps its digits there, which the coefficients of z lose. A section
+The velocity estimate is a difference over a window, followed by sections of first and second order in powers of
+``zeta = z - 1``. A filter that is slow compared with the sampling rate has poles close to z = 1, so coefficients in
+powers of z would lose digits. A second-order section
 
     (b2 zeta^2 + b1 zeta + b0)/(zeta^2 + a1 zeta + a0)
 
-has the states ``p = zeta W`` and ``q = W`` with ``zeta^2 W = w = u - a1 p - a0 q``, so that ``y = b2 w + b1 p + b0 q``.
+with input u and output y has the states ``p = zeta W`` and ``q = W``, where W is u divided by the denominator. With
+``w = zeta^2 W = u - a1 p - a0 q``, the output is ``y = b2 w + b1 p + b0 q``. Since ``zeta W`` is the change of W until
+the next sample, the states are updated by ``q += p`` and ``p += w``. A first-order section has the state q only, with
+``w = zeta W = u - a0 q``.
 """
 
 from __future__ import annotations
@@ -24,8 +28,8 @@ from zwidth.words.formatting import name_wall, with_unit
 from zwidth.words.unit_system import UnitSystem
 
 _COLUMNS = 100  # characters per line of a comment
-# A root is real whose imaginary part is no more of it than rounding.
-_ROUNDED = 1e-13
+# Largest imaginary part of a real root, relative to its modulus; covers rounding errors.
+REAL_TOLERANCE = 1e-13
 
 
 def _describe_call(system: UnitSystem) -> tuple[str, str]:
@@ -50,46 +54,59 @@ def _describe_cautions(scene: SceneParts, cautions: Sequence[str]) -> list[str]:
 
 
 def find_sections(estimate: Estimate) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """What follows the window's difference: tops and bottoms of one length, 2 or 3, the bottoms beginning with 1."""
-    # Zeros at z = 1 come first, so that what comes after them stays small.
-    behind = [1.0] * abs(estimate.lag)
-    zeros = _find_factors(np.append(estimate.zeros, behind if estimate.lag < 0 else []))
-    poles = _find_factors(np.append(estimate.poles, behind if estimate.lag > 0 else []))
+    """Return the sections after the difference over the window.
+
+    Returns:
+        Numerator and denominator of each section in powers of zeta, highest power first, both of the same length 2
+        (first order) or 3. The denominator starts with 1.
+    """
+    # Factors at z = 0 have the offset 1 from z = 1.
+    at_zero = [1.0] * abs(estimate.lag)
+    zeros = _find_factors(np.append(estimate.zeros, at_zero if estimate.lag < 0 else []))
+    poles = _find_factors(np.append(estimate.poles, at_zero if estimate.lag > 0 else []))
     if any(len(factor) == 3 for factor in (*zeros, *poles)):
         zeros, poles = _pair(zeros), _pair(poles)
     poles.sort(key=len, reverse=True)
+    # Zeros at z = 1 come first, so that the input of the following sections stays small.
     zeros.sort(key=lambda factor: (-len(factor), abs(factor[-1])))
-    # There are no more zeros than poles: each factor of the top finds a bottom that is as long.
+    # There are at most as many zeros as poles, so each numerator has a denominator of the same length. Missing
+    # numerators are 1.
     zeros += [(1.0,)] * (len(poles) - len(zeros))
-    return [((0.0,) * (len(bottom) - len(top)) + top, bottom) for top, bottom in zip(zeros, poles, strict=True)]
+    return [
+        ((0.0,) * (len(denominator) - len(numerator)) + numerator, denominator)
+        for numerator, denominator in zip(zeros, poles, strict=True)
+    ]
 
 
 def _find_factors(roots: np.ndarray) -> list[tuple[float, ...]]:
-    """Real factors by roots that are given by their offsets from 1: ``zeta + offset``, or of a complex pair."""
-    known: list[complex] = roots.tolist()
-    pairs = [one for one in known if one.imag > _ROUNDED * abs(one)]
-    real = [one.real for one in known if abs(one.imag) <= _ROUNDED * abs(one)]
-    return [(1.0, 2.0 * one.real, abs(one) ** 2) for one in pairs] + [(1.0, one) for one in real]
+    """Return the real factors of a polynomial in zeta, by the offsets ``1 - z`` of its roots.
+
+    A real root yields ``zeta + offset``, a complex pair a polynomial of second order.
+    """
+    offsets: list[complex] = roots.tolist()
+    pairs = [offset for offset in offsets if offset.imag > REAL_TOLERANCE * abs(offset)]
+    real = [offset.real for offset in offsets if abs(offset.imag) <= REAL_TOLERANCE * abs(offset)]
+    return [(1.0, 2.0 * offset.real, abs(offset) ** 2) for offset in pairs] + [(1.0, offset) for offset in real]
 
 
 def _pair(factors: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
-    """Two factors with one root each as one with two."""
+    """Multiply factors of first order in pairs; one remains if their number is odd."""
     single = sorted((factor for factor in factors if len(factor) == 2), key=lambda factor: abs(factor[1]))
-    both = [tuple(np.polymul(*two).tolist()) for two in zip(single[::2], single[1::2], strict=False)]
-    return [factor for factor in factors if len(factor) == 3] + both + single[2 * len(both) :]
+    products = [tuple(np.polymul(*two).tolist()) for two in zip(single[::2], single[1::2], strict=False)]
+    return [factor for factor in factors if len(factor) == 3] + products + single[2 * len(products) :]
 
 
 class WallProgram(NamedTuple):
-    """What a loop does; statements are C and Python alike, but for ``@`` before what is kept to the next sample."""
+    """Program of a wall as statements that are valid in C and Python, except for the mark ``@`` before states."""
 
-    head: str
-    window: int
-    states: list[str]
-    start: list[str]  # the states at rest
-    force: list[str]  # from the position x to the velocity v
-    law: str
+    head: str  # comment at the head of the program
+    window: int  # length of the difference in periods; 0 for none
+    states: list[str]  # names of the states of the sections
+    start: list[str]  # statements that set the states to those at rest
+    force: list[str]  # statements that compute the velocity v from the position x
+    law: str  # expression of the force
     max_force: float  # largest force; infinite for none
-    system: UnitSystem
+    system: UnitSystem  # units of the device
 
 
 def write_wall(
@@ -110,34 +127,34 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
         force = [f"u = (x - @past[@next]) / {count}", "@past[@next] = x", f"@next = (@next + 1) % {count}"]
     else:
         force = ["u = x - @x" if count else "u = x", "@x = x"]
-    # Behind a difference all is 0 at rest.
+    # At rest a difference is 0, and so are all states after it. Without a difference the input is u = x.
     sections = find_sections(estimate)
     start, states = [] if count or not sections else ["u = x"], []
-    for number, (top, bottom) in enumerate(sections):
-        *inner, last = names = [f"@{name}{number}" for name in "pq"[3 - len(bottom) :]]
+    for number, (numerator, denominator) in enumerate(sections):
+        *inner, last = names = [f"@{name}{number}" for name in "pq"[3 - len(denominator) :]]
         states += [name[1:] for name in names]
-        start += [f"{name} = 0.0" for name in inner] + [f"{last} = " + ("0.0" if count else f"u / {bottom[-1]!r}")]
-        start += [] if count or number == len(sections) - 1 else [f"u = {top[-1]!r} * {last}"]
-        if top == (1.0, 1.0) and bottom[-1] != 0:
-            # A zero at z = 0: the low-pass as people write it.
-            force += [f"{last} += {bottom[-1]!r} * (u - {last})", f"u = {last}"]
-            start = [line if line != f"{last} = u / {bottom[-1]!r}" else f"{last} = u" for line in start]
-            gain /= bottom[-1]
+        start += [f"{name} = 0.0" for name in inner] + [f"{last} = " + ("0.0" if count else f"u / {denominator[-1]!r}")]
+        start += [] if count or number == len(sections) - 1 else [f"u = {numerator[-1]!r} * {last}"]
+        if numerator == (1.0, 1.0) and denominator[-1] != 0:
+            # The section has a zero at z = 0: use the usual form of a first-order low-pass.
+            force += [f"{last} += {denominator[-1]!r} * (u - {last})", f"u = {last}"]
+            start = [line if line != f"{last} = u / {denominator[-1]!r}" else f"{last} = u" for line in start]
+            gain /= denominator[-1]
             continue
-        back = "".join(f" - {factor!r} * {name}" for factor, name in zip(bottom[1:], names, strict=True))
-        parts = [f"{factor!r} * {name}" for factor, name in zip(top, ("w", *names), strict=True) if factor]
-        force += [f"w = u{back}", f"u = {' + '.join(parts)}", *(f"{last} += {name}" for name in inner)]
+        feedback = "".join(f" - {factor!r} * {name}" for factor, name in zip(denominator[1:], names, strict=True))
+        terms = [f"{factor!r} * {name}" for factor, name in zip(numerator, ("w", *names), strict=True) if factor]
+        force += [f"w = u{feedback}", f"u = {' + '.join(terms)}", *(f"{last} += {name}" for name in inner)]
         force.append(f"{names[0]} += w")
     K, B, system = float(scene.wall.stiffness), float(scene.wall.virtual_damping), scene.unit_system
-    estimated = f"velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}"
+    estimator = f"velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}"
     limited = f" {'Torque' if system.rotary else 'Force'} limited to {with_unit(max_force, system['N'])}."
-    wall = f"Virtual wall: {name_wall(K, B, system)}, {estimated}.{limited if max_force < math.inf else ''}"
+    wall = f"Virtual wall: {name_wall(K, B, system)}, {estimator}.{limited if max_force < math.inf else ''}"
     head, law = "\n".join([wall, *_describe_cautions(scene, cautions)]), f"-({K!r} * x + {B!r} * v)"
     return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], law, float(max_force), system)
 
 
 def _write_c(program: WallProgram) -> str:
-    """The wall as C99."""
+    """Return the program in C99."""
     count = program.window
     members = [f"double past[{count}]", "int next"] if count > 1 else ["double x"]
     begin = [f"for (int k = 0; k < {count}; k++) wall->past[k] = x", "wall->next = 0"] if count > 1 else ["wall->x = x"]
@@ -152,35 +169,35 @@ def _write_c(program: WallProgram) -> str:
     start = [*(["double u"] if "u = x" in program.start else []), *begin, *program.start]
     force = [f"double {', '.join(names)}", *lines]
     blocks = ["\n".join(f"    {line.replace('@', 'wall->')};" for line in lines) for lines in (start, force)]
-    kept = "\n".join(f"    {line};" for line in (*members, *(f"double {name}" for name in program.states)))
-    words = "\n   ".join(
+    members_text = "\n".join(f"    {line};" for line in (*members, *(f"double {name}" for name in program.states)))
+    comment = "\n   ".join(
         [
             "/* " + program.head.replace("\n", "\n   "),
             *_describe_call(program.system),
             "Call wall_start once, then wall_force once per period. */",
         ]
     )
-    opened = "void wall_start(Wall *wall, double x)\n{\n", "double wall_force(Wall *wall, double x)\n{\n"
-    functions = [f"{head}{block}\n}}\n" for head, block in zip(opened, blocks, strict=True)]
-    return "\n".join([words, f"typedef struct {{\n{kept}\n}} Wall;\n", *functions])
+    signatures = "void wall_start(Wall *wall, double x)\n{\n", "double wall_force(Wall *wall, double x)\n{\n"
+    functions = [f"{head}{block}\n}}\n" for head, block in zip(signatures, blocks, strict=True)]
+    return "\n".join([comment, f"typedef struct {{\n{members_text}\n}} Wall;\n", *functions])
 
 
 def _write_python(program: WallProgram) -> str:
-    """The wall as a class of Python."""
+    """Return the program as a class in Python."""
     count = program.window
     begin = [f"@past = [x] * {count}", "@next = 0"] if count > 1 else ["@x = x"]
     limit, law = program.max_force, program.law
     law = law if limit == math.inf else f"max(-{limit!r}, min({limit!r}, {law}))"
     force = [*program.force, f"return {law} if x > 0.0 else 0.0"]
-    words = "\n    ".join(
+    docstring = "\n    ".join(
         [
             '    """' + program.head.replace("\n", "\n    ") + "\n",
             *_describe_call(program.system),
-            "Make one, then call force once per period.",
+            "Create one instance, then call force once per period.",
             '"""',
         ]
     )
     heads = "    def __init__(self, x=0.0):", "    def force(self, x):"
     blocks = ["\n".join(f"        {line}" for line in lines) for lines in ([*begin, *program.start], force)]
     functions = [f"{head}\n{block}\n".replace("@", "self.") for head, block in zip(heads, blocks, strict=True)]
-    return "\n".join([f"class Wall:\n{words}\n", *functions])
+    return "\n".join([f"class Wall:\n{docstring}\n", *functions])

@@ -1,7 +1,11 @@
 """Search for the stiffest wall of a scene that satisfies requirements on its margins.
 
-The slack of a requirement is the relative excess over it: 0 at the limit, negative if the requirement is violated, -1
-for an unstable wall. The active requirement of a wall is the one that excludes every stiffer wall.
+The *slack* of a requirement is the relative excess over it: 0 at the limit, negative if the requirement is violated, -1
+for an unstable wall. The slack of a stiffness K is the smallest slack of all requirements with the best damping B. The
+search brackets the largest K with nonnegative slack by steps on log K, and then finds the zero of the slack by false
+position (`arrays.roots.false_position`). The active requirement of a wall is the one that excludes every stiffer wall.
+Grasps are models of a hand on the device; the *safe limit* bounds K and B to walls that measurements of the device
+support.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from zwidth.arrays.roots import false_position, find_global_minimum
 from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
 from zwidth.parts.safe_limit import SafeLimit, reserve_damping
-from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, soft_dampings
+from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, find_connected_dampings
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.status import Status
@@ -27,12 +31,12 @@ DEFAULT_PHASE_MARGIN = 30.0  # degrees
 DEFAULT_GAIN_MARGIN = 2.0  # factor on K and B together, 6 dB
 
 SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive only in a small part of its stable range
-NEAR = 5.0  # tolerance of the best B over the tolerance of K
+NEAR = 5.0  # ratio of the tolerance of the best B to that of K; B may be less accurate, because its optimum is flat
 LEAST = 1e-9  # smallest stiffness tried, relative to the largest allowed one
 STEP_DOWN = 0.25  # factor by which K is lowered until a wall satisfies the requirements
 STEP_DOWN_UNSTABLE = 0.95  # the same for a device unstable without a wall, whose stable walls have a lower end in K
-HELD_GAIN = 1.1  # factor on K and B with which a wall must be stable in a required grasp, because grasps vary
-HELD = 0.95  # factor on K for the initial guess if a grasp destabilizes the wall
+GRASP_GAIN = 1.1  # factor on K and B with which a wall must be stable in a required grasp, because grasps vary
+GRASP_GUESS = 0.95  # factor on K for the initial guess if a grasp destabilizes the wall
 FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
 WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
 COARSE = 1e-3  # half-width of the bracket of log K for alternatives, whose gain or cost is printed with 2 or 3 digits
@@ -68,8 +72,8 @@ class Wanted(NamedTuple):
     ) -> Wanted:
         """Return the requirements, with defaults if none is given; raise `InputError` for an invalid value."""
         ranges = {"stiffness_fraction": FRACTION, **RANGES}
-        given = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
-        for name, value in given.items():
+        limits = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
+        for name, value in limits.items():
             number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
             if value is not None and not (number and math.isfinite(to_float(value)) and ranges[name].holds(value)):
                 raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, such as {_EXAMPLES[name]}")
@@ -79,11 +83,11 @@ class Wanted(NamedTuple):
                 raise InputError(f"{name}: got {value!r}; True or False is needed")
         if grasps is not None:
             check_choice("grasps", grasps, ("all", "soft", "none"))
-        default = not passive and all(value is None for value in given.values())
+        default = not passive and all(value is None for value in limits.values())
         if default:
-            given = dict(zip(given, (RECOMMENDED_SHARE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN), strict=True))
+            limits = dict(zip(limits, (RECOMMENDED_SHARE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN), strict=True))
         return cls(
-            **given,
+            **limits,
             passive=bool(passive),
             beyond_safe=bool(beyond_safe),
             grasps=grasps or ("soft" if default else "none"),
@@ -117,7 +121,7 @@ class WallChoice(NamedTuple):
     note: str = ""  # remark on the choice
 
 
-def list_held(scene: SceneOptima, wanted: Wanted) -> list[SceneOptima]:
+def list_grasped_scenes(scene: SceneOptima, wanted: Wanted) -> list[SceneOptima]:
     """Return the scene in each required grasp, and without its operator if grasps are required and it has one."""
     if not isinstance(scene.device, Device) or wanted.grasps == "none":
         return []
@@ -126,23 +130,24 @@ def list_held(scene: SceneOptima, wanted: Wanted) -> list[SceneOptima]:
     return [scene.replace(operator=hand) for hand in (*hands, *([None] if scene.operator is not None else []))]
 
 
-def measure_slack(scene: SceneOptima, wanted: Wanted, held: Sequence[SceneOptima] = ()) -> Slack:
+def measure_slack(scene: SceneOptima, wanted: Wanted, grasped: Sequence[SceneOptima] = ()) -> Slack:
     """Return a function of K in N/m and B in N s/m that returns the slack of each requirement on margins.
 
-    The wall must also be stable in every scene of ``held``. The slack of this requirement is the modulus margin of the
-    wall, so that a search for the largest slack prefers well-damped walls.
+    The wall must also be stable in every scene of ``grasped``. The slack of this requirement is the modulus margin of
+    the wall, so that a search for the largest slack prefers well-damped walls.
     """
     device_damping = float(scene.device.damping)
     reserve = 0.0 if wanted.beyond_safe else reserve_damping(scene)
-    asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
-    asked += ["modulus_margin"] if held else []
+    needed_margins = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
+    needed_margins += ["modulus_margin"] if grasped else []
 
     def slack(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
+        """Return the slack of each requirement for walls of one stiffness."""
         alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
         stable, slacks = scene.loop.labels(alpha, beta), {}
         margins: Any = None
-        if asked:
-            margins = scene.loop.margins(alpha, beta, asked)
+        if needed_margins:
+            margins = scene.loop.margins(alpha, beta, needed_margins)
             if wanted.gain_margin:
                 with np.errstate(all="ignore"):
                     slacks["gain_margin"] = np.abs(np.log(margins.gain_margin)) / math.log(wanted.gain_margin) - 1.0
@@ -152,17 +157,17 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, held: Sequence[SceneOptima
             margin = (np.asarray(scene.passivity_margin(stiffness, damping)) - reserve) / (device_damping or 1.0)
             # A margin of exactly 0 must yield a negative slack, because such a wall is not passive.
             slacks["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
-        if held:
-            steady = np.all([_is_stable_held(each, stiffness, damping) for each in held], axis=0)
-            slacks["grasps"] = np.where(steady, margins.modulus_margin, -1.0)
+        if grasped:
+            stable_in_grasps = np.all([_is_stable_in_grasp(each, stiffness, damping) for each in grasped], axis=0)
+            slacks["grasps"] = np.where(stable_in_grasps, margins.modulus_margin, -1.0)
         return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in slacks.items()}
 
     return slack
 
 
-def _is_stable_held(held: SceneOptima, stiffness: float, damping: Any) -> Any:
-    """Return whether walls are stable in a grasp, both with K and B and with ``HELD_GAIN`` times K and B."""
-    return np.all([held.is_stable(gain * stiffness, gain * damping) for gain in (1.0, HELD_GAIN)], axis=0)
+def _is_stable_in_grasp(grasped: SceneOptima, stiffness: float, damping: Any) -> Any:
+    """Return whether walls are stable in a grasp, both with K and B and with ``GRASP_GAIN`` times K and B."""
+    return np.all([grasped.is_stable(gain * stiffness, gain * damping) for gain in (1.0, GRASP_GAIN)], axis=0)
 
 
 def find_stiffest(
@@ -190,9 +195,10 @@ def find_stiffest(
         stiffness = math.exp(log_stiffness)
 
         def cost(beta: Any) -> np.ndarray:
+            """Return the negative of the smallest slack."""
             return -np.min(list(slack(stiffness, beta * unit).values()), axis=0)
 
-        intervals = soft_dampings(scene, stiffness)
+        intervals = find_connected_dampings(scene, stiffness)
         if safe is not None:
             intervals = _clip(intervals, *(end / unit for end in safe.dampings(stiffness) or (math.inf, -math.inf)))
         dips = [
@@ -244,14 +250,16 @@ def choose_wall(
     scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> WallChoice:
     """Choose the stiffest wall of a scene that satisfies the requirements; ``top`` is its stiffest stable wall."""
-    grasps, active = list_held(scene, wanted), list[SceneOptima]()
+    grasps, active = list_grasped_scenes(scene, wanted), list[SceneOptima]()
     free = choice = _choose_free(scene, wanted, top, near, width, active)
     # Require only the grasps that destabilize a chosen wall, because each grasp makes the search slower.
     while choice.status == Status.OK and (
-        unstable := [held for held in grasps if not _is_stable_held(held, choice.stiffness, choice.damping)]
+        unstable := [
+            grasped for grasped in grasps if not _is_stable_in_grasp(grasped, choice.stiffness, choice.damping)
+        ]
     ):
         active += unstable
-        choice = _choose_free(scene, wanted, top, HELD * choice.stiffness, width, active)
+        choice = _choose_free(scene, wanted, top, GRASP_GUESS * choice.stiffness, width, active)
     if choice.status != Status.OK:
         return choice
     return choice._replace(limit="grasps" if choice.stiffness < (1.0 - 2.0 * width) * free.stiffness else free.limit)
@@ -263,9 +271,9 @@ def _choose_free(
     top: StiffestWall,
     near: float | None,
     width: float,
-    held: Sequence[SceneOptima],
+    grasped: Sequence[SceneOptima],
 ) -> WallChoice:
-    """Choose the wall by all requirements, but require stability only in the grasps of ``held``."""
+    """Choose the wall by all requirements, but require stability only in the grasps of ``grasped``."""
     nan = math.nan
     if top.status != Status.OK:
         return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
@@ -278,7 +286,7 @@ def _choose_free(
         # Apply the same fraction to the safe limit as to K_max, because both need the same reserve.
         share = wanted.safe_share * safe.stiffness
         most, active = (share, "safe_limit") if share < most else (most, active)
-    usual, slack = choose_damping(scene, top, most), measure_slack(scene, wanted, held)
+    usual, slack = choose_damping(scene, top, most), measure_slack(scene, wanted, grasped)
     if safe is not None:
         low, high = safe.dampings(most) or (usual, usual)
         usual = min(max(usual, low), high)

@@ -155,7 +155,7 @@ def find_device_share(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) 
     which `add_si_columns` leaves tables unchanged.
     """
     scene = _find_scene(delta, d, owner)
-    return float(scene.own_delta / scene.delta) if scene is not None and scene.delta else 1.0
+    return float(scene.device_delta / scene.delta) if scene is not None and scene.delta else 1.0
 
 
 def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Scene | None:

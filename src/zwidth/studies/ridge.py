@@ -29,7 +29,7 @@ from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.loops.rigid.verdict import is_stable
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
-from zwidth.scenes.assessment import passive_edge
+from zwidth.scenes.assessment import trace_passivity_boundary
 from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, find_device_share
 from zwidth.words.errors import InputError
@@ -104,14 +104,14 @@ class PassivityStudy(CurvesStudy):
 
 def trace_unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
     """Return alpha and beta on the boundary of the passive set for delta = 1, by increasing beta."""
-    return passive_edge(Scene(Device(1.0, 1.0), Timing(1.0, d)))
+    return trace_passivity_boundary(Scene(Device(1.0, 1.0), Timing(1.0, d)))
 
 
 def find_edges(scene: Scene) -> dict[str, Outlines]:
     """Return the outlines of the stable set of a scene and, for a rigid device, of the passive set."""
     edges: dict[str, Outlines] = {"stable": [(np.stack(piece[:2], -1), piece.hole) for piece in scene.stable_region()]}
     if not scene.parts_beyond and scene.device.damping > 0:
-        edges["passive"] = [(np.stack(passive_edge(scene), -1), False)]
+        edges["passive"] = [(np.stack(trace_passivity_boundary(scene), -1), False)]
     return edges
 
 

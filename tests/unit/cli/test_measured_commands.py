@@ -60,7 +60,7 @@ def test_a_log_tells_a_safe_wall_and_what_a_stiffer_one_needs(first):
     lines = dict(line.split("  ", 1) for line in said.splitlines() if line[0] != " ")
     assert {"response of", "lines", "deviation", "K_max", "safe wall", "wrote"} <= lines.keys()
     assert "stable for every response in the band" in lines["safe wall"]
-    assert "measure anew from" in said
+    assert "measure again from" in said
     assert (folder / "r.png").stat().st_size > 10_000
 
 
@@ -83,7 +83,7 @@ def test_the_table_that_was_kept_gives_the_same_wall(first):
     wall = said_of(said)["safe wall"].strip()
     assert wall.partition(", ")[2].startswith(f"{again['K_max'].partition(' at ')[2].partition(',')[0]}: ")
     # Why no stiffer one is sure, in the same words.
-    reason = next(line for line in said.splitlines() if "measure anew from" in line).partition("  ")[2].strip()
+    reason = next(line for line in said.splitlines() if "measure again from" in line).partition("  ")[2].strip()
     assert said_of(said)["K_max"].strip().removeprefix("K = ").partition(",")[0] in again["note"]
     assert reason in again["note"]
     device = zwidth.MeasuredDevice.read(folder / "r.csv")
@@ -140,7 +140,7 @@ def test_a_response_is_a_device_of_every_command_that_judges(first):
     wall = ["--stiffness", 1.03 * known["stiffness"], "--virtual-damping", known["virtual_damping"]]
     lines = said_of(call("check", *device, *wall))
     assert "UNDECIDED" in lines
-    assert "measure anew from" in lines["note"]
+    assert "measure again from" in lines["note"]
     assert json.loads(call("check", *device, *wall, "--json"))["stable"] is None
     found = json.loads(call("recommend", *device, "--gain-margin", "1.3", "--json"))["recommended"]
     verdict = zwidth.assess(zwidth.Scene(scene.device, scene.timing, zwidth.VirtualWall(*(found[k] for k in known))))

@@ -100,7 +100,7 @@ def test_whole_numbers_are_points():
 @pytest.mark.parametrize(("name", "more"), [("ridge", ("damping", [1.0])), ("step", (1.0,)),
                                             ("bode", ()), ("nyquist", ()), ("poles", ())])  # fmt: skip
 def test_what_is_no_scene_is_refused_by_name(name, more, unpainted):
-    with pytest.raises(zwidth.InputError, match=r"scene: got 3\.0; a zwidth\.Scene is needed"):
+    with pytest.raises(zwidth.InputError, match=r"scene: got 3\.0; pass a zwidth\.Scene"):
         getattr(plot, name)(3.0, *more)
 
 

@@ -168,7 +168,7 @@ def test_the_rounding_of_a_sampled_system_takes_no_soft_wall_away(mass, damping)
     [
         ({"period": 2e-3}, "got a system sampled at 0.001 s in a loop of 0.002 s"),
         ({"delay": 0.5e-3}, "got 0.5 periods; a sampled device"),
-        ({"operator": zwidth.Operator(0.1)}, "operator: a hand holds a body"),
+        ({"operator": zwidth.Operator(0.1)}, "operator: allowed only with a zwidth.Device"),
     ],
 )
 def test_a_sampled_system_belongs_to_its_period(change, words):

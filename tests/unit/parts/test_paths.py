@@ -69,7 +69,7 @@ def test_whole_parts():
         ({"operator.mass": -1.0}, "operator.mass: got -1 kg"),
         ({"velocity.time_constant": 0.1}, "velocity: got both; give either cutoff"),
         ({"rate": 1000, "period": 1e-3}, "give either"),
-        ({"operator": 3}, "operator: got 3; a part of zwidth is needed"),
+        ({"operator": 3}, "operator: got 3; pass an object such as"),
     ],
 )
 def test_what_is_refused(changes, message):

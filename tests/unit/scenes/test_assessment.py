@@ -143,9 +143,9 @@ def test_parts_by_place():
     scene = zwidth.Scene(DEVICE, TIMING, SLOW, HAND)  # pyright: ignore[reportArgumentType]
     assert scene == zwidth.Scene(DEVICE, TIMING, velocity=SLOW, operator=HAND)
     assert zwidth.Scene(DEVICE, TIMING, SLOW, operator=HAND) == scene  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="as the velocity as well"):
+    with pytest.raises(InputError, match="but velocity is given too"):
         zwidth.Scene(DEVICE, TIMING, SLOW, zwidth.LowPass(cutoff=50))  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="as the velocity as well"):
+    with pytest.raises(InputError, match="but velocity is given too"):
         zwidth.Scene(DEVICE, TIMING, SLOW, HAND, HAND)  # pyright: ignore[reportArgumentType]
 
 
@@ -158,7 +158,7 @@ def test_a_hand_makes_no_wall_passive(seed):
     scene = zwidth.Scene(device, timing, wall, operator=zwidth.Operator(mass=rng.uniform(0.1, 1), damping=40))
     w = np.linspace(1e-5, np.pi, 200_001)
     z = np.exp(1j * w)
-    rendered = (wall.stiffness + wall.virtual_damping * (1 - 1 / z) / 1e-3) / z**scene.whole_delay
+    rendered = (wall.stiffness + wall.virtual_damping * (1 - 1 / z) / 1e-3) / z**scene.integer_delay
     needed = float(np.max(0.5e-3 / (1 - np.cos(w)) * ((1 - 1 / z) * rendered).real))
     verdict = zwidth.assess(scene)
     assert verdict.passivity_margin == pytest.approx(device.damping - max(needed, 0.0), rel=1e-6, abs=1e-6)

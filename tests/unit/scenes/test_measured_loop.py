@@ -118,8 +118,8 @@ def test_a_resonance_between_two_lines_is_undecided_and_named():
     assert coarse.decide_stability(*wall).status == Status.UNDECIDED
     assert not coarse.is_stable(*wall)
     said = " ".join(coarse.explain_undecided(*wall))
-    assert "measure anew from" in said
-    low, high = (float(word) for word in said.split("anew from ")[1].split(" Hz")[0].split(" to "))
+    assert "measure again from" in said
+    low, high = (float(word) for word in said.split("again from ")[1].split(" Hz")[0].split(" to "))
     assert low <= 97.0 <= high
 
 
@@ -222,14 +222,14 @@ def test_a_wrong_sign_decides_nothing(scene):
     turned = zwidth.Scene(zwidth.MeasuredDevice(DENSE, -response(scene, DENSE)), zwidth.Timing(PERIOD))
     found = turned.decide_stability(np.geomspace(10, 1e5, 50), 10.0)
     assert (found.status == Status.UNDECIDED).all()
-    assert "first line" in turned.explain_undecided(5e3, 10.0)[0]
+    assert "mass, damper or spring" in turned.explain_undecided(5e3, 10.0)[0]
 
 
 def test_a_first_line_behind_nearly_a_turn_of_delay_decides_nothing():
     late = zwidth.Scene(zwidth.Device(0.8, 0.0), zwidth.Timing(PERIOD, 19.7 * PERIOD))
     scene = measured(late, np.geomspace(43.6, 400.0, 200))
     assert scene.max_stiffness().status == Status.UNDECIDED
-    assert "first line" in scene.explain_undecided(5e3, 10.0)[0]
+    assert "mass, damper or spring" in scene.explain_undecided(5e3, 10.0)[0]
     assert measured(late, np.geomspace(0.5, 400.0, 3000)).max_stiffness().status == Status.OK
 
 
@@ -277,6 +277,6 @@ def test_too_few_lines_are_named_as_the_cause():
     found = zwidth.Scene(device, zwidth.Timing(1e-3)).recommend()
     assert found.status == Status.UNDECIDED
     assert found.reason.startswith(
-        "the 8 frequencies of the response decide the stability of no wall; measure anew from"
+        "the 8 frequencies of the response decide the stability of no wall; measure again from"
     )
-    assert found.reason.endswith("lines there are too far apart; measure more")
+    assert found.reason.endswith("with finer frequency spacing")

@@ -5,7 +5,7 @@ import pytest
 from required_values import find_required
 
 from zwidth import Device, LowPass, Scene, Status, Timing
-from zwidth.scenes.stiffest import Crossing, _cross
+from zwidth.scenes.stiffest import Crossing, _find_crossing
 from zwidth.words.errors import InputError
 
 RIGID = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3))
@@ -104,8 +104,8 @@ def test_a_range_of_long_delays_has_an_end(parameter, delay, ends):
 
 
 def test_a_crossing_next_to_what_cannot_be_computed_is_none():
-    assert _cross(lambda x: np.log(x) if abs(x - 1.5) > 0.6 else np.nan, 0.5, 3.0) is None
-    assert _cross(np.log, 0.5, 3.0) == Crossing(1.0 + 1e-11, "above")
+    assert _find_crossing(lambda x: np.log(x) if abs(x - 1.5) > 0.6 else np.nan, 0.5, 3.0) is None
+    assert _find_crossing(np.log, 0.5, 3.0) == Crossing(1.0 + 1e-11, "above")
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_a_crossing_next_to_what_cannot_be_computed_is_none():
     [
         (("velocity.cutof", 1e3), "parameter: got 'velocity.cutof'.*did you mean 'velocity.cutoff'"),
         (("stiffness", 1e3), "parameter: got 'stiffness'"),
-        (("velocity.order", 1e3), "a whole number"),
+        (("velocity.order", 1e3), "must be an integer"),
         (("mass", -1.0), "stiffness: got -1.0"),
         (("mass", 1e3, (2.0, 1.0)), "within: got"),
     ],

@@ -137,15 +137,15 @@ SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
         (lambda: zwidth.VirtualWall(stiffness=np.nan), "stiffness: got nan; it must be finite"),
         (lambda: zwidth.Timing(period=1e-3, delay=-1.0), "delay: got -1 s; it must be at least 0 s"),
         *(
-            (lambda ask=ask, given=given: ask(given), "scene: got .*; a zwidth.Scene is needed, as zwidth.Scene")
+            (lambda ask=ask, given=given: ask(given), "scene: got .*; pass a zwidth.Scene, such as zwidth.Scene")
             for ask in ASKED
             for given in (zwidth.Device(0.1), np.ones(2), 3)
         ),
         (
             lambda: zwidth.plot.region({"one": SCENE, "two": zwidth.Device(0.1)}),  # pyright: ignore[reportArgumentType]
-            "scene: got Device.*; a zwidth.Scene is needed",
+            "scene: got Device.*; pass a zwidth.Scene",
         ),
-        (lambda: SCENE.max_stiffness(negative_damping=np.ones(2)), "negative_damping: got array.*; it is True, False"),
+        (lambda: SCENE.max_stiffness(negative_damping=np.ones(2)), "negative_damping: got array.*; pass True, False"),
         (lambda: SCENE.required(np.ones(2), 1e3), "parameter: got array"),
         (lambda: SCENE.best_damping(1e3, goal=np.ones(2)), "goal: got array"),
     ],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.scenes.tolerances import _interval
+from zwidth.scenes.tolerances import _compute_confidence_interval
 
 WALL = zwidth.VirtualWall(17e3, 35.0)
 SCENE = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3), WALL)
@@ -78,10 +78,10 @@ def test_parts_are_drawn_as_well():
 
 def test_the_interval_of_a_share():
     """Clopper and Pearson 1934: no failure in n devices leaves up to 1 - 0.025^(1/n)."""
-    low, high = _interval(100, 100)
+    low, high = _compute_confidence_interval(100, 100)
     assert high == 1.0
     assert low == pytest.approx(0.025 ** (1 / 100), rel=1e-12)
-    assert _interval(0, 100) == pytest.approx((0.0, 1 - low), rel=1e-12)
+    assert _compute_confidence_interval(0, 100) == pytest.approx((0.0, 1 - low), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -89,8 +89,8 @@ def test_the_interval_of_a_share():
     [
         ({"massa": 0.1}, {}, "tolerances: got 'massa', .*did you mean 'mass'"),
         ({"stiffness": 0.1}, {}, "tolerances: got 'stiffness'"),
-        ({"mass": 1.5}, {}, "tolerances: mass: got 1.5; a share between 0 and 1"),
-        ({"mass": zwidth.Tolerance(0.5, "normal")}, {}, "mass: got 0.5; a share between 0 and 0.333"),
+        ({"mass": 1.5}, {}, "tolerances: mass: got 1.5; pass a share between 0 and 1"),
+        ({"mass": zwidth.Tolerance(0.5, "normal")}, {}, "mass: got 0.5; pass a share between 0 and 0.333"),
         ({"mass": 0.1}, {"samples": 0}, "samples: got 0"),
         ({"mass": 0.1}, {"reliability": 1.0}, "reliability: got 1.0"),
     ],

@@ -79,7 +79,7 @@ def judge(scene: Any, K: float, B: float, start: float, push: float, friction: t
     judged = Judge(scene, *friction)
     x, v0 = np.zeros(judged.size), 0.1
     x[: judged.bodies], x[judged.bodies : 2 * judged.bodies] = start, v0
-    T, late, part = scene.timing.period, scene.whole_delay, scene.d - scene.whole_delay
+    T, late, part = scene.timing.period, scene.integer_delay, scene.d - scene.integer_delay
     slip, commands, last = np.sign(v0), [0.0] * (late + 2), start - v0 * T
     read = (lambda y: quantum * np.floor(y / quantum + 0.5)) if quantum else (lambda y: y)
     last, found = read(last), []

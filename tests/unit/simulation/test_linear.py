@@ -90,7 +90,7 @@ def test_every_sample_is_that_of_the_closed_loop_matrix(kind):
         state = np.zeros(len(matrix))
         state[:bodies] = 1e-3
         # The filter has seen that position forever; its states hang on positions alone.
-        order = len(matrix) - 2 * bodies - scene.whole_delay - (scene.d > scene.whole_delay)
+        order = len(matrix) - 2 * bodies - scene.integer_delay - (scene.d > scene.integer_delay)
         own = slice(2 * bodies, 2 * bodies + order)
         state[own] = np.linalg.solve(np.eye(order) - matrix[own, own], matrix[own, : 2 * bodies] @ state[: 2 * bodies])
         sensor = int(scene.device.coupling is not None and scene.device.coupling.sensor == "tip")

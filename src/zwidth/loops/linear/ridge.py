@@ -298,7 +298,7 @@ def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> floa
     points = circle(np.array([ridge.w1, ridge.w2]))
     # A longer period shortens a delay measured in periods. If the delay is an integer, it becomes a fractional delay
     # with an integer part that is smaller by one.
-    n = scene.whole_delay - (path == "period" and scene.d == scene.whole_delay > 0)
+    n = scene.integer_delay - (path == "period" and scene.d == scene.integer_delay > 0)
     for weights in _list_differences(scene, path):
         try:
             states = [

@@ -16,7 +16,7 @@ from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.pages.verdict import write_check
 from zwidth.pages.words import list_slopes, pole_words, row, spell_radius, word_of
 from zwidth.parts.device import Device
-from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin
+from zwidth.scenes.assessment import Assessment, assess, limits_of, round_margin, trace_passivity_boundary
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.ending import describe_ending
 from zwidth.words.formatting import plain, round_safely, tell_apart
@@ -117,7 +117,7 @@ def passive_set(scene: Scene) -> Curve | None:
     """The edge of the passive walls, None where no condition is known; empty where no wall is passive."""
     if find_unsupported_reason(**vars(scene.device)):
         return None
-    return passive_edge(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
+    return trace_passivity_boundary(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 
 
 def ridge_path(scene: Scene) -> Curve:

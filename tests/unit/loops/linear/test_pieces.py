@@ -281,4 +281,4 @@ def test_edges_that_meet_at_no_damping_hold_soft_walls(delay):
         wall = scene.max_stiffness()
         assert wall.status == zwidth.Status.OK
         assert wall[:2] == pytest.approx([stiffest, 0.0], rel=1e-9, abs=1e-9)
-        assert scene.loop.holds_softly(0.5 * stiffest / scene.units.stiffness, 0.0)
+        assert scene.loop.is_connected(0.5 * stiffest / scene.units.stiffness, 0.0)

@@ -34,7 +34,7 @@ WINDOW = PAPER.replace(velocity=WindowedDifference(15))
 
 
 def wanted(scene: Scene, negative: bool) -> RidgeSolution:
-    found = find_ridge(scene.loop.border, negative)
+    found = find_ridge(scene.loop.stable_set, negative)
     assert found is not None
     return found
 

@@ -15,7 +15,7 @@ from zwidth.words.errors import InputError
 def needed_on_a_grid(scene, stiffness, damping):
     """The condition of a held delay as it is derived, at 40,000 frequencies, in N s/m."""
     period = scene.timing.period
-    whole, part = scene.whole_delay, scene.d - scene.whole_delay
+    whole, part = scene.integer_delay, scene.d - scene.integer_delay
     w = np.concatenate([np.geomspace(1e-4, 0.1, 4000), np.linspace(0.1, np.pi, 36000)])
     z = np.exp(1j * w)
     top, bottom = velocity_polynomials(scene)
@@ -55,13 +55,13 @@ def delayed(values, count):
 
 def least_damping(scene, wall, periods):
     """Return the damping below which some trajectory of that many periods extracts energy, in N s/m."""
-    f, period, n = scene.d - scene.whole_delay, scene.timing.period, periods
+    f, period, n = scene.d - scene.integer_delay, scene.timing.period, periods
     # One column per free position: the samples, then the positions at which delayed forces arrive between samples.
     unit = np.eye(n * (2 if f else 1))
     x = np.concatenate([np.zeros((1, unit.shape[1])), unit[:n]])
     top, bottom = velocity_polynomials(scene)
     top = np.concatenate([np.zeros(len(bottom) - len(top)), top])
-    force = delayed(wall[0] * x + wall[1] * scipy.signal.lfilter(top, bottom, x, axis=0), scene.whole_delay)
+    force = delayed(wall[0] * x + wall[1] * scipy.signal.lfilter(top, bottom, x, axis=0), scene.integer_delay)
     steps, forces, durations = [np.diff(x, axis=0)], [force[:-1]], [period]
     if f:
         between = unit[n:]
