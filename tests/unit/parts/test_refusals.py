@@ -83,7 +83,7 @@ CASES = {
     "link that cannot be resolved": (
         lambda: zwidth.Scene(zwidth.Device(0.1, coupling=zwidth.Coupling(0.1, 1e14)), TIMING).check_parts(),
         "coupling.stiffness",
-        "leave the coupling out",
+        "omit the coupling",
     ),
     "damper that cannot be resolved": (
         lambda: zwidth.Scene(zwidth.Device(0.1, coupling=zwidth.Coupling(0.1, 1e4, 1e14)), TIMING).check_parts(),
