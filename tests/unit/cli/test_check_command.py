@@ -198,7 +198,7 @@ def test_rate_and_period_are_one_thing():
 @pytest.mark.parametrize(
     ("arguments", "doubt"),
     [
-        (["--mass", "70", *RATE], "--mass is 70 kg, far from any device; did you mean --mass '70 g'?"),
+        (["--mass", "70", *RATE], "--mass is 70 kg, an implausible value; did you mean --mass '70 g'?"),
         (["--mass", "1", "--period", "4000"], "--period is 4000 s, .* did you mean --rate '4000 Hz'?"),
         (["--mass", "1", "--period", "1"], "--period is 1 s, .* did you mean --period '1 ms'?"),
         (["--mass", "1", "--rate", "1"], "--rate is 1 Hz, .* did you mean --rate '1 kHz'?"),

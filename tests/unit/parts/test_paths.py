@@ -68,7 +68,7 @@ def test_whole_parts():
         ({"velocity.samples": 5}, "parameter: got 'velocity.samples', allowed are 'mass', "),
         ({"operator.mass": -1.0}, "operator.mass: got -1 kg"),
         ({"velocity.time_constant": 0.1}, "velocity: got both cutoff and time_constant; pass either"),
-        ({"rate": 1000, "period": 1e-3}, "give either"),
+        ({"rate": 1000, "period": 1e-3}, "pass either"),
         ({"operator": 3}, "operator: got 3; a part of zwidth is needed"),
     ],
 )
