@@ -166,7 +166,7 @@ def test_mixing_is_refused(field, make):
 def test_no_typing_error_of_a_rotary_unit_is_taken_for_a_linear_one():
     with pytest.raises(zwidth.InputError, match=r"did you mean 'mN m s/rad'\?"):
         zwidth.Device(1e-6, "0.02 mN m s/rd")
-    with pytest.raises(zwidth.InputError, match=r"a unit of a rotary device where the device is linear"):
+    with pytest.raises(zwidth.InputError, match=r"a rotary unit for a linear device"):
         zwidth.Scene(LINEAR_DEVICE, TIMING).is_stable(10, "0.02 mN m s/rad")
 
 
