@@ -99,7 +99,7 @@ def test_a_period_that_the_times_contradict_is_refused(tmp_path):
 REFUSED = {
     "empty": ("", {}, "it is empty"),
     "remarks alone": ("# t,x,F\n", {}, "it is empty"),
-    "no samples": ("t,x,F\n", {}, "names of columns and no samples"),
+    "no samples": ("t,x,F\n", {}, "column names without samples"),
     "no names": ("0,1,2\n1,2,3\n", {}, "log.csv:1: got numbers where the names"),
     "names in a remark": ("# t,x,F\n0;1,5;2\n1;2;3\n", {}, "log.csv:2: got numbers where the names"),
     "one column": ("t\n0\n", {}, "log.csv:1: got 't'; separate the columns"),
@@ -113,7 +113,7 @@ REFUSED = {
     "commas, then points": ("t x F\n0 1,5 1\n1 2.5 1\n", {}, "log.csv:3: got '2.5', and '1,5' in line 2; a comma is"),
     "a remark among samples": ("t,x,F\n0,1,2\n# gap\n1,2,3\n", {}, "log.csv:3: got '# gap' under 't'"),
     "decimal commas between commas": ("t,x,F\n0,1,5,2\n", {}, "got 4 cells for 3 columns; a comma as decimal sign"),
-    "no text": (b"\xff\xfet,x,F", {}, "no text in UTF-8"),
+    "no text": (b"\xff\xfet,x,F", {}, "not a text in UTF-8"),
     "no such column": ("t,xpos,F\n0,1,2\n", {"position": "xpso"}, "no column 'xpso'; did you mean 'xpos'?"),
     "ambiguous": ("t,x,angle,F\n0,1,2,3\n", {}, "position: may be any of the columns 'x', 'angle' in"),
     "unknown": ("t,y,F\n0,1,2\n", {}, "position: no column for position recognized in"),
