@@ -255,22 +255,24 @@ def compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
 
     The highest power is first. Modes are not included.
     """
-    # The loop adds body after body, from the last one to the first. top/bottom is the dynamic stiffness of the part
-    # processed so far; seen/top is its response from a force on its first body to the position of the sensor body, if
-    # the part contains this body. All terms are positive, so nothing cancels and slow roots are accurate.
-    top, bottom, seen = np.zeros(0), np.ones(1), np.ones(1)
+    # The loop adds one body after the other, from the last one to the first. The bodies added so far have the dynamic
+    # stiffness (force over position of the first of them) numerator/denominator. Once they include the sensor body, its
+    # position in response to this force is sensor_numerator/numerator. All terms are positive, so nothing cancels and
+    # slow roots are accurate.
+    numerator, denominator, sensor_numerator = np.zeros(0), np.ones(1), np.ones(1)
     for k in reversed(range(len(chain.bodies))):
         body = chain.bodies[k]
         dynamic_stiffness = np.array([body.mass, body.damping, body.stiffness], float)
-        if top.size:
+        if numerator.size:
             link = np.array([chain.links[k].damping, chain.links[k].stiffness], float)
-            bottom = np.polyadd(np.convolve(link, bottom), top)
-            # The link in series with the part has the dynamic stiffness link top/bottom with the new bottom.
-            top = np.polyadd(np.convolve(dynamic_stiffness, bottom), np.convolve(link, top))
-            seen = bottom if k == chain.sensor else np.convolve(link, seen)
+            denominator = np.polyadd(np.convolve(link, denominator), numerator)
+            # The link and the bodies in series have the dynamic stiffness link * numerator/denominator, with the new
+            # denominator.
+            numerator = np.polyadd(np.convolve(dynamic_stiffness, denominator), np.convolve(link, numerator))
+            sensor_numerator = denominator if k == chain.sensor else np.convolve(link, sensor_numerator)
         else:
-            top = dynamic_stiffness
-    return np.trim_zeros(seen, "f"), np.trim_zeros(top, "f")
+            numerator = dynamic_stiffness
+    return np.trim_zeros(sensor_numerator, "f"), np.trim_zeros(numerator, "f")
 
 
 def _find_roots(polynomial: np.ndarray) -> np.ndarray:

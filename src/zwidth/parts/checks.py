@@ -32,10 +32,10 @@ def in_periods(delay: Array, period: Array) -> Array:
     # Without this correction, 1.1 ms over 0.1 ms would be 11.000000000000002 periods in float64, a fractional delay.
     xp = namespace(delay, period)
     quotient = delay / period
-    whole = xp.round(quotient)
-    near = xp.abs(quotient - whole) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(whole, 1.0)
+    nearest = xp.round(quotient)
+    near = xp.abs(quotient - nearest) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(nearest, 1.0)
     # Subtract the rounding error as a constant, so that the derivatives remain those of the quotient.
-    return quotient - frozen(xp.where(near & (whole > 0), quotient - whole, 0.0), xp)
+    return quotient - frozen(xp.where(near & (nearest > 0), quotient - nearest, 0.0), xp)
 
 
 class Span(NamedTuple):

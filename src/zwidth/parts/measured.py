@@ -128,6 +128,7 @@ class MeasuredDevice(WholeDevice):
 
     @property
     def _key(self) -> tuple[bytes, ...]:
+        """All values as bytes, for comparisons and hashes."""
         parts = (self.frequency, self.response, self.deviation)
         return (*(b"" if part is None else part.tobytes() for part in parts), bytes([self.rotary]))
 
@@ -237,11 +238,11 @@ def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
     return hertz, response * scale, band, rotary
 
 
-def _size(file: Path, name: str, unit: str, dimension: Dimension, known: tuple[str, ...]) -> float:
+def _size(file: Path, name: str, unit: str, dimension: Dimension, allowed: tuple[str, ...]) -> float:
     """Return the factor that converts a unit of a column to SI; raise `InputError` for an unknown or missing unit."""
     size = dimension.in_base("1", 0, unit) if unit else None
     if size is None:
-        remedy = suggestion(unit, known, f"write one of {', '.join(known)} in brackets after the name")
+        remedy = suggestion(unit, allowed, f"write one of {', '.join(allowed)} in brackets after the name")
         raise InputError(f"{file}: got {unit or 'no unit'} for column {name}; {remedy}")
     return size
 
@@ -256,5 +257,5 @@ def _compliance(file: Path, name: str, unit: str) -> tuple[float, bool]:
     angular = _ANGULAR_COMPLIANCE.in_base("1", 0, unit)
     if angular is not None:
         return angular, True
-    known = ("m/N", "mm/N", "um/N", "rad/(N m)", "deg/(N m)", *(("dB",) if name == "magnitude" else ()))
-    return _size(file, name, unit, _COMPLIANCE, known), False
+    allowed = ("m/N", "mm/N", "um/N", "rad/(N m)", "deg/(N m)", *(("dB",) if name == "magnitude" else ()))
+    return _size(file, name, unit, _COMPLIANCE, allowed), False

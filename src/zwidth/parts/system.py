@@ -58,12 +58,12 @@ class System:
 
     def realize(self) -> Realization:
         """Return the matrices of x'; for a sampled device, those of x[k+1]."""
-        rate, push = _realize_companion(self.device) if hasattr(self.mass, "mid") else _realize_sections(self.device)
+        A, B = _realize_companion(self.device) if hasattr(self.mass, "mid") else _realize_sections(self.device)
         if self.sampled:
-            push = push * (self.mass / self.period**2)
-            return Realization(rate, push, push)
-        push = push * (self.mass / self.period)
-        return Realization(rate * self.period, push, push)
+            B = B * (self.mass / self.period**2)
+            return Realization(A, B, B)
+        B = B * (self.mass / self.period)
+        return Realization(A * self.period, B, B)
 
     def check(self) -> None:
         """Raise `InputError` if the period or the delay does not fit the device."""
@@ -92,19 +92,19 @@ def _realize_sections(device: LinearDevice) -> tuple[np.ndarray, np.ndarray]:
 
     The rounding errors of one root then do not affect other roots.
     """
-    # seen and through are C and D of the sections that are connected already.
-    rate, push, seen, through = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
+    # A, B, C and D are the matrices of the sections connected so far, without the gain.
+    A, B, C, D = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
     for numerator, denominator in _pair_roots(device.zeros, device.poles):
         order = denominator.size - 1
         section = np.eye(order, k=1)
         section[-1] = -denominator[:0:-1]
-        output = (numerator[1:] - numerator[0] * denominator[1:])[::-1]
+        section_C = (numerator[1:] - numerator[0] * denominator[1:])[::-1]
         entry = np.eye(order)[-1]
-        size = len(rate)
-        rate = np.block([[rate, np.zeros((size, order))], [np.outer(entry, seen), section]])
-        push = np.append(push, entry * through)
-        seen, through = np.append(numerator[0] * seen, output), numerator[0] * through
-    return _output_as_first_state(rate, push * device.gain, seen)
+        size = len(A)
+        A = np.block([[A, np.zeros((size, order))], [np.outer(entry, C), section]])
+        B = np.append(B, entry * D)
+        C, D = np.append(numerator[0] * C, section_C), numerator[0] * D
+    return _output_as_first_state(A, B * device.gain, C)
 
 
 def _pair_roots(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -146,27 +146,27 @@ def _realize_companion(device: LinearDevice) -> tuple[Any, Any]:
     denominator = [value / device.system.denominator[0] for value in device.system.denominator]
     numerator = [value / device.system.denominator[0] for value in device.system.numerator]
     size = len(denominator) - 1
-    rate = np.array([[flint.arb(int(j == i + 1)) for j in range(size)] for i in range(size)], object)
-    rate[-1] = [-ball(value) for value in denominator[:0:-1]]
-    push = np.array([flint.arb(int(i == size - 1)) for i in range(size)], object)
-    seen = np.array([ball(value) for value in numerator[::-1]] + [flint.arb(0)] * (size - len(numerator)), object)
-    return _output_as_first_state(rate, push, seen)
+    A = np.array([[flint.arb(int(j == i + 1)) for j in range(size)] for i in range(size)], object)
+    A[-1] = [-ball(value) for value in denominator[:0:-1]]
+    B = np.array([flint.arb(int(i == size - 1)) for i in range(size)], object)
+    C = np.array([ball(value) for value in numerator[::-1]] + [flint.arb(0)] * (size - len(numerator)), object)
+    return _output_as_first_state(A, B, C)
 
 
-def _output_as_first_state(rate: Any, push: Any, seen: Any) -> tuple[Any, Any]:
+def _output_as_first_state(A: Any, B: Any, C: Any) -> tuple[Any, Any]:
     """Return A and B of the same system with the output y = C x as first state.
 
     Args:
-        rate: A.
-        push: B.
-        seen: C. The output replaces the state with the largest coefficient, so that the transformation is
+        A: state matrix.
+        B: input vector.
+        C: output vector. The output replaces the state with the largest coefficient, so that the transformation is
             well-conditioned.
     """
-    best = max(range(len(seen)), key=lambda k: abs(float(seen[k])))
-    order = [best, *(k for k in range(len(seen)) if k != best)]
-    rate, push, seen = rate[order][:, order], push[order], seen[order]
+    best = max(range(len(C)), key=lambda k: abs(float(C[k])))
+    order = [best, *(k for k in range(len(C)) if k != best)]
+    A, B, C = A[order][:, order], B[order], C[order]
     # Substitute x1 = (y - c2 x2 - c3 x3 - ..)/c1.
-    columns = rate[:, :1] / seen[0]
-    rate = np.concatenate([columns, rate[:, 1:] - columns * seen[None, 1:]], 1)
-    first = seen @ rate
-    return np.concatenate([first[None], rate[1:]]), np.concatenate([[seen @ push], push[1:]])
+    columns = A[:, :1] / C[0]
+    A = np.concatenate([columns, A[:, 1:] - columns * C[None, 1:]], 1)
+    first = C @ A
+    return np.concatenate([first[None], A[1:]]), np.concatenate([[C @ B], B[1:]])

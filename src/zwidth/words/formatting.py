@@ -189,21 +189,22 @@ def describe(value: Any) -> str:
 
 
 def _count(number: int, noun: str) -> str:
+    """Format a number of items with their noun in singular or plural."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def resembling(name: Any, known: Iterable[str]) -> str | None:
-    """Return the name in ``known`` that is most similar to ``name``, ignoring case; None if none is similar."""
+def resembling(name: Any, names: Iterable[str]) -> str | None:
+    """Return the name in ``names`` that is most similar to ``name``, ignoring case; None if none is similar."""
     if not isinstance(name, str):
         return None
-    by_lower = {candidate.lower(): candidate for candidate in known}
+    by_lower = {candidate.lower(): candidate for candidate in names}
     matches = difflib.get_close_matches(name.lower(), by_lower, n=1)
     return by_lower[matches[0]] if matches else None
 
 
-def suggestion(name: Any, known: Iterable[str], otherwise: str) -> str:
-    """Return the question "did you mean ...?" with the most similar known name; ``otherwise`` if none is similar."""
-    similar = resembling(name, known)
+def suggestion(name: Any, names: Iterable[str], otherwise: str) -> str:
+    """Return the question "did you mean ...?" with the most similar names name; ``otherwise`` if none is similar."""
+    similar = resembling(name, names)
     return f"did you mean {similar!r}?" if similar else otherwise
 
 

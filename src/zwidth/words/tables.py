@@ -145,7 +145,7 @@ class DecimalSigns:
         if match := _FRACTION.fullmatch(cell):
             self.first.setdefault(match[1], (line, cell))
             if len(self.first) > 1:
-                ((number, other),) = (place for sign, place in self.first.items() if sign != match[1])
+                ((number, other),) = (first for sign, first in self.first.items() if sign != match[1])
                 raise InputError(
                     f"{self.file}:{line}: got {cell!r}, and {other!r} in line {number}; all numbers must have the same "
                     "decimal sign and no thousands separators"

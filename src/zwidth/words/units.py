@@ -207,17 +207,19 @@ def _drop_separators(text: str, *, strict: bool = True) -> str:
         return text
     sign = digits[: len(digits) - len(number)]
     decimal = next((mark for mark in ",." if number.count(mark) == 1 and number.rindex(mark) > _last(number, mark)), "")
-    whole, _, fraction = number.rpartition(decimal) if decimal else (number, "", "")
-    grouped = _GROUPED.fullmatch(whole) is not None
-    plain_digits = re.sub("[^0-9]", "", whole)
+    integer_part, _, fraction = number.rpartition(decimal) if decimal else (number, "", "")
+    grouped = _GROUPED.fullmatch(integer_part) is not None
+    plain_digits = re.sub("[^0-9]", "", integer_part)
     if decimal == "," and marks == "," and _GROUPED.fullmatch(number):
         if not strict:
             return text
-        readings = " or ".join(repr(f"{sign}{each}{rest}") for each in (plain_digits + fraction, f"{whole}.{fraction}"))
+        readings = " or ".join(
+            repr(f"{sign}{each}{rest}") for each in (plain_digits + fraction, f"{integer_part}.{fraction}")
+        )
         raise UnusableValueError(
             f"got {describe(text)}", "the comma is ambiguous: decimal or thousands separator", f"write {readings}"
         )
-    if whole.isdigit() or grouped or (_GROUPED.fullmatch(number) and not decimal):
+    if integer_part.isdigit() or grouped or (_GROUPED.fullmatch(number) and not decimal):
         return f"{sign}{plain_digits}{'.' if decimal else ''}{fraction}{rest}"
     if not strict:
         return text

@@ -195,8 +195,8 @@ def nan_beyond(limits: tuple[float, float], *values: Array) -> list[np.ndarray]:
 
 
 # At an invalid point, values and derivatives must both be NaN. `where(ok, value, nan)` does not suffice, because its
-# derivative would be 0. If a kernel can compute with NaN, apply `nan_unless` to its arguments. Otherwise, as in solvers,
-# replace invalid arguments by valid ones and add `nan_with_nan_slopes` to the results.
+# derivative would be 0. If a kernel can compute with NaN, apply `nan_unless` to its arguments. Otherwise, as in
+# solvers, replace invalid arguments by valid ones and add `nan_with_nan_slopes` to the results.
 
 
 def nan_unless(ok: Array, *values: Array) -> tuple[Array, ...]:

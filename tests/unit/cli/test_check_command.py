@@ -270,7 +270,10 @@ def test_a_coded_period_that_is_not_the_loop_s_is_pointed_out():
     ("arguments", "message"),
     [
         (["--velocity-cutoff", "800"], "'--velocity-cutoff': got 800 Hz; it must be below half the sampling rate"),
-        (["--velocity-cutoff", "10", "--velocity-order", "3"], "'--velocity-order': got 3; it must be a whole number from 1 to 2"),
+        (
+            ["--velocity-cutoff", "10", "--velocity-order", "3"],
+            "'--velocity-order': got 3; it must be a whole number from 1 to 2",
+        ),
         (["--velocity-order", "2"], "--velocity-order does not belong to a velocity estimate of kind"),
         (["--velocity-kind", "butterworth"], "needs --velocity-cutoff"),
         (["--coupling-mass", "1"], "a coupling has a mass and a stiffness; give --coupling-stiffness"),
