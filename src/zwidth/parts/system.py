@@ -111,7 +111,8 @@ def _pair_roots(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, 
     """Distribute zeros and poles to sections of two poles each, the last with one if the number of poles is odd.
 
     Returns:
-        Numerator and denominator of each section, slow sections first; the numerator has leading zeros.
+        Numerator and denominator of each section: sections with two poles first, and slow ones first among them. The
+        numerators have leading zeros.
     """
 
     def group(roots: Any) -> list[np.ndarray]:
