@@ -20,7 +20,7 @@ import numpy as np
 
 import zwidth
 from methods.clock import time_calls
-from methods.page import hand_out, page_parser
+from methods.page import write_page
 
 SEED, SAMPLE = 20060901, 20_000
 
@@ -94,15 +94,6 @@ def measure_all(points: int, runs: int) -> str:
     return "\n".join([*lines, ""])
 
 
-def main() -> None:
-    """Measure, and print or write."""
-    parser = page_parser(__doc__)
-    parser.add_argument("--points", type=int, default=1_000_000)
-    parser.add_argument("--runs", type=int, default=5)
-    given = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    hand_out(measure_all(given.points, given.runs), given.write)
-
-
 if __name__ == "__main__":
-    main()
+    jax.config.update("jax_enable_x64", True)
+    write_page(__doc__, measure_all, points=(1_000_000, "points per batch"), runs=(5, "timed runs"))

@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 
 import measured_devices
 
-from methods.page import hand_out, page_parser
+from methods.page import write_page
 
 PERIOD, SKIP = 1e-3, 22
 NAMES = ("mass", "damping", "delay", "friction")
@@ -343,7 +343,7 @@ def report(count: int, parts: int, processes: int) -> str:
     # Of this machine and this day: not for the page.
     print(f"a fit took {np.median([row['took'] for row in fitted]):.2f} s of the processor (median)")
     lines = [
-        "# How good fits of logs are",
+        "# Accuracy of fits to logs",
         "",
         "Written by `benchmarks/bench_fit.py --write docs/fitting.md`.",
         "",
@@ -383,15 +383,11 @@ def report(count: int, parts: int, processes: int) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Measure, and print or write."""
-    parser = page_parser(__doc__)
-    parser.add_argument("--logs", type=int, default=1000)
-    parser.add_argument("--devices", type=int, default=1000, help="logs of devices with lags and resonances")
-    parser.add_argument("--processes", type=int, default=2)
-    given = parser.parse_args()
-    hand_out(report(given.logs, given.devices, given.processes), given.write)
-
-
 if __name__ == "__main__":
-    main()
+    write_page(
+        __doc__,
+        report,
+        logs=(1000, "logs of rigid devices"),
+        devices=(1000, "logs of devices with lags and resonances"),
+        processes=(2, "parallel processes"),
+    )

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Count the fitted walls that are the same in every command, and stable on the true device.
+"""Count the recommended walls of fits that are equal in all commands, and stable on the true device.
 
     python benchmarks/bench_handover.py [--devices 300] [--first 0] [--every 10]
 
-Each device has resonances, an actuator lag or both, which the record hides in part. The wall of the fit is compared to
-that of its configuration, of the run of it, and of the program in C; every tenth run is written with its report. Walls
-within the safe limit are drawn at random. Stability on the true device is by eigenvalues without zwidth, of a wall and
-of softer ones with the same damping.
+Each device has resonances, an actuator lag or both, which are partly undetected in the log. The wall of the fit is
+compared with those of its configuration, of a run of the configuration, and of the program in C; every tenth run also
+writes a report. Further walls within the safe limit are random. A wall counts as stable if it and softer walls with the
+same damping are stable on the true device by eigenvalues, computed without zwidth.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 
 from measured_devices import TrueDevice, draw_hidden
 
-DRAWN = 40  # walls within the safe limit of each device
-SOFTER = (1.0, 0.7, 0.4, 0.1, 0.01)  # shares of a stiffness at which stability is checked
+DRAWN = 40  # random walls within the safe limit, per device
+SOFTER = (1.0, 0.7, 0.4, 0.1, 0.01)  # relative stiffnesses at which stability is checked
 REQUIREMENTS: tuple[dict[str, Any], ...] = ({"stiffness_fraction": 0.9}, {"phase_margin": 10.0, "gain_margin": 1.3})
 
 
@@ -103,7 +103,7 @@ def hand_over(seed: int, folder: Path, with_run: bool) -> Counter[str]:
 
 
 def check_device(seed: int, folder: Path, every: int) -> tuple[Counter[str], list[str]]:
-    """Return the counts of one device, and its results that differ or its unstable wall."""
+    """Return the counts of one device, and its failures: names of results that differ, and "unstable"."""
     counts = hand_over(seed, folder, seed % every == 0)
     broken = [name for name in counts if name.startswith("same") and not counts[name]]
     if counts["walls"] and not counts["stable on the true device"]:
@@ -113,7 +113,7 @@ def check_device(seed: int, folder: Path, every: int) -> tuple[Counter[str], lis
 
 def main() -> None:
     parser = build_parser(__doc__, 300)
-    parser.add_argument("--every", type=int, default=10, help="a run with a report for every so many devices")
+    parser.add_argument("--every", type=int, default=10, help="number of devices per run with a report")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         count_devices(given, lambda seed: check_device(seed, Path(folder), given.every))

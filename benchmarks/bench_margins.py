@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Print the table of docs/guides/my-device.md that compares requirements on recommended walls.
+"""Print the table of docs/guides/my-device.md that compares requirements for recommended walls.
 
     python benchmarks/bench_margins.py [--count 60]
 
@@ -24,11 +24,11 @@ REQUIREMENTS: dict[str, dict[str, Any]] = {
     "**30 deg, gain 2**": {"phase_margin": 30, "gain_margin": 2},
     "40 deg, gain 2": {"phase_margin": 40, "gain_margin": 2},
 }
-NEARBY = 50  # devices near each random device
+NEARBY = 50  # number of nearby devices per random device
 
 
 def draw_scene(random: np.random.Generator) -> zwidth.Scene:
-    """Return a random linear or rotary device."""
+    """Return a random linear or rotary device in its loop."""
     rotary, period = bool(random.integers(2)), 10 ** random.uniform(-4, -2.52)
     mass = 10 ** random.uniform(-2, 0) * (10 ** random.uniform(-4, -2) if rotary else 1.0)
     damping = 10 ** random.uniform(-3, np.log10(2)) * mass / period
@@ -40,7 +40,7 @@ def draw_scene(random: np.random.Generator) -> zwidth.Scene:
 
 
 def count_unstable(scene: zwidth.Scene, random: np.random.Generator) -> float:
-    """Return the share of nearby devices on which the wall of a scene is unstable."""
+    """Return the proportion of nearby devices on which the wall of a scene is unstable."""
     period, unstable = scene.timing.period, 0
     for mass, damping, delay, shift in random.uniform(-1, 1, (NEARBY, 4)):
         later = scene.timing.delay * (1 + 0.1 * delay) + 0.1 * shift * period

@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
-"""Measure fits of onsets of instability: how often intervals of K_max and walls hold on the true device.
+"""Compare fits to walls at the onset of instability with the true devices: K_max, its interval, and recommended walls.
 
     python benchmarks/bench_onsets.py [--rigid 200] [--others 200] [--processes 2] [--write docs/onsets.md]
 
-Devices with an actuator lag, one or two resonances, or both are those of `tests/oracles/measured_devices.py`. Onsets
-and stability on the true device are computed by eigenvalues, without zwidth. Most devices have five walls, with 2 %
-noise in K and f.
+The devices are those of `tests/oracles/measured_devices.py`, rigid or with an actuator lag, one or two resonances, or
+both. Onsets and stability on the true device are computed by eigenvalues, without zwidth.
 """
 
 from __future__ import annotations
@@ -26,28 +25,32 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 
 from measured_devices import TrueDevice
 
-from methods.page import hand_out, page_parser
+from methods.page import write_page
 
 NOISE = 0.02  # relative standard deviation of K and f
-MOST_PER_RIGID = 30.0  # softest onset over the maximum stiffness; devices below are not measurable in practice
-SOFTER = np.array([0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0])  # a user raises K from below
+SOFTEST = 30.0  # the search for an onset begins at K = 1e-3 m/T^2 divided by this; devices unstable there are skipped
+# Relative stiffnesses at which stability is checked, because a user raises K from below.
+SOFTER = np.array([0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0])
 INTRODUCTION = """\
-# How good fits of onsets are
+# Accuracy of fits to walls at the onset of instability
 
 Written by `benchmarks/bench_onsets.py --write docs/onsets.md`.
 
-`zwidth.fit_buzz` fits a rigid device to walls at the onset of instability. The devices here are random: rigid ones with
-four walls, and others with an actuator lag of 0.1 to 1 ms, one or two resonances of 30 to 400 Hz, or both, with four to
-six walls. K and f have 2 % noise. B increases from 0 to 0.7 to 1.2 times the damping of the stiffest wall. Onsets and
-stability are computed by eigenvalues of the true device. A safe wall counts as stable only if softer walls of the same
-damping are stable, too; it is computed for 99 % of the devices that the measurements allow. No K_max means that the fit
-refused the walls or warned, and recommends no wall. The width of the interval and the stiffness of the safe wall are
-medians, relative to the true K_max.
+`zwidth.fit_buzz` fits a rigid device to walls at the onset of instability. The devices of this benchmark are random.
+Rigid devices have four measured walls. All others have an actuator lag of 0.1 to 1 ms, one or two resonances of 30 to
+400 Hz, or both, and four to six measured walls. The virtual dampings B of the walls of a device are equally spaced. The
+smallest is 0, the largest a random multiple, 0.7 to 1.2, of the damping of the stiffest wall. K and f have independent
+random errors with a relative standard deviation of 2 %; B is exact. Onsets and stability are computed from the
+eigenvalues of the true device.
+
+Fits without K_max are those that refuse the walls or return a warning; they recommend no wall. Safe walls are computed
+for a reliability of 99 %. A safe wall counts as stable if softer walls with the same B are also stable. The interval
+width and the stiffness of the safe wall are medians, relative to K_max of the true device.
 """
 
 
 def draw_device(random: np.random.Generator, rigid: bool) -> TrueDevice:
-    """Return a random device without resonances and lag, or with at least one of them."""
+    """Return a random rigid device, or one with a lag, resonances or both."""
     while True:
         true = TrueDevice.draw(random)
         if rigid:
@@ -63,7 +66,7 @@ def name_kind(true: TrueDevice) -> str:
 
 
 def raise_stiffness(true: TrueDevice, damping: float) -> tuple[float, float]:
-    """Return the smallest unstable K at a damping and the frequency in Hz there; NaN if the softest is unstable."""
+    """Return the smallest unstable K in N/m for a damping, and the frequency of the instability in Hz; NaN if none."""
     A, B, C = true.sampled()
     size, rate = B.size, damping / true.period
 
@@ -74,7 +77,7 @@ def raise_stiffness(true: TrueDevice, damping: float) -> tuple[float, float]:
         poles = np.linalg.eigvals(closed)
         return poles[np.argmax(np.abs(poles))]
 
-    low = high = 1e-3 * true.mass / true.period**2 / MOST_PER_RIGID
+    low = high = 1e-3 * true.mass / true.period**2 / SOFTEST
     if abs(find_dominant(low)) >= 1:
         return np.nan, np.nan
     while abs(find_dominant(high)) < 1:
@@ -86,7 +89,7 @@ def raise_stiffness(true: TrueDevice, damping: float) -> tuple[float, float]:
 
 
 def measure(seed: int, rigid: bool) -> tuple[TrueDevice, np.ndarray, float] | None:
-    """Return a device, its walls with noise and its K_max; None if a wall cannot be measured."""
+    """Return a random device, its walls (K, B, f) with noise, and its K_max; None if a wall cannot be measured."""
     random = np.random.default_rng([11, seed, rigid])
     true = draw_device(random, rigid)
     device = zwidth.LinearDevice(true.matrices())
@@ -102,7 +105,7 @@ def measure(seed: int, rigid: bool) -> tuple[TrueDevice, np.ndarray, float] | No
 
 
 def judge(seed: int, rigid: bool) -> dict[str, Any] | None:
-    """Fit the walls of one device, and compare with the truth."""
+    """Return the results of a fit to the walls of one device; None if the walls cannot be measured."""
     measured = measure(seed, rigid)
     if measured is None:
         return None
@@ -131,7 +134,7 @@ def judge(seed: int, rigid: bool) -> dict[str, Any] | None:
 
 
 def judge_all(count: int, rigid: bool, processes: int) -> list[dict[str, Any]]:
-    """Return the rows of as many devices whose walls can be measured."""
+    """Return the rows of the first ``count`` devices whose walls can be measured."""
     rows: list[dict[str, Any]] = []
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         for row in pool.map(partial(judge, rigid=rigid), range(3 * count), chunksize=5):
@@ -144,7 +147,7 @@ def judge_all(count: int, rigid: bool, processes: int) -> list[dict[str, Any]]:
 
 def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
     """Yield the lines of the table, in Markdown."""
-    yield "| device | fits | no K_max | interval contains K_max | its width | stable safe walls | their stiffness |"
+    yield "| device | fits | no K_max | interval contains K_max | interval width | stable safe walls | stiffness |"
     yield "|---|--:|--:|--:|--:|--:|--:|"
     kinds = sorted({row["kind"] for row in rows} - {"rigid"})
     for kind in ("rigid", *kinds, "all but rigid"):
@@ -172,15 +175,11 @@ def report(rigid: int, others: int, processes: int) -> str:
     return "\n".join([INTRODUCTION, *tabulate(rows), "", stable, ""])
 
 
-def main() -> None:
-    """Measure, and print or write."""
-    parser = page_parser(__doc__)
-    parser.add_argument("--rigid", type=int, default=200, help="rigid devices")
-    parser.add_argument("--others", type=int, default=200, help="devices with a lag, resonances or both")
-    parser.add_argument("--processes", type=int, default=2)
-    given = parser.parse_args()
-    hand_out(report(given.rigid, given.others, given.processes), given.write)
-
-
 if __name__ == "__main__":
-    main()
+    write_page(
+        __doc__,
+        report,
+        rigid=(200, "rigid devices"),
+        others=(200, "devices with a lag, resonances or both"),
+        processes=(2, "parallel processes"),
+    )

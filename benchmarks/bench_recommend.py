@@ -1,11 +1,15 @@
 #!/usr/bin/env python3
-"""Check recommended walls of random ordinary devices by eigenvalues and frequency responses computed without zwidth.
+"""Check recommended walls of random devices with eigenvalues and frequency responses computed without zwidth.
 
     python benchmarks/bench_recommend.py [--devices 400] [--first 0]
 
-Checks per device: the printed wall is stable, alone and in the soft reference grasps; the labels of all grasps are
-right; cautions appear if and only if a margin is thin or a grasp is unstable; the printed range of B is stable and
-contains the printed B; the stiffness of each improvement agrees with the recommendation for the changed device.
+Checks per device:
+
+- The printed wall is stable, without an operator and in the soft reference grasps.
+- The stability in each reference grasp is reported correctly.
+- Cautions appear if and only if a margin is thin or the wall is unstable in a grasp.
+- The printed range of B is stable and contains the printed B.
+- The stiffness of each improvement agrees with the recommendation for the changed device.
 """
 
 from __future__ import annotations
@@ -28,15 +32,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 
 from any_loop import closed_loop_matrix, continuous, flow, velocity_polynomials
 
-POINTS = 40_000  # frequencies of an open-loop response
-NEAR = 0.02  # relative distance from a threshold within which no caution is checked
+POINTS = 40_000  # frequencies on the uniform grid of an open-loop response
+NEAR = 0.02  # margins this close to their threshold, relative to it, are not checked
 PREFIXES = {"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6}
-ROUNDING = 1e-12  # relative; of a product of a number and its prefix
-TRUE_STEP = 0.02  # relative error allowed in the stiffness of an improvement
+ROUNDING = 1e-12  # relative rounding error of a printed number times its SI prefix
+TRUE_STEP = 0.02  # largest relative error of the stiffness of an improvement
 
 
 def draw_scene(random: np.random.Generator) -> zwidth.Scene:
-    """Return a linear or rotary device with an ordinary velocity estimate."""
+    """Return a random linear or rotary device with a common velocity estimate."""
     rotary = bool(random.integers(2))
     period, delta = 10 ** random.uniform(-4, -2.7), 10 ** random.uniform(-3, math.log10(2))
     mass = 10 ** (random.uniform(-6, -3) if rotary else random.uniform(-1.5, 0.5))
@@ -57,7 +61,7 @@ def draw_scene(random: np.random.Generator) -> zwidth.Scene:
 
 
 def draw_wishes(random: np.random.Generator) -> dict[str, Any]:
-    """Return the requirements of a recommendation; the default ones for every other device."""
+    """Return random requirements of a recommendation: the defaults with probability 1/2."""
     if random.integers(2):
         return {}
     wishes: list[dict[str, Any]] = [
@@ -78,7 +82,7 @@ def find_radius(scene: zwidth.Scene, stiffness: float, damping: float) -> float:
 
 
 def measure_margins(scene: zwidth.Scene, stiffness: float, damping: float) -> dict[str, float]:
-    """Return the smallest gain, phase (degrees) and delay (s) margins by the frequency response of the open loop."""
+    """Return the gain margin, the phase margin in degrees and the delay margin in s from the open-loop response."""
     a, b, sensor = continuous(scene)
     period, part = scene.timing.period, scene.d - scene.whole_delay
     step, older = flow(a, b, period)[0], flow(a, b, part * period)[1]
@@ -95,7 +99,7 @@ def measure_margins(scene: zwidth.Scene, stiffness: float, damping: float) -> di
         return (stiffness + damping * np.polyval(top, z) / np.polyval(bottom, z)) * plant
 
     def cross(values: np.ndarray) -> np.ndarray:
-        """Return the angles of the sign changes."""
+        """Return the angles at which values change their sign, by linear interpolation."""
         index = np.flatnonzero(values[:-1] * values[1:] < 0)
         share = values[index] / (values[index] - values[index + 1])
         return angle[index] + share * (angle[index + 1] - angle[index])
@@ -113,7 +117,7 @@ def measure_margins(scene: zwidth.Scene, stiffness: float, damping: float) -> di
 
 
 def judge_thin(scene: zwidth.Scene, stiffness: float, damping: float) -> bool | None:
-    """Return True if a margin is thin; None if one lies next to its threshold."""
+    """Return whether a margin is thin; None if a margin is too close to its threshold for a check."""
     margins, period = measure_margins(scene, stiffness, damping), scene.timing.period
     constant = -period / math.log(find_radius(scene, stiffness, damping))
     ratios = (
@@ -128,7 +132,7 @@ def judge_thin(scene: zwidth.Scene, stiffness: float, damping: float) -> bool | 
 
 
 def judge_grasps(scene: zwidth.Scene, stiffness: float, damping: float) -> dict[str, bool]:
-    """Return the stability in the reference grasps, by name."""
+    """Return whether a wall is stable in each reference grasp, by the name of the grasp."""
     found: dict[str, bool] = {}
     for radius in zwidth.parts.grasps.RADII if scene.device.rotary else (None,):
         for name, hand in zwidth.reference_grasps(radius).items():
@@ -138,7 +142,7 @@ def judge_grasps(scene: zwidth.Scene, stiffness: float, damping: float) -> dict[
 
 
 def improve(scene: zwidth.Scene, step: Any) -> zwidth.Scene:
-    """Return the changed device, built from its parameters."""
+    """Return a new scene with an improvement from `Recommendation.steps`."""
     device, timing = scene.device, scene.timing
     velocity: Any = scene.velocity
     period, delay = timing.period, timing.delay
@@ -209,7 +213,7 @@ def check_device(seed: int) -> tuple[Counter[str], list[str]]:
 
 
 def check_remedy(caution: str, scene: zwidth.Scene, count: Any) -> None:
-    """Count the wall that a caution proposes as stable in all grasps, or as one without thin margins."""
+    """Count whether the wall that a caution proposes is stable in all grasps, or has no thin margin."""
     wall = re.search(r": K = (\S+) (\S*?)N(?:/m| m/rad).*?, B = (\S+) (\S*?)N (?:s/m|m s/rad) \(", caution)
     if wall is None:
         count("cautions with a remedy", False, caution)

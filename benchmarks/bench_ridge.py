@@ -25,7 +25,7 @@ import optimistix
 
 import zwidth
 from methods.clock import time_calls
-from zwidth.loops.rigid.polynomial import frequency_boundary, frequency_loop
+from zwidth.loops.rigid.polynomial import build_frequency_loop, find_boundary_wall
 from zwidth.loops.rigid.ridge import ridge_kernel
 
 REFERENCE = Path(__file__).resolve().parents[1] / "tests" / "reference" / "ridge_extended.json"
@@ -46,16 +46,16 @@ class Row(NamedTuple):
 
 
 def fast(delta: jax.Array, d: jax.Array) -> jax.Array:
-    """alpha_max of one point by the library's own route."""
+    """Return alpha_max of one point, computed by zwidth."""
     return ridge_kernel(delta, d).alpha
 
 
 def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
-    """The same with optimistix' Newton method on the slope of the closed-form curve; smooth optima only."""
+    """Return alpha_max by optimistix' Newton method for a zero derivative of the closed form; smooth optima only."""
 
     def slope(omega: jax.Array, point: tuple[jax.Array, jax.Array]) -> jax.Array:
-        loop = frequency_loop(*point)
-        return jax.grad(lambda w: frequency_boundary(w, loop).alpha)(omega)
+        loop = build_frequency_loop(*point)
+        return jax.grad(lambda w: find_boundary_wall(w, loop).alpha)(omega)
 
     # As good a start as the fast route has, which fits s = sin(omega/2): within 4 %.
     u, t = 1.0 / (d + 1.0), delta * (d + 1.0) / (delta * (d + 1.0) + 3.0)
@@ -64,7 +64,7 @@ def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
     omega = optimistix.root_find(
         slope, solver, jax.lax.stop_gradient(start), args=(delta, d), max_steps=16, throw=False
     ).value
-    return frequency_boundary(omega, frequency_loop(delta, d)).alpha
+    return find_boundary_wall(omega, build_frequency_loop(delta, d)).alpha
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, float]:

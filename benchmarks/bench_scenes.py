@@ -21,7 +21,7 @@ import numpy as np
 
 import zwidth
 from methods.clock import time_calls
-from methods.page import hand_out, page_parser
+from methods.page import write_page
 from zwidth.arrays.polynomials import companion
 from zwidth.loops.linear.roots import affine_polynomial
 
@@ -140,11 +140,5 @@ def _rigid_ratio(scene: zwidth.Scene) -> float:
     return min(own) / min(plain)
 
 
-def main() -> None:
-    """Measure, and print or write."""
-    given = page_parser(__doc__).parse_args()
-    hand_out(report(), given.write)
-
-
 if __name__ == "__main__":
-    main()
+    write_page(__doc__, report)

@@ -19,7 +19,7 @@ import scipy.signal
 
 import zwidth
 from methods.clock import time_calls
-from methods.page import hand_out, page_parser
+from methods.page import write_page
 
 SCENES, PERIODS, BESIDE = 10_000, 1000, 20
 PUSH = 0.5
@@ -136,11 +136,5 @@ def report_parts() -> list[str]:
     return lines
 
 
-def main() -> None:
-    """Measure, and print or write."""
-    given = page_parser(__doc__).parse_args()
-    hand_out(report(), given.write)
-
-
 if __name__ == "__main__":
-    main()
+    write_page(__doc__, report)

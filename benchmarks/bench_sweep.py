@@ -102,7 +102,7 @@ def run(config: Path, out: Path, workers: int) -> dict[str, float]:
 
     store = Store(out / "map.zarr")
     tasks = list(store.plan.tasks())
-    ends = sorted((store.flag(task).stat().st_mtime_ns, task.points) for task in tasks)
+    ends = sorted((store.status_file(task).stat().st_mtime_ns, task.points) for task in tasks)
     points = sum(number for _, number in ends)
     # Each worker's first chunk pays for its start.
     first, last = ends[workers - 1][0], ends[-1][0]

@@ -1,4 +1,4 @@
-"""Common frame of the benchmarks that count correct results of random devices."""
+"""Command line and main loop of the benchmarks that count correct results for random devices."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import argparse
 from collections import Counter
 from collections.abc import Callable
 
-PRINTED = 10  # devices between two lines of totals
+PRINTED = 10  # number of devices after which the totals are printed
 
 
 def build_parser(doc: str | None, devices: int) -> argparse.ArgumentParser:
-    """Return a parser of the number of devices, with its default, and of the first seed."""
+    """Return a parser of the options for the number of devices, with this default, and for the first seed."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--devices", type=int, default=devices)
     parser.add_argument("--first", type=int, default=0, help="seed of the first device")
@@ -18,7 +18,7 @@ def build_parser(doc: str | None, devices: int) -> argparse.ArgumentParser:
 
 
 def count_devices(given: argparse.Namespace, check: Callable[[int], tuple[Counter[str], list[str]]]) -> None:
-    """Print the failures of each device and the totals; ``check`` returns counts and failures of a seed."""
+    """Print failures and totals for all devices; ``check`` returns the counts and the failures for one seed."""
     total: Counter[str] = Counter()
     for seed in range(given.first, given.first + given.devices):
         counts, failures = check(seed)

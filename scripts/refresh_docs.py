@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from reference_pages import TABLES
 from refresh_readme import ROOT, show_commands
 
 from zwidth.studies import published as report
@@ -134,7 +135,7 @@ def compare_paper() -> str:
     return text.partition("\n")[2].strip().replace("\n## ", "\n### ")
 
 
-MADE = {"gallery": list_gallery, "published": compare_paper}
+MADE = {"gallery": list_gallery, "published": compare_paper, **TABLES}
 
 
 def main() -> None:

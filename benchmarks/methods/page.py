@@ -1,20 +1,26 @@
-"""What scripts that make a page of tables share: the option that names it, and where the text goes."""
+"""Command line of the benchmarks that write a page of the documentation."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 
-def page_parser(description: str | None) -> argparse.ArgumentParser:
-    """A parser of a script's options, with the page to write."""
+def write_page(description: str | None, report: Callable[..., str], **options: tuple[int, str]) -> None:
+    """Print a page, and write it to the file of the option ``--write``.
+
+    Args:
+        description: description of the program.
+        report: function that returns the page in Markdown; the values of the options are its arguments, in their order.
+        options: default value and description of each further option, an integer, by its name.
+    """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", type=Path, help="the page to write, in Markdown")
-    return parser
-
-
-def hand_out(text: str, page: Path | None) -> None:
-    """Print a text, and write it where a page is named."""
+    for name, (default, text) in options.items():
+        parser.add_argument(f"--{name}", type=int, default=default, help=f"{text} (default: {default})")
+    given = parser.parse_args()
+    text = report(*(getattr(given, name) for name in options))
     print(text)
-    if page is not None:
-        page.write_text(text, encoding="utf-8")
+    if given.write is not None:
+        given.write.write_text(text, encoding="utf-8")

@@ -10,7 +10,7 @@ import numpy as np
 
 from zwidth.loops.rigid import certified
 from zwidth.loops.rigid.boundary import boundary, sample_lobe
-from zwidth.loops.rigid.outermost_poles import outermost_poles
+from zwidth.loops.rigid.outermost_poles import compute_dominant_poles
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.verdict import decide_stability
 from zwidth.words.status import Status
@@ -157,7 +157,7 @@ def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
     """
     import flint
 
-    pole = outermost_poles([np.array([value]) for value in (alpha, beta, delta, d)], 1e-9)
+    pole = compute_dominant_poles([np.array([value]) for value in (alpha, beta, delta, d)], 1e-9)
     if not pole.error[0] <= 1e-9:
         raise ArithmeticError(f"no proof of the outermost pole at {(alpha, beta, delta, d)}")
     with flint.ctx.workprec(_ROOT_BITS):

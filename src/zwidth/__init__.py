@@ -1,11 +1,11 @@
-"""Stability of haptic virtual walls: boundaries, the stiffest stable wall, passivity, and sweeps of them.
+"""Stability of haptic virtual walls: boundaries, maximum stiffness, passivity, margins, simulation, and sweeps.
 
-Names are loaded on first use, so that `import zwidth` and the command line's help need no JAX.
+The public names are loaded on first use, so that `import zwidth` and the help of the command line do not load JAX.
 """
 
 import lazy_loader
 
 __version__ = "0.1.0"
 
-# The names stand in __init__.pyi.
+# The stub __init__.pyi lists the public names and the modules that define them.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

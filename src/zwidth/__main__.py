@@ -1,4 +1,4 @@
-"""The command `zwidth`, and `python -m zwidth`."""
+"""Entry point of the command `zwidth` and of `python -m zwidth`."""
 
 import atexit
 import gc
@@ -7,10 +7,11 @@ import os
 
 def main() -> None:
     """Run the command line and exit."""
-    # OpenBLAS reads this variable when NumPy is loaded. Its matrices here are small: on a busy machine several OpenBLAS
-    # threads take several times as long as one. zwidth starts its own threads for large arrays.
+    # Limit OpenBLAS to one thread, because the matrices of zwidth are small: on a busy machine several OpenBLAS threads
+    # take several times as long as one. For large arrays zwidth starts its own threads. OpenBLAS reads this variable
+    # when NumPy is loaded.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Skip the garbage collection at exit, because it takes a tenth of the time of a short command.
+    # Skip the garbage collection at exit, because it takes 10 % of the time of a short command.
     atexit.register(gc.freeze)
     from zwidth.cli import main as run
 

@@ -7,31 +7,34 @@ from contract.matrix import EVERY_CASE, combinations
 
 _HEAD = """# What every public function promises
 
-Written by `scripts/refresh_contract.py` from the cases of `tests/contract/cases.py`, each of which runs through all
-tests of `tests/contract/test_contract.py`:
+Written by `scripts/refresh_contract.py` from `tests/contract/cases.py`. Each case runs through all tests of
+`tests/contract/test_contract.py`:
 
-- **Anything in.** Numbers, lists, NumPy and JAX arrays that broadcast; numbers give NumPy scalars, NumPy arrays give
-  NumPy arrays, JAX arrays give JAX arrays, all in float64 whatever JAX's settings. A number is answered without loading
-  JAX. Nothing in, nothing out. What is no real number, and shapes that do not fit, raise `InputError` by name.
-- **Every type of argument.** One argument traced or none, the others Python numbers, NumPy scalars and arrays of ints
-  and floats, 0-d arrays, lists or JAX arrays; called directly and inside `jit`, `vmap`, `grad`, `jit(grad)` and the
-  second derivative; in float64 and float32: {combinations:,} combinations, of methods of a rigid `Scene` as well
-  (`tests/contract/test_matrix.py`).
-- **Bad points.** An entry that is NaN, infinite or negative where it must not be gives what the column "bad points"
-  says, with INVALID_INPUT where there is a status; one beyond the domain likewise, with OUT_OF_RANGE. Its neighbors
-  keep every bit. A number beyond the domain raises `InputError` with field, value and range; "raises" in the column
-  "bad number" says that NaN and negative numbers raise as well.
-- **Inside `jit`, `vmap`, `grad` with x64.** Values and statuses are those of the direct call, to 1e-11; bad points and
-  their neighbors behave as above.
-- **Inside `jit` without x64.** float32 values to 2e-3 at moderate points, the same statuses; what lies beyond the
-  domain is NaN there too.
-- **Derivatives** are finite at good points and NaN at bad ones. The first order is tested here, the second in the tests
-  of each function, and so is the first of {elsewhere}.
-- **On a graphics processor.** Inside `jit` a function runs where JAX does, with these values and statuses: these tests
-  pass on one, too. Called directly few points go to NumPy, and many to JAX in pieces made for a processor's caches: a
-  million walls belong into your own `jit` there.
+- **Types of results.** Arguments are numbers, lists, NumPy arrays or JAX arrays that broadcast. The results are
+  NumPy scalars for numbers, NumPy arrays for NumPy arrays, and JAX arrays for JAX arrays, all in float64
+  regardless of JAX's settings. Numbers are computed without loading JAX. Empty arrays return empty arrays. Values
+  that are not real numbers, and shapes that do not broadcast, raise `InputError` with the name of the argument.
+- **Types of arguments.** At most one argument is traced. The others are Python numbers, NumPy scalars, NumPy
+  arrays of ints or floats, 0-d arrays, lists or JAX arrays. `tests/contract/test_matrix.py` tests
+  {combinations:,} combinations of these types in direct calls and inside `jit`, `vmap`, `grad`, `jit(grad)` and
+  the second derivative, in float64 and float32. It includes methods of a rigid `Scene`.
+- **Bad points.** For an entry that is NaN, infinite, or negative where negative values are not allowed, the
+  result is that of the column "bad points", and the status, if there is one, is INVALID_INPUT. An entry outside
+  the domain has the same result with the status OUT_OF_RANGE. Bad entries do not change the other entries. A
+  number outside the domain raises `InputError` with field, value and range; "raises" in the column "bad number"
+  means that NaN and negative numbers raise the error as well.
+- **Inside `jit`, `vmap`, `grad` with x64.** Values and statuses agree with those of direct calls to 1e-11. Bad
+  points behave as above.
+- **Inside `jit` without x64.** float32 values agree to 2e-3 at moderate points, with the same statuses. Results
+  outside the domain are NaN.
+- **Derivatives** are finite at good points and NaN at bad ones. The contract tests cover the first order. The
+  tests of each function cover the second order, and the first order of {elsewhere}.
+- **On a graphics processor.** Inside `jit`, functions run on the device of JAX, with the same values and
+  statuses; these tests pass on a graphics processor as well. Direct calls compute few points with NumPy, and
+  divide many points into blocks that fit the caches of a CPU. On a graphics processor, call the functions inside
+  your own `jit` instead.
 
-Domains, of arguments that are finite:
+Domains of finite arguments:
 
 | domain | arguments |
 |---|---|
@@ -49,8 +52,8 @@ def page() -> str:
     number = sum(1 for case in EVERY_CASE for _ in combinations(case))
     head = _HEAD.format(elsewhere=elsewhere, domains=domains, combinations=number)
     others = "".join(f"| `{name}` | {why} |\n" for name, why in sorted(OTHERS.items()))
-    rest = "Functions that take no arrays point by point, or that a number has compiled:"
-    return f"{head}{rows}\n{rest}\n\n| function | takes, and where its promises are tested |\n|---|---|\n{others}"
+    rest = "Functions that do not compute arrays point by point, and functions that compile even for numbers:"
+    return f"{head}{rows}\n{rest}\n\n| function | arguments, and tests of the contract |\n|---|---|\n{others}"
 
 
 def _row(case: Case) -> str:

@@ -184,7 +184,7 @@ def test_stopped_before_its_first_chunk_a_run_says_the_same(config, tmp_path, mo
     process = start("run", config, "--out", tmp_path)
     wait_for_chunks(process, tmp_path, 1)
     kill_group(process)
-    monkeypatch.setattr("zwidth.sweep.engine.repair", stopped)
+    monkeypatch.setattr("zwidth.sweep.engine.repair_store", stopped)
     assert main_of("run", config, "--out", tmp_path, "--resume") == 130
     says = f"zwidth: stopped; what is done is kept, go on with: zwidth run {config} --out {tmp_path} --resume\n"
     assert capsys.readouterr().err == says

@@ -98,7 +98,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(config, words, name, tmp_p
         config = written(tmp_path / "others.yaml", {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0})
     file = tmp_path / "a_file"
     file.touch()
-    for out, says in ((file, "is a file"), (file / "below", f"cannot be made, for {file} is a file")):
+    for out, says in ((file, "is a file"), (file / "below", f"cannot be created because {file} is a file")):
         assert main_of(*words, config, "--out", out) == 2
         message = capsys.readouterr().err
         assert message.startswith(f"Error: out: {out} {says}")
@@ -115,7 +115,7 @@ def test_a_read_only_folder_is_refused(config, tmp_path, capsys):
     folder.chmod(0o555)
     with as_nobody():
         assert main_of("run", config, "--out", folder / "out") == 2
-    says = f"Error: out: {folder}/out cannot be made, for {folder} is read-only, at least to you; choose another"
+    says = f"Error: out: {folder}/out cannot be created because {folder} is not writable for you; choose another"
     assert capsys.readouterr().err.startswith(says)
 
 
@@ -205,7 +205,7 @@ def test_a_damaged_description_of_a_store_is_told(config, copy, capsys):
 def test_a_folder_without_a_store_is_told(tmp_path, capsys):
     for words in (["verify", tmp_path], ["export", tmp_path, "--csv", tmp_path / "x.csv"]):
         assert main_of(*words) == 2
-        assert "holds no store of a sweep" in capsys.readouterr().err
+        assert "contains no store of a sweep" in capsys.readouterr().err
     assert main_of("verify", tmp_path / "no") == 2
     assert "no such folder" in capsys.readouterr().err
 

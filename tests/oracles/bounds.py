@@ -7,7 +7,7 @@ import numpy as np
 from zwidth.arrays.evaluate import broadcast
 from zwidth.loops.rigid.folding import NAMES
 from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.outermost_poles import find_poles, outermost_poles
+from zwidth.loops.rigid.outermost_poles import compute_dominant_poles, find_poles
 from zwidth.words.status import Status
 
 
@@ -28,7 +28,7 @@ def bound_radius(alpha, beta, delta, d, *, accuracy=1e-9) -> Radius:
     proved, status = np.full(radius.shape, accuracy), np.asarray(wall_status(*arrays))
     # What is known of the others, whether of a map or not.
     left = [array[~certified] for array in arrays]
-    proved[~certified] = np.where(np.isnan(radius[~certified]), np.inf, outermost_poles(left, accuracy).error)
+    proved[~certified] = np.where(np.isnan(radius[~certified]), np.inf, compute_dominant_poles(left, accuracy).error)
     # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
     error = np.where(np.isinf(proved), np.inf, (np.expm1(proved) + 2e-16) * radius)
     status = np.where((status == Status.OK) & ~certified, Status.NOT_CONVERGED, status)

@@ -15,8 +15,19 @@ import zwidth
 from zwidth.arrays.polynomials import companion
 from zwidth.loops.rigid.boundary import sample_lobe
 from zwidth.loops.rigid.folding import find_degree
-from zwidth.loops.rigid.poles import aberth_kernel, discs, pole_kernel, product_form, radius_by_companion
-from zwidth.loops.rigid.polynomial import affine, coefficients, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.poles import (
+    aberth_kernel,
+    compute_discs,
+    factor_with_pole_axis,
+    pole_kernel,
+    radius_by_companion,
+)
+from zwidth.loops.rigid.polynomial import (
+    build_frequency_loop,
+    compute_coefficients,
+    expand_affine,
+    find_boundary_wall,
+)
 from zwidth.loops.rigid.response import step_response
 from zwidth.words import types as _types
 from zwidth.words.types import Reals, Roots
@@ -30,7 +41,7 @@ GRID = dict(zip(WALL, np.broadcast_arrays(*WALL.values()), strict=True))
 DEVICE = {"delta": GRID["delta"], "d": np.full((2, 3), 1.5)}
 HALF = find_degree(1.5)
 KERNEL = {**GRID, **DEVICE, "degree": HALF}
-LOOP = frequency_loop(**DEVICE)
+LOOP = build_frequency_loop(**DEVICE)
 ROOTS_FIRST = np.moveaxis(pole_kernel(**KERNEL), -1, 0)
 
 CALLS = [
@@ -44,13 +55,13 @@ CALLS = [
     (zwidth.stable_region, {"delta": 0.1, "d": 1.0, "points": 20}),
     (sample_lobe, {"delta": 0.1, "d": 1.0, "points": 20}),
     (step_response, {"alpha": 0.1, "beta": 0.2, "delta": 0.1, "d": 1.0, "periods": 20}),
-    (affine, {**DEVICE, "degree": HALF}),
-    (coefficients, KERNEL),
-    (companion, {"monic": coefficients(**KERNEL)}),
+    (expand_affine, {**DEVICE, "degree": HALF}),
+    (compute_coefficients, KERNEL),
+    (companion, {"monic": compute_coefficients(**KERNEL)}),
     (pole_kernel, KERNEL),
     (aberth_kernel, KERNEL),
-    (discs, {"z": ROOTS_FIRST, "loop": product_form(**KERNEL), "degree": HALF}),
-    (frequency_boundary, {"omega": np.full((2, 3), 0.3), "loop": LOOP}),
+    (compute_discs, {"z": ROOTS_FIRST, "loop": factor_with_pole_axis(**KERNEL), "degree": HALF}),
+    (find_boundary_wall, {"omega": np.full((2, 3), 0.3), "loop": LOOP}),
 ]
 
 

@@ -1,4 +1,4 @@
-"""The group of commands, and those for a device, a file or a page: thin shells over the library, imported on call."""
+"""The command ``zwidth`` and its commands for devices, files and pages; each imports the library when it is called."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from zwidth import __version__
-from zwidth.cli.hardware import diagnose_wall, hardware_options
+from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     SHARE,
@@ -31,6 +31,7 @@ from zwidth.pages.words import row
 from zwidth.parts.device import Device
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
+from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import InputError, ZwidthError, check_choice, how_to_install
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import SIZES, Range
@@ -38,13 +39,13 @@ from zwidth.words.status import Status
 
 EXIT_FAILED, EXIT_INPUT = 1, 2
 _PACKAGE = Path(__file__).resolve().parents[1]
-# A table that a configuration reads from its own folder.
+# Table in the folder of the configuration that names it.
 _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
 
 
 @click.group(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="Exit codes: 0 for an answer, which may be UNSTABLE; 1 if no wall or value exists, or a computation fails; "
+    epilog="Exit codes: 0 for a result, including UNSTABLE; 1 if no wall or value exists, or a computation fails; "
     "2 for invalid input.\n\n"
     "Completion in bash (zsh, fish): _ZWIDTH_COMPLETE=bash_source zwidth > FILE, and '. FILE' in ~/.bashrc.",
 )
@@ -52,8 +53,9 @@ _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
 def cli() -> None:
     """Stability of haptic virtual walls: what stiffness and damping a sampled, delayed device can render.
 
-    A quantity is a number in SI base units (10e3) or a number with a unit ("10 kN/m"). A rotary device has its own:
-    "12 g cm^2", "0.02 mN m s/rad", "20 mN m/deg"; where one option is in these, or --device is rotary, all are.
+    A quantity is a number in SI base units (10e3) or a number with a unit ("10 kN/m"). Rotary devices have rotary
+    units: "12 g cm^2", "0.02 mN m s/rad", "20 mN m/deg". If one option has such a unit, or --device is rotary, all
+    options are rotary.
     """
 
 
@@ -87,7 +89,8 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
             result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
-        lines = check_lines(scene, verdict, limits, silent=find_silent(), diagnosis=diagnosis, verbose=verbose)
+        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
+        lines = check_lines(scene, verdict, limits, **told, diagnosis=diagnosis, verbose=verbose)
     words.tell(result, lines + words.note_lines(notes), as_json, words.LABEL)
 
 
@@ -124,7 +127,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
     if isinstance(scene.device, Device):
-        # Else no mass is known, in whose units normalized numbers are.
+        # Normalized parameters exist only for a device with a known mass.
         omega = wall.frequency * (2.0 * math.pi * scene.timing.period)
         numbers = {"delta": scene.delta, "d": scene.d, "alpha_max": alpha, "beta": beta, "omega": omega}
         result = {name: float(number) for name, number in numbers.items()}
@@ -139,12 +142,15 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     result["kind"] = kind
     if given is not None:
         slopes, notes = words.list_slopes(scene), words.scene_notes(scene) + _say_stiffer(scene)
+        stiffest = scene.replace(wall=VirtualWall(float(wall.stiffness), float(wall.virtual_damping)))
+        cautions = [*words.compare_with_limit(stiffest), *words.silent_cautions(scene, find_silent())]
         found = wall.stiffness, wall.virtual_damping, wall.frequency
         named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, found), strict=True))
         result |= named | {
             "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
+            "cautions": cautions,
         }
         B, f = with_unit(found[1], scene.unit_system["N s/m"]), with_unit(named["frequency"], "Hz")
         K = spell_stiffness(named["stiffness_max"], scene.unit_system)
@@ -154,7 +160,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
             *lines,
             words.line("device", spell_device(scene, find_silent())),
             *words.part_lines(scene),
-            *(words.line("CAUTION", text) for text in words.silent_cautions(scene, find_silent())),
+            *(words.line("CAUTION", text) for text in cautions),
             words.line("next", "zwidth recommend, with the same options, for the wall to set"),
             "",
             *(slope.line() for slope in slopes),
@@ -164,7 +170,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _say_stiffer(scene: Any) -> list[str]:
-    """Why no stiffer wall is sure on a measured response, and what to measure for one."""
+    """Return notes on what to measure for a stiffer wall on a measured response."""
     if not isinstance(scene.device, MeasuredDevice):
         return []
     from zwidth.fitting.respond import find_nominal_limit
@@ -172,7 +178,7 @@ def _say_stiffer(scene: Any) -> list[str]:
     top = find_nominal_limit(scene)
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
     K_max = spell_stiffness(float(top.stiffness), scene.unit_system)
-    return [f"K_max = {K_max} by the curve without its deviation; {text}" for text in said]
+    return [f"K_max = {K_max} for the measured curve without its error band; {text}" for text in said]
 
 
 @cli.command()
@@ -187,7 +193,7 @@ def schema() -> None:
 @click.argument("name", required=False)
 @json_option
 def devices(name: str | None, as_json: bool) -> None:
-    """List devices with published numbers, or those of one NAME with their sources."""
+    """List devices with published parameters, or the parameters of the device NAME with their sources."""
     from zwidth.parts.devices import DEVICES, find_device
 
     chosen = DEVICES if name is None else (find_device(name),)
@@ -195,7 +201,7 @@ def devices(name: str | None, as_json: bool) -> None:
         lines = []
         for device in chosen:
             numbers = (f"{key.replace('_', ' ')} {each.spell()}" for key, each in device.numbers.items())
-            # Of counts the unit says what they are.
+            # Omit the name "counts", because it is also the unit.
             lines.append(row(device.name, ", ".join(number.removeprefix("counts ") for number in numbers)))
     else:
         notes = {quantity: f" ({number.note})" if number.note else "" for quantity, number in chosen[0].numbers.items()}
@@ -214,13 +220,13 @@ def _complete(context: click.Context, parameter: click.Parameter, begun: str) ->
     "--example",
     metavar="EXAMPLE",
     shell_complete=_complete,
-    help="The example to begin with.  [default: NAME's, else quickstart]",
+    help="Example to copy.  [default: NAME if it is an example, else quickstart]",
 )
 @click.option("--list", "listing", is_flag=True, help="List the examples.")
 def init(name: str | None, example: str | None, listing: bool) -> None:
-    """Write an example configuration NAME.yaml, to run and to change.
+    """Write an example configuration NAME.yaml to run and edit.
 
-    No file is ever replaced. Without a NAME the file is named after the example.
+    Existing files are never replaced. Without NAME, the file has the name of the example.
     """
     known = find_examples()
     if listing:
@@ -237,13 +243,13 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     if not re.fullmatch("[a-z0-9_-]{1,64}", name):
         raise InputError(f"NAME: got {name!r}; write 1 to 64 of a-z, 0-9, _ and -, as in my_device")
     text = known[example].read_text(encoding="utf-8")
-    # The schema's place is known in a checkout alone, and each configuration has results of its own.
+    # Remove the path of the schema, which exists in a checkout only; rename the results with the configuration.
     text = re.sub(r"\A# yaml-language-server:.*\n(?:#\n)?", "", text)
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", text, count=1)
     wanted = {Path(f"{name}.yaml"): text}
     for table in map(Path, _TABLE.findall(text)):
         content = known[example].with_name(table.name).read_text(encoding="utf-8")
-        # A table that is there as it would be written serves as it is.
+        # Keep an existing table with the same content.
         if not table.is_file() or table.read_bytes() != content.encode():
             wanted[table] = content
     for file in wanted:
@@ -257,7 +263,7 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
 
 
 def find_examples() -> dict[str, Path]:
-    """The example configurations by name: those of the package, or of the checkout that it is imported from."""
+    """Return the example configurations by name, from the package or from the checkout."""
     packaged = _PACKAGE / "examples"
     folder = packaged if packaged.is_dir() else _PACKAGE.parents[1] / "configs"
     found = {file.stem: file for file in sorted(folder.glob("*.yaml"))}
@@ -271,10 +277,10 @@ def find_examples() -> dict[str, Path]:
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
 @click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
 def explore(path: Path | None, port: int, no_browser: bool) -> None:
-    """Open a page with sliders, on which the stable walls follow.
+    """Open a page with sliders for device and wall that shows the stable walls.
 
-    It starts from the scene of a CONFIG file, or of the run in DIR. The server is for this machine alone and asks for
-    the token in its address. Ctrl-C ends it.
+    The page starts with the scene of a CONFIG file, or of the run in DIR. The server accepts connections from this
+    machine only, with the token in its address. Ctrl-C ends it.
     """
     import threading
     import webbrowser
@@ -293,7 +299,7 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
     explorer = Explorer(read_controls(find_config(path) if path and path.is_dir() else path), port)
     click.echo(f"{explorer.address}  (Ctrl-C ends it)")
     if not no_browser:
-        # A browser in the terminal would keep the server waiting for its own page.
+        # Open the browser in a thread, because a text browser would block the server.
         threading.Thread(target=webbrowser.open, args=(explorer.address,), daemon=True).start()
     explorer.run()
     click.echo("stopped")
@@ -301,12 +307,12 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
 
 @cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="The file.  [default: DIR/report.html]")
+@click.option("--out", type=click.Path(path_type=Path), help="File to write.  [default: DIR/report.html]")
 @json_option
 def report(folder: Path, out: Path | None, as_json: bool) -> None:
     """Write the run in DIR as one HTML file, with slices of its maps.
 
-    It holds figures, methods, versions and configuration, and needs no server and no network.
+    The file contains figures, methods, versions and configuration, and requires no server and no network.
     """
     from zwidth.runs.report.page import write_report
 
@@ -323,17 +329,21 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option("--stiffness-fraction", type=SHARE, help="Largest share of K_max.  [default: 75%]")
 @click.option("--gain-margin", type=_FACTOR, help="Smallest gain margin, a factor on K and B together.  [default: 2]")
 @click.option("--phase-margin", type=_DEGREES, help="Smallest phase margin, in degrees.  [default: 30]")
-@click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
+@click.option(
+    "--passive",
+    is_flag=True,
+    help="Only passive walls: stable in any grasp, because no passive hand can destabilize them.",
+)
 @click.option(
     "--grasps",
     type=click.Choice(("all", "soft", "none")),
-    help="Reference grasps in which the wall must be stable; for every hand, use --passive.  [default: soft, with the "
-    "default margins]",
+    help="Reference grasps in which the wall must be stable; for every passive hand, use --passive.  [default: soft "
+    "with the default margins, else none]",
 )
 @hardware_options
 @beyond_safe_option
 @figure_option
-@click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
+@click.option("--code", type=click.Choice(("c", "python")), help="Print only the code of the wall for the loop.")
 @verbose_option
 @json_option
 def recommend(
@@ -377,7 +387,8 @@ def recommend(
         result["cautions"] += words.silent_cautions(scene, find_silent())
         result |= {} if diagnosis is None else {"diagnosis": diagnosis.as_dict()}
     else:
-        lines = recommend_lines(found, silent=find_silent(), diagnosis=diagnosis, verbose=verbose)
+        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
+        lines = recommend_lines(found, **told, diagnosis=diagnosis, verbose=verbose)
     words.tell(result, [*lines, *words.note_lines(notes), *wrote], as_json, words.LABEL)
     if found.status != Status.OK:
         raise SystemExit(EXIT_FAILED)

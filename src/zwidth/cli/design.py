@@ -1,4 +1,4 @@
-"""`zwidth design`: what a wanted stiffness asks of a device, and how tolerances change the answer."""
+"""`zwidth design`: parameters that a given stiffness requires, and the effect of tolerances."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from zwidth.cli.options import (
     flag_of,
     json_option,
     read_pairs,
-    read_share,
     scene_options,
 )
 from zwidth.pages.verdict import spell_device
-from zwidth.pages.words import LABEL, line, part_lines, tell
+from zwidth.pages.words import LABEL, line, note_lines, part_lines, tell
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import (
     count_digits,
@@ -34,6 +33,7 @@ from zwidth.words.formatting import (
 )
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.status import Status
+from zwidth.words.units import read_share
 
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
@@ -42,7 +42,7 @@ _BOX = ("mass", "damping", "period", "delay")
 
 
 def _read_tolerance(text: str) -> tuple[str, float]:
-    """A parameter and the share by which it may differ."""
+    """Return a parameter and its relative tolerance."""
     name, _, share = text.partition("=")
     return name.strip(), read_share(share)
 
@@ -54,32 +54,32 @@ _TOLERANCE = Parsed(
 
 @cli.command(**show_example("design --stiffness '30 kN/m' --find rate", OF_SCENE))
 @scene_options(wall=True)
-@click.option("--find", type=click.Choice(tuple(_FINDS)), help="What is to be chosen for --stiffness.")
+@click.option("--find", type=click.Choice(tuple(_FINDS)), help="Parameter to compute for --stiffness.")
 @click.option(
     "--tolerance",
     "tolerances",
     type=_TOLERANCE,
     multiple=True,
     callback=read_pairs,
-    help="By how much a property may differ, as mass=10%; may be repeated.",
+    help="Relative tolerance of a parameter, as mass=10%; may be repeated.",
 )
 @click.option(
     "--distribution",
     type=click.Choice(("uniform", "normal")),
     default="uniform",
     show_default=True,
-    help="What a tolerance is: a share either way, or a standard deviation.",
+    help="Meaning of a tolerance: largest deviation (uniform), or standard deviation (normal).",
 )
-@click.option("--samples", type=int, help="How many devices are drawn; 10,000, or 200 of a scene with parts.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the draws.")
+@click.option("--samples", type=int, help="Number of random devices.  [default: 10,000, or 200 for scenes with parts]")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random devices.")
 @json_option
 def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: bool, **drawn: Any) -> None:
-    """Say what a wanted stiffness needs, or what tolerances cost.
+    """Compute the parameter that a given stiffness requires, or the effect of tolerances.
 
-    With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given;
-    or the virtual damping with which a wall of --stiffness settles fastest. With --tolerance: the share of devices on
-    which the wall (--stiffness, --virtual-damping) is stable, the stiffness up to which 99 % of them are stable,
-    and, for uniform tolerances of a rigid device, the stiffest wall that is stable on all of them, found by search.
+    With --find: the value of one parameter at which K_max reaches --stiffness; with --find virtual_damping, the damping
+    with which a wall of --stiffness settles fastest. With --tolerance: the share of random devices on which the wall
+    (--stiffness, --virtual-damping) is stable, the stiffness up to which 99 % of them are stable, and, for uniform
+    tolerances of a rigid device, the stiffest wall, found by search, that is stable on all devices.
     SCENE.yaml (or the folder of a run) supplies parameters not given as options; options override it.
     """
     if find is None and not tolerances:
@@ -102,7 +102,7 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
 
 
 def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
-    """The value of one property that is enough, and on which side of it there is enough."""
+    """Return the value of one parameter at which K_max reaches the given stiffness, as data and as lines."""
     path = _FINDS[find]
     if path == "virtual_damping":
         return _choose_damping(scene)
@@ -159,7 +159,7 @@ def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, fl
 
 
 def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
-    """The virtual damping with which a wall of a wanted stiffness settles fastest."""
+    """Return the virtual damping with which a wall of given stiffness settles fastest, as data and as lines."""
     wanted, best, units = float(scene.wall.stiffness), scene.best_damping(), scene.unit_system
     result = {"parameter": "virtual_damping", "value": best.virtual_damping, "unit": units["N s/m"]}
     result |= {"spectral_radius": best.spectral_radius, "modulus_margin": best.modulus_margin}
@@ -176,7 +176,8 @@ def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
 def _tolerate(
     scene: Any, shares: dict[str, float], distribution: Any, samples: int | None, seed: int
 ) -> tuple[dict[str, Any], list[str]]:
-    """What tolerances leave, by devices drawn within them."""
+    """Return the share of random devices within tolerances on which the wall is stable, as data and as lines."""
+    from zwidth.scenes.assessment import describe_islands
     from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 
     count = samples if samples is not None else scene.loop.draws
@@ -187,7 +188,7 @@ def _tolerate(
     percent = f"{100 * found.reliability:g} %"
     unit = scene.unit_system["N/m"]
     borne, most = (with_unit(round_safely(end, "below"), unit) for end in (found.stiffness, found.stiffness_max))
-    # Not 100 % where one of many does not bear it.
+    # Round towards the safe side, so that 100 % means all devices.
     ends = (found.stable, "below"), (found.stable_low, "below"), (found.stable_high, "above")
     stable, low, high = (plain(round_safely(100 * each, side)) for each, side in ends)
     share = f"{stable} % of {found.samples} devices drawn"
@@ -199,7 +200,7 @@ def _tolerate(
     ]
     if found.stiffness_max == found.stiffness_max:
         lines.append(line("", f"or up to {most}, each device with its best B"))
-    return result, lines
+    return result, [*lines, *note_lines(describe_islands(scene))]
 
 
 def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
@@ -224,5 +225,6 @@ def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], l
     units, names = scene.unit_system, ("stiffness", "stiffness_max")
     stiffness, most = (with_unit(round_safely(result[name], "below"), units["N/m"]) for name in names)
     damping = with_unit(result["virtual_damping"], units["N s/m"], DIGITS)
-    text = f"of them (by search) are stable with K = {stiffness} at B = {damping}; {most}, each with its best B"
+    text = f"of all devices within the tolerances are stable for K up to {stiffness} at B = {damping} (by search), "
+    text += f"or up to {most}, each device with its best B"
     return result, [line("100 %", text)]

@@ -33,14 +33,14 @@ class GroupedCommand(click.Command):
         rows: dict[str, list[tuple[str, str]]] = {name: [] for name in GROUPS}
         for option in self.get_params(ctx):
             if isinstance(option, click.Option) and (record := option.get_help_record(ctx)) is not None:
-                rows[_find_group(option.opts[-1])].append(record)
+                rows[find_group(option.opts[-1])].append(record)
         for name, records in rows.items():
             if records:
                 with formatter.section(name):
                     formatter.write_dl(records)
 
 
-def _find_group(flag: str) -> str:
+def find_group(flag: str) -> str:
     """Return the heading of the group that contains an option."""
     for name, prefixes in GROUPS.items():
         if any(flag == each or (each not in EXACT and flag.startswith(each)) for each in prefixes):

@@ -1,15 +1,16 @@
-"""Commands on logs: `zwidth fit`, and `zwidth excite` and `zwidth respond`, the record to play and what it tells."""
+"""Commands on logs: `zwidth fit`; `zwidth excite` designs a record, and `zwidth respond` evaluates it."""
 
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
 from zwidth.cli.commands import EXIT_FAILED, cli
-from zwidth.cli.hardware import diagnose_wall
+from zwidth.cli.hardware import add_option, diagnose_wall
 from zwidth.cli.help import show_example
 from zwidth.cli.options import (
     SHARE,
@@ -36,12 +37,12 @@ from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 from zwidth.words.units import tell_kind
 
-# A letter, "=", and all up to the next letter with "=".
+# A letter, "=", and the text up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
 
 
 def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
-    """K, B and f of a wall at the onset of buzzing, and whether it is of a rotary axis; None where no unit says."""
+    """Return K, B and f of a wall at the onset of oscillation, and True if it is rotary; None if it has no unit."""
     entries = _ENTRY.findall(text.replace(",", " "))
     found = dict(entries)
     if _ENTRY.sub("", text.replace(",", " ")).strip() or {"K", "f"} - set(found) or len(found) < len(entries):
@@ -59,8 +60,7 @@ def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
 
 
 _WALL = Parsed("WALL", _read_wall)
-# Steps down to a wall that is sure as it is written.
-_SOFTER = 50
+_SOFTER = 50  # largest number of reductions of K until the rounded wall is stable
 
 
 _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
@@ -68,11 +68,18 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 
 @cli.command(**show_example("fit --rate '1 kHz'", *_BUZZING))
 @loop_options(logs=True)
-@click.option("--buzz", "walls", type=_WALL, multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
-@click.option("--noise", type=SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
+@click.option(
+    "--buzz",
+    "walls",
+    type=_WALL,
+    multiple=True,
+    help="Wall at the onset of oscillation, as 'K=3.2kN/m B=0 f=71Hz'; may be repeated.",
+)
+@click.option("--noise", type=SHARE, help="Relative noise of K and f in --buzz, as 2%.")
 @log_options
-@click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
-@click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
+@click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay to search for in a log, in s.")
+@click.option("--resample", is_flag=True, help="Treat samples with timestamp jitter as evenly spaced.")
+@partial(add_option, chosen="max_force")
 @figure_option
 @click.option(
     "--code",
@@ -92,6 +99,7 @@ def fit(
     walls: tuple[Any, ...],
     loop: RecordLoop,
     noise: float | None,
+    max_force: float | None,
     figure: Path | None,
     code: Any,
     as_yaml: bool,
@@ -99,13 +107,15 @@ def fit(
     as_json: bool,
     **of_logs: Any,
 ) -> None:
-    """Find a device's mass, damping and delay, and recommend a wall.
+    """Identify mass, damping and delay of a device, and recommend a wall.
 
-    With --buzz: from walls at which it began to buzz as K was raised, at two dampings or more, and the frequencies
-    heard. With LOG.csv: from its free motion under a force that a computer commanded, friction included; several logs
-    are of one device and have the same columns. Units stand in headers, as 'encoder [counts]', or behind a colon.
-    SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, and the period of walls and of
-    logs without a column of times; options override it. Exit code 1: no wall is recommended (0 with --yaml).
+    With LOG.csv: from its free motion under the force commanded by a computer; also identifies friction. Several logs
+    must be of the same device, with the same columns. Units are in the headers, as 'encoder [counts]', or follow a
+    colon. With --buzz: from walls, at two or more values of B, at which the device began to oscillate while K was
+    raised, and their frequencies.
+    SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, the motor's largest force, and
+    the period of walls and of logs without a column of times; options override it. --max-force limits the force in the
+    program of --code and in the simulation. Exit code 1: no wall is recommended (0 with --yaml).
     """
     from zwidth.fitting.words import list_units, write_scene
 
@@ -139,6 +149,8 @@ def fit(
         motions = read_logs(logs, loop, **of_logs)
         found = fit_motions(motions, period=period, velocity=velocity, **options)
         source = " and ".join(log.name for log in logs)
+    motor = {"max_force": max_force or get_hardware().get("max_force")}
+    motor = {name: value for name, value in motor.items() if value}
     wrote = []
     if figure is not None:
         from zwidth.figures import draw_device_fit
@@ -149,13 +161,13 @@ def fit(
     if code:
         if found.recommended.status != Status.OK:
             raise click.ClickException(found.recommended.reason)
-        click.echo(found.recommended.code(code), nl=False)
+        click.echo(found.recommended.code(code, **motor), nl=False)
         return
     if as_yaml:
         period_given = any(motion.time is None for motion in motions)
-        click.echo("\n".join(write_scene(found, source, period_given=period_given)))
+        click.echo("\n".join(write_scene(found, source, period_given=period_given, **motor)))
         return
-    diagnosis = _diagnose(found)
+    diagnosis = _diagnose(found, motor)
     if as_json:
         checks = {"diagnosis": None if diagnosis is None else diagnosis.as_dict()}
         print_json({**found.as_dict(), "units": list_units(found), **checks})
@@ -165,24 +177,26 @@ def fit(
         raise SystemExit(EXIT_FAILED)
 
 
-def _diagnose(found: Any) -> Any:
-    """Return the diagnosis of the recommended wall with the fitted friction and encoder; None without one of them."""
+def _diagnose(found: Any, motor: dict[str, float]) -> Any:
+    """Return the diagnosis of the recommended wall with the fitted friction and encoder and the motor's largest force.
+
+    The result is None without any of them.
+    """
     from zwidth.fitting.words import list_hardware
 
     recommended = found.recommended
     if recommended.status != Status.OK:
         return None
-    return diagnose_wall(recommended.scene, list_hardware(found), remedies=False)
+    return diagnose_wall(recommended.scene, list_hardware(found) | motor, remedies=False)
 
 
 def _list_lines(found: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
     """Return the printed lines of a fit, with the results in a hand and of a simulation as `zwidth recommend`."""
     from zwidth.fitting.words import detail_fit, summarize_fit
-    from zwidth.pages.verdict import spell_hands
 
     checks, more = [], "details: --verbose; scene for the other commands: --yaml"
     if found.recommended.status == Status.OK:
-        checks = [("in a hand", spell_hands(found.recommended))]
+        checks = [("in a hand", found.recommended.spell_hands())]
         more += "; program for the loop: --code c"
     checks += spell_diagnosis(diagnosis)
     details = [("", ""), *detail_fit(found, source)] if verbose else []
@@ -195,15 +209,15 @@ _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
 
 @cli.command(**show_example("excite --rate '1 kHz' --force '2 N' --resolution '10 um'"))
 @loop_options(logs=False)
-@click.option("--force", type=quantity_type("N", POSITIVE), help="The largest force to command, in N.")
+@click.option("--force", type=quantity_type("N", POSITIVE), help="Largest force of the record, in N.")
 @click.option(
     "--resolution",
     type=quantity_type("m", POSITIVE, counts=True),
     help="Encoder step in m, or counts per turn as '2000 counts'.",
 )
-@click.option("--duration", type=_TIME, default="60 s", show_default=True, help="How long it plays, in s.")
-@click.option("--response", type=_FILE, help="The response of a first record, to design the second.")
-@click.option("--out", type=_FILE, default=Path("play.csv"), show_default=True, help="The file to play.")
+@click.option("--duration", type=_TIME, default="60 s", show_default=True, help="Length of the record, in s.")
+@click.option("--response", type=_FILE, help="Response to a first record, to design a second one.")
+@click.option("--out", type=_FILE, default=Path("play.csv"), show_default=True, help="File of the record.")
 @json_option
 def excite(
     loop: RecordLoop,
@@ -254,22 +268,22 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
     lines = [
         row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), units['N'])}"),
         row("lines", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"),
-        row("deviation", f"{_compliance(made.deviation, units)} to expect, in the median"),
+        row("deviation", f"{_compliance(made.deviation, units)} expected (median)"),
     ]
     result: dict[str, Any] = {"file": str(out), "samples": made.force.size, "cycle": made.cycle}
     if made.expected is not None and made.limit is not None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
         expected = name_wall(made.expected.stiffness, made.expected.virtual_damping, units)
-        lines += [row("will tell", f"{expected} as safe, {100 * share:.0f} % of K_max by now")]
+        lines += [row("expected", f"safe wall {expected}, {100 * share:.0f} % of the present K_max")]
     tell(result, [*lines, row("wrote", str(out))], as_json)
 
 
 @cli.command(**show_example("respond log.csv --save response.csv --figure response.png"))
 @loop_options(logs=True)
-@click.option("--cycle", type=_TIME, help="Period of the force, in s; found from a force that repeats exactly.")
+@click.option("--cycle", type=_TIME, help="Period of the force, in s.  [default: found in a repeating force]")
 @log_options
-@click.option("--save", type=_FILE, metavar="FILE.csv", help="Keep the response.")
+@click.option("--save", type=_FILE, metavar="FILE.csv", help="File for the response.")
 @figure_option
 @json_option
 def respond(
@@ -281,11 +295,11 @@ def respond(
     as_json: bool,
     **of_logs: str | None,
 ) -> None:
-    """Find a device's frequency response, and what is safe by it.
+    """Measure the frequency response of a device, and compute a safe wall from it.
 
-    Without a model, with the band that noise leaves. From logs of a force that `zwidth excite` designed, or of any
-    other. What --save keeps, and any table of an analyzer, is a device of the other commands: `zwidth ridge --device
-    FILE.csv` answers of it. SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, and
+    No model is required; the response has an error band. The logs contain a force designed by `zwidth excite`, or any
+    other force. The other commands accept the file of --save, or the table of an analyzer, as a device: `zwidth ridge
+    --device FILE.csv`. SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, and
     the period of logs without a column of times; options override it.
     """
     if not logs:
@@ -304,26 +318,26 @@ def _print_response(
     from zwidth.scenes.scene import Scene
 
     device, period, doubts = found.device, found.period, found.doubts
-    kind = "stretches of a force that repeats" if found.cycle else "pieces"
+    kind = "parts of a repeating force" if found.cycle else "parts"
     source = f"{' and '.join(log.name for log in logs)}, {found.records} {kind}"
     scene = Scene(device, Timing(period), velocity=velocity or BackwardDifference())
     top, safe = find_nominal_limit(scene), scene.max_stiffness()
     low, high = (with_unit(float(end), "Hz") for end in device.frequency[[0, -1]])
     lines = [row("response of", source), row("lines", f"{device.frequency.size} from {low} to {high}")]
     if device.deviation is not None:
-        lines.append(row("deviation", f"{_compliance(device.deviation, device.unit_system)} in the median"))
+        lines.append(row("deviation", f"{_compliance(device.deviation, device.unit_system)} (median)"))
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
     words = (
-        f"{name_wall(*top[:2], device.unit_system)}, by the curve that was measured"
+        f"{name_wall(*top[:2], device.unit_system)}, for the measured curve without its error band"
         if top.status == Status.OK
         else "undecided"
     )
     lines.append(row("K_max", words))
     given = safe.status == Status.OK and device.deviation is not None and not doubts
-    words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none is told"
+    words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none"
     lines.append(row("safe wall", words))
-    lines += [row("a stiffer one" if k == 0 else "", text) for k, text in enumerate(said)]
-    lines += [row("doubt", text) for text in doubts]
+    lines += [row("stiffer wall" if k == 0 else "", text) for k, text in enumerate(said)]
+    lines += [row("warning", text) for text in doubts]
     lines += [row("note", text) for text in found.notes]
     if save is not None:
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
@@ -337,7 +351,7 @@ def _print_response(
 
 
 def spell_safe_wall(scene: Any, wall: Any) -> str:
-    """A wall at the edge of what is sure, in few digits and as much softer as it takes to be sure as it is written."""
+    """Return a safe wall in words, with K reduced until the rounded wall is stable for the whole error band."""
     stiffness, damping = float(wall.stiffness), float(f"{float(wall.virtual_damping):.4g}")
     for _ in range(_SOFTER):
         stiffness = round_safely(stiffness, "below")
@@ -359,7 +373,7 @@ def _plain(wall: Any) -> dict[str, float]:
 
 
 def _draw(scene: Any, wall: Any) -> Any:
-    """The response with its band, and the open loop of a wall."""
+    """Draw the response with its error band, and the open loop of a wall."""
     from zwidth import figures
     from zwidth.figures.style import style_sheet
 

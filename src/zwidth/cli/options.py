@@ -1,4 +1,4 @@
-"""Options that several commands share, quantities and those of a scene."""
+"""Options shared by several commands: quantities, and the parameters of a scene."""
 
 from __future__ import annotations
 
@@ -23,18 +23,17 @@ from zwidth.parts.velocity import ESTIMATES, name_estimate
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError
 from zwidth.words.plausible import list_doubts
-from zwidth.words.quantities import ANY, CHOICES, OF_PARTS, PARAMETERS, Range
+from zwidth.words.quantities import ANY, CHOICES, HARDWARE, OF_PARTS, PARAMETERS, Range
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
-from zwidth.words.units import DIMENSIONS, read_quantity, tell_kind
+from zwidth.words.units import DIMENSIONS, read_quantity, read_share, tell_kind
 
 if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
 
-# Where the texts of options are kept whose units tell linear and rotary devices apart.
-_TOLD = "zwidth.told"
+_TOLD = "zwidth.told"  # key of the options whose units determine the kind of device, in the context of a command
 _HARDWARE = "zwidth.hardware"  # key of the hardware of the scene file in the context of a command
-BOTH_PERIODS = "--period and --rate are both given: they are one thing, give one of them"
+BOTH_PERIODS = "--period and --rate are both given: give one of them"
 Command: TypeAlias = Callable[..., Any]
 
 # By path in a scene, as in configuration files, one part after the other.
@@ -48,7 +47,7 @@ _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
 class Parsed(click.ParamType):
-    """What a function reads of an option's text, or raises a `ValueError` for: then ``remedy`` says what to write."""
+    """Type of an option that a function parses; ``remedy`` completes the message of its `ValueError`."""
 
     def __init__(self, name: str, read: Callable[[str], Any], remedy: str = "") -> None:
         self.name, self.read, self.remedy = name, read, remedy
@@ -89,30 +88,24 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
             number = text
         if periods:
             return read_span(number, allowed)
-        # Each option has its own system here; all options together are checked when the scene is made.
+        # Read each option in the system of its own unit; the options are compared when the scene is built.
         dimension = DIMENSIONS[SYSTEMS[bool(tell_kind(number))][unit]]
         return read_quantity(number, dimension, allowed, counts=counts)[0]
 
     return Parsed("quantity", read)
 
 
-def read_share(text: str) -> float:
-    """A share: ``2%`` or ``0.02``."""
-    text = text.strip()
-    return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
-
-
 SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 
 
 def read_factor(text: str) -> float:
-    """A factor: ``2`` or ``6 dB``."""
+    """Parse a factor such as ``2`` or ``6 dB``."""
     number = float(text.strip().removesuffix("dB"))
     return 10.0 ** (number / 20.0) if text.strip().endswith("dB") else number
 
 
 def _read_figure(text: str) -> Path:
-    """The file of a picture, in a folder that there is."""
+    """Parse the path of a figure in an existing folder."""
     file = Path(text)
     if file.suffix not in (".png", ".svg", ".pdf"):
         raise ValueError(f"got {text!r}; name a file that ends with .png, .svg or .pdf")
@@ -122,7 +115,7 @@ def _read_figure(text: str) -> Path:
 
 
 def flag_of(path: str) -> str:
-    """The option of a parameter: ``--velocity-cutoff`` for ``velocity.cutoff``."""
+    """Return the option of a parameter: ``--velocity-cutoff`` for ``velocity.cutoff``."""
     return "--" + path.replace(".", "-").replace("_", "-")
 
 
@@ -243,7 +236,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Load the scene from a file and override the parameters given as command-line options."""
+    """Return the scene of a file with the parameters given as options replaced."""
     from zwidth.parts.devices import KnownDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
@@ -325,7 +318,7 @@ def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[
 
 
 def _list_needed(kind: Any) -> list[str]:
-    """The fields without which there is no such part."""
+    """Return the required fields of a part."""
     return [item.name for item in fields(kind) if item.default is MISSING]
 
 
@@ -339,7 +332,7 @@ def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
 
 
 def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
-    """What is given of one part, by the names of its fields."""
+    """Return the given parameters of one part, by field name."""
     return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
 
 
@@ -359,22 +352,29 @@ def make_velocity(given: dict[str, Any]) -> Any:
     return part(**given)
 
 
-figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
+figure_option = click.option(
+    "--figure", type=Parsed("FILE.png", _read_figure), help="Write a figure: FILE.png, .svg or .pdf."
+)
 beyond_safe_option = click.option("--beyond-safe", is_flag=True, help="Ignore the safe limit of a fitted scene.")
 verbose_option = click.option("--verbose", is_flag=True, help="Print all results.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 
 
 def find_silent() -> frozenset[str]:
-    """Return which of damping and delay are 0 because neither an option nor a file gives a value."""
-    given = click.get_current_context().params
-    if given.get("scene_file") is not None:
-        return frozenset()
-    return frozenset(name for name in ("damping", "delay") if given.get(name) is None)
+    """Return which of damping, delay and friction are 0 because neither an option nor a file gives a value.
+
+    Friction is included only if the command simulates an encoder.
+    """
+    given, hardware = click.get_current_context().params, get_hardware()
+    named = () if given.get("scene_file") is not None else ("damping", "delay")
+    silent = {name for name in named if given.get(name) is None}
+    values = {name: hardware.get(name) if given[name] is None else given[name] for name in HARDWARE if name in given}
+    simulated = values.get("resolution") and "coulomb" in values
+    return frozenset(silent | ({"friction"} if simulated and values["coulomb"] is values["static"] is None else set()))
 
 
 def read_pairs(context: click.Context, option: click.Parameter, pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Values by their names of an option that may be repeated, each name once."""
+    """Return the values of a repeated option by name; raise an error if a name is repeated."""
     found: dict[str, Any] = {}
     for name, value in pairs:
         if name in found:
@@ -384,7 +384,7 @@ def read_pairs(context: click.Context, option: click.Parameter, pairs: Iterable[
 
 
 def save_figure(drawn: Any, file: Path) -> str:
-    """Write a picture to the file that an option names; returns the line that says so."""
+    """Write a figure to a file; return the line to print."""
     from zwidth.figures import save
 
     save(drawn, file.with_suffix(""), (file.suffix[1:],))

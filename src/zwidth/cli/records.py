@@ -1,4 +1,4 @@
-"""Options of the commands on records: the loop of a record, which a scene file completes, and its logs."""
+"""Options of the commands on records: logs, and the control loop in which they were recorded."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from zwidth.cli.options import (
     change_scene,
     flag_of,
     get_hardware,
+    get_told,
     make_velocity,
     take_options,
 )
+from zwidth.parts.checks import find_kind
 from zwidth.words.quantities import CHOICES, OF_LOGS, OF_PARTS
 from zwidth.words.unit_system import UnitSystem
 
@@ -25,11 +27,11 @@ if TYPE_CHECKING:
     from zwidth.parts.velocity import Velocity
     from zwidth.scenes.scene import Scene
 
-_LONG = 2**23  # bytes; the user is informed that reading a longer log takes a while
+_LONG = 2**23  # bytes; before reading a longer log, a message is printed
 
 
 class RecordLoop(NamedTuple):
-    """The control loop of a record: options, completed by a scene file."""
+    """Control loop of a record, given by options and a scene file."""
 
     period: float | None  # in s, from the options
     velocity: Velocity | None  # velocity estimate from the options or the file
@@ -41,16 +43,17 @@ class RecordLoop(NamedTuple):
         return self.scene.timing.period if self.period is None and self.scene is not None else self.period
 
     def check_kind(self, rotary: bool) -> None:
-        """Raise an error if a record and the scene of the file belong to different kinds of devices."""
-        if self.scene is not None and self.scene.device.rotary != rotary:
-            kinds = ("rotary", "linear") if rotary else ("linear", "rotary")
-            raise click.UsageError(
-                f"the record is that of a {kinds[0]} device, but the scene file has a {kinds[1]} one"
-            )
+        """Raise an error if a record, the scene of the file and the options belong to different kinds of devices."""
+        implied = {"the scene file has": self.scene and self.scene.device.rotary}
+        implied |= {f"{flag} has units of": find_kind({flag: text}) for flag, text in get_told().items()}
+        kinds = ("rotary", "linear") if rotary else ("linear", "rotary")
+        for source, kind in implied.items():
+            if kind is not None and bool(kind) != rotary:
+                raise click.UsageError(f"the record is that of a {kinds[0]} device, but {source} a {kinds[1]} one")
 
 
 def _make_loop(given: dict[str, Any], _: UnitSystem) -> RecordLoop:
-    """Return the loop described by options, given by path, and by the scene of a file."""
+    """Return the loop described by options, given by path, and by a scene file."""
     scene = given.pop("scene", None)
     if {"period", "rate"} <= given.keys():
         raise click.UsageError(BOTH_PERIODS)
@@ -108,14 +111,14 @@ def log_options(command: Command) -> Command:
 def read_logs(
     logs: Iterable[Path], loop: RecordLoop, *, resolution: str | None, motor_constant: str | None, **columns: Any
 ) -> list[Any]:
-    """Return the motions of logs; report on the error stream which logs are read if that takes long.
+    """Return the motions of logs; print the names of long logs to the error stream.
 
     Args:
         logs: paths of the logs.
         loop: loop of the logs; the period of its scene replaces a missing column of times.
-        resolution: option of that name; by default that of the scene file.
-        motor_constant: option of that name.
-        columns: the other `log_options`.
+        resolution: text of the option, or None; the default is the value of the scene file.
+        motor_constant: text of the option, or None.
+        columns: texts of the other `log_options`.
     """
     if columns["time"] is not None and loop.period is not None:
         raise click.UsageError("give one of --time, --period and --rate")

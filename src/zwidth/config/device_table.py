@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from pydantic_core import PydanticCustomError
 
 from zwidth.config.fields import LocatedProblem, Strict, listing, printable, problem, problems_of, validation_error
 from zwidth.config.values import quantity_of, read_entries, share
+from zwidth.words.contexts import set_temporarily
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, resembling, suggestion
 from zwidth.words.quantities import PARAMETERS
@@ -28,22 +28,17 @@ MAX_CSV_BYTES = 2**25
 
 _FORMS = "lists of equal length under the names of parameters, or {csv: FILE}"
 
-# Names of files in a configuration are relative to its folder, which no value of it knows.
+# A context variable, because values of a configuration do not contain its folder.
 _folder: ContextVar[Path] = ContextVar("folder", default=Path())
 
 
-@contextmanager
-def files_relative_to(folder: Path) -> Iterator[None]:
-    """Let the files that a configuration names be looked for in its own folder."""
-    token = _folder.set(folder)
-    try:
-        yield
-    finally:
-        _folder.reset(token)
+def files_relative_to(folder: Path) -> AbstractContextManager[None]:
+    """Return a context manager in which file names in a configuration are relative to a folder."""
+    return set_temporarily(_folder, folder)
 
 
 def find_file(name: str) -> Path:
-    """A file that the configuration being read names."""
+    """Return the path of a file named in the configuration that is being read."""
     return _folder.get() / name
 
 

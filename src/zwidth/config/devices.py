@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, Validat
 from zwidth.config.device_table import find_file
 from zwidth.config.fields import LocatedProblem, Strict, listing, problem, validation_error
 from zwidth.config.parts import PART_NAMES, PartSection, split_refusal
-from zwidth.config.values import Delay, Quantity, find_system, quantity_of
+from zwidth.config.values import Delay, Quantity, get_system, quantity_of
 from zwidth.parts.checks import Span
 from zwidth.parts.devices import DEVICES
 from zwidth.parts.linear_device import LinearDevice, split_fraction
@@ -59,7 +59,7 @@ class SystemSection(PartSection, what="a linear system"):
     """Likewise; of a higher degree."""
 
     zeros: _Numbers | None = None
-    """Finite zeros in rad/s, or in z; complex ones as text, '-3+40j', with their conjugates. None where left out."""
+    """Finite zeros in rad/s, or in z; complex ones as text, '-3+40j', with their conjugates. Default: none."""
 
     poles: _Numbers | None = None
     """Poles, likewise."""
@@ -167,7 +167,7 @@ NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
 
 
 class OneKind(Strict):
-    """Base of what is either physical or normalized: the other kind's keys get a message of their own."""
+    """Base of sections that are either physical or normalized, with messages for keys of the other kind."""
 
     @classmethod
     def unknown(cls, name: str) -> tuple[str, str, str]:
@@ -186,7 +186,7 @@ class OneKind(Strict):
 
 
 def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float:
-    """The period itself, or one over the rate."""
+    """Return the period, given as such or as the inverse of the rate."""
     if value is not None:
         return read(value)
     # A rate that failed its own check is absent from the data; that fault is enough.
@@ -197,7 +197,7 @@ def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) 
 
 
 def _mass(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float | None:
-    """The mass itself; none of a device that is given as a whole."""
+    """Return the mass; None for a linear system or a measured response."""
     if value is not None:
         return read(value)
     if info.data.get("device", ...) is None:
@@ -207,52 +207,52 @@ def _mass(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> flo
 
 
 def find_second_period(keys: Iterable[str]) -> Iterable[LocatedProblem]:
-    """A problem where the sampling period is given twice."""
+    """Return a problem if both period and rate are given."""
     for second in [key for key in keys if key in ("period", "rate")][1:]:
-        allowed = "the sampling period and its rate say the same"
+        allowed = "the period is the inverse of the rate"
         yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
 
 
 def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
-    """Problems of what a device that is given as a whole holds already."""
+    """Return problems of parameters that a linear system or measured response already contains."""
     for key in keys:
         if key.partition(".")[0] in ("mass", "damping", *PARTS, "modes") and keys[key]:
-            allowed = "the linear system or response of the device holds it"
-            yield (key,), problem(f"got {key!r} beside a device given as a whole", allowed, "remove one", on_key=True)
+            what, allowed = f"got {key!r} together with a system or response", "the system or response contains it"
+            yield (key,), problem(what, allowed, "remove one", on_key=True)
 
 
-def tell_rotary(value: Any = None) -> bool | None:
-    """Return True for a file of rotary devices, None for a file of linear devices."""
+def read_rotary(value: Any = None) -> bool | None:
+    """Validate the key ``rotary``; return True for a file of rotary devices, None for a file of linear devices."""
     if value is not None and not isinstance(value, bool):
-        raise problem(f"got {describe(value)}", "it must be true or false", "remove it: units tell the kind")
-    if value is False and find_system().rotary:
+        raise problem(f"got {describe(value)}", "it must be true or false", "remove it: the units determine the kind")
+    if value is False and get_system().rotary:
         raise problem("got false", "other devices of the file are rotary, or have units of rotation", "write two files")
-    return value or find_system().rotary or None
+    return value or get_system().rotary or None
 
 
-Rotary = Annotated[bool | None, PlainValidator(tell_rotary, json_schema_input_type=bool)]
+Rotary = Annotated[bool | None, PlainValidator(read_rotary, json_schema_input_type=bool)]
 
 
 def _add_device(schema: dict[str, Any]) -> None:
-    """What editors are told of the texts that name a device, in the place of mass and damping."""
+    """Add the texts that name a device in place of mass and damping to the schema for editors."""
     forms = schema["properties"]["device"]["anyOf"]
     forms[:0] = [{"enum": [device.name for device in DEVICES]}, {"type": "string"}]
 
 
 class SampledMass(OneKind):
-    """A mass with damping, sampled, in SI units."""
+    """A sampled mass with damping, in SI units."""
 
-    # The name of a published device is replaced by its numbers.
+    # The schema also allows the name of a published device, which `prepare` replaces by its parameters.
     model_config = ConfigDict(json_schema_extra=_add_device)
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Put the numbers of a published device in the place of its name; those that are written count."""
+        """Replace the name of a published device by its parameters; keys of the section override them."""
         name = raw.get("device")
         known = {device.name: device for device in DEVICES}.get(name) if isinstance(name, str) else None
         if known is None:
             return super().prepare(raw)
-        if known.rotary != find_system().rotary:
+        if known.rotary != get_system().rotary:
             allowed = "this device is linear, and others of the file are rotary"
             what = problem(f"got {describe(name)}", allowed, "write two files")
             raise validation_error(cls.__name__, [(("device",), what)])
@@ -260,7 +260,7 @@ class SampledMass(OneKind):
         return super().prepare({**found, **{key: value for key, value in raw.items() if key != "device"}})
 
     device: DeviceForm | None = None
-    """Name of a published device, whose mass and damping are taken where none are written; or a device that is no mass
+    """Name of a published device, which supplies mass and damping if they are not given; or a device that is not a mass
     with damping: a linear system ('1 / 0.1 10 0' in s, or a mapping), or a measured response (FILE.csv)."""
 
     mass: Annotated[float | None, quantity_of("mass"), WrapValidator(_mass)] = Field(
@@ -268,8 +268,8 @@ class SampledMass(OneKind):
     )
     damping: Annotated[float, quantity_of("damping")] = 0.0
 
-    rotary: Rotary = Field(default_factory=tell_rotary)
-    """Whether the device turns, as all of a file do where one quantity has a unit of rotation."""
+    rotary: Rotary = Field(default_factory=read_rotary)
+    """True for rotary devices. One quantity with a rotary unit makes all devices of a file rotary."""
 
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
     period: Annotated[float, quantity_of("period"), WrapValidator(read_period)] = Field(

@@ -85,12 +85,11 @@ _PLAIN = {
     "dict_type": ("it must be a mapping", "write 'key: value' lines, or {key: value}"),
 }
 
-
-_DELAY_MODELS = ("delay_model", "delay_models")
+_DELAY_MODELS = ("delay_model", "delay_models")  # keys of earlier releases
 
 
 def problems_of(error: ValidationError | PydanticCustomError, *above: str) -> list[LocatedProblem]:
-    """Every problem of an error with the path to its field, below the keys ``above`` of what was read."""
+    """Return all problems of an error with the paths to their fields; ``above`` precedes each path."""
     if not isinstance(error, ValidationError):
         return [(above, error)]
     found = []
@@ -169,22 +168,22 @@ class Strict(BaseModel):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Hook: fill in what another part of the file supplies."""
+        """Return a mapping completed with values that other parts of the file supply; a hook."""
         return raw
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        """Hook: faults that show in the keys alone; ``raw`` may hold anything."""
+        """Return the faults visible from the keys of a mapping with unchecked values; a hook."""
         return ()
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
-        """Hook: what is allowed and the remedy where the required key ``name`` is absent."""
+        """Return what is allowed and the remedy if a required key is missing; a hook."""
         return f"{cls.what} needs it", f"add {name!r}"
 
     @classmethod
     def unknown(cls, name: str) -> tuple[str, str, str]:
-        """Return the problem, what is allowed and the remedy for a key that is not allowed here."""
+        """Return the problem, what is allowed and the remedy for a key that is not allowed; a hook."""
         if name == "<<":
             return "unknown key", "YAML 1.2 has no merge keys", "write the keys out"
         if name in _DELAY_MODELS:
@@ -192,17 +191,17 @@ class Strict(BaseModel):
             return "key of an earlier release", "every delay is exact ('held')", remedy
         key, colon, value = name.partition(":")
         if colon and key in cls.model_fields:
-            return "unknown key", "a blank follows the colon behind a key", f"write '{key}: {value}'"
+            return "unknown key", "a space follows the colon after a key", f"write '{key}: {value}'"
         allowed = f"{cls.what} has the keys {listing(cls.model_fields)}"
         return "unknown key", allowed, suggestion(name, cls.model_fields, "remove it")
 
     def limits(self) -> Iterable[LocatedProblem]:
-        """Hook: faults that only valid values show."""
+        """Return the faults of a model whose fields are all valid; a hook."""
         return ()
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """Describe every field as a quantity or as the source does below it, where pydantic looks in every run."""
+        """Add the description of each field to the schema: that of its quantity, or its docstring."""
         found = handler(schema)
         properties = handler.resolve_ref_schema(found)["properties"]
         for name in FIELDS.keys() & properties.keys():

@@ -53,7 +53,7 @@ MAX_DEPTH = 20
 
 
 def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Model:
-    """Read a file and check all of it against a model; a `ConfigFileError` lists its faults."""
+    """Return the model of a configuration file; raise a `ConfigFileError` that lists all faults."""
     file = os.fsdecode(path)
     tree = _Tree(file, _read_text(file))
     with files_relative_to(Path(file).parent):
@@ -61,7 +61,7 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
 
 
 def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
-    """Check what a file would hold against a model; a fault then has a field and no place."""
+    """Return the model of a mapping; raise a `ConfigFileError` whose faults have fields but no line numbers."""
     problems: list[LocatedProblem] = []
     simple = _simplify(data, (), problems)
     return _check(model, simple, locate("", problems, {}, {}), lambda found: locate("", found, {}, {}))
@@ -70,10 +70,10 @@ def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
 def _check(
     model: type[_Model], data: Any, faults: list[Fault], place: Callable[[list[LocatedProblem]], list[Fault]]
 ) -> _Model:
-    """The model of plain values; else all faults, those known already and those that are given their places."""
+    """Return the model of plain values; raise a `ConfigFileError` with ``faults`` and those of the model."""
     found = None
     try:
-        with read_in_units(SYSTEMS[tells_rotary(data)]):
+        with read_in_units(SYSTEMS[has_rotary_devices(data)]):
             found = model.model_validate(data)
     except ValidationError as error:
         faults = faults + place(problems_of(error))
@@ -82,13 +82,13 @@ def _check(
     return found
 
 
-def tells_rotary(data: Any, key: str = "") -> bool:
+def has_rotary_devices(data: Any, key: str = "") -> bool:
     """Return whether a configuration has rotary devices, by its units, ``rotary: true``, device names or data files."""
-    # One rotary value makes all devices of a file rotary. A fit determines the kind from its logs.
+    # One rotary value makes all devices of a file rotary. Skip fits, because they determine the kind from their logs.
     if isinstance(data, Mapping):
-        return data.get("kind") != "fit" and any(tells_rotary(each, str(name)) for name, each in data.items())
+        return data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
     if isinstance(data, list):
-        return any(tells_rotary(each, key) for each in data)
+        return any(has_rotary_devices(each, key) for each in data)
     if key == "device" and isinstance(data, str):
         if data.endswith(SUFFIXES):
             # Ignore an unreadable table here, because the validation of its section reports the error.

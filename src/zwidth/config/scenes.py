@@ -37,15 +37,15 @@ _Parts: Any = make_parts_base("the difference of two samples", "none")
 
 
 class _PhysicalPlant(_Parts, SampledMass):
-    """The same with the parts that it may have beside."""
+    """A device in SI units with its optional parts."""
 
     def limits(self) -> Iterable[LocatedProblem]:
         if not self.d <= MAX_DELAY_PERIODS:
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
             yield ("delay",), problem(f"got {self.delay}, which is {short(self.d)} periods", allowed, "check the units")
             return
-        if self._is_double:
-            # Its keys have told.
+        if self.device is not None and any(getattr(self, name) for name in (*PARTS, "modes")):
+            # Parts in addition to a linear system or measured response are reported as conflicting keys.
             return
         try:
             scene = self.to_scene()
@@ -68,13 +68,8 @@ class _PhysicalPlant(_Parts, SampledMass):
                 yield (field,), problem(what, f"{name} must be {bounds}", "check the units and the mass")
 
     @property
-    def _is_double(self) -> bool:
-        """Whether parts stand beside a device that is given as a whole."""
-        return self.device is not None and any(getattr(self, name) for name in (*PARTS, "modes"))
-
-    @property
     def parts_beyond(self) -> tuple[str, ...]:
-        """What makes it more than a rigid mass with the difference of two samples, which every kind of study takes."""
+        """Names of the parts that only some kinds of study accept."""
         return self.to_scene().parts_beyond
 
     @property
@@ -88,21 +83,21 @@ class _PhysicalPlant(_Parts, SampledMass):
         return self.delay.periods(self.period)
 
     def to_scene(self) -> Scene:
-        """The device, its timing and, where it has one, its wall in SI units."""
+        """Return the device, its timing and, if given, its wall in SI units."""
         return self._scene
 
     @cached_property
     def _scene(self) -> Scene:
-        # As a length of time of its own: seconds of a delay in periods may miss it by a rounding error.
+        # Pass the delay as a `Span`, because the conversion of periods to seconds has rounding errors.
         timing = Timing(self.period, self.delay)
-        # A device that is given as a whole is one of the parts, and takes the place of this one.
+        # A linear system or measured response is one of the parts, and replaces this device.
         device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
         limit = getattr(self, "safe_limit", None)
         return replace_parameters(Scene(device, timing, safe_limit=limit and limit.known), build_parts(self))
 
 
 class _NormalizedPlant(OneKind):
-    """The same as two dimensionless numbers, those of a mass of 1 kg at a period of 1 s."""
+    """A plant in normalized parameters, as a mass of 1 kg at a period of 1 s."""
 
     period: ClassVar[float] = 1.0
     parts_beyond: ClassVar[tuple[str, ...]] = ()
@@ -111,7 +106,7 @@ class _NormalizedPlant(OneKind):
     d: Annotated[float, quantity_of("d")] = 0.0
 
     def to_scene(self) -> Scene:
-        """That mass and its timing."""
+        """Return the device with a mass of 1 kg and a period of 1 s."""
         return Scene(Device(1.0, self.delta), Timing(self.period, self.d))
 
 
@@ -129,7 +124,7 @@ class SimulatedDevice(PhysicalDevice):
     """A device in SI units whose velocity estimate need not be linear."""
 
     velocity: SimulatedVelocityField | None = None
-    """How the velocity is estimated; the difference of two samples where left out."""
+    """Velocity estimate. Default: the difference of two samples."""
 
 
 class LabeledDevice(_PhysicalPlant, what="a device"):
@@ -164,7 +159,7 @@ class NormalizedWall(OneKind, what="a wall"):
 
 
 def _pick_wall(scene: Any, kind: Any) -> Any:
-    """The wall of a scene, of which one number is enough; None where none is given."""
+    """Return the wall of a scene, with an absent parameter as 0; None if both are absent."""
     given = {name: getattr(scene, name) for name in kind.model_fields}
     return None if set(given.values()) == {None} else kind(**{name: value or 0.0 for name, value in given.items()})
 
@@ -176,7 +171,7 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
 
     velocity: SimulatedVelocityField | None = None
-    """How the velocity is estimated; the difference of two samples where left out."""
+    """Velocity estimate. Default: the difference of two samples."""
 
     safe_limit: SafeLimitSection | None = None
     """Stiffest wall that measurements of the device support."""
@@ -189,17 +184,17 @@ class PhysicalScene(_PhysicalPlant, what="a scene"):
 
     @property
     def hardware(self) -> dict[str, float]:
-        """The given parameters of encoder, friction and motor."""
+        """Given parameters of encoder, friction and motor, by name."""
         return {name: value for name in HARDWARE if (value := getattr(self, name)) is not None}
 
     @cached_property
     def _scene(self) -> Scene:
-        # One that is not given has no stiffness and no damping.
+        # A wall that is not given has no stiffness and no damping.
         wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
         return replace(super()._scene, wall=wall)
 
     def bare(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
-        """The scene without its wall, as a device of a kind; by default of one whose velocity estimate is linear."""
+        """Return the scene without its wall, by default as a device with a linear velocity estimate."""
         names = "mass", "damping", "period", "delay", "rotary", "safe_limit"
         own = {name: getattr(self, name) for name in names}
         return kind(**{name: value for name, value in own.items() if value is not None}, **list_parts(self))

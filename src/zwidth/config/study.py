@@ -12,7 +12,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 from zwidth.config.fields import LocatedProblem, Name, Strict, listing, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
-from zwidth.config.values import Axis, find_system
+from zwidth.config.values import Axis, get_system
 from zwidth.words.unit_system import UnitSystem
 
 MAX_POINTS = 150_000_000
@@ -25,7 +25,7 @@ _Kind = TypeVar("_Kind", bound="type[Study]")
 
 
 def register(model: _Kind) -> _Kind:
-    """Make a kind known, a `zwidth.studies.ComputedStudy`: its field ``kind`` has one literal type, the kind's name."""
+    """Register a kind of study, a `zwidth.studies.ComputedStudy` whose field ``kind`` has one literal: its name."""
     KINDS[model.kind_name()] = model
     if "what" not in vars(model):
         model.what = f"a {model.kind_name()} study"
@@ -33,12 +33,12 @@ def register(model: _Kind) -> _Kind:
 
 
 def name_parts(parts: Iterable[str]) -> str:
-    """Names of parts as words; a device that is given as a whole is one of them."""
+    """Return names of parts in words; the part "device" is a system or response in place of a mass."""
     return " and ".join("a system or response in place of its mass" if name == "device" else name for name in parts)
 
 
 def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticCustomError:
-    """The problem of a device with parts in a study that would forget them."""
+    """Return the problem of a device with parts in a study that would ignore them."""
     what = f"got a device with {name_parts(parts)}"
     allowed = f"the kind {kind!r} answers for a rigid mass with the difference of two samples alone"
     kinds = f"use one of the kinds {listing(name for name in sorted(KINDS) if KINDS[name].takes_parts)}"
@@ -46,39 +46,39 @@ def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticC
 
 
 class Study(Strict):
-    """What all studies have."""
+    """Base of all studies."""
 
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")  # what the file's scene supplies where they are left out
-    # Whether it answers for a device with a velocity filter, a hand or another part; it then has the field device.
+    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")  # fields whose default is the value of the file's scene
+    # True if it computes devices with a velocity filter, a hand or another part; it then has the field device.
     takes_parts: ClassVar[bool] = False
-    simulates: ClassVar[bool] = False  # whether it answers for a velocity estimate without a linear form
-    method: ClassVar[str] = ""  # how it computes, and how far its numbers may be off: a sentence for a run's report
-    point_bytes: ClassVar[int] = 80  # about how many the result has for each point
+    simulates: ClassVar[bool] = False  # True if it accepts a velocity estimate without a linear form
+    method: ClassVar[str] = ""  # method and errors of the results, in a sentence for reports
+    point_bytes: ClassVar[int] = 80  # approximate size of the result in bytes per point
     remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"
 
     name: Name
     """Name of the study, unique in the file; its results are stored under it."""
 
-    _system: UnitSystem = PrivateAttr(default_factory=find_system)
+    _system: UnitSystem = PrivateAttr(default_factory=get_system)
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The units of its devices."""
+        """The unit system of the study's devices."""
         return self._system
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """Let an editor's check pass where the scene supplies what a study leaves out, and say so."""
+        """Mark the fields that the scene supplies as optional, and describe their default."""
         found = super().__get_pydantic_json_schema__(schema, handler)
         own = handler.resolve_ref_schema(found)
         own["required"] = [name for name in own.get("required", []) if name not in cls.from_scene]
         for field in (own["properties"][name] for name in cls.from_scene):
-            field["description"] += " The scene's where left out."
+            field["description"] += " Default: that of the scene."
         return found
 
     @classmethod
     def kind_name(cls) -> str:
-        """The name of the kind: the one literal of the field ``kind``, which every kind of study has."""
+        """Return the name of the kind, the only literal of the field ``kind``."""
         (name,) = get_args(cls.model_fields["kind"].annotation)
         return name
 
@@ -103,7 +103,7 @@ class Study(Strict):
 
     @classmethod
     def _list_absent(cls, raw: dict[str, Any]) -> list[str]:
-        """What the study leaves to the scene; who gives the rate has given the period."""
+        """Return the absent keys that the scene supplies; a rate counts as a period."""
         given = {*raw, "period"} if "rate" in raw else raw
         return [name for name in cls.from_scene if name not in given]
 

@@ -17,7 +17,7 @@ from zwidth.config.devices import (
     Rotary,
     find_second_device,
     find_second_period,
-    tell_rotary,
+    read_rotary,
 )
 from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, listing, members, problem
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
@@ -62,8 +62,8 @@ def _axis_field(name: str) -> tuple[Any, Any]:
         rows = "Parameters that move together, one row a device: lists of equal length, or a CSV file."
         return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
     axis: Any = Annotated[Axis, axis_of(name)]
-    # What stands where it is left out: the scene's, here.
-    words = describe_parameter(replace(PARAMETERS[name], note="" if name in WALL else "the scene's where left out"))
+    # Axes have the scene as default, not the default in the note of the parameter.
+    words = describe_parameter(replace(PARAMETERS[name], note="" if name in WALL else "default: that of the scene"))
     return axis | None, Field(default=None, description=f"{words}.")
 
 
@@ -164,7 +164,8 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
 OutputName = Annotated[str, GetPydanticSchema(lambda _, handler: handler.generate_schema(Literal[tuple(OUTPUTS)]))]
 
 
-_Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
+_SCENE = "that of the scene"
+_Parts: Any = make_parts_base(_SCENE, _SCENE, " Its keys may be axes, with its name and a dot.")
 
 
 @register
@@ -181,14 +182,14 @@ class SweepStudy(_Parts, Study):
     """The parameters and their values; every combination is computed."""
 
     device: DeviceForm | None = None
-    """A linear system or a measured response in place of mass and damping; the scene's where left out."""
+    """A linear system or a measured response in place of mass and damping. Default: that of the scene."""
 
-    rotary: Rotary = Field(default_factory=tell_rotary)
-    """Whether its devices turn, as all of a file do where one quantity has a unit of rotation."""
+    rotary: Rotary = Field(default_factory=read_rotary)
+    """True for rotary devices. One quantity with a rotary unit makes all devices of a file rotary."""
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The units of its devices."""
+        """The unit system of the study's devices, also for a study that is read from a store."""
         return SYSTEMS[bool(self.rotary)]
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from math import inf
@@ -20,6 +20,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from zwidth.config.fields import LocatedProblem, Strict, problem, problems_of, repeated, validation_error
 from zwidth.parts.checks import Span, read_span
+from zwidth.words.contexts import set_temporarily
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, FIELDS, FRACTION, NOT_NEGATIVE, POSITIVE, Range
@@ -43,22 +44,16 @@ Entry: TypeAlias = Callable[[Any], float]
 
 _FORMS = "a number, a list of numbers, {linear: {start, stop, num}} or {log: {start, stop, num}}"
 
-
-# A value of a file does not contain the kind of device; other values of the file determine it.
+# A context variable, because a value may have no unit: other values of the file determine the kind of device.
 _system: ContextVar[UnitSystem] = ContextVar("system", default=LINEAR)
 
 
-@contextmanager
-def read_in_units(system: UnitSystem) -> Iterator[None]:
-    """Read values of a configuration in a unit system."""
-    token = _system.set(system)
-    try:
-        yield
-    finally:
-        _system.reset(token)
+def read_in_units(system: UnitSystem) -> AbstractContextManager[None]:
+    """Return a context manager in which values of a configuration are read in a unit system."""
+    return set_temporarily(_system, system)
 
 
-def find_system() -> UnitSystem:
+def get_system() -> UnitSystem:
     """Return the unit system of the configuration that is being read."""
     return _system.get()
 
@@ -82,7 +77,7 @@ class Quantity:
                 return read_span(value, self.allowed)
             if self.unit == "1":
                 return self._read_number(value)
-            unit = find_system()[self.unit] if self.turns else self.unit
+            unit = get_system()[self.unit] if self.turns else self.unit
             return read_quantity(value, DIMENSIONS[unit], self.allowed, counts=self.counts)[0]
         except UnusableValueError as error:
             raise problem(*error.parts) from None

@@ -1,10 +1,10 @@
-"""Figures in matplotlib: a table or a dataset in, Axes out.
+"""Figures in matplotlib: each function draws a table or a dataset and returns the Axes.
 
-Each function draws into Axes of yours where they are given, else into those of a new figure, which pyplot does not
-know, and returns them. No module here imports JAX or changes matplotlib's global settings, and none is loaded before it
-is asked for. `draw_plane`, `draw_curves` and `draw_outlines` take the dataset of a sweep, as `zwidth.open_dataset`
-gives it, or a part of one; the others the table of a study, as its CSV file holds it, of maps and limit cycles the
-arrays of their npz file. What each draws, its first line says: ``help(zwidth.figures)`` lists them.
+A function draws into existing Axes if they are passed, otherwise into a new figure, which pyplot does not manage.
+Functions change no global settings of matplotlib; modules are loaded on first use and do not import JAX. `draw_plane`,
+`draw_curves` and `draw_outlines` take the dataset of a sweep as returned by `zwidth.open_dataset`, or a part of it. The
+other functions take the table of a study, as in its CSV file, or for maps and limit cycles the arrays of its npz file.
+``help(zwidth.figures)`` lists all functions.
 
 Example:
     >>> import numpy as np, zwidth
@@ -18,5 +18,5 @@ Example:
 
 import lazy_loader
 
-# The names stand in __init__.pyi.
+# The stub __init__.pyi lists the public names and the modules that define them.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""Every name of `zwidth.figures`, once."""
+"""Public names of `zwidth.figures`, and the modules that define them."""
 
 from . import plot as plot
 from .curves import draw_curves as draw_curves

@@ -1,4 +1,7 @@
-"""Outputs of a sweep over one parameter, and boundaries of many devices in one panel."""
+"""Draw outputs of a sweep over one parameter, and stability boundaries of many devices in one panel.
+
+A *family* of curves shows one curve per value of a further parameter.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,8 @@ from zwidth.words.quantities import OUTPUTS, VARIABLES, WALL
 if TYPE_CHECKING:
     import xarray
 
-# Characters of names that fit beside each other above the panels.
-_LINE = 56
-# More curves than this in one panel cannot be told apart.
-_CURVES = 9
+_LEGEND_LETTERS = 56  # letters of labels that fit into one row of the legend
+_MAX_CURVES = 9  # curves per panel, because more cannot be distinguished; of more, evenly spaced ones are drawn
 
 
 @draws_tables
@@ -31,35 +32,39 @@ def draw_curves(
     hue: str | None = None,
     col: str | None = None,
 ) -> np.ndarray:
-    """Draw an output of a sweep over one parameter, a curve for each value of another one, panels for a third.
+    """Draw an output of a sweep over one parameter, with curves for the values of another and panels for a third one.
 
     Args:
-        data: results of a sweep, as `zwidth.open_dataset` gives them, or a part of them.
-        name: the output, a number.
-        axes: Axes of yours, one for each panel or fewer.
-        x: the parameter from left to right; the one with most values of the first two that vary where left out.
-        hue: the one that has a curve for each of its values.
-        col: the one of the panels; all others are then at their first value.
+        data: Results of a sweep as returned by `zwidth.open_dataset`, or a part of them.
+        name: Name of the output, which must be a number.
+        axes: Existing Axes, at most one per panel.
+        x: Parameter of the horizontal axis; by default the one with more values among the first two that vary.
+        hue: Parameter with one curve per value.
+        col: Parameter with one panel per value; further parameters then have their first value.
     """
     output, data = OUTPUTS[name], grid.prepare(data, [name])
     dims = grid.choose_axes(data, name, x, but=(hue, col))
     dims = dims if x else sorted(dims, key=lambda dim: -data.sizes[dim])
     if not dims:
-        raise InputError(f"name: {name!r} varies over no parameter that it could be drawn over")
+        raise InputError(f"name: {name!r} varies over no parameter; choose another output, or a larger part")
     x, others = dims[0], [dim for dim in reversed(grid.list_varied(data, name)) if dim not in (*dims, col)]
     several = [hue] if hue else [*dims[1:], *others][:1]
     parts, columns = grid.panels(data, [x, *several], col=col)
     panels = panel_grid(axes, len(parts), columns)
-    picked = style.pick_evenly(data.sizes[several[0]], _CURVES) if several else [0]
+    picked = style.pick_evenly(data.sizes[several[0]], _MAX_CURVES) if several else [0]
     labels = [grid.spell(data[several[0]][k]) for k in picked] if several else [""]
     looks = _list_looks(several[0] if several else "", len(picked))
     few, whole_numbers = data.sizes[x] <= 12, x in VARIABLES and VARIABLES[x].whole
     whole = np.concatenate([part[name].values.ravel() for part in parts])
     for part, ax in zip(parts, panels, strict=False):
         curves = [part.isel({several[0]: k}) for k in picked] if several else [part]
-        known = np.stack([curve[name].values for curve in curves])
-        # There is no place for 0 on a logarithmic axis, as of the delay margin of an unstable wall.
-        shown = np.where(np.isfinite(known) & ((known > 0) | (not output.logarithmic)), known, np.nan)
+        values_of_curves = np.stack([curve[name].values for curve in curves])
+        # Leave out values that are not positive on a logarithmic axis, such as delay margins of unstable walls.
+        shown = np.where(
+            np.isfinite(values_of_curves) & ((values_of_curves > 0) | (not output.logarithmic)),
+            values_of_curves,
+            np.nan,
+        )
         for values, label, look in zip(shown, labels, looks, strict=True):
             dots = style.POINTS if whole_numbers else {"marker": "o" if few else "", "markersize": 3.5}
             ax.plot(data[x].values, values, label=label, **look | dots)
@@ -68,7 +73,7 @@ def draw_curves(
             style.use_whole(ax)
         ax.margins(y=0.06)
         if output.logarithmic:
-            # Panels share the axis: ticks that fit all of them.
+            # Choose the ticks by the values of all panels, because the panels share the axis.
             style.use_logarithmic(ax, "y", whole)
         if output.look == "diverging":
             ax.axhline(output.center, color=style.GRAY, linewidth=0.7, linestyle=style.DASHED, zorder=0.5)
@@ -77,12 +82,15 @@ def draw_curves(
         panels[0].set_xlim(*style.span(float(values.min()), float(values.max())))
     grid.name_panels(panels, parts)
     style.label_axes(panels, grid.axis_label(data, x), grid.output_label(data, name), once=axes is None)
-    _name_looks(panels, labels, looks, outside=axes is None)
+    _add_legend(panels, labels, looks, outside=axes is None)
     return panels
 
 
 def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
-    """The output whose contours are the boundaries of walls, and the parameter each of whose values has one."""
+    """Return the output whose contours are stability boundaries of walls, and the parameter of the family of them.
+
+    None if the data contain no boundaries of several devices.
+    """
     planes = {name: grid.choose_axes(data, name) for name in (*SMOOTH, "stable") if name in data}
     name = next((name for name, axes in planes.items() if len(axes) == 2 and axes[1] in WALL), None)
     dims = [dim for dim in grid.list_varied(data, name) if dim not in WALL] if name else []
@@ -92,22 +100,22 @@ def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
 
 @draws_tables
 def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, edges: Edges | None = None) -> np.ndarray:
-    """Draw the boundaries of the stable walls of many devices into one panel, panels for a further parameter.
+    """Draw the stability boundaries of many devices into one panel, with panels for a further parameter.
 
     Args:
-        data: results of a sweep over walls and devices, as `zwidth.open_dataset` gives them, or a part of them.
-        axes: Axes of yours, one for each panel or fewer.
-        edges: gives the exact outlines of the stable walls, drawn in place of contours that agree with them.
+        data: Results of a sweep over walls and devices as returned by `zwidth.open_dataset`, or a part of them.
+        axes: Existing Axes, at most one per panel.
+        edges: Function that returns the exact outlines of the stable walls; they replace contours that agree with them.
     """
-    found = find_family(data)
-    if found is None:
-        raise InputError("data: holds no boundaries of several devices; a sweep over walls and devices does")
-    name, family = found
+    name_and_family = find_family(data)
+    if name_and_family is None:
+        raise InputError("data: contains no boundaries of several devices; pass a sweep over walls and devices")
+    name, family = name_and_family
     data = grid.prepare(data, [name])
     x, y = dims = grid.choose_axes(data, name)
     parts, columns = grid.panels(data, [family, *dims], plane=dims)
     panels = panel_grid(axes, len(parts), columns)
-    picked = style.pick_evenly(data.sizes[family], _CURVES)
+    picked = style.pick_evenly(data.sizes[family], _MAX_CURVES)
     looks = _list_looks(family, len(picked))
     labels = [grid.spell(data[family][k]) for k in picked]
     for part, ax in zip(parts, panels, strict=False):
@@ -119,22 +127,26 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
         ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
     grid.name_panels(panels, parts)
     style.label_axes(panels, grid.axis_label(data, x), grid.axis_label(data, y), once=axes is None)
-    _name_looks(panels, labels, looks, outside=axes is None, title="boundaries of the stable walls")
+    _add_legend(panels, labels, looks, outside=axes is None, title="boundaries of the stable walls")
     return panels
 
 
 def _list_looks(family: str, count: int) -> list[dict[str, Any]]:
-    """Colors of curves in the order of their values; of devices, which have no order, line styles too."""
+    """Return color and line style of each curve: colors ordered by value, and for devices also line styles.
+
+    ``family`` is the parameter with one curve per value. Devices have no order, so their line styles differ as well.
+    """
     if family == "device":
         return [style.look(k) for k in range(count)]
     return [{"color": color, "linestyle": style.SOLID} for color in style.ordered_colors(count)]
 
 
-def _name_looks(
+def _add_legend(
     axes: np.ndarray, names: list[str], looks: list[dict[str, Any]], *, outside: bool, title: str | None = None
 ) -> None:
+    """Add a legend with name, color and line style of each curve, above the panels or in the first one."""
     longest = max(10 if "$" in name else len(name) for name in names)
-    columns = max(1, min(len(names), 6, _LINE // max(longest, 1)))
+    columns = max(1, min(len(names), 6, _LEGEND_LETTERS // max(longest, 1)))
     handles = [
         style.line(name, look["linestyle"], color=look["color"])
         for name, look in zip(names, looks, strict=True)

@@ -1,4 +1,7 @@
-"""What a device is designed by: the stiffest wall behind velocity filters, and over the parameter that is wanted."""
+"""Draw design aids: maximum stiffness with different velocity filters, and over the parameter to be designed.
+
+b is the physical damping of the device, K_max the stiffness of its stiffest stable wall.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,14 @@ from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, in_order, sele
 from zwidth.words.formatting import ENOUGH, count_digits_apart, header, round_safely, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS
 
-_STIFFNESS, _NOISE = SI_COLUMNS[0], "velocity_noise_m_per_s"
+_STIFFNESS = SI_COLUMNS[0]  # column of K_max
+_NOISE = "velocity_noise_m_per_s"  # column of the velocity noise
+# Column and axis label of the parameter of each kind of filter.
 _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),
     "windowed_difference": ("samples", "length of the window  $n$  in periods"),
 }
-# The look of each over the noise, and its name in a legend.
+# Line style, marker and legend entry of each kind of velocity estimate.
 _KINDS: dict[str, tuple[Any, str, str]] = {
     "low_pass": (style.SOLID, "", "low-pass"),
     "windowed_difference": (style.DOTTED, "", "window"),
@@ -28,11 +33,11 @@ _KINDS: dict[str, tuple[Any, str, str]] = {
 
 @draws_tables
 def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the stiffest stable wall over the cut-off of a low-pass and over the length of a window.
+    """Draw the maximum stable stiffness over the cut-off frequency of a low-pass and over the length of a window.
 
     Args:
-        table: columns of a filters study.
-        axes: Axes of yours, one for each kind of filter that the table has.
+        table: Columns of a filters study.
+        axes: Existing Axes, one per kind of filter in the table.
     """
     kinds = [kind for kind in _OVER if kind in np.asarray(table["estimate"])]
     panels = style.panels(axes, len(kinds), 3.6 * len(kinds) + 0.4, 3.6, len(kinds), sharey=True)
@@ -43,9 +48,9 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
             rows = in_order(select(table, damping_N_s_per_m=damping, estimate=kind), over)
             look = {"color": color, "label": f"b = {damping:g}", **(style.POINTS if over == "samples" else _dots(rows))}
             ax.plot(rows[over], rows[_STIFFNESS] * factor, **look)
-            (bare,) = select(table, damping_N_s_per_m=damping, estimate="backward_difference")[_STIFFNESS]
+            (unfiltered,) = select(table, damping_N_s_per_m=damping, estimate="backward_difference")[_STIFFNESS]
             look = {"linewidth": 0.9, "linestyle": style.DASHED, "label": f"difference, b = {damping:g}"}
-            ax.axhline(bare * factor, color=color, **look)
+            ax.axhline(unfiltered * factor, color=color, **look)
         ax.set_xlabel(label)
         values = select(table, estimate=kind)[over]
         style.use_logarithmic(ax, "y", table[_STIFFNESS], style.DECADES)
@@ -62,16 +67,16 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
 @draws_tables
 def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the stiffest stable wall over the noise of the velocity that its filter lets through.
+    """Draw the maximum stable stiffness over the velocity noise after the filter.
 
     Args:
-        table: columns of a filters study with a resolution.
-        limit: the noise that is allowed, in m/s; NaN where there is none.
-        axes: an Axes of yours.
+        table: Columns of a filters study with a resolution.
+        limit: Largest allowed noise in m/s; NaN if there is no limit.
+        axes: An existing Axes.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 4.0)
     colors, factor, words = _scale(table)
-    speed, spelled = style.si_unit(np.append(table[_NOISE], limit), "m/s")
+    speed, noise_unit = style.si_unit(np.append(table[_NOISE], limit), "m/s")
     kinds = {kind: look for kind, look in _KINDS.items() if kind in np.asarray(table["estimate"])}
     handles: list[Any] = []
     for damping, color in colors.items():
@@ -86,49 +91,53 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
         ax.axvline(limit * speed, color=style.GRAY, linewidth=0.9, linestyle=style.DASHED, zorder=0.5, label="limit")
     style.use_logarithmic(ax, "x", speed * np.append(table[_NOISE], limit), style.DECADES)
     style.use_logarithmic(ax, "y", table[_STIFFNESS], style.DECADES)
-    ax.set(xlabel=rf"noise of the velocity  $\sigma_v$  in {spelled}", ylabel=words)
+    ax.set(xlabel=rf"noise of the velocity  $\sigma_v$  in {noise_unit}", ylabel=words)
     handles += [style.line(words, dash, marker=marker, markersize=4.5) for dash, marker, words in kinds.values()]
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels
 
 
 def _scale(table: Table) -> tuple[dict[float, Any], float, str]:
-    """Colors of the dampings, and the factor and the label of the axis of stiffnesses."""
+    """Return the color of each damping, and factor and label of the stiffness axis."""
     factor, unit = style.si_unit(table[_STIFFNESS], "N/m")
     words = f"maximum stable stiffness  $K_{{\\max}}$  in {unit}"
     return style.color_by_value(table["damping_N_s_per_m"]), factor, words
 
 
 def _name_damping(damping: float) -> str:
+    """Return the legend entry of a physical damping."""
     return f"$b$ = {with_unit(damping, style.units()['N s/m'], 3)}"
 
 
 def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) -> str:
-    """Mark the stiffest wall within the limit; returns the filter that allows it, for the legend."""
-    spelled = ""
+    """Mark the stiffest wall within the noise limit; return its filter and stiffness for the legend.
+
+    ``factors`` scale noise and stiffness to the units of the axes.
+    """
+    text = ""
     for row in zip(*(rows[name] for name in (_NOISE, _STIFFNESS, "cutoff_Hz", "samples")), strict=True):
         noise, stiffness, cutoff, samples = map(float, row)
         which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
         ax.plot(noise * factors[0], stiffness * factors[1], linestyle="", label="best", **look)
-        spelled = f":  ${which}$,  {with_unit(round_safely(stiffness, 'below', 3), style.units()['N/m'], 3)}"
-    return spelled
+        text = f":  ${which}$,  {with_unit(round_safely(stiffness, 'below', 3), style.units()['N/m'], 3)}"
+    return text
 
 
 def _dots(rows: Table) -> dict[str, Any]:
-    """Few values are dots on their line."""
+    """Return line properties that mark each point with a dot if there are few."""
     return {"marker": "o", "markersize": 3.5} if len(rows[_STIFFNESS]) <= 24 else {}
 
 
 @draws_tables
 def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the stiffest stable wall over a parameter, and where it reaches each wanted stiffness.
+    """Draw the maximum stable stiffness over a parameter, and the value at which it reaches each required stiffness.
 
     Args:
-        curve: columns parameter, value with its unit (as ``value_Hz``), stiffness_N_per_m.
-        required: columns of a design study: stiffness_N_per_m, reserve, present and value and
-            other_crossings with their unit, enough, and stable_share where tolerances are given.
-        axes: an Axes of yours.
+        curve: Columns parameter, value with its unit (such as ``value_Hz``), stiffness_N_per_m.
+        required: Columns of a design study: stiffness_N_per_m, reserve, present, value and other_crossings with their
+            unit, enough, and with tolerances stable_share.
+        axes: An existing Axes.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 3.8)
     parameter = PARAMETERS[str(np.asarray(curve["parameter"])[0])]
@@ -137,8 +146,8 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     wanted = np.asarray(required[SI_COLUMNS[0]])
     targets = wanted * required["reserve"]
     factor, unit = style.si_unit(np.append(stiffness, targets), "N/m")
-    known = np.concatenate([values, required[value_in], required[present_in]])
-    scale, spelled = style.si_unit(np.sqrt(np.nanmax(known) * values.min()), parameter.unit)
+    all_known = np.concatenate([values, required[value_in], required[present_in]])
+    scale, value_unit = style.si_unit(np.sqrt(np.nanmax(all_known) * values.min()), parameter.unit)
     ax.plot(values * scale, stiffness * factor, color=style.BLACK, label="K_max", zorder=3)
     colors = style.color_by_value(targets.tolist())
     ax.set(xscale="log", yscale="log")
@@ -150,42 +159,56 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     columns = (required[name] for name in (value_in, "enough", header("other_crossings", parameter.unit)))
     names = []
     for target, value, enough, others in zip(targets, *columns, strict=True):
-        known = enough in ENOUGH
-        _mark_required(ax, curve_drawn, target * factor, value * scale if known else np.nan, colors[target])
-        # As a design study writes them.
+        all_known = enough in ENOUGH
+        _mark_required(ax, curve_drawn, target * factor, value * scale if all_known else np.nan, colors[target])
+        # A design study writes the other crossings as quantities separated by semicolons.
         crossings = [float(each.split()[0]) for each in str(others).split("; ") if each]
-        name = spell_enough(float(value), enough, crossings, style.units()[parameter.unit], 3) if known else ""
+        name = spell_enough(float(value), enough, crossings, style.units()[parameter.unit], 3) if all_known else ""
         names.append(name.replace("g cm^2", style.write_unit("g cm^2")))
     heights = np.append(stiffness, targets)
     for name, scaled in (("x", values * scale), ("y", heights * factor)):
         style.use_logarithmic(ax, name, scaled, style.DECADES)
     ax.set(
         xlim=(values[0] * scale, values[-1] * scale),
-        xlabel=f"{parameter.label_in(style.units())}  in {spelled}",
+        xlabel=f"{parameter.label_in(style.units())}  in {value_unit}",
         ylabel=f"maximum stable stiffness  $K_{{\\max}}$  in {unit}",
     )
-    # Beside the panel: below its dot a value would stand on the line of the next one.
+    # Write the values to the right of the panel, because next to its dot a value would cover the line of the next one.
     style.name_heights(ax, names, (targets * factor).tolist(), [colors[target] for target in targets])
-    handles = [style.line(words, style.DASHED, color=colors[at]) for at, words in _name_targets(required, factor, unit)]
-    handles.append(style.line("as it is", "", color=style.BLACK, marker="s", markerfacecolor="white", markersize=5))
+    entries = _name_targets(required, factor, unit)
+    handles = [style.line(words, style.DASHED, color=colors[target]) for target, words in entries]
+    handles.append(
+        style.line("present value", "", color=style.BLACK, marker="s", markerfacecolor="white", markersize=5)
+    )
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels
 
 
 def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[float, str]]:
-    """What each dashed line stands for: the wanted stiffness, its reserve, and the share of devices that bear it."""
-    borne = "stable_share" in required
-    shares = required["stable_share"] if borne else np.full(len(required["reserve"]), np.nan)
+    """Yield the height and the legend entry of each dashed line.
+
+    The entry states the required stiffness, its reserve, and with tolerances the share of devices stable with it.
+    """
+    with_shares = "stable_share" in required
+    shares = required["stable_share"] if with_shares else np.full(len(required["reserve"]), np.nan)
     digits = count_digits_apart(np.asarray(required[SI_COLUMNS[0]]).tolist(), 3)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.{digits}g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
-        # Not 100 % where one of many does not.
+        # Round down, so that 100 % is never printed if a single device is unstable.
         percent = f"{round_safely(100.0 * share, 'below', 3):.3g}"
         yield wanted * reserve, words + (f": stable on {percent} % of devices" if np.isfinite(share) else "")
 
 
 def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, color: Any) -> None:
-    """Mark the wanted stiffness, and where on the curve there is enough for it."""
+    """Mark a required stiffness, the values of the parameter at which K_max is sufficient, and the required value.
+
+    Args:
+        ax: Axes of the curve.
+        curve: Points (x, y) of the curve of K_max, of shape (2, n), in the units of the axes.
+        target: Required stiffness including its reserve, in the unit of the axis.
+        value: Required value of the parameter; NaN if there is none.
+        color: Color of the marks.
+    """
     ax.axhline(target, color=color, linewidth=0.9, linestyle=style.DASHED, zorder=2, label=f"wanted {target:g}")
     x, y = (np.append(part, end) for part, end in zip(curve, (value, target), strict=True))
     order = np.argsort(x)

@@ -1,4 +1,8 @@
-"""What the figures of sweeps share: axes, panels and values in units of few digits, and the labels of contours."""
+"""Common parts of the figures of sweeps: choice of axes and panels, scaling to units with few digits, contour labels.
+
+A figure of a sweep shows a *variable* (an output) of an `xarray.Dataset` over one or two parameters, the *axes*; a
+*plane* is a figure over two parameters. Further parameters that vary are shown in *panels*, one per value.
+"""
 
 from __future__ import annotations
 
@@ -20,39 +24,51 @@ if TYPE_CHECKING:
 
     Data = TypeVar("Data", xarray.Dataset, xarray.DataArray)
 
-# The color of a panel where it shows nothing.
-MISSING = "#D9D9D9"
-# As many values as one panel, or one of several, resolves; of a finer grid every n-th is drawn.
-_RESOLVED, _RESOLVED_BY_MANY = 1000, 500
-# A grid of more panels than this says nothing on a page: evenly spaced values stand for all.
-_ACROSS = 3
-_MANY_PANELS = 9
-# So many values fit above one of several panels.
-_FITTING = 3
-# Values that are no exact ratios of each other are on a logarithmic axis from here on, which has 2 and 5 up to there.
-_WIDE, _FEW_DECADES = 5.0, 50.0
-# What an axis of a plane is, rather than a choice of panels: the first two that vary.
-_FIRST = ("alpha", "stiffness", "beta", "virtual_damping")
+MISSING = "#D9D9D9"  # gray of panels at points without a value
+
+# Limits of panels. If there are more values, evenly spaced ones are drawn.
+_MAX_VALUES = 1000  # values drawn along an axis of a single panel
+_MAX_VALUES_OF_MANY = 500  # values drawn along an axis of one of several panels
+_MAX_COLUMNS = 3  # columns of panels; also values of each parameter if two of them vary from panel to panel
+_MAX_PANELS = 9  # panels, if a single parameter varies from panel to panel
+_MAX_TITLE_VALUES = 3  # parameter values that fit into the title of one of several panels
+
+# Axes.
+_MIN_RATIO = 5.0  # ratio of the ends from which an axis of values such as 1, 2, 5, 10 is logarithmic
+_FEW_DECADES = 50.0  # ratio of the ends below which a logarithmic axis also has ticks at 2 and 5
+# Parameters in the order in which they become axes of a plane: the first two that vary; the others become panels.
+_WALL_PARAMETERS = ("alpha", "stiffness", "beta", "virtual_damping")
 _PARTS = tuple(parameter.variable for parameter in VARIABLES.values() if parameter.name in OF_PARTS)
-_ORDER = (*_FIRST, *_PARTS, "delta", "damping", "d", "delay", "rate", "period", "mass")
-_LABEL_FONT = 7.0
-# Of a panel, what its labels and the color bar may leave when it is laid out.
-_LEFT = 0.72
-# In units of a label: how far its middle is from lines and from the middle of other labels.
-_FROM_LINES, _FROM_LABELS = 0.6, 1.2
-# Points between which a label is placed, in dots.
-_LABEL_STEP = 3.0
-_CANDIDATES = 60
+_ORDER = (*_WALL_PARAMETERS, *_PARTS, "delta", "damping", "d", "delay", "rate", "period", "mass")
+
+# Labels of contours.
+_LABEL_FONT = 7.0  # points
+# The labels are placed before the layout, which shrinks a panel to about this share because of axis labels and color
+# bar. Label sizes are enlarged accordingly.
+_LAYOUT_SHRINKAGE = 0.72
+_LINE_DISTANCE = 0.6  # least distance of a label's center from other lines, in label sizes
+_LABEL_DISTANCE = 1.2  # least distance between the centers of two labels, in mean label sizes
+_LABEL_STEP = 3.0  # spacing of the candidate points along a contour, in dots
+_MAX_CANDIDATES = 60  # candidate points per contour
 
 
 def list_varied(data: xarray.Dataset, name: str) -> list[str]:
+    """Return the dimensions of a variable with more than one value."""
     return [str(dim) for dim in data[name].dims if data.sizes[dim] > 1]
 
 
 def choose_axes(
     data: xarray.Dataset, name: str, x: str | None = None, y: str | None = None, *, but: Sequence[str | None] = ()
 ) -> list[str]:
-    """One or two parameters that a variable is drawn over: those given, and the first others that it varies over."""
+    """Choose the one or two axes over which a variable is drawn.
+
+    Args:
+        data: Results of a sweep.
+        name: Name of the variable.
+        x: Horizontal axis; by default the first parameter of the declared order that varies.
+        y: Vertical axis; likewise.
+        but: Parameters that are not to become axes.
+    """
     dims = list_varied(data, name)
     free = iter([dim for dim in _ORDER if dim in dims and dim not in (x, y, *but)])
     axes = [x or next(free, None), y or next(free, None)]
@@ -60,28 +76,30 @@ def choose_axes(
 
 
 def in_order(data: Data) -> Data:
-    """Results by rising values of every parameter, which a sweep may have in any order; devices as they are."""
+    """Sort results in ascending order of every parameter; keep the order of devices."""
     mixed = [dim for dim, index in data.indexes.items() if dim != "device" and not index.is_monotonic_increasing]
     return data.sortby(mixed) if mixed else data
 
 
 def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
-    """Some variables of one family as they are drawn."""
-    # Only dimensions with two values or more remain, in rising order, single values of the others beside them. All is
-    # in units with few digits, which the attribute ``units`` names. What was not computed is NaN; truth values are 0
-    # and 1.
+    """Return variables of one family of outputs, prepared for drawing.
+
+    Dimensions with a single value become scalar coordinates; the others are sorted in ascending order. Values and
+    coordinates are scaled to units with few digits, stored in the attribute ``units``; the attribute ``factor`` of a
+    coordinate is its scale. Booleans become 0 and 1, and points that were not computed NaN.
+    """
     family = OUTPUTS[names[0]].family
     status = STATUS_OF[family]
     data = data[[*names, status]]
-    beside = [name for name, values in data.coords.items() if values.ndim and name not in data.dims]
-    beside += [name for name in WALL if family == "device" and name not in data.dims]
-    data = in_order(data.drop_vars(beside, errors="ignore").squeeze())
+    unused = [name for name, values in data.coords.items() if values.ndim and name not in data.dims]
+    unused += [name for name in WALL if family == "device" and name not in data.dims]
+    data = in_order(data.drop_vars(unused, errors="ignore").squeeze())
     for name in names:
         values, output = data[name], OUTPUTS[name]
         if output.dtype == "bool":
             values = values.astype(float).where(data[status] == Status.OK)
         elif output.dtype == "float64":
-            # Two digits of the first slice are enough to choose a prefix.
+            # Choose the prefix by the median of the first slice, because reading all values of a large store is slow.
             part = values.isel({dim: slice(0, 1) for dim in values.dims[:-2]}).values
             part = np.abs(part[np.isfinite(part) & (part != 0)])
             middle = np.median(part) if part.size else 1.0
@@ -90,11 +108,13 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
         data[name] = values
     for name, values in data.coords.items():
         if name in VARIABLES:
-            # Over many decades the middle has few digits.
-            known = values.values
-            known = np.sqrt(known.min() * known.max()) if logarithmic(known) else known
-            factor, unit = style.si_unit(known, str(values.attrs.get("units", "1")))
-            # Without the coordinates of its own, which would bring back those that are scaled already.
+            # Choose the unit for the geometric mean of the ends if the axis is logarithmic.
+            numbers_along = values.values
+            numbers_along = (
+                np.sqrt(numbers_along.min() * numbers_along.max()) if logarithmic(numbers_along) else numbers_along
+            )
+            factor, unit = style.si_unit(numbers_along, str(values.attrs.get("units", "1")))
+            # Assign plain arrays, because a DataArray would bring its unscaled coordinates back into the dataset.
             numbers = values.values * factor
             digits = count_digits_apart(numbers.ravel().tolist())
             scaled = (values.dims, numbers, {**values.attrs, "units": unit, "factor": factor, "digits": digits})
@@ -105,64 +125,74 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
 def panels(
     data: xarray.Dataset, over: list[str], plane: Sequence[str] = (), col: str | None = None
 ) -> tuple[list[xarray.Dataset], int]:
-    """A part of a dataset for each panel, and how many panels are beside each other."""
-    # A panel has the dimensions ``over``, of which those of a ``plane`` resolve so many values and no more. The last
-    # two others vary from panel to panel, or ``col`` alone, all others at their first value.
+    """Return the part of a dataset for each panel, and the number of columns of panels.
+
+    Args:
+        data: Prepared results.
+        over: Dimensions within a panel.
+        plane: Those of them that are axes of a plane, which are thinned to a number of values that a panel resolves.
+        col: Only parameter that varies from panel to panel; by default the last two others. All further parameters
+            have their first value.
+    """
     free = [str(dim) for dim in next(iter(data.data_vars.values())).dims if dim not in over]
     if col is not None:
         data = data.isel(dict.fromkeys([dim for dim in free if dim != col], 0))
         free = [col]
     data = data.isel(dict.fromkeys(free[:-2], 0))
     free = free[-2:]
-    picked = [style.pick_evenly(data.sizes[dim], _MANY_PANELS if len(free) == 1 else _ACROSS) for dim in free]
-    places = [dict(zip(free, place, strict=True)) for place in product(*picked)]
-    most = _RESOLVED if len(places) == 1 else _RESOLVED_BY_MANY
-    thin = {dim: slice(None, None, -(-data.sizes[dim] // most)) for dim in plane}
-    parts = [data.isel({**place, **thin}) for place in places]
+    picked = [style.pick_evenly(data.sizes[dim], _MAX_PANELS if len(free) == 1 else _MAX_COLUMNS) for dim in free]
+    indices = [dict(zip(free, index, strict=True)) for index in product(*picked)]
+    most = _MAX_VALUES if len(indices) == 1 else _MAX_VALUES_OF_MANY
+    thinned = {dim: slice(None, None, -(-data.sizes[dim] // most)) for dim in plane}
+    parts = [data.isel({**index, **thinned}) for index in indices]
     if len(free) == 2:
         return parts, len(picked[1])
-    return parts, 2 if len(parts) == 4 else min(_ACROSS, len(parts))
+    return parts, 2 if len(parts) == 4 else min(_MAX_COLUMNS, len(parts))
 
 
 def spell(value: xarray.DataArray) -> str:
-    """A single value of a parameter, with symbol and unit, and as many digits as tell it from the others."""
+    """Return a parameter value with symbol and unit, with enough digits to distinguish the values of its dimension."""
     if value.name == "device":
         return style.literal(value.values)
     number = f"{float(value):.{value.attrs.get('digits', 4)}g}"
     unit = style.write_unit(value.attrs["units"]).removeprefix("sampling ")
     unit = unit.removesuffix("s") if unit == "periods" and number == "1" else unit
-    # Within mathematics as it is.
+    # Set the unit upright within mathematics, with its spaces.
     unit = rf"\,\mathrm{{{unit.replace(' ', '~').replace('$', '')}}}" if unit else ""
     return rf"${VARIABLES[str(value.name)].symbol_in(style.units())} = {number}{unit}$"
 
 
 def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
-    """Write the single values of its part above a panel; of more than fit those that tell it from others."""
+    """Write the parameter values of each panel as its title; if they are too many, only those that differ."""
     first = parts[0]
     names = [name for name in ("device", *VARIABLES) if name in first.coords and not first[name].ndim]
-    if len(names) > _FITTING and len(parts) > 1:
+    if len(names) > _MAX_TITLE_VALUES and len(parts) > 1:
         names = [name for name in names if any(part[name].values != first[name].values for part in parts)]
     for ax, part in zip(axes, parts, strict=False):
         ax.set_title(",  ".join(spell(part[name]) for name in names))
 
 
 def axis_label(data: xarray.Dataset, name: str) -> str:
-    """A parameter in words, with symbol and unit."""
+    """Return the axis label of a parameter: words, symbol and unit."""
     return VARIABLES[name].label_in(style.units()) + _in_unit(data, name)
 
 
 def output_label(data: xarray.Dataset, name: str) -> str:
-    """A variable in words, with symbol and unit."""
+    """Return the axis label of an output: words, symbol and unit."""
     return f"{OUTPUTS[name].words}  ${OUTPUTS[name].symbol}$" + _in_unit(data, name)
 
 
 def _in_unit(data: xarray.Dataset, name: str) -> str:
+    """Return the unit of a variable for an axis label; "" for numbers."""
     unit = style.write_unit(data[name].attrs.get("units", "1"))
     return f"  in {unit}" if unit else ""
 
 
 def logarithmic(values: np.ndarray) -> bool:
-    """Whether the values of an axis are in equal ratios, or nearly so and far apart, as 1, 2, 5 and 10 are."""
+    """Return whether an axis with these values is to be logarithmic.
+
+    It is if the values have equal ratios, or if they span a large ratio with nearly equal ratios, as 1, 2, 5, 10 do.
+    """
     values = np.asarray(values, dtype=np.float64)
     if values.size < 3 or not (values > 0).all():
         return False
@@ -172,11 +202,11 @@ def logarithmic(values: np.ndarray) -> bool:
     if np.allclose(ratios, ratios[0], rtol=1e-6):
         return not np.allclose(steps, steps[0], rtol=1e-6)
     uneven, unequal = (float(np.ptp(each) / np.abs(each.mean())) for each in (steps, ratios))
-    return bool(unequal < 0.5 * uneven and values.max() >= _WIDE * values.min())
+    return bool(unequal < 0.5 * uneven and values.max() >= _MIN_RATIO * values.min())
 
 
 def find_edges(values: np.ndarray) -> np.ndarray:
-    """Where the cells of a plane end, half way between values, up to the first and the last one's own half."""
+    """Return the edges of the cells along an axis of a plane: halfway between values, and as far beyond both ends."""
     scaled = np.log(values) if logarithmic(values) else np.asarray(values, dtype=np.float64)
     middle = 0.5 * (scaled[1:] + scaled[:-1])
     edges = np.concatenate([[2 * scaled[0] - middle[0]], middle, [2 * scaled[-1] - middle[-1]]])
@@ -184,7 +214,7 @@ def find_edges(values: np.ndarray) -> np.ndarray:
 
 
 def scale_axis(ax: Axes, which: str, values: Any) -> None:
-    """The range of an axis, and its spacing."""
+    """Set the range of an axis, and make it logarithmic if the values are spaced logarithmically."""
     low, high = float(np.min(values)), float(np.max(values))
     if logarithmic(values):
         style.use_logarithmic(ax, which, values, _FEW_DECADES)
@@ -193,7 +223,7 @@ def scale_axis(ax: Axes, which: str, values: Any) -> None:
 
 
 def draw_cells(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, **look: Any) -> Any:
-    """A cell round each point of (y, x); the frame, whose axes are scaled, cuts those at the ends in half."""
+    """Draw one colored cell per point of (y, x); the limits of the axes, set before, cut the outer cells in half."""
     limits = ax.get_xlim(), ax.get_ylim()
     image = ax.pcolormesh(find_edges(x), find_edges(y), values, shading="flat", rasterized=True, **look)
     ax.set(xlim=limits[0], ylim=limits[1])
@@ -203,60 +233,78 @@ def draw_cells(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, **look: Any)
 def label_contours(
     ax: Axes, drawn: ContourSet, colors: Sequence[Any], shades: Sequence[Any], others: Sequence[np.ndarray] = ()
 ) -> None:
-    """Write the level of each contour, a round number, on its longest line where there is room, once."""
-    # The range and the spacing of the axes must be set: where lines are on the page decides on what has room. Each
-    # label covers its line with the shade behind it, and keeps away from the points (x, y) of other lines and marks.
+    """Write the level of each contour once, on its longest line, if there is room.
+
+    The limits and scales of the axes must be set, because the position of the lines on the page determines the room.
+
+    Args:
+        ax: Axes of the contours.
+        drawn: The contours, whose levels are round numbers.
+        colors: Color of each label.
+        shades: Background of each label, the color of the region around its line.
+        others: Points (x, y) of further lines and marks, from which the labels keep a distance.
+    """
     frame = ax.get_window_extent()
     lines = [_list_lines(ax, path.to_polygons(closed_only=False)) for path in drawn.get_paths()]
     taken = _list_lines(ax, [np.atleast_2d(points) for points in others if len(points)])
     placed: list[tuple[np.ndarray, np.ndarray]] = []
-    for k, (level, own) in enumerate(zip(drawn.levels, lines, strict=True)):
+    for k, (level, pieces) in enumerate(zip(drawn.levels, lines, strict=True)):
         text = f"{level:.12g}"
-        dots = ax.figure.dpi / 72.0 / _LEFT
+        dots = ax.figure.dpi / 72.0 / _LAYOUT_SHRINKAGE
         size = dots * _LABEL_FONT * np.array([0.62 * len(text) + 0.4, 1.3])
-        line = max(own, key=len, default=None)
+        line = max(pieces, key=len, default=None)
         if line is None or np.ptp(line, axis=0).max() < 1.5 * size[0]:
             continue
         off = [each for j, near in enumerate(lines) if j != k for each in near] + taken
-        at = _find_place(line, size, frame, off, placed)
-        if at is None:
+        center = _place_label(line, size, frame, off, placed)
+        if center is None:
             continue
-        placed.append((at, size))
-        x, y = ax.transData.inverted().transform(at)
+        placed.append((center, size))
+        x, y = ax.transData.inverted().transform(center)
         box = {"facecolor": shades[k], "edgecolor": "none", "pad": 0.6}
         ax.text(x, y, text, fontsize=_LABEL_FONT, color=colors[k], ha="center", va="center", bbox=box, zorder=2.5)
 
 
 def _list_lines(ax: Axes, lines: Sequence[Any]) -> list[np.ndarray]:
-    """Lines in dots, their points so close that a label between two of them touches one."""
-    found = []
+    """Return lines in dots of the page, with points so close that a label cannot pass between two of them."""
+    resampled = []
     for line in lines:
         dots = np.asarray(ax.transData.transform(line))
         dots = dots[np.isfinite(dots).all(axis=1)]
         if not len(dots):
             continue
         along = np.append(0.0, np.cumsum(np.hypot(*np.diff(dots, axis=0).T)))
-        at = np.linspace(0.0, along[-1], 2 + int(min(along[-1] / _LABEL_STEP, 1000)))
-        found.append(np.stack([np.interp(at, along, values) for values in dots.T], -1))
-    return found
+        steps = np.linspace(0.0, along[-1], 2 + int(min(along[-1] / _LABEL_STEP, 1000)))
+        resampled.append(np.stack([np.interp(steps, along, values) for values in dots.T], -1))
+    return resampled
 
 
-def _find_place(
+def _place_label(
     line: np.ndarray, size: np.ndarray, frame: Any, lines: list[np.ndarray], labels: list[tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray | None:
-    """The point of a line with most room, the one closest to the middle of the frame where several have enough."""
+    """Return the best center of a label on a line; None if there is no room.
+
+    It is the point with most room; among points with enough room, one near the middle of the frame is preferred.
+
+    Args:
+        line: Points of the line, in dots.
+        size: Width and height of the label, in dots.
+        frame: Bounding box of the panel, in dots.
+        lines: Points of other lines and marks, in dots.
+        labels: Center and size of the labels placed before.
+    """
     low, high = np.array([frame.x0, frame.y0]) + 0.6 * size, np.array([frame.x1, frame.y1]) - 0.6 * size
     inside = line[np.all((line > low) & (line < high), axis=1)]
-    inside = inside[:: max(1, len(inside) // _CANDIDATES)]
+    inside = inside[:: max(1, len(inside) // _MAX_CANDIDATES)]
     if not len(inside):
         return None
     room = np.full(len(inside), np.inf)
     if lines:
         away = np.abs(inside[:, None] - np.concatenate(lines)[None]) / size
-        room = away.max(axis=2).min(axis=1) / _FROM_LINES
-    for at, other in labels:
-        room = np.minimum(room, (np.abs(inside - at) / (0.5 * (size + other))).max(axis=1) / _FROM_LABELS)
-    # Twice the room that is needed is as good as more.
+        room = away.max(axis=2).min(axis=1) / _LINE_DISTANCE
+    for center, other in labels:
+        room = np.minimum(room, (np.abs(inside - center) / (0.5 * (size + other))).max(axis=1) / _LABEL_DISTANCE)
+    # Count room of more than twice the required distance only as twice.
     off_middle = np.hypot(*((inside - 0.5 * (low + high)) / (high - low)).T)
     best = int(np.argmax(np.minimum(room, 2.0) - 0.2 * off_middle))
     return inside[best] if room[best] >= 1.0 else None

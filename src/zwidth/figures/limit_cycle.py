@@ -1,4 +1,8 @@
-"""Limit cycles of walls: amplitude over a plane of two parameters, and amplitude and frequency over one."""
+"""Draw limit cycles of walls: amplitude over two parameters, and amplitude and frequency over one parameter.
+
+A *condition* is a set of simulation conditions, such as friction and encoder, with one panel or column of panels each.
+Motions with an amplitude below the lower bound count as at rest; above the upper bound they are not drawn.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +22,13 @@ from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import count_digits_apart, header, spell_short
 from zwidth.words.quantities import FIELDS
 
+# Parameters that may be an axis of these figures, by name of the column.
 AXES = {
     header(name, FIELDS[name].unit): FIELDS[name] for name in ("stiffness", "virtual_damping", "resolution", "coulomb")
 }
-"""Parameters that may be an axis of these figures, by column name."""
-# Up to so many points of a curve are seen one by one.
-_FEW = 12
+_MAX_DOTS = 12  # points of a curve up to which each is drawn as a large dot
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
+# Look of points with an amplitude above the upper bound.
 _BEYOND: dict[str, Any] = {"facecolor": grid.MISSING, "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 
@@ -38,10 +42,10 @@ def draw_limit_cycles(
     White: at rest. Hatched: amplitude above the upper bound. Line: stability boundary of the linear theory.
 
     Args:
-        arrays: what the npz file of a limit_cycle study holds.
-        edges: columns condition, number and those of the two parameters; nothing where there is no linear boundary.
-        bounds: smallest and largest amplitude counted as a limit cycle, in m.
-        axes: Axes of yours, one for each condition.
+        arrays: Arrays of the npz file of a limit_cycle study.
+        edges: Columns condition, number and those of the two parameters; empty if there is no linear boundary.
+        bounds: Smallest and largest amplitude counted as a limit cycle, in m.
+        axes: Existing Axes, one per condition.
     """
     across, along = names = [name for name in AXES if name in arrays]
     arrays = grid_in_order(arrays, names)
@@ -59,14 +63,14 @@ def draw_limit_cycles(
     for k, (ax, label) in enumerate(zip(panels, labels, strict=False)):
         x, y = arrays[across] * scales[across][0], arrays[along] * scales[along][0]
         if beyond[k].any():
-            # Seen where the values above it are left out.
+            # Hatch the whole panel first. The hatching remains visible where no cells are drawn above it.
             ax.fill_between([x.min(), x.max()], y.min(), y.max(), **_BEYOND, zorder=0.5)
         shown = np.where(beyond[k], np.nan, np.maximum(arrays["amplitude_m"][k], 1e-300)) * factor
         look: dict[str, Any] = {"shading": "nearest", "rasterized": True, "zorder": 1}
         image = ax.pcolormesh(x, y, shown.T, cmap=colors, norm=norm, **look)
-        for one in curves(edges, "number", condition=label) if edges else ():
-            ends = (getattr(one, name) * scales[name][0] for name in names)
-            ax.plot(*ends, color=style.VERMILION, linewidth=1.2, label=f"linear, {one.number}", zorder=3)
+        for edge_curve in curves(edges, "number", condition=label) if edges else ():
+            ends = (getattr(edge_curve, name) * scales[name][0] for name in names)
+            ax.plot(*ends, color=style.VERMILION, linewidth=1.2, label=f"linear, {edge_curve.number}", zorder=3)
         if len(labels) > 1:
             ax.set_title(style.literal(label))
         grid.scale_axis(ax, "x", x)
@@ -88,6 +92,7 @@ def draw_limit_cycles(
 
 
 def _find_beyond(arrays: Mapping[str, np.ndarray], bounds: tuple[float, float]) -> np.ndarray:
+    """Return which motions diverge, or have no amplitude or one above the upper bound."""
     return (arrays["outcome"] == MotionKind.DIVERGED) | ~(arrays["amplitude_m"] <= bounds[1])
 
 
@@ -105,11 +110,11 @@ def draw_limit_cycle_curves(
     Vertical line: stability boundary of the linear theory.
 
     Args:
-        arrays: what the npz file of a limit_cycle study holds.
-        edges: columns condition, number and the parameter; nothing where there is no linear boundary.
-        bounds: smallest and largest amplitude counted as a limit cycle, in m.
-        family: the name of the parameter that has a curve for each of its values; "" where there is none.
-        axes: Axes of yours, those of the amplitudes first.
+        arrays: Arrays of the npz file of a limit_cycle study.
+        edges: Columns condition, number and the parameter; empty if there is no linear boundary.
+        bounds: Smallest and largest amplitude counted as a limit cycle, in m.
+        family: Column of the parameter with one curve per value; "" if there is none.
+        axes: Existing Axes, those of the amplitudes first.
     """
     names = [name for name in AXES if name in arrays]
     arrays = grid_in_order(arrays, names)
@@ -118,28 +123,28 @@ def draw_limit_cycle_curves(
     size = (max(1.0 + 2.7 * len(labels), 5.8), 4.8)
     panels = style.panels(axes, 2 * len(labels), *size, len(labels), sharex=True, sharey="row")
     scale, unit = style.si_unit(arrays[over], AXES[over].unit)
-    # The curves along the axis before the last one.
+    # Arrange the arrays as (condition, curve, point).
     grids = {name: arrays[name] if family else arrays[name][:, None] for name in _CYCLES}
     cycles = {name: values.swapaxes(1, 2) if names[-1] == family else values for name, values in grids.items()}
-    buzzes = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
-    factor, meter = style.si_unit(cycles["amplitude_m"][buzzes], "m")
-    # Panels of a row share the axis: ticks that fit all of them.
-    amplitudes = cycles["amplitude_m"][buzzes] * factor
+    oscillating = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
+    factor, meter = style.si_unit(cycles["amplitude_m"][oscillating], "m")
+    # Choose the ticks by the amplitudes of all panels, because the panels of a row share the axis.
+    amplitudes = cycles["amplitude_m"][oscillating] * factor
     quantities = (("amplitude_m", factor, f"amplitude  in {meter}"), ("frequency_Hz", 1.0, "frequency  in Hz"))
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
-    # A wall that buzzes between two that do not is a dot without a line.
-    dots = {"marker": "o", "markersize": 3.5 if arrays[over].size <= _FEW else 1.25, "clip_on": False}
+    # Draw dots as well as lines, because a limit cycle between two points without one has no line.
+    dots = {"marker": "o", "markersize": 3.5 if arrays[over].size <= _MAX_DOTS else 1.25, "clip_on": False}
     largest = spell_short(bounds[1], style.units()["m"])
-    for row, (name, times, words) in enumerate(quantities):
+    for row, (name, scaling, words) in enumerate(quantities):
         for column, ax in enumerate(panels[row * len(labels) : (row + 1) * len(labels)]):
-            for curve, buzz, look in zip(cycles[name][column], buzzes[column], looks, strict=True):
-                shown = np.where(buzz, curve, np.nan) * times
+            for curve, is_cycle, look in zip(cycles[name][column], oscillating[column], looks, strict=True):
+                shown = np.where(is_cycle, curve, np.nan) * scaling
                 ax.plot(arrays[over] * scale, shown, linewidth=1.0, **dots, **look)
             grid.scale_axis(ax, "x", arrays[over] * scale)
-            for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
-                ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
+            for edge_curve in curves(edges, "number", condition=labels[column]) if edges and not family else ():
+                ax.axvline(getattr(edge_curve, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
-                _name_absent(ax, looks, buzzes[column], cycles[name][column] < bounds[0], largest)
+                _name_absent(ax, looks, oscillating[column], cycles[name][column] < bounds[0], largest)
                 if amplitudes.size:
                     style.use_logarithmic(ax, "y", amplitudes)
                 ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
@@ -155,15 +160,23 @@ def draw_limit_cycle_curves(
 
 
 def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest: np.ndarray, widest: str) -> None:
-    """Write into a panel which curves have no limit cycle, and why."""
+    """Write into a panel which curves have no limit cycle, with the reason.
+
+    Args:
+        ax: Axes of the panel.
+        looks: Look and label of each curve.
+        cycles: Whether each point of each curve is a limit cycle.
+        rest: Whether each point of each curve is at rest.
+        widest: Upper bound of the amplitude, as text.
+    """
     reasons: dict[str, list[str]] = {}
-    for look, cycle, still in zip(looks, cycles, rest, strict=True):
+    for look, cycle, resting in zip(looks, cycles, rest, strict=True):
         if not cycle.any():
-            wide = f"larger than {widest}"
+            too_large = f"larger than {widest}"
             reason = (
-                f"{'at rest' if still.all() else wide} everywhere"
-                if still.all() or not still.any()
-                else (f"at rest or {wide}")
+                f"{'at rest' if resting.all() else too_large} everywhere"
+                if resting.all() or not resting.any()
+                else (f"at rest or {too_large}")
             )
             reasons.setdefault(reason, []).append(look["label"])
     blocks = []
@@ -176,16 +189,16 @@ def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest
 
 
 def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarray) -> list[dict[str, Any]]:
-    """The look of every curve, and its label: which value it belongs to, and where no wall of it is linearly stable."""
+    """Return line properties and label of each curve; the label states its value, and if all its walls are unstable."""
     if not family:
         return [{**style.look(0), "label": "limit cycle"}]
-    values, known = arrays[family], AXES[family]
-    times, unit = style.si_unit(values, known.unit)
+    values, parameter = arrays[family], AXES[family]
+    scaling, unit = style.si_unit(values, parameter.unit)
     colors = style.ordered_colors(values.size)
     unstable = [not np.any(stable[:, k]) for k in range(values.size)]
-    digits = count_digits_apart((values * times).tolist())
-    texts = [f"${known.symbol} = {value * times:.{digits}g}$ {unit}" for value in values]
+    digits = count_digits_apart((values * scaling).tolist())
+    texts = [f"${parameter.symbol} = {value * scaling:.{digits}g}$ {unit}" for value in values]
     return [
-        {**style.look(k), "color": color, "label": text + (", unstable" if lost else "")}
-        for k, (color, text, lost) in enumerate(zip(colors, texts, unstable, strict=True))
+        {**style.look(k), "color": color, "label": text + (", unstable" if all_unstable else "")}
+        for k, (color, text, all_unstable) in enumerate(zip(colors, texts, unstable, strict=True))
     ]

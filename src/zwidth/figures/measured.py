@@ -1,4 +1,8 @@
-"""What records of a device tell: a fit with the boundary that follows, and a measured response with its band."""
+"""Draw what is identified from measurements: a fitted device with its stability boundary, and a measured response.
+
+An *onset of instability* is a wall at which the operator observed the beginning of a limit cycle; the columns and
+kinds of the tables call such walls "buzzing". The *set* wall is the one recommended for use on the device.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +17,12 @@ from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
 from zwidth.words.formatting import round_safely
 
-# Samples that one panel shows; of longer logs every n-th.
-_MOST = 4000
+_MAX_SAMPLES = 4000  # samples drawn per panel; of longer logs every n-th
 _TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder": 6}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}
-_LOW, _HIGH = "stiffness_low_N_per_m", "stiffness_high_N_per_m"
-_FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))
+_LOW = "stiffness_low_N_per_m"  # column of the lower end of the 95 % band
+_HIGH = "stiffness_high_N_per_m"  # column of its upper end
+_FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))  # line, band and dash per fit
 _ROWS = ("position", "residuals", "autocorrelation", "walls")
 
 
@@ -32,21 +36,22 @@ def draw_device_fit(
     correlation: Table | None = None,
     step: float = 0.0,
 ) -> np.ndarray:
-    """Draw what a fit rests on and what follows: motion, residuals, their autocorrelation, and the stable walls.
+    """Draw a fitted device: measured motion, residuals, their autocorrelation, and the stable walls.
 
-    The last panel is the boundary with its 95 % band, the stiffest wall, the wall to set, and the walls that buzzed.
-    Before it stand the position measured and modelled, what is left of it, and how that is correlated, with the 95 %
-    band of white noise; and of walls that buzzed how far they lie from the fit, in units of their noise.
+    The last panel shows the stability boundary with its 95 % band, the stiffest wall, the recommended wall, and the
+    onsets of instability. For a fit to a log, the panels before it show the measured and the modelled position, the
+    residuals, and their autocorrelation with the 95 % band of white noise. For a fit to onsets, one panel shows their
+    deviations from the fit, in standard deviations of their noise.
 
     Args:
-        boundary: columns virtual_damping and stiffness with its low and high end, of one or several fits by the column
-            ``fitted_to``.
-        walls: columns fitted_to, kind ("stiffest", "set" or "buzzing"), stiffness, its error, virtual_damping,
-            frequency; and stiffness_residual and frequency_residual of those that buzzed.
-        axes: Axes of yours, one a panel.
-        motion: columns log, time, position, modelled and residual, of a log.
-        correlation: columns lag, autocorrelation and band, of a log.
-        step: of the encoder, to draw beside the residuals; 0 for none.
+        boundary: Columns virtual_damping and stiffness with its lower and upper end, of one or several fits, given by
+            the column ``fitted_to``.
+        walls: Columns fitted_to, kind ("stiffest", "set" for the recommended wall, or "buzzing" for an onset),
+            stiffness, its error, virtual_damping, frequency; for onsets also stiffness_residual and frequency_residual.
+        axes: Existing Axes, one per panel.
+        motion: Columns log, time, position, modelled and residual of the logs.
+        correlation: Columns lag, autocorrelation and band of the logs.
+        step: Encoder step, drawn with the residuals; 0 for none.
     """
     names = [*(_ROWS[:3] if motion is not None and correlation is not None else ())]
     names += ["walls"] if "buzzing" in np.asarray(walls["kind"]) else []
@@ -65,20 +70,21 @@ def draw_device_fit(
 
 
 def _make_panels(axes: style.AnyAxes | None, rows: int) -> Any:
-    """So many panels below each other, and a high one to the right of them."""
+    """Return the given Axes, or ``rows`` panels below each other and a high one to the right of them."""
     if axes is not None:
         return np.asarray(axes, dtype=object).ravel()[: rows + 1]
     figure, _ = style.new_figure(8.8, max(3.6, 1.55 * rows + 0.7))
     figure.clear()
     shape: Any = [[str(row), "right"] for row in range(rows)] or [["right"]]
-    found = figure.subplot_mosaic(shape, width_ratios=(1.0, 1.05) if rows else (1.0,))
-    return [*(found[str(row)] for row in range(rows)), found["right"]]
+    axes_by_name = figure.subplot_mosaic(shape, width_ratios=(1.0, 1.05) if rows else (1.0,))
+    return [*(axes_by_name[str(row)] for row in range(rows)), axes_by_name["right"]]
 
 
 def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
+    """Draw the positions and the residuals of the first log."""
     logs = np.asarray(motion["log"])
     first = select(motion, log=logs[0])
-    thin = slice(None, None, max(1, -(-logs[logs == logs[0]].size // _MOST)))
+    thin = slice(None, None, max(1, -(-logs[logs == logs[0]].size // _MAX_SAMPLES)))
     time, place, model, rest = (first[name] for name in ("time_s", "position_m", "modelled_m", "residual_m"))
     clock, second = style.si_unit(time[-1] - time[0], "s")
     time = (time - time[0]) * clock
@@ -99,14 +105,15 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
         for end in (-0.5 * step, 0.5 * step) if step else ():
             ax.axhline(end * factor, color=style.BLACK, linestyle=style.DASHED, linewidth=0.8, label="half a step")
-        ax.set(xlabel=f"time  in {second}", ylabel=f"measured less\nmodelled  in {length}", xlim=(0.0, time[-1]))
+        ax.set(xlabel=f"time  in {second}", ylabel=f"measured minus\nmodelled  in {length}", xlim=(0.0, time[-1]))
         if step:
-            _put_above(ax, [style.line("half a step of the encoder", style.DASHED, 0.8, style.BLACK)])
+            _put_above(ax, [style.line("half an encoder step", style.DASHED, 0.8, style.BLACK)])
             far = factor * max(0.62 * step, float(np.nanmax(np.abs(rest))))
             ax.set_ylim(*style.span(-far, far, 0.12))
 
 
 def _draw_correlation(ax: Axes, correlation: Table) -> None:
+    """Draw the autocorrelation of the residuals over the lag, with the 95 % band of white noise."""
     lag, band = (np.asarray(correlation[name]) for name in ("lag_s", "band"))
     factor, second = style.si_unit(lag, "s")
     values = np.asarray(correlation["autocorrelation"])
@@ -121,13 +128,14 @@ def _draw_correlation(ax: Axes, correlation: Table) -> None:
 
 
 def _put_above(ax: Axes, handles: Any = None) -> None:
-    """A legend in one line above the panel, beside its letter."""
-    found = handles or ax.get_legend_handles_labels()[0]
+    """Add a legend in one row above the panel, to the right of its letter."""
+    entries = handles or ax.get_legend_handles_labels()[0]
     place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderaxespad": 0.0}
-    ax.legend(handles=found, ncols=len(found), columnspacing=1.2, **place)
+    ax.legend(handles=entries, ncols=len(entries), columnspacing=1.2, **place)
 
 
 def _draw_onsets(ax: Axes, walls: Table) -> None:
+    """Draw the deviations of the onsets of instability from the fit, in standard deviations of their noise."""
     buzzing = select(walls, kind="buzzing")
     factor, unit = style.si_unit(buzzing[SI_COLUMNS[1]], "N s/m")
     for name, marker, color in (("stiffness", "o", style.VERMILION), ("frequency", "s", style.BLUE)):
@@ -138,34 +146,34 @@ def _draw_onsets(ax: Axes, walls: Table) -> None:
     far = max(
         3.0, *(1.2 * float(np.nanmax(np.abs(buzzing[f"{name}_residual"]))) for name in ("stiffness", "frequency"))
     )
-    ax.set(ylim=(-far, far), xlabel=f"virtual damping  $B$  in {unit}", ylabel="walls less fit,\nin their noise")
+    ax.set(ylim=(-far, far), xlabel=f"virtual damping  $B$  in {unit}", ylabel="onset minus fit,\nstandardized")
     ax.margins(x=0.1)
     _put_above(ax)
 
 
 def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
-    """The stable walls: B over K."""
+    """Draw the stability boundary of each fit in the plane of K and B, with its 95 % band and marked walls."""
     every, high, dampings = np.asarray(walls[SI_COLUMNS[0]]), np.asarray(boundary[_HIGH]), boundary[SI_COLUMNS[1]]
     to_spring, spring = style.si_unit(every, "N/m")
     to_damper, damper = style.si_unit(dampings, "N s/m")
     handles, colors = [], {}
     for fit, (color, shade, dash) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):
-        own, source = vars(fit), style.literal(fit.fitted_to)
+        columns, source = vars(fit), style.literal(fit.fitted_to)
         colors[fit.fitted_to] = color
-        K, low, up = (own[name] * to_spring for name in (SI_COLUMNS[0], _LOW, _HIGH))
-        B = own[SI_COLUMNS[1]] * to_damper
+        K, low, up = (columns[name] * to_spring for name in (SI_COLUMNS[0], _LOW, _HIGH))
+        B = columns[SI_COLUMNS[1]] * to_damper
         ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {source}")
-        # Up to where it meets K = 0.
+        # Draw the part of the boundary with K > 0, and one point beyond each of its ends, where it meets K = 0.
         ends = np.flatnonzero(K > 0)
         shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
         ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
         ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {source}", zorder=3)
         handles.append(style.line(f"boundary with its 95 % band, {source}", dash, color=color))
-    # Of one fit they are black, of two in the colors of their boundaries.
+    # Draw the marks of a single fit in black, those of two fits in the colors of their boundaries.
     colors = colors if len(colors) > 1 else dict.fromkeys(colors, style.BLACK)
     handles += _mark_walls(ax, walls, colors, (to_spring, spring), (to_damper, damper))
     ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to_spring)
-    # Room for the legend.
+    # Leave room for the legend.
     highest = float(np.max(dampings)) * to_damper
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
     name_axes(ax, spring, damper)
@@ -175,57 +183,68 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
 def _mark_walls(
     ax: Axes, walls: Table, colors: dict[str, str], stiffness: tuple[float, str], damping: tuple[float, str]
 ) -> list[Any]:
-    """The stiffest walls, those to set, and those that buzzed, in such units; returns entries of a legend."""
+    """Mark the stiffest walls, the recommended walls and the onsets of instability; return legend entries.
+
+    Args:
+        ax: Axes of the boundary.
+        walls: The walls, see `draw_device_fit`.
+        colors: Color of each fit.
+        stiffness: Factor and unit of the stiffness axis.
+        damping: Factor and unit of the damping axis.
+    """
     handles, kinds = [], {}
     for kind in ("stiffest", "set", "buzzing"):
-        found = select(walls, kind=kind)
-        K, B = found[SI_COLUMNS[0]] * stiffness[0], found[SI_COLUMNS[1]] * damping[0]
-        kinds[kind] = found, K, B
-    for kind, mark, words in (("stiffest", "stiffest", "stiffest wall"), ("set", "recommended", "wall to set")):
-        found, *values = kinds[kind]
-        for fit, K, B in zip(found["fitted_to"], *values, strict=True):
+        selected = select(walls, kind=kind)
+        K, B = selected[SI_COLUMNS[0]] * stiffness[0], selected[SI_COLUMNS[1]] * damping[0]
+        kinds[kind] = selected, K, B
+    for kind, mark, words in (("stiffest", "stiffest", "stiffest wall"), ("set", "recommended", "recommended wall")):
+        selected, *values = kinds[kind]
+        for fit, K, B in zip(selected["fitted_to"], *values, strict=True):
             color = colors.get(fit, style.BLACK)
             mark_wall(ax, (K, B), kind, kind=mark, color=color)
-            # With four digits and K rounded down the wall holds as it is read.
+            # Print four digits and round K down, so that the printed wall is stable, too.
             numbers = f"$K = {round_safely(K, 'below'):.4g}$ {stiffness[1]}, $B = {B:.4g}$ {damping[1]}"
             handles.append(style.line(f"{words}: {numbers}", "", color=color, **MARKS[mark]))
     if not kinds["set"][1].size:
-        handles.append(style.line("no wall to set: a doubt, or none holds", ""))
-    found, K, B = kinds["buzzing"]
+        handles.append(style.line("no wall recommended: warnings, or no safe wall", ""))
+    selected, K, B = kinds["buzzing"]
     if K.size:
         look = {"color": style.VERMILION, "markersize": 5.0, "marker": "X"}
-        reach = 1.96 * found["stiffness_error_N_per_m"] * stiffness[0]
+        reach = 1.96 * selected["stiffness_error_N_per_m"] * stiffness[0]
         ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
         middle = float(np.max(kinds["stiffest"][2]))
-        for x, y, heard in zip(K, B, found["frequency_Hz"], strict=True):
-            # Outside of the stable walls.
+        for x, y, frequency in zip(K, B, selected["frequency_Hz"], strict=True):
+            # Write the frequency outside the region of stable walls.
             place = (11, -10) if y < middle else (11, 5)
-            ax.annotate(f"{heard:.3g} Hz", (x, y), xytext=place, color=style.VERMILION, **_TEXT)
-        handles.append(style.line("began to buzz at this frequency", "", **look))
+            ax.annotate(f"{frequency:.3g} Hz", (x, y), xytext=place, color=style.VERMILION, **_TEXT)
+        handles.append(style.line("onset of instability, with frequency", "", **look))
     return handles
 
 
-_NEEDED = ("frequency_Hz", "real_m_per_N", "imag_m_per_N")
-_KNOWN = ("deviation_m_per_N", "open_loop_real", "open_loop_imag")
-# Half the width of the picture around -1.
-_REACH = 1.6
+_REQUIRED_COLUMNS = ("frequency_Hz", "real_m_per_N", "imag_m_per_N")
+_OPTIONAL_COLUMNS = ("deviation_m_per_N", "open_loop_real", "open_loop_imag")
+_REACH = 1.6  # half the width of the panel around -1
 
 
 @draws_tables
 def draw_response(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw a response over frequency, and, of a wall, the open loop around the point -1 that no response may reach.
+    """Draw a measured frequency response with its band; for a given wall, also the open loop L around -1.
+
+    A stable wall stays stable with every response of the band if no disc around the open loop contains -1.
 
     Args:
-        table: columns frequency_Hz, real_m_per_N, imag_m_per_N; where they are known deviation_m_per_N, the radius of
-            the band, and open_loop_real and open_loop_imag of a wall.
-        axes: Axes of yours, for the size alone, for the phase as well, and for the open loop.
+        table: Columns frequency_Hz, real_m_per_N, imag_m_per_N; optionally deviation_m_per_N, the radius of the band,
+            and open_loop_real and open_loop_imag for a wall.
+        axes: Existing Axes for the magnitude; or for magnitude and phase; or for both and the open loop.
     """
-    columns: Any = {name: np.asarray(table[name], float) for name in (*_NEEDED, *_KNOWN) if name in table}
+    columns: Any = {
+        name: np.asarray(table[name], float) for name in (*_REQUIRED_COLUMNS, *_OPTIONAL_COLUMNS) if name in table
+    }
     f, G = columns["frequency_Hz"], columns["real_m_per_N"] + 1j * columns["imag_m_per_N"]
     radius, size = columns.get("deviation_m_per_N", np.zeros(f.size)), np.abs(G)
-    looped = "open_loop_real" in columns
-    panels = style.panels(axes, 2 + looped, style.WIDTH, 2.7, columns=2 + looped)
-    # Where the band reaches 0 there is any phase.
+    with_loop = "open_loop_real" in columns
+    panels = style.panels(axes, 2 + with_loop, style.WIDTH, 2.7, columns=2 + with_loop)
+    # Draw the phase only where the band excludes G = 0, because otherwise every phase is possible.
     clear = radius < size
     band: Any = {"color": style.SKY, "alpha": 0.5, "linewidth": 0}
     least = 0.3 * float(size.min())
@@ -246,13 +265,16 @@ def draw_response(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
         panels[1].set_ylabel("phase in degrees")
     for ax in panels[:2]:
         ax.set(xscale="log", xlim=(f[0], f[-1]), xlabel="frequency  $f$  in Hz")
-    if looped and len(panels) > 2:
+    if with_loop and len(panels) > 2:
         _draw_loop(panels[2], columns["open_loop_real"] + 1j * columns["open_loop_imag"], radius / size)
     return panels
 
 
 def _draw_loop(ax: Any, L: np.ndarray, share: np.ndarray) -> None:
-    """The open loop, a disc around each line that the band makes of it, and -1."""
+    """Draw the open loop, the disc around each of its points given by the band of the response, and the point -1.
+
+    ``share`` is the radius of the band relative to the magnitude of the response.
+    """
     near = np.abs(1.0 + L) < 2.0 * _REACH
     wide = 2.0 * (share * np.abs(L))[near]
     look: Any = {"units": "xy", "offset_transform": ax.transData, "color": style.SKY, "alpha": 0.3, "linewidth": 0}

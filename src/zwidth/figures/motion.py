@@ -1,4 +1,8 @@
-"""Motions over time: responses to a step of force (Fig. 11), and simulated motions, their phase plane and energy."""
+"""Draw motions over time: step responses (Fig. 11 of the paper), and simulated motions, phase planes and energies.
+
+Quantities of a step response are in SI units, or normalized: time by the sampling period T, position by F T^2/m for a
+force F on a mass m. Positions are positive inside the wall, whose surface is at 0.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,10 @@ from matplotlib.lines import Line2D
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves, draws_tables
 
+# Suffix of the columns of a step study in SI units.
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
-# A force is held until the next one.
-_HELD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}
+_ZERO_ORDER_HOLD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}  # look of the sampled wall force
 # Axis limit if a motion grows without bound, as a multiple of the smallest motion's largest value.
 _CLIP = 8.0
 # Growth criterion: ratio of the largest value in the last quarter to that before. A motion of constant velocity, which
@@ -22,25 +26,29 @@ _CLIP = 8.0
 _GROWTH = 1.5
 # Length of the time axis if all motions leave the wall, as a multiple of the end of the last contact.
 _WINDOW = 3.0
-_MOST_PANELS = 6
+_MAX_PANELS = 6  # motions in a figure of energies; of more, evenly spaced ones are drawn
+# Legend entry, color and line style of each energy.
 _ENERGIES = {
     "energy_J": ("energy of the bodies", style.BLACK, style.SOLID),
-    "wall_work_J": ("given by the wall", style.VERMILION, style.DASHED),
-    "push_work_J": ("given by the hand", style.GREEN, style.DOTTED),
-    "damping_loss_J": ("taken by dampers", style.BLUE, style.DASH_DOTTED),
-    "friction_loss_J": ("taken by friction", style.PURPLE, style.SOLID),
+    "wall_work_J": ("work of the wall", style.VERMILION, style.DASHED),
+    "push_work_J": ("work of the hand", style.GREEN, style.DOTTED),
+    "damping_loss_J": ("dissipated by dampers", style.BLUE, style.DASH_DOTTED),
+    "friction_loss_J": ("dissipated by friction", style.PURPLE, style.SOLID),
 }
 
 
 def _name_force() -> str:
+    """Return the name of the wall force for axis labels."""
     return "wall torque" if style.units().rotary else "wall force"
 
 
 def _name_position() -> str:
+    """Return name and symbol of the position for axis labels."""
     return r"angle  $\theta$" if style.units().rotary else "position  $x$"
 
 
 def _name_velocity() -> str:
+    """Return name and symbol of the velocity for axis labels."""
     return r"angular velocity  $\dot\theta$" if style.units().rotary else "velocity  $v$"
 
 
@@ -49,39 +57,39 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw step responses from force to position, with final values (thin) and settling times (dots).
 
     Args:
-        table: columns of a step study: label, alpha, beta, time, position, wall_force, final_position, settling_time;
-            those of a device in SI units have their units behind their names, as in time_s and position_m. The times
-            of settling may be left out, and for positions alone the forces.
-        axes: an Axes of yours for the positions alone, or two.
+        table: Columns of a step study: label, alpha, beta, time, position, wall_force, final_position, settling_time;
+            names of columns in SI units end with the unit, as in time_s and position_m. The column settling_time is
+            optional, and wall_force as well if only positions are drawn.
+        axes: An existing Axes for the positions only, or two.
     """
     panels = style.panels(axes, 2, 5.6, 5.0, height_ratios=(1.8, 1.2), sharex=True)
     clock, unit = draw_positions(panels[0], table)
     responses = _read_responses(table)
     for ax in panels[1:]:
         for each in responses:
-            look = {**each.look, **_HELD, "label": f"wall_force, {each.label}"}
+            look = {**each.look, **_ZERO_ORDER_HOLD, "label": f"wall_force, {each.label}"}
             ax.plot(each.time * clock, each.wall_force, zorder=3, **look)
         ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
         ax.set_ylabel(f"{_name_force()} in {style.units()['N']}" if unit else "wall force  in $F$")
     for ax in panels:
-        # The last sample ends before the time that was asked for.
+        # Extend the axis by one sampling period, because the last sample holds until then.
         ax.set_xlim(0.0, max(float(each.time[-1] + each.time[1]) for each in responses) * clock)
     panels[-1].set_xlabel(f"time  $t$  in {unit}" if unit else "time  $t/T$  in sampling periods")
     handles = [line for line in panels[0].lines if not line.get_label().startswith("_")]
     if any(each.settled for each in responses):
         handles.append(Line2D([], [], color=style.GRAY, label="settled to 2 %", **_DOT))
-    # Responses swing over all of the panel.
+    # Put the legend outside, because responses oscillate over the whole panel.
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels
 
 
 def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
-    """Draw the position of every response over time; returns the scale and the unit of time, "" where normalized."""
+    """Draw the position of each response over time; return factor and unit of time, 1 and "" if normalized."""
     responses, physical = _read_responses(table), "time_s" in table
     clock, unit, factor, length = 1.0, "", 1.0, ""
     if physical:
         clock, unit = style.si_unit([each.time[-1] for each in responses], "s")
-        # The final position: an unstable response has no largest one worth a unit.
+        # Choose the unit by the final positions, because the largest position of an unstable response is arbitrary.
         finals = [abs(each.final_position) for each in responses if np.isfinite(each.final_position)]
         largest = max(float(np.nanmax(np.abs(each.position))) for each in responses)
         factor, length = style.si_unit(max(finals, default=largest), "m")
@@ -92,8 +100,8 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
         if np.isfinite(each.final_position):
             ax.axhline(each.final_position * factor, color=each.look["color"], linewidth=0.5, zorder=2)
         if each.settled:
-            at = np.interp(each.settling_time, each.time, each.position)
-            ax.plot(each.settling_time * clock, at * factor, color=each.look["color"], zorder=4, **_DOT)
+            position = np.interp(each.settling_time, each.time, each.position)
+            ax.plot(each.settling_time * clock, position * factor, color=each.look["color"], zorder=4, **_DOT)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
     ax.set_ylabel(
         f"{_name_position()}  in {length} for 1 {style.units()['N']}" if physical else r"position  $x$  in $F\,T^2\!/m$"
@@ -102,9 +110,12 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
 
 
 def _read_responses(table: Table) -> list[Any]:
-    """The responses in a table; ``settled``: for good, at the end of the time shown; None where that is not known."""
-    spelled = ((name, key) for name, unit in _UNITS.items() for key in (name + unit, name))
-    columns = {name: np.asarray(table[key]) for name, key in spelled if key in table}
+    """Return the step responses in a table, with their columns and line properties as attributes.
+
+    The attribute ``settled`` states whether the response has settled by the end of its time; None if unknown.
+    """
+    keys = ((name, key) for name, unit in _UNITS.items() for key in (name + unit, name))
+    columns = {name: np.asarray(table[key]) for name, key in keys if key in table}
     columns |= {name: table[name] for name in ("label", "alpha", "beta")}
     responses = _read_motions(columns, "time")
     for each in responses:
@@ -116,24 +127,24 @@ def _read_responses(table: Table) -> list[Any]:
 
 @draws_tables
 def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the position of every motion over time and the force of the wall; thin: the bodies behind links.
+    """Draw the position of each motion and the wall force over time; thin lines: tip and hand, if they are modeled.
 
     If all motions leave the wall, the time axis ends at three times the end of the last contact. A motion that grows
     without bound is clipped at eight times the largest value of the smallest motion.
 
     Args:
-        table: columns of a simulate study.
-        axes: an Axes of yours for the positions alone, or two.
+        table: Columns of a simulate study.
+        axes: An existing Axes for the positions only, or two.
     """
     motions = _read_motions(table)
     panels = style.panels(axes, 2, 6.4, 4.8, height_ratios=(1.6, 1.0), sharex=True)
     clock, second = style.si_unit([each.time_s[-1] for each in motions], "s")
-    behind = [name for name in ("tip_position_m", "hand_position_m") if hasattr(motions[0], name)]
-    quantities = (("position_m", _name_position(), behind), ("wall_force_N", _name_force(), []))
+    further = [name for name in ("tip_position_m", "hand_position_m") if hasattr(motions[0], name)]
+    quantities = (("position_m", _name_position(), further), ("wall_force_N", _name_force(), []))
     for ax, (name, words, others) in zip(panels, quantities, strict=False):
         factor, unit = _limit(ax, "y", [getattr(each, one) for each in motions for one in (name, *others)], name[-1])
         for each in motions:
-            look = each.look if name == "position_m" else {**each.look, **_HELD}
+            look = each.look if name == "position_m" else {**each.look, **_ZERO_ORDER_HOLD}
             ax.plot(each.time_s * clock, getattr(each, name) * factor, label=each.label, zorder=3, **look)
             for other in others:
                 look = {**each.look, "linewidth": 0.6}
@@ -143,17 +154,17 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         _begin_at_zero(ax, max(float(each.time_s[-1]) for each in motions) * clock)
     _mark_wall(panels[0], "y", motions)
     panels[-1].set_xlabel(f"time  $t$  in {second}")
-    _explain(panels, motions, *([style.line("bodies behind links", width=0.6)] if behind else []), outside=axes is None)
+    _add_legend(panels, motions, *([style.line("tip or hand", width=0.6)] if further else []), outside=axes is None)
     return panels
 
 
 @draws_tables
 def draw_phase_plane(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the velocity of every motion over its position, with the wall; a dot where each starts.
+    """Draw the velocity of each motion over its position, with the wall; dots mark the initial states.
 
     Args:
-        table: columns of a simulate study.
-        axes: an Axes of yours.
+        table: Columns of a simulate study.
+        axes: An existing Axes.
     """
     motions = _read_motions(table)
     (ax,) = panels = style.panels(axes, 1, 5.6, 4.2)
@@ -169,20 +180,20 @@ def draw_phase_plane(table: Table, axes: style.AnyAxes | None = None) -> np.ndar
     _mark_wall(ax, "x", motions)
     ax.set(xlabel=f"{_name_position()}  in {meter}", ylabel=f"{_name_velocity()}  in {speed}")
     start = style.line("start", "", color=style.BLACK, marker="o", markersize=4.0)
-    _explain(panels, motions, start, outside=axes is None)
+    _add_legend(panels, motions, start, outside=axes is None)
     return panels
 
 
 @draws_tables
 def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw for every motion what wall and hand have given, what dampers and friction have taken, and what there is.
+    """Draw the energy balance of each motion: work of wall and hand, losses by dampers and friction, and energy.
 
     Args:
-        table: columns of a simulate study.
-        axes: Axes of yours, one for each motion.
+        table: Columns of a simulate study.
+        axes: Existing Axes, one per motion.
     """
     motions = _read_motions(table)
-    motions = [motions[k] for k in style.pick_evenly(len(motions), _MOST_PANELS)]
+    motions = [motions[k] for k in style.pick_evenly(len(motions), _MAX_PANELS)]
     columns = min(3, len(motions))
     rows = -(-len(motions) // columns)
     panels = style.panels(axes, len(motions), 0.9 + 2.5 * columns if columns > 1 else 5.6, 0.9 + 2.4 * rows, columns)
@@ -204,8 +215,9 @@ def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
 
 def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
-    """The motions in a table, each with its look; two of them may be alike in all but that each begins at time 0."""
+    """Return the motions in a table, with their columns and line properties (``look``) as attributes."""
     columns = {str(name): np.asarray(table[name]) for name in table}
+    # Separate the motions by their start at time 0, because all other columns of two motions may be equal.
     motions = curves({**columns, "number": np.cumsum(columns[time] == 0.0)}, "number")
     for k, each in enumerate(motions):
         each.label = style.literal(each.label[0])
@@ -230,12 +242,12 @@ def _trim(motions: list[Any]) -> list[Any]:
 
 
 def _begin_at_zero(ax: Axes, end: float) -> None:
-    """The axis of a time; of one instant as of a motion that is over at once it has any end."""
+    """Set the range of a time axis; an arbitrary one if a motion consists of a single instant."""
     ax.set_xlim(0.0, end or 1.0)
 
 
 def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[float, str]:
-    """Set the range of an axis, so that one that grows without end does not hide the others; returns its unit."""
+    """Set the range of an axis, with a limit for motions that grow without bound; return its factor and unit."""
     finite = [each[np.isfinite(each)] for each in values]
     largest = [float(np.abs(each).max(initial=0.0)) for each in finite]
     growing = any(_grows(np.abs(each)) for each in values)
@@ -254,7 +266,7 @@ def _grows(sizes: np.ndarray) -> bool:
 
 
 def _mark_wall(ax: Axes, which: str, motions: list[Any]) -> None:
-    """Mark the wall's surface, and where the wall is unless it acts on both sides."""
+    """Mark the surface of the wall, and shade its inside unless the wall is bilateral."""
     line = ax.axhline if which == "y" else ax.axvline
     line(0.0, color=style.GRAY, linewidth=1.0, zorder=2)
     if all(np.all(each.contact) for each in motions):
@@ -267,11 +279,12 @@ def _mark_wall(ax: Axes, which: str, motions: list[Any]) -> None:
 
 
 def _in_math(label: str) -> str:
+    """Return a label with K_max set as mathematics."""
     return label.replace("K_max", r"$K_{\max}$")
 
 
-def _explain(panels: np.ndarray, motions: list[Any], *more: Line2D, outside: bool) -> None:
-    """A legend with each motion that has a name; of long ones two side by side."""
+def _add_legend(panels: np.ndarray, motions: list[Any], *more: Line2D, outside: bool) -> None:
+    """Add a legend of the motions with labels, in fewer columns if labels are long; ``more`` are further entries."""
     named = [each for each in motions if each.label]
     lines = [style.line(_in_math(each.label), each.look["linestyle"], color=each.look["color"]) for each in named]
     columns = 2 if max(len(each.label) for each in motions) > 20 else 4

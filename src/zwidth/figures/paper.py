@@ -1,4 +1,9 @@
-"""The paper's planes, normalized: alpha and beta (Figs. 5, 7, 8), and walls over the damping delta (Figs. 6, 9, 10)."""
+"""Draw normalized figures of the paper: (alpha, beta) planes (Figs. 5, 7, 8), and walls over delta (Figs. 6, 9, 10).
+
+alpha and beta are the normalized stiffness and damping of the wall, delta the normalized physical damping of the
+device, d its delay in sampling periods, and alpha_max the largest stable alpha. The *delay model* is "held" (exact
+fractional delay) or "fractional_power" (the paper's z^d).
+"""
 
 from __future__ import annotations
 
@@ -21,10 +26,14 @@ from zwidth.words.formatting import round_safely
 from zwidth.words.quantities import OUTPUTS
 from zwidth.words.status import Status
 
-# The first scaling of Fig. 10 shows this share of the range of delta.
-_ZOOM = 0.1
-# Below, alpha_max hardly depends on delta and the ratio says nothing.
-_LEAST_DELTA = 0.1
+_ZOOM = 0.1  # fraction of the range of delta shown in the first scaling of Fig. 10
+_MIN_DELTA = 0.1  # smallest delta of alpha_max/delta, because alpha_max hardly depends on smaller ones
+
+
+def _list_curves(table: Table, **wanted: object) -> list[Any]:
+    """Return the curves of a table over delta, one per delay and, if it is a column, per delay model."""
+    models = ("delay_model",) if "delay_model" in table else ()
+    return curves(table, "d", *models, over="delta", **wanted)
 
 
 @draws_tables
@@ -35,14 +44,13 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     ``beta = -delta`` is common to all delays.
 
     Args:
-        table: columns of a boundary study in the plane delta_beta: curve, d, delta, beta_lower, beta_upper; with
-            delay_model ("held" or "fractional_power") those of a study of kind paper_fig6.
-        ax: an Axes of yours; the function returns one, not an array of them.
+        table: Columns of a boundary study in the plane delta_beta: curve, d, delta, beta_lower, beta_upper; or of a
+            study of kind paper_fig6, which also has delay_model ("held" or "fractional_power").
+        ax: An existing Axes; the function returns one, not an array of them.
     """
     ax = ax or style.panels(None, 1, 5.4, 4.1)[0]
     assert ax is not None
-    stable = curves(table, "d", "delay_model", over="delta", curve="stable")
-    passive = curves(table, "d", over="delta", curve="passive")
+    stable, passive = _list_curves(table, curve="stable"), curves(table, "d", over="delta", curve="passive")
     colors = style.color_by_value([interval.d for interval in stable])
     for interval in stable:
         if style.is_exact(interval):
@@ -53,7 +61,7 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
         _shade(ax, interval, style.VERMILION)
         for name in ("beta_lower", "beta_upper"):
             ax.plot(interval.delta, getattr(interval, name), label=f"passive {name}, d = {interval.d:g}", **look)
-    # One line for all delays, where they agree.
+    # Draw one lower bound, because it is the same for all delays.
     lower, middle = stable[0].beta_lower, int(0.55 * stable[0].delta.size)
     ax.plot(stable[0].delta, lower, color=style.BLACK, label="beta_lower", zorder=2.5)
     text = r"$\beta = -\delta$ for every $d$" if len(colors) > 1 else r"$\beta = -\delta$"
@@ -72,14 +80,26 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _draw_curve(ax: Axes, of: Any, x: Any, y: Any, colors: dict[float, Any], words: str, **look: Any) -> None:
-    """Draw the curve of a delay in its color, dashed for the fractional power; a single point becomes a dot."""
+def _draw_curve(ax: Axes, curve: Any, x: Any, y: Any, colors: dict[float, Any], words: str, **look: Any) -> None:
+    """Draw the curve of a delay in its color, dashed for the fractional power; a single point becomes a dot.
+
+    Args:
+        ax: Axes to draw into.
+        curve: Row group of a table with the attribute ``d`` and possibly ``delay_model``.
+        x: Horizontal coordinates.
+        y: Vertical coordinates.
+        colors: Color of each delay.
+        words: Name of the quantity in the label of the line.
+        look: Further properties of the line.
+    """
     look |= {"marker": "o", "clip_on": False} if np.size(x) == 1 else {}
-    label = ", ".join([f"{words}, d = {of.d:g}", *([of.delay_model] if hasattr(of, "delay_model") else [])])
-    ax.plot(x, y, label=label, **{"color": colors[of.d], "linestyle": style.dash_of(of), "zorder": 3, **look})
+    label = ", ".join([f"{words}, d = {curve.d:g}", *([curve.delay_model] if hasattr(curve, "delay_model") else [])])
+    dash = style.SOLID if style.is_exact(curve) else style.DASHED
+    ax.plot(x, y, label=label, **{"color": colors[curve.d], "linestyle": dash, "zorder": 3, **look})
 
 
 def _shade(ax: Axes, interval: Any, color: Any, **keywords: Any) -> None:
+    """Shade an interval of beta over delta."""
     look = {"color": color, "alpha": 0.08, "linewidth": 0.0, **keywords}
     ax.fill_between(interval.delta, interval.beta_lower, interval.beta_upper, **look)
 
@@ -89,10 +109,10 @@ def draw_ridge(table: Table, axes: style.AnyAxes | None = None, *, two_scalings:
     """Draw alpha_max over delta, one curve per delay; below a curve some wall is stable.
 
     Args:
-        table: columns of a ridge study: d, delta, alpha_max; with delay_model ("held" or "fractional_power") those of a
-            study of kind paper_fig10.
-        axes: an Axes of yours; two of them, in this order, for the two scalings.
-        two_scalings: show the small deltas, if there are any, in a panel of their own, as the paper does.
+        table: Columns of a ridge study: d, delta, alpha_max; or of a study of kind paper_fig10, which also has
+            delay_model ("held" or "fractional_power").
+        axes: An existing Axes; or two of them if there are two scalings, that of the small deltas first.
+        two_scalings: Show small deltas, if any, in a separate panel, as the paper does.
     """
     delta = np.asarray(table["delta"])
     two_scalings = bool(two_scalings and delta.min() <= _ZOOM * delta.max())
@@ -107,11 +127,11 @@ def draw_ridge(table: Table, axes: style.AnyAxes | None = None, *, two_scalings:
 
 
 def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
-    """Draw the curves up to a share of the range of delta."""
+    """Draw the curves up to a fraction of the range of delta."""
     delta = np.asarray(table["delta"])
     end = share * float(delta.max())
     columns = {name: column[delta <= end * (1.0 + 1e-12)] for name, column in select(table).items()}
-    shown = curves(columns, "d", "delay_model", over="delta")
+    shown = _list_curves(columns)
     colors = style.color_by_value([path.d for path in shown])
     for path in shown:
         _draw_curve(ax, path, path.delta, path.alpha_max, colors, "alpha_max")
@@ -128,7 +148,7 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
 
 
 def _scale_stiffness(ax: Axes, delta: np.ndarray, stiffness: np.ndarray) -> None:
-    """From 0 up; logarithmic where the damping is, with which it grows over as many decades."""
+    """Scale the stiffness axis from 0 upwards, or logarithmically if delta is spaced logarithmically."""
     highest = float(np.nanmax(stiffness))
     ax.set_ylim(0.0, 1.04 * highest)
     if grid.logarithmic(delta):
@@ -138,16 +158,16 @@ def _scale_stiffness(ax: Axes, delta: np.ndarray, stiffness: np.ndarray) -> None
 
 @draws_tables
 def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw alpha_max/delta over delta beside its limit g(d), and g over the delay.
+    """Draw alpha_max/delta over delta with its limit g(d), and g over the delay.
 
     Args:
-        table: columns of a ridge study: d, delta, alpha_max.
-        slopes: columns d and slope, the limit g(d), over a range of delays that includes those of ``table``.
-        axes: an existing Axes for the first panel only, or two.
+        table: Columns of a ridge study: d, delta, alpha_max; of a study of kind paper_fig10, only curves of the exact
+            delay are drawn.
+        slopes: Columns d and slope, the limit g(d), over a range of delays that includes those of ``table``.
+        axes: An existing Axes for the first panel only, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2, gridspec_kw={"width_ratios": [1.15, 1.0]})
-    paths, limits = curves(table, "d", "delay_model", over="delta"), select(slopes)
-    paths = [path for path in paths if style.is_exact(path)]
+    paths, limits = list(filter(style.is_exact, _list_curves(table))), select(slopes)
     colors = style.color_by_value([path.d for path in paths])
     for path in paths:
         path.limit = float(limits["slope"][limits["d"] == path.d][0])
@@ -159,15 +179,15 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
 
 
 def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
-    """alpha_max/delta on logarithmic axes, the limits dotted across."""
+    """Draw alpha_max/delta on logarithmic axes, with the limits as dotted lines."""
     for path in paths:
-        shown = path.delta >= _LEAST_DELTA
+        shown = path.delta >= _MIN_DELTA
         delta = path.delta[shown]
         _draw_curve(ax, path, delta, path.alpha_max[shown] / delta, colors, "alpha_max/delta")
         look = {"color": colors[path.d], "linestyle": style.DOTTED, "linewidth": 0.9, "zorder": 2}
         ax.axhline(path.limit, label=f"g, d = {path.d:g}", **look)
     limits = [path.limit for path in paths]
-    ends = _LEAST_DELTA, max(float(path.delta.max()) for path in paths)
+    ends = _MIN_DELTA, max(float(path.delta.max()) for path in paths)
     style.use_logarithmic(ax, "x", ends)
     style.use_logarithmic(ax, "y", limits)
     ax.set_xlim(*ends)
@@ -179,6 +199,7 @@ def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
 
 
 def _draw_limit(ax: Axes, paths: list[Any], d: np.ndarray, slope: np.ndarray, colors: dict[float, Any]) -> None:
+    """Draw the limit slope g over the delay, with a dot at the delay of each path of maximum stiffness."""
     ax.plot(d, slope, label="g", color=style.GRAY, zorder=2)
     for path in paths:
         ax.plot([path.d], [path.limit], "o", color=colors[path.d], markersize=5, zorder=3, clip_on=False)
@@ -192,8 +213,8 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     """Draw the stiffest stable (solid) and the stiffest passive wall (dash-dotted) over delta, and their ratio.
 
     Args:
-        table: columns of a passivity study: d, delta, alpha_max, alpha_max_passive.
-        axes: an Axes of yours for the two maxima alone, or two.
+        table: Columns of a passivity study: d, delta, alpha_max, alpha_max_passive.
+        axes: An existing Axes for the two maxima only, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2)
     costs = curves(table, "d", over="delta")
@@ -211,7 +232,7 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     style.label_ends(maxima, costs, [cost.alpha_max[-1] for cost in costs], colors)
     maxima.set_ylabel(style.label_quantity("alpha"))
     stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")
-    # Single dots are in the middle, and curves rise to the right.
+    # Single points are in the middle of the panel, and curves rise to the right.
     place = "upper left" if costs[0].delta.size > 1 else "center left"
     maxima.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc=place)
     for ax in shares:
@@ -224,26 +245,24 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     return panels
 
 
-# A legend of more entries than this is harder to read than a color bar.
-_LEGEND_ENTRIES = 8
-# A grid of more panels than this says nothing on a page: evenly spaced deltas and delays stand for all.
-_PANELS = 3
+_MAX_LEGEND_ENTRIES = 8  # largest number of deltas in a legend; more are easier to read from a color bar
+_MAX_PANELS = 3  # largest number of deltas and of delays in a grid of panels; of more, evenly spaced ones are drawn
 
 
 @draws_tables
 def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw stability boundaries, one panel for every delay, with the stable side shaded.
+    """Draw stability boundaries, one panel per delay, with the stable side shaded.
 
     Solid: a complex pair of poles crosses the unit circle; dotted: a real pole at z = -1; dashed: the path of maximum
     stiffness; dash-dotted: the passivity condition.
 
     Args:
-        table: columns of a boundary study: curve, d, delta, omega in rad per sample, alpha, beta; with
-            stiffness_N_per_m and virtual_damping_N_s_per_m the axes are in SI units as well.
-        axes: an Axes of yours for all delays together, or one for each delay.
+        table: Columns of a boundary study: curve, d, delta, omega in rad per sample, alpha, beta; with
+            stiffness_N_per_m and virtual_damping_N_s_per_m, the panels also have axes in SI units.
+        axes: An existing Axes for all delays together, or one per delay.
 
     Raises:
-        InputError: several Axes, but not one for each delay.
+        InputError: Several Axes are given, but not one per delay.
     """
     edges = curves(table, "d", "delta", curve="boundary")
     delays, colors = sorted({edge.d for edge in edges}), style.color_by_value([edge.delta for edge in edges])
@@ -254,19 +273,19 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
     else:
         columns = 2 if len(delays) <= 4 else 3
         panels = style.panels(axes, len(delays), style.WIDTH, 2.4 * -(-len(delays) // columns) + 0.7, columns)
-    apart = len(panels) == len(delays)
-    if not apart and len(panels) > 1:
-        raise InputError(f"axes: got {len(panels)} for {len(delays)} delays; give one for all, or one for each")
+    one_per_delay = len(panels) == len(delays)
+    if not one_per_delay and len(panels) > 1:
+        raise InputError(f"axes: got {len(panels)} for {len(delays)} delays; pass one for all, or one for each")
     for panel, d in zip(panels, delays, strict=False):
-        _draw_boundaries(panel, select(table, d=d) if apart else select(table), colors, scale)
-        if apart:
+        _draw_boundaries(panel, select(table, d=d) if one_per_delay else select(table), colors, scale)
+        if one_per_delay:
             panel.set_title(f"$d = {d:g}$")
     style.label_axes(panels, style.label_quantity("alpha"), style.label_quantity("beta"), once=axes is None)
     if scale is not None:
         for panel in panels:
             style.add_si_axes(panel, scale)
-    handles = _legend_handles(table, colors if len(colors) <= _LEGEND_ENTRIES else {})
-    if len(colors) > _LEGEND_ENTRIES:
+    handles = _legend_handles(table, colors if len(colors) <= _MAX_LEGEND_ENTRIES else {})
+    if len(colors) > _MAX_LEGEND_ENTRIES:
         bar = ScalarMappable(Normalize(min(colors), max(colors)), ListedColormap(list(colors.values())))
         panels[0].figure.colorbar(bar, ax=list(panels), label=style.label_quantity("delta"))
     style.legend(panels, handles, outside=axes is None and len(panels) > 1, ncols=min(6, len(handles)))
@@ -274,9 +293,9 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
 
 
 def _draw_boundaries(ax: Axes, table: Table, colors: dict[float, Any], scale: tuple[float, float] | None) -> None:
-    """Draw all of a table into one Axes, without labels."""
+    """Draw all curves of a table into one Axes, without labels; ``scale`` converts alpha and beta to SI units."""
     edges = curves(table, "d", "delta", curve="boundary")
-    # From the largest region to the smallest, so that none hides another.
+    # Draw the largest region, that of the largest delta, first, so that it does not hide the others.
     shade = min(0.10, 0.7 / len(edges))
     for edge in sorted(edges, key=lambda edge: -edge.delta):
         _draw_edge(ax, edge, colors[edge.delta], shade)
@@ -297,7 +316,7 @@ def _draw_boundaries(ax: Axes, table: Table, colors: dict[float, Any], scale: tu
 
 
 def _draw_edge(ax: Axes, edge: Any, color: Any, shade: float) -> None:
-    """The shaded region, its curve, and the straight part where a real pole is at z = -1."""
+    """Draw a shaded region with its boundary, dotted on the straight part with a real pole at z = -1."""
     shade_region(ax, [(np.stack([edge.alpha, edge.beta], -1), False)], color, alpha=shade)
     line = np.flatnonzero(edge.omega >= np.pi)
     curve = slice(None) if line.size < 2 else slice(0, line[0] + 1)
@@ -310,7 +329,7 @@ def _draw_edge(ax: Axes, edge: Any, color: Any, shade: float) -> None:
 
 
 def _mark_maximum(ax: Axes, edge: Any, scale: tuple[float, float] | None) -> None:
-    """A dot at the stiffest stable wall, labelled inside the region."""
+    """Mark the stiffest stable wall with a dot and a label inside the region."""
     top = int(np.argmax(edge.alpha))
     place = (edge.alpha[top], edge.beta[top])
     text = rf"$\alpha_{{\max}} = {round_safely(place[0], 'below'):.4g}$"
@@ -342,32 +361,32 @@ def draw_map(
     *,
     edges: Callable[[float, float], Outlines | None] = lambda delta, d: None,
 ) -> np.ndarray:
-    """Draw one output over alpha and beta: panels for delta (columns) and d (rows), three of each at most.
+    """Draw one output over alpha and beta, with columns of panels for up to three deltas and rows for up to three d.
 
     Args:
-        arrays: what the npz file of a map study holds: alpha, beta, delta, d, and the output and its status along
-            these; with stiffness_N_per_m and virtual_damping_N_s_per_m a single panel is in SI units as well.
+        arrays: Arrays of the npz file of a map study: alpha, beta, delta, d, and the output and its status over these;
+            with stiffness_N_per_m and virtual_damping_N_s_per_m, a single panel also has axes in SI units.
         output: "stable", "spectral_radius" or "passive".
-        axes: an Axes of yours for the first delta and d alone, or one for each panel.
-        edges: gives the exact edge of what is stable, or for "passive" passive, at a delta and d, drawn in place of
-            that of the cells where all cells agree with it.
+        axes: An existing Axes for the first delta and d only, or one per panel.
+        edges: Function of delta and d that returns the exact boundary of the stable walls, or of the passive walls if
+            the output is "passive". If all cells agree with it, it replaces the edges of the cells.
     """
     scale = si_scale(arrays)
     arrays = grid_in_order(arrays, ("alpha", "beta", "delta", "d"))
     delta, d = arrays["delta"], arrays["d"]
-    rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
-    places = list(product(rows, columns))
-    panels = panel_grid(axes, len(places), len(columns))
-    known = arrays["status"] == Status.OK if "status" in arrays else np.isfinite(arrays[output])
-    values = np.ma.masked_array(arrays[output].astype(float), ~known)
+    rows, columns = style.pick_evenly(d.size, _MAX_PANELS), style.pick_evenly(delta.size, _MAX_PANELS)
+    cells = list(product(rows, columns))
+    panels = panel_grid(axes, len(cells), len(columns))
+    computed = arrays["status"] == Status.OK if "status" in arrays else np.isfinite(arrays[output])
+    values = np.ma.masked_array(arrays[output].astype(float), ~computed)
     shown = []
-    for ax, (row, column) in zip(panels, places, strict=False):
+    for ax, (row, column) in zip(panels, cells, strict=False):
         exact = edges(float(delta[column]), float(d[row]))
         outlines = {} if exact is None else {"passive" if output == "passive" else "stable": exact}
         shown.append(Panel(arrays["alpha"], arrays["beta"], {output: values[:, :, column, row].T}, outlines))
         ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")
     style.label_axes(panels, style.label_quantity("alpha"), style.label_quantity("beta"), once=axes is None)
     draw_panels(panels, shown, output, rf"{OUTPUTS[output].words}  ${OUTPUTS[output].symbol}$", outside=axes is None)
-    if len(places) == 1 and scale is not None:
+    if len(cells) == 1 and scale is not None:
         style.add_si_axes(panels[0], scale)
     return panels

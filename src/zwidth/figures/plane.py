@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap, LogNorm, Normalize, TwoSlopeNorm
+from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, MaxNLocator
 
 from zwidth.figures import grid, stable_set, style
+from zwidth.figures.color_scale import choose_levels, choose_scale, find_colormap, make_norm
 from zwidth.figures.grid import MISSING, label_contours
 from zwidth.figures.stable_set import SHADES
 from zwidth.figures.table import Table, draws_tables
@@ -23,48 +23,32 @@ from zwidth.words.quantities import OUTPUTS, Output
 if TYPE_CHECKING:
     import xarray
 
-# Gives the outlines of the "stable" and the "passive" walls of a panel, in its units and stiffness first.
 Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, stable_set.Outlines]]"
+"""Returns the outlines of the "stable" and the "passive" walls of a panel in its units, stiffness first."""
 
-# Numbers whose contour is the boundary of the stable walls, smoother than that of truth values.
+# Outputs with a contour at the boundary of the stable walls, which is smoother than that of the output "stable".
 SMOOTH = ("margin", "spectral_radius")
 _SMOOTH = {"stable": SMOOTH, "passive": ("passivity_margin",)}
-# What is finite for stable walls alone.
+# Outputs that are finite for stable walls only.
 _FINITE_IF_STABLE = ("settling_time", "delay_margin")
-# The stiffest stable wall in a plane of walls.
+# Names of the stiffest stable wall and its damping, by the name of the stiffness.
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
-# Beyond this multiple of the smallest, a output that grows without end has one color.
-_STEEP = 100.0
-LEAST_POSITIVE = 1e-300  # smallest value shown on a logarithmic scale
-# A color bar of fewer decades than this has 2 and 5 between them.
-_FEW_TICKS = 1000.0
-# A region that fills less of its panel than this has no room for labels.
-_LABELLED = 0.1
-# Less than this cannot be seen.
-_SEEN = 0.003
-# The boundary where it is known.
+_FEW_TICKS = 1000.0  # ratio of largest to smallest value below which a color bar has ticks at 2 and 5, too
+_LABELLED = 0.1  # fraction of a panel that a region must fill for contour labels
+_SEEN = 0.003  # fraction of a panel that corner optima must fill for a legend entry
+# Look of a boundary.
 _EDGE: dict[str, Any] = {"color": style.BLACK, "linestyle": style.SOLID, "linewidth": 1.3, "zorder": 2.2}
 _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
 
 
-class ColorScale(NamedTuple):
-    """Mapping of an output's values to colors; values outside [low, high] have the color of the nearer end."""
-
-    colormap: str  # name in matplotlib
-    low: float  # value of the first color
-    high: float  # value of the last color
-    logarithmic: bool
-    extend: Literal["neither", "min", "max", "both"]  # ends of the color bar with an arrow, because values lie outside
-
-
 class Panel(NamedTuple):
-    """What one panel shows: variables over y and x, masked where they are not known, and exact outlines, x first."""
+    """Content of one panel."""
 
-    x: np.ndarray
-    y: np.ndarray
-    variables: Mapping[str, np.ma.MaskedArray]
-    outlines: Mapping[str, stable_set.Outlines]
-    peak: tuple[float, ...] = ()  # the stiffest stable wall, where it is known and within the axes
+    x: np.ndarray  # values along the x axis
+    y: np.ndarray  # values along the y axis
+    variables: Mapping[str, np.ma.MaskedArray]  # arrays over (y, x), masked if undecided
+    outlines: Mapping[str, stable_set.Outlines]  # exact outlines of the "stable" and "passive" walls, x first
+    peak: tuple[float, ...] = ()  # (x, y) of the stiffest stable wall if it lies within the axes
 
 
 @draws_tables
@@ -78,24 +62,24 @@ def draw_plane(
     col: str | None = None,
     edges: Edges | None = None,
 ) -> np.ndarray:
-    """Draw an output of a sweep over two parameters, a panel for each of some values of the others.
+    """Draw an output of a sweep over two parameters, in panels for up to a few values of the other parameters.
 
-    Truth values are shown as regions within their boundary, ``passive`` over ``stable`` where both are known; numbers
-    as colors under labelled contours, the edge of what is stable or passive as the bold one. The stiffest stable wall
-    is marked where it is known; in a ridge surface, corner optima are hatched.
+    The outputs ``stable`` and ``passive`` are drawn as regions with their boundaries, ``passive`` over ``stable``.
+    Other outputs are drawn as colors with labeled contours; a bold contour is the boundary of the stable or passive
+    walls. The stiffest stable wall is marked if the data contain it. In a ridge surface, corner optima are hatched.
 
     Args:
-        data: results of a sweep, as `zwidth.open_dataset` gives them, or a part of them.
+        data: results of a sweep as returned by `zwidth.open_dataset`, or a part of them.
         name: the output.
-        axes: Axes of yours, one for each panel or fewer.
-        x: the parameter from left to right; stiffness or the first that varies where left out.
-        y: the one from bottom to top.
-        col: the one of the panels; all others are then at their first value.
-        edges: gives the exact outlines of the stable and the passive walls of a panel, which are drawn in place of
-            contours and of the edges of cells where all cells agree with them.
+        axes: existing Axes, one per panel; further panels are omitted.
+        x: parameter along the x axis. Default: the stiffness, or the first parameter that varies.
+        y: parameter along the y axis.
+        col: parameter whose values have one panel each; all other parameters have their first value.
+        edges: function that returns the exact outlines of the stable and the passive walls of a panel. If all cells
+            agree with them, they replace contours and cell edges.
 
     Raises:
-        InputError: the output varies over less than two parameters.
+        InputError: if the output varies over fewer than two parameters.
     """
     dims = grid.choose_axes(data, name, x, y, but=(col,))
     if len(dims) < 2:
@@ -112,12 +96,12 @@ def draw_plane(
 
 
 def read_panel(part: xarray.Dataset, name: str, edges: Edges | None) -> Panel:
-    """A part (y, x) of a dataset."""
+    """Return the panel of a part (y, x) of a dataset."""
     up, across = map(str, part[name].dims)
     variables = {str(each): np.ma.masked_invalid(values.values) for each, values in part.items() if values.ndim}
     peak = {str(each).removesuffix("_peak"): float(values) for each, values in part.items() if not values.ndim}
     inside = all(part[dim].min() <= value <= part[dim].max() for dim, value in peak.items())
-    # Outlines have the stiffness first.
+    # Outlines have the stiffness first, so swap their columns if it is not along x.
     turn, found = -1 if across in ("beta", "virtual_damping") else 1, edges(part) if edges else {}
     outlines = {kind: [(points[:, ::turn], hole) for points, hole in each] for kind, each in found.items()}
     axes = part[across].values, part[up].values
@@ -125,7 +109,7 @@ def read_panel(part: xarray.Dataset, name: str, edges: Edges | None) -> Panel:
 
 
 def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
-    """The output, and what is drawn along with it."""
+    """Return a dataset of the output and of the variables drawn with it."""
     shown = ("stable", "passive") if name == "stable" else [each for each in _SMOOTH if each == name]
     smooth = [next((edge for edge in _SMOOTH[each] if edge in data), each) for each in shown]
     beside = [name, *shown, *smooth, *(["kind"] if OUTPUTS[name].family == "device" else [])]
@@ -136,7 +120,7 @@ def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
 
 
 def _add_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xarray.Dataset:
-    """The stiffest stable wall of every panel, where the plane is one of walls."""
+    """Return ``drawn`` with the stiffest stable wall of each panel, if the plane is one of walls and has them."""
     names = dict(zip((x, y), _PEAKS.get(x, ()), strict=False))
     if y not in ("beta", "virtual_damping") or not names or not all(name in data for name in names.values()):
         return drawn
@@ -146,12 +130,12 @@ def _add_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xa
 
 
 def boundary_level(name: str) -> float:
-    """The level at which the contour of an output is the boundary of what is stable or passive."""
+    """Return the level of an output whose contour is the boundary of the stable or passive walls."""
     return OUTPUTS[name].center if OUTPUTS[name].look == "diverging" else 0.5
 
 
 def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndarray:
-    """So many panels in columns, which share their axes, or those that are given."""
+    """Return ``count`` panels in columns with shared axes, or the given Axes."""
     columns = min(count, columns)
     rows = -(-count // columns)
     width, height = (5.9, 4.5) if count == 1 else (max(5.0, 0.9 + 2.5 * columns), 1.2 + 2.2 * rows)
@@ -159,21 +143,22 @@ def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndar
 
 
 def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str, *, outside: bool) -> None:
-    """Draw an output into panels, whose colors and axes mean the same, and explain it."""
-    norm, image = _norm(panels, name), None
+    """Draw an output into panels with a common color scale and a legend."""
+    output = OUTPUTS[name]
+    norm, image = make_norm(output, choose_scale(output, _finite(panels, name))), None
     for ax, panel in zip(axes, panels, strict=True):
         ax.set_facecolor(MISSING)
         grid.scale_axis(ax, "x", panel.x)
         grid.scale_axis(ax, "y", panel.y)
-        if OUTPUTS[name].look == "truth":
+        if output.look == "truth":
             image = _draw_regions(ax, panel, name)
         else:
             shown = panel.variables[name]
-            image = grid.draw_cells(ax, panel.x, panel.y, shown, cmap=_colors(OUTPUTS[name]), norm=norm)
+            image = grid.draw_cells(ax, panel.x, panel.y, shown, cmap=find_colormap(output), norm=norm)
             if min(shown.shape) > 1 and shown.count():
-                # Labelled contours where the number is good, and the bold one at which it ceases to be.
+                # Draw the boundary first, because contour labels keep away from it.
                 others = draw_edge(ax, panel, name, **_EDGE) + ([np.array([panel.peak])] if panel.peak else [])
-                draw_contours(ax, panel.x, panel.y, shown, OUTPUTS[name], norm, others)
+                draw_contours(ax, panel.x, panel.y, shown, output, norm, others)
             corner = np.ma.filled(panel.variables.get("kind", np.zeros(1)) == 1, False)
             if min(shown.shape) > 1 and corner.any():
                 with matplotlib.rc_context({"hatch.linewidth": 0.5, "hatch.color": "#606060"}):
@@ -185,7 +170,7 @@ def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str
 
 
 def _draw_regions(ax: Axes, panel: Panel, name: str) -> Any:
-    """Stable and passive walls as areas, each with its boundary."""
+    """Draw the stable and the passive walls as areas with their boundaries; return the image of the last."""
     image = None
     x, y, variables = panel.x, panel.y, panel.variables
     for each, dash in (("stable", style.SOLID), ("passive", style.DASH_DOTTED)):
@@ -194,7 +179,7 @@ def _draw_regions(ax: Axes, panel: Panel, name: str) -> Any:
         shown = variables[each]
         edge = next((edge for edge in _SMOOTH[each] if edge in variables), each)
         smooth, level = variables[edge], boundary_level(edge)
-        # Where a part is missing, its cells are all that says where.
+        # If cells are missing, draw single cells, because a filled contour would hide the gaps.
         whole = min(smooth.shape) > 1 and shown.count() == smooth.count() == shown.size
         outside = "white" if image is None else (0, 0, 0, 0)
         shades = ListedColormap([outside, outside if whole else SHADES[each]])
@@ -213,7 +198,7 @@ def _draw_regions(ax: Axes, panel: Panel, name: str) -> Any:
 
 
 def _draw_line(ax: Axes, panel: Panel, name: str, look: Mapping[str, Any]) -> Any:
-    """The boundary: the contour on which something changes, where the panel has one."""
+    """Draw the contour of an output at the boundary level; return it, or None if the values do not cross the level."""
     values, level = panel.variables[name], boundary_level(name)
     if min(values.shape) < 2 or not values.count() or not values.min() < level < values.max():
         return None
@@ -224,12 +209,12 @@ def _draw_line(ax: Axes, panel: Panel, name: str, look: Mapping[str, Any]) -> An
 def draw_contours(
     ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, output: Output, norm: Any, others: Sequence[np.ndarray] = ()
 ) -> None:
-    """Labelled contours of an output at round numbers; labels keep away from the points of other lines."""
-    levels = _levels(values, output, norm)
+    """Draw labeled contours at round values; the labels keep away from the points of other lines."""
+    levels = choose_levels(values, output, norm)
     if not levels.size:
         return
-    # Over a dark color a light line, over a light one a dark line.
-    shades = _colors(output)(norm(levels))
+    # Use light lines on dark colors and dark lines on light ones.
+    shades = find_colormap(output)(norm(levels))
     luminance = shades[:, :3] @ np.array([0.299, 0.587, 0.114])
     colors = [("white" if dark < 0.5 else "#303030") for dark in luminance]
     drawn = ax.contour(x, y, values, levels=levels, colors=colors, linewidths=0.7)
@@ -239,7 +224,7 @@ def draw_contours(
 
 
 def draw_edge(ax: Axes, panel: Panel, name: str, **look: Any) -> list[np.ndarray]:
-    """The edge of what is stable or passive, exactly where it is known, or as a contour; returns its lines."""
+    """Draw the boundary of the stable or passive walls, exactly or as a contour; return its lines."""
     output, values, level = OUTPUTS[name], panel.variables[name], boundary_level(name)
     crossed = output.look in ("diverging", "truth")
     if not crossed and name not in _FINITE_IF_STABLE:
@@ -254,72 +239,13 @@ def draw_edge(ax: Axes, panel: Panel, name: str, **look: Any) -> list[np.ndarray
     return drawn.get_paths()[0].to_polygons(closed_only=False) if drawn else []
 
 
-def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
-    """Round numbers at which contours are drawn."""
-    low, high = float(values.min()), float(values.max())
-    if output.logarithmic:
-        # Short of where a steep number rises without end, but not of the values where these are close together.
-        end = min(high, max(norm.vmax / 2.0, (low * high) ** 0.5)) if output.look == "steep" else high
-        levels = np.asarray(LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, end))
-        levels = levels[levels <= end]
-    elif output.look == "diverging":
-        ends = (low, output.center) if output.below else (output.center, high)
-        levels = np.asarray(MaxNLocator(6).tick_values(*ends)) if ends[0] < ends[1] else np.empty(0)
-        levels = levels[levels != output.center]
-        levels = levels[(levels < output.center) == output.below]
-    else:
-        levels = np.asarray(MaxNLocator(8).tick_values(low, high))
-    return levels[(levels > low) & (levels < high)]
-
-
-def _colors(output: Output) -> Any:
-    return matplotlib.colormaps[_name_colormap(output)]
-
-
-def _name_colormap(output: Output) -> str:
-    if output.look == "diverging":
-        return "PuOr_r" if output.below else "PuOr"
-    return "viridis_r" if output.look == "steep" else "viridis"
-
-
-def choose_scale(output: Output, finite: np.ndarray) -> ColorScale:
-    """Choose the color scale of an output from its finite values, for figures and reports."""
-    finite = finite[finite >= LEAST_POSITIVE] if output.logarithmic else finite
-    least, most = _range(finite) or ((1.0, 10.0) if output.logarithmic else (0.0, 1.0))
-    if output.look == "diverging":
-        # Both sides get the range of the favorable side, if it has values; values beyond it share one color.
-        sides = [output.center - least, most - output.center]
-        good, bad = sides if output.below else reversed(sides)
-        span = max(good if good > 0 else bad, 1e-6)
-        low, high = output.center - span, output.center + span
-    elif output.logarithmic:
-        low, high = least, min(most, _STEEP * least) if output.look == "steep" else most
-        high = max(high, 1.001 * low)
-    else:
-        low, high = least, most if most > least else least + 1.0
-    beyond: Any = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
-    return ColorScale(_name_colormap(output), low, high, output.logarithmic, beyond[least < low, most > high])
-
-
 def _finite(panels: Sequence[Panel], name: str) -> np.ndarray:
     return np.concatenate([panel.variables[name].compressed() for panel in panels])
 
 
-def _norm(panels: Sequence[Panel], name: str) -> Any:
-    output = OUTPUTS[name]
-    scale = choose_scale(output, _finite(panels, name))
-    if output.look == "diverging":
-        return TwoSlopeNorm(output.center, scale.low, scale.high)
-    return (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
-
-
-def _range(finite: np.ndarray) -> tuple[float, float] | None:
-    return (float(finite.min()), float(finite.max())) if finite.size else None
-
-
 def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, label: str, *, outside: bool) -> None:
     handles: list[Any] = []
-    output, ends = OUTPUTS[name], _range(finite := _finite(panels, name))
+    output, finite = OUTPUTS[name], _finite(panels, name)
     if output.look == "truth":
         for each, dash in (("stable", "-"), ("passive", "-.")):
             if each == name or each in panels[0].variables:
@@ -332,7 +258,7 @@ def _explain(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any, l
             style.use_logarithmic(bar.ax, "y", (image.norm.vmin, image.norm.vmax), _FEW_TICKS)
         bar.ax.tick_params(labelsize=8)
     exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
-    crossed = ends is not None and ends[0] < output.center < ends[1]
+    crossed = finite.size and finite.min() < output.center < finite.max()
     if crossed if output.look == "diverging" else (exact and output.look != "truth"):
         what = "passive" if name == "passivity_margin" else "stable"
         handles.append(style.line(f"edge of what is {what}", width=1.3, color=style.BLACK))
@@ -356,23 +282,24 @@ def draw_workspace(
     *,
     names: tuple[tuple[str, str], tuple[str, str]] | None = None,
 ) -> np.ndarray:
-    """Draw the stiffest stable wall over two coordinates of a device's pose, the weakest pose marked.
+    """Draw the maximum stiffness over two coordinates of a device's pose, and mark the pose with the smallest one.
 
-    Poses on a grid are a surface with contours, others dots.
+    Poses on a grid are drawn as a surface with contours, other poses as dots.
 
     Args:
         table: columns of a workspace study.
-        across: the column from left to right.
-        up: the one from bottom to top.
-        axes: an Axes of yours.
-        names: name and unit of both, "" of no unit; where left out, a column's unit is behind its last underscore.
+        across: column along the x axis.
+        up: column along the y axis.
+        axes: an existing Axes.
+        names: name and unit of both coordinates; "" for no unit. By default the unit follows the last underscore of
+            the column.
     """
     (ax,) = panels = style.panels(axes, 1, 5.9, 4.3)
-    # Behind the coordinates, which may be called anything.
+    # Use the last match, because the coordinates precede it and may have any name.
     wanted = [str(name) for name in table if str(name).startswith("stiffness_")][-1]
     x, y, stiffness = (np.asarray(table[name], float) for name in (across, up, wanted))
     factor, unit = style.si_unit(stiffness, "N/m")
-    # A pose without an answer stays empty, which no smooth shading can show.
+    # Smooth shading cannot leave undecided poses empty.
     stiffness = np.ma.masked_invalid(stiffness)
     shading = "nearest" if np.ma.is_masked(stiffness) else "gouraud"
     norm, weakest = LogNorm(factor * stiffness.min(), factor * stiffness.max()), int(stiffness.argmin())
@@ -397,6 +324,6 @@ def draw_workspace(
 
 
 def _split_column(column: str) -> tuple[str, str]:
-    """The name of a column and its unit, as it is likely to be written."""
+    """Split a column such as ``elbow_deg`` into name and unit."""
     name, _, unit = column.rpartition("_")
     return (name.replace("_", " "), unit) if name else (column, "")

@@ -1,4 +1,9 @@
-"""Stable sets in a plane of walls: regions within exact outlines, islands and holes, and the walls that matter."""
+"""Draw the stable set in the plane of stiffness and virtual damping: its exact boundary, and marked walls.
+
+The boundary consists of *outlines*, closed lines of three kinds: the outline of the set connected to K = 0 (in
+figures: "outline"), outlines of *islands*, stable sets not connected to it, and outlines of *holes*, unstable sets
+inside a stable one. A *cell* is one point of a grid of walls, drawn as a colored rectangle.
+"""
 
 from __future__ import annotations
 
@@ -17,33 +22,34 @@ from zwidth.words.formatting import round_safely, with_unit
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
 
-# Points (x, y) of each closed line, and whether it surrounds a hole.
+# For each closed line, its points (x, y) of shape (n, 2), and whether it surrounds a hole.
 Outlines: TypeAlias = Sequence[tuple[np.ndarray, bool]]
-# Light, so that labels and curves drawn over them stay legible; in gray, passive is the darker one.
+# Light colors, so that labels and curves drawn over them stay legible; printed in gray, passive is the darker one.
 SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
-# So many points a step of an outline bend it as a logarithmic axis does.
-_BEND = 32
-# How walls that matter are marked, in a legend as well.
+_INTERPOLATION = 32  # points per straight step of an outline, which is curved on a logarithmic axis
+# Marks of walls, in panels and legends.
 MARKS: dict[str, dict[str, Any]] = {
     "stiffest": {"marker": "o", "markersize": 4.5},
     "recommended": {"marker": "D", "markersize": 5.0},
 }
-# Of words beside them, in points; and what of a panel lies beside its axes, in inches.
-_LETTER, _AROUND = 4.4, 0.8
+_LETTER_WIDTH = 4.4  # points; mean width of a letter of the text at a mark
+_FRAME_MARGIN = 0.8  # inches; width of a panel outside its axes
+# Line style by kind of outline.
 _DASHES = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED, "passive": style.DASH_DOTTED}
 
 
 def shade_region(ax: Axes, outlines: Outlines, face: Any, *, alpha: float | None = None, zorder: float = 1.0) -> None:
-    """Shade what lies within outlines, and not in their holes."""
+    """Shade the region within outlines, without their holes."""
     if outlines and face != "none":
         path = to_path(outlines)
-        # `add_patch` would look for the extremes of every straight piece by itself, for as long as all else takes.
+        # Update the data limits by the vertices. `add_patch` computes them segment by segment, which takes as long as
+        # all other drawing.
         ax.update_datalim(path.vertices)
         ax.add_artist(PathPatch(path, facecolor=face, alpha=alpha, linewidth=0.0, zorder=zorder))
 
 
 def to_path(outlines: Outlines) -> Path:
-    """The shape of a region; holes run the other way round, so that they stay empty."""
+    """Return the path of a region, in which holes run clockwise, so that they stay empty."""
     paths = []
     for closed, hole in ((_close(points), hole) for points, hole in outlines):
         x, y = closed[:-1].T
@@ -53,6 +59,7 @@ def to_path(outlines: Outlines) -> Path:
 
 
 def _close(points: np.ndarray) -> np.ndarray:
+    """Return the points of a closed line with the first point repeated at the end."""
     return points if np.array_equal(points[0], points[-1]) else np.append(points, points[:1], 0)
 
 
@@ -67,26 +74,37 @@ def mark_wall(
     room: float = np.inf,
     **look: Any,
 ) -> None:
-    """Mark a wall, its stiffness and damping, with words to the right or to the left, where ``room`` points are."""
+    """Mark a wall in a panel.
+
+    Args:
+        ax: Axes of the panel.
+        wall: Stiffness and virtual damping, in the units of the axes.
+        label: Label of the mark for legends.
+        kind: Kind of the mark, a key of `MARKS`.
+        text: Text next to the mark.
+        right: Write the text to the right of the mark instead of the left.
+        room: Room to the left of the mark, in points. If the text does not fit, it begins at the axis above the mark.
+        look: Properties of the mark that differ from those of its kind.
+    """
     look = {"linestyle": "", "color": style.BLACK, "zorder": 5, "clip_on": False, **MARKS[kind], **look}
     ax.plot(*wall, label=label, **look)
     if text:
         place: Any = {"xytext": (6 if right else -8, 0), "ha": "left" if right else "right", "va": "center"}
-        if room < _LETTER * max(map(len, text.split("\n"))) + 8:
-            # From the axis on, above the mark, readable over the lines behind.
-            behind = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 1.0}
-            place = {"xytext": (4 - room, 6), "ha": "left", "va": "bottom", "bbox": behind}
+        if room < _LETTER_WIDTH * max(map(len, text.split("\n"))) + 8:
+            # Begin at the axis, above the mark, on a white background, because lines may cross the text.
+            background = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 1.0}
+            place = {"xytext": (4 - room, 6), "ha": "left", "va": "bottom", "bbox": background}
         ax.annotate(text, wall, textcoords="offset points", fontsize=8, zorder=6, **place)
 
 
 def draw_zeros(ax: Axes) -> None:
-    """Lines where stiffness and damping are zero."""
+    """Draw the lines of zero stiffness and of zero damping."""
     ax.axvline(0.0, color=style.GRAY, linewidth=0.6, zorder=0.5)
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
 
 
 def name_axes(ax: Axes, spring: str, damper: str) -> None:
-    """Label the axes of stiffness and damping, normalized where they have no unit, with lines where these are zero."""
+    """Label the axes of stiffness and damping, normalized if the units are empty, and draw the lines of zero."""
     draw_zeros(ax)
     in_si = f"stiffness  $K$  in {spring}", f"virtual damping  $B$  in {damper}"
     style.label_axes(
@@ -97,13 +115,23 @@ def name_axes(ax: Axes, spring: str, damper: str) -> None:
 
 
 def agrees(outlines: Outlines, x: np.ndarray, y: np.ndarray, good: np.ndarray) -> bool:
-    """Whether the cells (y, x) that are good lie within, but for those next to a change, which the outline parts."""
+    """Return whether cells agree with outlines: exactly those inside are ``good``, except for cells at the boundary.
+
+    Args:
+        outlines: The outlines.
+        x: Horizontal coordinates of the cells.
+        y: Vertical coordinates of the cells.
+        good: Whether each cell is stable, or passive; of shape (y, x).
+    """
     inside = _cells_inside(outlines, x, y)
     return not np.any((inside != good) & ~_changes(inside) & ~_changes(good))
 
 
 def _cells_inside(outlines: Outlines, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Cells (y, x) with an odd number of edges to their left; axes may run either way."""
+    """Return which cells, of shape (y, x), lie inside outlines: those with an odd number of crossings to their left.
+
+    The coordinates x and y may be ascending or descending.
+    """
     columns, rows = np.argsort(x), np.argsort(y)
     crossed = np.zeros((y.size, x.size + 1), int)
     for closed, _ in outlines:
@@ -123,7 +151,20 @@ def _cells_inside(outlines: Outlines, x: np.ndarray, y: np.ndarray) -> np.ndarra
 def draw_exact(
     ax: Axes, outlines: Outlines | None, x: np.ndarray, y: np.ndarray, good: np.ndarray, face: Any = "none", **look: Any
 ) -> Outlines:
-    """Draw outlines where they are known and the cells agree with them; returns what is drawn, on these axes."""
+    """Draw exact outlines if there are any and the cells agree with them.
+
+    Args:
+        ax: Axes with their final scales and limits.
+        outlines: The outlines; None if there are none.
+        x: Horizontal coordinates of the cells.
+        y: Vertical coordinates of the cells.
+        good: Whether each cell is stable, or passive; of shape (y, x).
+        face: Color of the region.
+        look: Properties of the lines.
+
+    Returns:
+        The outlines as drawn; empty if none are drawn.
+    """
     if outlines is None or not agrees(outlines, x, y, good):
         return []
     fitted = fit_axes(outlines, ax)
@@ -134,7 +175,7 @@ def draw_exact(
 
 
 def _changes(cells: np.ndarray) -> np.ndarray:
-    """Cells that differ from one beside them: of all nine some are true and some are not."""
+    """Return the cells at a change: those with true and false values among themselves and their eight neighbors."""
     padded = np.pad(cells, 1, mode="edge").view(np.uint8)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     true = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
@@ -142,31 +183,37 @@ def _changes(cells: np.ndarray) -> np.ndarray:
 
 
 def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
-    """Outlines as they can be drawn on logarithmic axes: what is not positive lies beyond the frame."""
+    """Return outlines that can be drawn on logarithmic axes: zero and negative coordinates become small positive ones.
+
+    The replaced points lie outside the frame.
+    """
     both = ax.xaxis, ax.yaxis
     least = [0.1 * min(axis.get_view_interval()) if axis.get_scale() == "log" else -np.inf for axis in both]
     if not np.isfinite(least).any():
         return outlines
-    return [(np.maximum(Path(_close(points)).interpolated(_BEND).vertices, least), hole) for points, hole in outlines]
+    return [
+        (np.maximum(Path(_close(points)).interpolated(_INTERPOLATION).vertices, least), hole)
+        for points, hole in outlines
+    ]
 
 
 def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
-    """The outlines of the stable set, the largest first, as columns; the hole of an island lies inside of it."""
+    """Yield the outlines of the stable set of a scene as columns of a table, the largest outline first."""
     for number, outline in enumerate(scene.stable_region(), start=1):
         piece = "hole" if outline.hole else ("island" if outline.island else "outline")
-        # Closed: the first point comes again at the end.
+        # Close the line by repeating its first point.
         closed = (np.append(part, part[0]) for part in outline[:2])
         yield {**columns, "number": number, "piece": piece, **tabulate_walls(scene, *closed)}
 
 
 def tabulate_walls(scene: Scene, stiffness: Any, virtual_damping: Any) -> dict[str, Any]:
-    """Walls as columns, normalized and in SI units."""
+    """Return walls as columns of a table, normalized and in SI units."""
     normalized = {"alpha": stiffness / scene.units.stiffness, "beta": virtual_damping / scene.units.virtual_damping}
     return {**normalized, **dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))}
 
 
 def tabulate_sets(scenes: Mapping[str, Scene]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The outlines of devices by their labels, and the stiffest wall of each, as `draw_stable_set` takes them."""
+    """Return two tables for `draw_stable_set`: the outlines of scenes, by label, and the stiffest wall of each."""
     outlines = stack(piece for label, scene in scenes.items() for piece in trace_outlines(scene, label=label))
     tops = {label: tabulate_walls(scene, *scene.max_stiffness()[:2]) for label, scene in scenes.items()}
     return outlines, stack({"label": label, "wall": "stiffest", **wall} for label, wall in tops.items())
@@ -178,15 +225,16 @@ def draw_stable_set(
 ) -> np.ndarray:
     """Draw the stable walls of one or several devices over stiffness and virtual damping.
 
-    Solid: the largest outline; dashed: islands, stable walls apart from it; dotted: holes, unstable walls within;
-    dash-dotted: passive walls.
+    Solid: walls connected to K = 0; dashed: islands, stable walls not connected to them; dotted: holes, unstable walls
+    surrounded by stable ones; dash-dotted: passive walls.
 
     Args:
-        outlines: columns label, number, piece (outline, island, hole or passive), stiffness_N_per_m,
+        outlines: Columns label, number, piece (outline, island, hole or passive), stiffness_N_per_m,
             virtual_damping_N_s_per_m.
-        walls: columns label, wall (stiffest or recommended), the same two and, where one needs more than 4, digits.
-        axes: an Axes of yours.
-        normalized: from the columns alpha and beta in place of those two.
+        walls: Columns label, wall (stiffest or recommended), stiffness_N_per_m, virtual_damping_N_s_per_m and, if a
+            wall must be printed with more than 4 digits, digits.
+        axes: An existing Axes.
+        normalized: Draw the columns alpha and beta instead of those in SI units.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 4.0)
     tables = [table for table in (walls, outlines) if "label" in table]
@@ -200,9 +248,9 @@ def draw_stable_set(
     for label, color in colors.items() if "label" in outlines else ():
         pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factors, 0.5 / (1 + len(labels)))
     rows, spec = select(walls), ax.get_subplotspec()
-    wide = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
-    # Room for words to the right of the stiffest wall, as wide as they are in a narrow panel too.
-    beyond, most = 0.28 * max(1.0, 5.6 / wide), max(rows[names[0]], default=np.nan) * factors[0]
+    width = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
+    # Leave room for the text to the right of the stiffest wall; its width does not shrink with the panel.
+    right_margin, most = 0.28 * max(1.0, 5.6 / width), max(rows[names[0]], default=np.nan) * factors[0]
     rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
     for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
         # Round K down, so that the printed wall is stable.
@@ -217,13 +265,15 @@ def draw_stable_set(
         text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""
         look = {"color": style.BLACK} if alone else {"color": colors[label]}
         look |= {"marker": markers[label]} if which == "stiffest" else {}
-        room = np.inf if which == "stiffest" else 72.0 * (wide - _AROUND) * wall[0] / ((1.0 + beyond) * most)
+        room = (
+            np.inf if which == "stiffest" else 72.0 * (width - _FRAME_MARGIN) * wall[0] / ((1.0 + right_margin) * most)
+        )
         mark_wall(ax, wall, kind, kind=which, text=text, right=kind == "stiffest", room=room, **look)
     name_axes(ax, *units)
     ax.margins(0.04)
     if alone and np.isfinite(rows[names[0]]).any():
         low, high = ax.get_xlim()
-        ax.set_xlim(low, high + beyond * (high - low))
+        ax.set_xlim(low, high + right_margin * (high - low))
     handles: list[Any] = []
     for label, color in colors.items() if not alone else ():
         mark = {**MARKS["stiffest"], "marker": markers[label]}
@@ -235,26 +285,26 @@ def draw_stable_set(
 
 
 def scale_walls(tables: Sequence[Table], names: Sequence[str] = SI_COLUMNS) -> tuple[list[float], list[str]]:
-    """The factors and the units in which stiffness and damping of some walls have few digits; normalized ones stay."""
+    """Return factors and units for stiffness and damping that give few digits; factor 1, no unit, if normalized."""
     units = ("N/m", "N s/m") if tuple(names) == SI_COLUMNS else ("1", "1")
-    found = [
+    scales = [
         style.si_unit(np.concatenate([np.asarray(table[name], float) for table in tables]), unit)
         for name, unit in zip(names, units, strict=True)
     ]
-    return [factor for factor, _ in found], [unit.removeprefix("1") for _, unit in found]
+    return [factor for factor, _ in scales], [unit.removeprefix("1") for _, unit in scales]
 
 
 def _draw_pieces(
     ax: Axes, table: Table, names: tuple[str, ...], color: Any, factors: Sequence[float], shade: float
 ) -> set[str]:
-    """One device's outlines, what is stable and what is passive shaded; returns which kinds of them there are."""
+    """Draw the outlines of one device and shade its stable and its passive walls; return the kinds of its outlines."""
     edges: dict[bool, list[Any]] = {False: [], True: []}
-    found = curves(table, "number", "piece")
-    for one in found:
-        path = np.stack([getattr(one, name) for name in names], -1) * factors
-        look = {"color": color, "linestyle": _DASHES[one.piece], "zorder": 3}
-        ax.plot(*path.T, label=f"{one.piece} {one.number}", **look)
-        edges[one.piece == "passive"].append((path, one.piece == "hole"))
+    pieces = curves(table, "number", "piece")
+    for outline in pieces:
+        path = np.stack([getattr(outline, name) for name in names], -1) * factors
+        look = {"color": color, "linestyle": _DASHES[outline.piece], "zorder": 3}
+        ax.plot(*path.T, label=f"{outline.piece} {outline.number}", **look)
+        edges[outline.piece == "passive"].append((path, outline.piece == "hole"))
     for passive, outlines in edges.items():
         shade_region(ax, outlines, style.GRAY if passive else color, alpha=shade, zorder=1.5 if passive else 1.0)
-    return {str(one.piece) for one in found}
+    return {str(outline.piece) for outline in pieces}

@@ -1,17 +1,18 @@
-"""One look for all figures: sizes, lines, colors, axis labels, and how files are written.
+"""House style of all figures: sizes, line styles, colors, units, axis labels and file output.
 
-Everything is applied within a context; matplotlib's global settings stay as they are.
+All settings apply within a context; matplotlib's global settings do not change. *Panels* are the Axes of a figure. A
+*look* is a dict of matplotlib properties of a line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from io import BytesIO
 from pathlib import Path
 from textwrap import fill
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import matplotlib
 import numpy as np
@@ -22,68 +23,80 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from zwidth.words.contexts import set_temporarily
 from zwidth.words.errors import InputError
 from zwidth.words.files import write_whole
 from zwidth.words.formatting import PREFIXES
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
-# Okabe and Ito's palette, told apart with any color vision.
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+# Palette of Okabe and Ito (2008), distinguishable with any color vision.
+BLACK = "#000000"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+PURPLE = "#CC79A7"
 GRAY = "#6E6E6E"
-DISTINCT = (BLUE, ORANGE, BLACK, GREEN, VERMILION, SKY, PURPLE)
+DISTINCT = (BLUE, ORANGE, BLACK, GREEN, VERMILION, SKY, PURPLE)  # colors of curves without an order
 
-# Line styles carry the meaning that the paper gives them, so that it survives in gray.
+# The meaning of line styles is that of the paper's figures, also legible in gray.
 SOLID = "-"
 DASHED = (0, (5.0, 2.2))
 DASH_DOTTED = (0, (6.0, 1.8, 1.2, 1.8))
 DOTTED = (0, (1.2, 1.6))
 STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED, (0, (11.0, 2.5)), (0, (6.0, 1.8, 1.2, 1.8, 1.2, 1.8)))
-# What tells curves apart whose line styles have a meaning of their own.
+# Markers of curves whose line styles already have a meaning.
 MARKERS = ("o", "s", "^", "v", "P", "X", "*")
 
 # Spelling of units in labels, where it differs from that of datasets (UDUNITS).
 _WRITTEN = {"1": "", "degree": "degrees", "g cm^2": "g cm$^2$"}
 
-# Of a whole number there is nothing between its values.
+# Look of integer quantities, without lines between the points.
 POINTS: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 3.5}
 
 AnyAxes: TypeAlias = Axes | Sequence[Axes] | np.ndarray
 
 WIDTH = 7.0  # inches: both columns of a journal page
-DECADES = 3000.0  # from so many times its least value on, an axis of stiffnesses has powers of ten only
-PNG_DPI = 180
+DECADES = 3000.0  # ratio of largest to smallest stiffness from which an axis has ticks at powers of ten only
+PNG_DPI = 180  # dots per inch
 LIGHTEST = 0.6  # position in viridis of the lightest curve color; contrast 3:1 against white
-# Values closer together than this have but one or two of 1, 2 and 5 among them.
-_FEW = 5.0
-# How far an axis goes on either side of a single value.
-_AROUND = 2.0
+_DENSE_TICKS = 5.0  # ratio of largest to smallest value below which a logarithmic axis has more ticks than 1, 2 and 5
+_SINGLE_VALUE_RANGE = 2.0  # ratio of the ends of a logarithmic axis to a single value
 
-# Dates and versions out of the files, for the same figure is to give the same bytes.
+# Omit dates and versions, so that the same figure always has the same bytes.
 _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
 Size: TypeAlias = tuple[float, float | None]
-# Settings of figures in the current context, like matplotlib's rcParams: changes of the house style by a style sheet,
-# size of new figures in inches, dots per inch, and units.
-_wanted: ContextVar[tuple[Any, Size | None, float | None, UnitSystem]] = ContextVar(
-    "wanted", default=((), None, None, LINEAR)
-)
-# Narrower, in inches, panels stand below each other: beside each other their labels would have no room.
+# Width in inches below which panels are arranged in one column, because labels of narrower panels have no room.
 _ONE_COLUMN = 5.0
+
+
+class _Settings(NamedTuple):
+    """Settings of figures in the current context, in addition to matplotlib's rcParams."""
+
+    style: Mapping[Any, Any] = {}  # rcParams of a style sheet, which override the house style
+    size: Size | None = None  # size of new figures in inches
+    dpi: float | None = None  # resolution of saved figures
+    system: UnitSystem = LINEAR  # units of axes and labels
+
+
+_DEFAULTS = _Settings()
+_settings: ContextVar[_Settings] = ContextVar("settings", default=_DEFAULTS)
 
 
 @contextmanager
 def house_style(system: UnitSystem | None = None) -> Iterator[None]:
     """Draw and save in the house style, in a unit system if given; restore the previous settings at the end."""
-    with style_sheet(system=system), matplotlib.rc_context({**_RC, **dict(_wanted.get()[0])}):
+    with style_sheet(system=system), matplotlib.rc_context({**_RC, **_settings.get().style}):
         yield
 
 
 def units() -> UnitSystem:
     """Return the unit system of the figures drawn in the current context."""
-    return _wanted.get()[3]
+    return _settings.get().system
 
 
 @contextmanager
@@ -93,42 +106,49 @@ def style_sheet(
     dpi: float | None = None,
     system: UnitSystem | None = None,
 ) -> Iterator[None]:
-    """Draw with the settings of a matplotlib style sheet, a size in inches, a resolution and a unit system if given."""
-    # A size without a height does not change the font size. A size or resolution set by an outer call has priority.
-    changes, known, dots, outer = _wanted.get()
+    """Draw with the settings of a matplotlib style sheet, a size in inches, a resolution and a unit system if given.
+
+    A size without a height does not change the font size. A size or resolution set by an outer call has priority.
+    """
+    outer = _settings.get()
     try:
-        changes = changes if file is None else dict(rc_params_from_file(file, use_default_template=False))
+        style = outer.style if file is None else dict(rc_params_from_file(file, use_default_template=False))
     except OSError as error:
         raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error
-    token = _wanted.set((changes, known or size, dots or dpi, system or outer))
-    try:
+    with set_temporarily(_settings, _Settings(style, outer.size or size, outer.dpi or dpi, system or outer.system)):
         yield
-    finally:
-        _wanted.reset(token)
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **keywords: Any) -> tuple[Figure, Any]:
-    """A figure of its own, unknown to pyplot, and its axes as a 2-D array."""
+    """Return a new figure, which pyplot does not manage, and a 2-D array of its Axes.
+
+    Args:
+        width: Default width in inches; a size of the current context replaces it.
+        height: Default height in inches; likewise.
+        rows: Number of rows of panels.
+        columns: Number of columns of panels; they are arranged in one column if the figure is narrow.
+        keywords: Arguments of `matplotlib.figure.Figure.subplots`.
+    """
     engine = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05)
-    across, up = _wanted.get()[1] or (width, height)
+    across, up = _settings.get().size or (width, height)
     if up is None:
         narrow = across < _ONE_COLUMN and columns > 1 and not {"width_ratios", "height_ratios"} & set(keywords)
         rows, columns, height = (rows * columns, 1, height * columns) if narrow else (rows, columns, height)
-        # Labels stay as high as they are: a panel is not as flat as it is narrow.
+        # Reduce the height less than the width, because labels keep their height.
         up = height * min(1.0, max(across * (2.0 if narrow else 1.0) / width, 0.9))
     figure = Figure(figsize=(across, up), layout=engine)
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
 
 
 def panels(given: AnyAxes | None, count: int, width: float, height: float, columns: int = 1, **keywords: Any) -> Any:
-    """The Axes to draw into, in one dimension: those given, or so many panels of a new figure, unknown to pyplot."""
+    """Return a 1-D array of the Axes to draw into: the given ones, or ``count`` panels of a `new_figure`."""
     if given is not None:
         return np.asarray(given, dtype=object).ravel()[:count]
     _, axes = new_figure(width, height, -(-count // columns), columns, **keywords)
     for spare in axes.flat[count:]:
         spare.remove()
     for lowest in axes.flat[max(0, count - columns) : count]:
-        # Of its column, in the last row or not; panels that share an axis would leave it bare.
+        # Also label the lowest panel of a column that ends above the last row.
         lowest.tick_params(labelbottom=True)
     return axes.ravel()[:count]
 
@@ -146,20 +166,20 @@ def write_unit(unit: str) -> str:
 
 
 def letter(axes: np.ndarray) -> None:
-    """Name several panels (a), (b) and so on."""
+    """Set the titles (a), (b), (c) if there are several panels."""
     for ax, title in zip(axes if len(axes) > 1 else (), "abc", strict=False):
         ax.set_title(f"({title})")
 
 
 def literal(text: Any) -> str:
-    """A label of somebody's own as matplotlib writes it letter by letter, in legends too: no mathematics, no hiding."""
+    """Escape a user's text so that matplotlib shows it literally, also in legends."""
     text = "".join(sign if sign.isprintable() or sign == "\n" else " " for sign in str(text)).replace("$", r"\$")
-    # Legends leave out what begins with an underscore: a space without width stands before it.
+    # Prefix a zero-width space, because legends omit labels that begin with an underscore.
     return f"\u200b{text}" if text.startswith("_") else text
 
 
 def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
-    """Name the axes of every panel, or once for all."""
+    """Label the axes of each panel, or the figure once."""
     if once and len(axes) > 1:
         axes[0].figure.supxlabel(x, fontsize=9.0)
         axes[0].figure.supylabel(y, fontsize=9.0)
@@ -171,11 +191,19 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
 def legend(
     axes: np.ndarray | Sequence[Axes], handles: Sequence[Any], *, outside: bool, loc: Any = "best", **keywords: Any
 ) -> None:
-    """Explain what is drawn, if anything is, above the panels in as many columns as fit, or at ``loc`` in the first."""
+    """Add a legend if there are handles.
+
+    Args:
+        axes: The panels.
+        handles: Legend entries.
+        outside: Place the legend above the panels, in as many columns as fit, instead of in the first panel.
+        loc: Position in the first panel.
+        keywords: Arguments of `matplotlib.figure.Figure.legend`; ``ncols`` is the largest number of columns.
+    """
     if not handles:
         return
     if not outside:
-        # Said, or matplotlib warns on a busy machine that it looks for the place.
+        # Pass ``loc``, because matplotlib warns if its default search for a place is slow.
         axes[0].legend(handles=handles, loc=loc)
         return
     figure, columns = figure_of(axes), keywords.pop("ncols", 1)
@@ -193,62 +221,79 @@ def legend(
 
 
 class _PlainLocator(LogLocator):
-    """Ticks of a logarithmic axis, as of a linear one where there would not be two of them."""
+    """Locator of a logarithmic axis that uses linear ticks if fewer than two logarithmic ones are visible."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
+        """Return the ticks of an axis with the given ends."""
         ticks = np.asarray(super().tick_values(vmin, vmax))
         low, high = sorted((vmin, vmax))
         if low <= 0 or np.count_nonzero((low <= ticks) & (ticks <= high)) > 1:
             return ticks
-        # Of very many decades matplotlib marks none of 2 and 5, and then no power of ten either.
+        # With subs 2 and 5, matplotlib places no ticks at all on axes of very many decades.
         wide = LogLocator() if high > 10.0 * low else AutoLocator()
         return wide.tick_values(low, high)
 
 
 def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> None:
-    """A logarithmic axis with plain numbers: 2 and 5 too unless positive values are as far apart, more of a few."""
+    """Make an axis logarithmic with plain numbers at ticks.
+
+    Args:
+        ax: Axes to change.
+        which: Axis, "x" or "y".
+        values: Values along the axis; only finite positive ones count.
+        wide: Ratio of largest to smallest value from which only powers of ten have ticks; below, also 2 and 5 times
+            these powers, and more if the ratio is small.
+    """
     getattr(ax, f"set_{which}scale")("log")
-    axis, known = getattr(ax, f"{which}axis"), np.asarray(values, dtype=np.float64)
-    known = known[np.isfinite(known) & (known > 0)]
-    if known.size and known.min() == known.max():
-        # A single value would have decades around it.
-        getattr(ax, f"set_{which}lim")(known[0] / _AROUND, known[0] * _AROUND)
-    near = not known.size or known.max() < wide * known.min()
-    few = known.size and known.max() < _FEW * known.min()
+    axis, positive = getattr(ax, f"{which}axis"), np.asarray(values, dtype=np.float64)
+    positive = positive[np.isfinite(positive) & (positive > 0)]
+    if positive.size and positive.min() == positive.max():
+        # Without limits, matplotlib shows decades around a single value.
+        getattr(ax, f"set_{which}lim")(positive[0] / _SINGLE_VALUE_RANGE, positive[0] * _SINGLE_VALUE_RANGE)
+    with_2_and_5 = not positive.size or positive.max() < wide * positive.min()
+    dense = positive.size and positive.max() < _DENSE_TICKS * positive.min()
     axis.set_major_locator(
-        _PlainLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if few else (1.0, 2.0, 5.0) if near else (1.0,))
+        _PlainLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if dense else (1.0, 2.0, 5.0) if with_2_and_5 else (1.0,))
     )
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
 
 def use_whole(ax: Axes) -> None:
-    """Ticks of whole numbers from left to right, where there is nothing between them."""
+    """Place the ticks of the x axis of an integer quantity at integers, if the axis is linear."""
     if ax.get_xscale() == "linear":
         ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
 
 
-def label_ends(ax: Axes, found: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:
-    """Write the delay of each curve to the right of its end; of two delay models only the exact one is labeled."""
-    named = [k for k, curve in enumerate(found) if is_exact(curve)]
-    texts = [f"$d = {found[k].d:g}$" for k in named]
-    name_heights(ax, texts, [ends[k] for k in named], [colors[found[k].d] for k in named])
+def label_ends(ax: Axes, curves: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:
+    """Write the delay of each curve to the right of its end; with two delay models, label only the exact curves.
+
+    Args:
+        ax: Axes of the curves.
+        curves: The curves, with their delay as attribute ``d``.
+        ends: Height of the end of each curve.
+        colors: Color of each delay.
+    """
+    named = [k for k, curve in enumerate(curves) if is_exact(curve)]
+    texts = [f"$d = {curves[k].d:g}$" for k in named]
+    name_heights(ax, texts, [ends[k] for k in named], [colors[curves[k].d] for k in named])
 
 
 def name_heights(ax: Axes, names: Sequence[str], ends: Sequence[float], colors: Sequence[Any]) -> None:
-    """Write names to the right of a panel, moved apart where they would overlap."""
+    """Write names to the right of a panel at the heights ``ends``, moved apart if they overlap."""
     to_scale = ax.yaxis.get_transform().transform
     low, high = to_scale(np.array(ax.get_ylim()))
     heights = (to_scale(np.array(ends, dtype=np.float64)) - low) / (high - low)
     spec = ax.get_subplotspec()
     rows = spec.get_gridspec().nrows if spec else 1
-    places = spread(heights, 0.18 * rows / figure_of(ax).get_figheight())
+    heights_apart = spread(heights, 0.18 * rows / figure_of(ax).get_figheight())
     look: dict[str, Any] = {"xycoords": "axes fraction", "fontsize": 8, "va": "center", "annotation_clip": False}
-    for name, place, color in zip(names, places, colors, strict=True):
+    for name, place, color in zip(names, heights_apart, colors, strict=True):
         ax.annotate(name, (1.015, place), color=color, **look)
 
 
 def line(label: str, dash: Any = SOLID, width: float | None = None, color: str = GRAY, **keywords: Any) -> Line2D:
+    """Return a line as legend entry, with label, line style, width and color."""
     return Line2D([], [], color=color, linestyle=dash, linewidth=width, label=label, **keywords)
 
 
@@ -257,18 +302,14 @@ def is_exact(curve: Any) -> bool:
     return getattr(curve, "delay_model", "held") == "held"
 
 
-def dash_of(curve: Any) -> Any:
-    """Return the line style of a curve: solid for the exact delay, dashed for the paper's fractional power."""
-    return SOLID if is_exact(curve) else DASHED
-
-
-def delay_model_handles(found: Sequence[Any]) -> list[Line2D]:
+def delay_model_handles(curves: Sequence[Any]) -> list[Line2D]:
     """Return legend entries for solid and dashed lines if fractional powers are drawn."""
-    both = not all(map(is_exact, found))
+    both = not all(map(is_exact, curves))
     return [line("held delay (exact)"), line(r"fractional power $z^{1+d}$", DASHED)] if both else []
 
 
 def figure_of(drawn: AnyAxes | Figure) -> Figure:
+    """Return the figure that contains the given Axes, or the given figure itself."""
     figure = drawn if isinstance(drawn, Figure) else np.asarray(drawn, dtype=object).flat[0].get_figure(root=True)
     assert isinstance(figure, Figure), "an Axes belongs to a figure"
     return figure
@@ -280,13 +321,13 @@ def save(
     formats: Sequence[str] = ("png", "svg"),
     dpi: float | None = None,
 ) -> tuple[Path, ...]:
-    """Write the figure of some Axes as ``stem.png`` and so on; the same figure gives the same bytes.
+    """Write a figure as ``stem.png`` and so on; return the paths. The same figure always has the same bytes.
 
     Args:
-        drawn: the figure, or Axes of it.
-        stem: the files' name without its ending.
-        formats: the endings, of "png", "svg" and "pdf".
-        dpi: resolution in dots per inch, also of maps in SVG and PDF files. Default: 180 for PNG.
+        drawn: The figure, or its Axes.
+        stem: Path of the files without suffix.
+        formats: File formats, of "png", "svg" and "pdf".
+        dpi: Resolution in dots per inch, also of maps in SVG and PDF files. Default: 180 for PNG.
     """
     figure = figure_of(drawn)
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
@@ -295,47 +336,47 @@ def save(
         for file in files:
             usual = PNG_DPI if file.suffix == ".png" else "figure"
             kind = {"format": file.suffix[1:], "metadata": _METADATA[file.suffix]}
-            figure.savefig(drawing := BytesIO(), dpi=dpi or _wanted.get()[2] or usual, **kind)
+            figure.savefig(drawing := BytesIO(), dpi=dpi or _settings.get().dpi or usual, **kind)
             write_whole(file, drawing.getvalue())
-            # What is laid out once need not be again: it is half of the work.
+            # Keep the layout for the next format, because layout is half of the run time.
             figure.set_layout_engine(None)
     figure.set_layout_engine(engine)
     return files
 
 
 def ordered_colors(count: int) -> list[Any]:
-    """Colors for values in ascending order: the larger the value, the darker."""
+    """Return colors for values in ascending order; larger values are darker."""
     shades = np.linspace(LIGHTEST, 0.0, count) if count > 1 else np.array([0.25])
     return [matplotlib.colormaps["viridis"](shade) for shade in shades]
 
 
 def color_by_value(values: Sequence[float]) -> dict[float, Any]:
-    """A color for every value that occurs, `ordered_colors` in ascending order."""
+    """Return a color for each distinct value; larger values are darker."""
     distinct = sorted(set(values))
     return dict(zip(distinct, ordered_colors(len(distinct)), strict=True))
 
 
 def look(k: int) -> dict[str, Any]:
-    """Color and line style of one of several curves; in gray their lines tell six of them apart."""
+    """Return color and line style of the k-th curve; the line styles of the first six differ."""
     return {"color": DISTINCT[k % len(DISTINCT)], "linestyle": STYLES[k % len(STYLES)]}
 
 
 def pick_evenly(count: int, most: int) -> list[int]:
-    """Indices of all values, or of so many that are spaced evenly."""
+    """Return the indices of all values, or of at most ``most`` evenly spaced ones."""
     return list(range(count)) if count <= most else sorted({round(place) for place in np.linspace(0, count - 1, most)})
 
 
 def span(low: float, high: float, margin: float = 0.05) -> tuple[float, float]:
-    """An axis range with a margin on both sides."""
+    """Return an axis range with a margin on both sides."""
     width = (high - low) or abs(high) or 1.0
     return low - margin * width, high + margin * width
 
 
 def spread(positions: Sequence[float], gap: float) -> np.ndarray:
-    """Positions at least ``gap`` apart, as close to the given ones as their order allows."""
+    """Return the positions moved to be at least ``gap`` apart, in the same order and as close as possible."""
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(len(positions))
-    # Of those that would be closer, as many as it takes share their mean.
+    # Isotonic regression: positions that would be too close are centered at their mean.
     groups: list[list[float]] = []
     for place in np.asarray(positions, dtype=np.float64)[order] - steps:
         groups.append([place])
@@ -347,14 +388,20 @@ def spread(positions: Sequence[float], gap: float) -> np.ndarray:
 
 
 def add_si_axes(ax: Axes, scale: tuple[float, float]) -> None:
-    """Read the normalized axes of an (alpha, beta) plane in SI units as well, at the top and the right."""
+    """Add axes in SI units at the top and the right of an (alpha, beta) plane.
+
+    ``scale`` is the pair of K at alpha = 1 and B at beta = 1.
+    """
     ax.spines[["top", "right"]].set_visible(True)
     ends, names = (ax.get_xlim()[1], max(map(abs, ax.get_ylim()))), ("N/m", "N s/m")
-    places: Any = ((ax.secondary_xaxis, "top", "stiffness  $K$"), (ax.secondary_yaxis, "right", "virtual damping  $B$"))
-    for (add, side, words), one, end, unit in zip(places, scale, ends, names, strict=True):
-        factor, spelled = si_unit(one * end, unit)
-        both = (lambda value, by=one * factor: value * by), (lambda value, by=one * factor: value / by)
-        add(side, functions=both).set(**{"xlabel" if side == "top" else "ylabel": f"{words}  in {spelled}"})
+    secondary_axes: Any = (
+        (ax.secondary_xaxis, "top", "stiffness  $K$"),
+        (ax.secondary_yaxis, "right", "virtual damping  $B$"),
+    )
+    for (add, side, words), si_per_unit, end, unit in zip(secondary_axes, scale, ends, names, strict=True):
+        factor, unit_text = si_unit(si_per_unit * end, unit)
+        both = (lambda value, by=si_per_unit * factor: value * by), (lambda value, by=si_per_unit * factor: value / by)
+        add(side, functions=both).set(**{"xlabel" if side == "top" else "ylabel": f"{words}  in {unit_text}"})
 
 
 def si_unit(values: Any, unit: str) -> tuple[float, str]:
@@ -364,7 +411,7 @@ def si_unit(values: Any, unit: str) -> tuple[float, str]:
     """
     unit, largest = units()[unit], float(np.nanmax(np.abs(values), initial=0.0))
     if not np.isfinite(largest) or largest <= 0 or unit == "sampling periods" or unit.startswith("1"):
-        # Of an inverse the prefix would be read as its unit's.
+        # An inverse unit gets no prefix, because it would seem to belong to the unit in the denominator.
         return 1.0, unit
     if unit == "kg":
         return (1.0, unit) if largest >= 1 else (1e3, "g")

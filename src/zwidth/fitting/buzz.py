@@ -8,7 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.buzz_search import AS_GOOD, EXACT, Candidate, RigidFit, find_device, find_edges, is_blind, weigh
+from zwidth.fitting.buzz_search import (
+    AS_GOOD,
+    EXACT,
+    Candidate,
+    RigidFit,
+    are_on_boundary,
+    find_device,
+    is_blind,
+    weigh,
+)
 from zwidth.fitting.buzzing import Onsets
 from zwidth.fitting.device_estimate import differentiate, find_stiffest
 from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FurtherExperiment, RivalDevice, doubt_period
@@ -20,20 +29,21 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
+from zwidth.words.units import read_share
 
 CHANCE = 0.003  # probability of refusing the walls of a rigid device
 ROUGH = 0.1  # largest standard deviation of K and f if the noise is not given
-ANGLES = 240  # frequencies of the boundary at which the next experiment is searched
+ANGLES = 240  # frequencies on the boundary that are candidates for the next experiment
 SAME = 1e-6  # dampings with a smaller relative difference count as one
 
 
 class BuzzPoint(NamedTuple):
-    """A wall at the onset of buzzing.
+    """A wall at the onset of instability.
 
     Args:
-        stiffness: K in N/m, raised at this damping until the wall buzzes.
+        stiffness: K in N/m, raised at this damping until the wall becomes unstable.
         virtual_damping: B in N s/m.
-        frequency: heard or measured, in Hz.
+        frequency: frequency of the oscillation in Hz, heard or measured.
     """
 
     stiffness: float
@@ -46,7 +56,7 @@ def fit_buzz(
     *,
     period: Any,
     velocity: Velocity | None = None,
-    noise: float | tuple[float, float] | None = None,
+    noise: float | str | tuple[float | str, float | str] | None = None,
     rotary: bool | None = None,
 ) -> DeviceFit:
     """Fit mass, damping and delay of a rigid device to walls at the onset of instability.
@@ -63,8 +73,9 @@ def fit_buzz(
             two dampings. Texts with units, such as "0.4 N m/rad", are allowed.
         period: T in s.
         velocity: the velocity estimate; the backward difference by default.
-        noise: relative standard deviation of K and f, one number or one for each. By default it is equal for both and
-            estimated from the residuals, which is inaccurate for two or three walls; identical walls then count once.
+        noise: relative standard deviation of K and f, as 0.02 or "2%", or one for each. By default it is equal for both
+            and estimated from the residuals, which is inaccurate for two or three walls; identical walls then count
+            once.
         rotary: True if K is in N m/rad and B in N m s/rad. By default, the units of the points decide; numbers without
             units are those of a linear device.
 
@@ -132,7 +143,7 @@ def fit_buzz(
         against = "these walls are not on the stability boundary of the fitted device; check K, B, f and the period"
     status = Status.NO_BOUNDARY if against else Status.OK
     slopes = weigh(onsets.follow(best.theta).slopes(), weights)
-    _refuse_blind(slopes, best.theta, table, bool(equals))
+    _refuse_blind(slopes, best.theta, table, bool(equals), system)
     information = slopes.T @ slopes / scale
     scene = chosen.scene(best.theta)
     by_theta = differentiate(lambda theta: onsets.normalize(theta).to_numbers(period), best.theta)
@@ -140,7 +151,7 @@ def fit_buzz(
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
     apart = [best.theta]
     for other in equals[1:] if status == Status.OK else ():
-        # Not along the flat floor of the same valley.
+        # Skip devices that differ from a listed one only along poorly determined directions.
         if all((away := other.theta - one) @ information @ away > AS_GOOD for one in apart):
             apart.append(other.theta)
     rivals = tuple(_describe_rival(chosen.scene(theta)) for theta in apart[1:])
@@ -183,7 +194,11 @@ def fit_buzz(
 def _read_points(
     points: Iterable[Any], period: float, copies_count_once: bool, system: UnitSystem
 ) -> tuple[np.ndarray, list[str]]:
-    """The walls as an array, and doubts; an impossible one is refused, and so are walls that cannot tell a device."""
+    """Return the walls as an array of shape (walls, 3), and warnings.
+
+    Raises:
+        InputError: a wall is invalid, or all walls have the same damping.
+    """
     if not isinstance(points, Iterable) or isinstance(points, str | dict):
         raise InputError(f"points: got {points!r}; give walls, each (K in N/m, B in N s/m, f in Hz)")
     rows, units = [], (system["N/m"], system["N s/m"], "Hz")
@@ -214,15 +229,13 @@ def _read_points(
         )
         rows = kept
     table = np.array(rows)
-    # A force over a velocity: the dampings that matter are of this size.
+    # Typical size of a virtual damping, K/w, for the comparison of the dampings.
     unit = table[0, 0] / (2 * np.pi * table[0, 2])
     if np.ptp(table[:, 1]) <= SAME * max(unit, np.abs(table[:, 1]).max()):
-        count = (
-            "one wall gives two equations for" if len(table) == 1 else f"{len(table)} walls of one damping cannot tell"
-        )
+        count = "one wall does" if len(table) == 1 else f"{len(table)} walls of one damping do"
         raise InputError(
-            f"points: {count} the three unknowns m, b and t_d; what is missing is a wall of another damping: raise K "
-            f"at B = {with_unit(table[0, 1] + 0.4 * unit, units[1], 2)}, say, until it buzzes"
+            f"points: {count} not determine m, b and t_d; add another damping: raise K at B = "
+            f"{with_unit(table[0, 1] + 0.4 * unit, units[1], 2)}"
         )
     return table, doubts
 
@@ -231,11 +244,12 @@ def _read_noise(noise: Any) -> tuple[float, float] | None:
     if noise is None:
         return None
     try:
-        pair = np.broadcast_to(np.asarray(noise, float), (2,))
-    except ValueError:
+        shares = [read_share(each) if isinstance(each, str) else each for each in np.ravel(np.array(noise, object))]
+        pair = np.broadcast_to(np.asarray(shares, float), (2,))
+    except (TypeError, ValueError):
         pair = np.zeros(2)
     if not np.all((pair > 0) & (pair < 1)):
-        raise InputError(f"noise: got {noise!r}; give the relative noise of K and f, as 0.02, or (0.03, 0.01)")
+        raise InputError(f"noise: got {noise!r}; give the relative noise of K and f, as 0.02, 2% or (0.03, 0.01)")
     return float(pair[0]), float(pair[1])
 
 
@@ -244,30 +258,49 @@ def _describe_rival(scene: Scene) -> RivalDevice:
 
 
 def _delay_beyond(slopes: np.ndarray, best: Candidate) -> float:
-    """Where the delay of the least squares would lie that is held at 0, in standard errors of walls of noise 1."""
+    """Return the least-squares delay of a fit whose delay is fixed at 0, in standard errors for unit noise."""
     inverse = np.linalg.pinv(slopes)[2]
     return float(inverse @ best.residuals.ravel() / np.linalg.norm(inverse))
 
 
-def _refuse_blind(slopes: np.ndarray, theta: np.ndarray, table: np.ndarray, on_edge: bool) -> None:
+def _refuse_blind(
+    slopes: np.ndarray, theta: np.ndarray, table: np.ndarray, on_boundary: bool, system: UnitSystem
+) -> None:
+    """Raise `InputError` if the walls do not determine mass, damping and delay.
+
+    Args:
+        slopes: weighted derivatives of the residuals in theta.
+        theta: parameters of the best device.
+        table: walls, shape (walls, 3).
+        on_boundary: the walls are on the stability boundary of that device.
+        system: units of the walls.
+    """
     if is_blind(slopes):
         dampings = ", ".join(f"{value:g}" for value in np.unique(table[:, 1]))
-        if not on_edge:
+        if not on_boundary:
             raise InputError(
-                "points: no device has these walls on the edge of its stable set; check K, B, f and the period, and at "
-                "each B raise K from far below until the wall begins to buzz"
+                "points: no device has these walls on its stability boundary; check K, B, f and period; raise K from "
+                "far below at each B"
             )
         raise InputError(
-            f"points: walls of B = {dampings} N s/m cannot tell m, b and t_d apart"
-            + (f", the mass hardly counts beside the damping (b T/m = {plain(theta[1], 2)})" if theta[1] > 3 else "")
-            + "; what is missing is a wall of a damping farther away"
+            f"points: B = {dampings} {system['N s/m']} do not determine m, b and t_d"
+            + (f" (large b T/m = {plain(theta[1], 2)})" if theta[1] > 3 else "")
+            + "; add a clearly different B"
         )
 
 
 def _further(
     chosen: RigidFit, stiffest: float, information: np.ndarray, wanted: np.ndarray, precision: np.ndarray
 ) -> FurtherExperiment | None:
-    """Return the wall on the boundary of the device, B >= 0, that reduces the error of K_max most."""
+    """Return the wall with B >= 0 on the boundary of the device that reduces the error of K_max most; None without one.
+
+    Args:
+        chosen: the fit.
+        stiffest: K_max.
+        information: information matrix of theta from the measured walls.
+        wanted: derivatives of K_max in theta.
+        precision: inverse variances of ln K and ln f.
+    """
     onsets, theta = chosen.onsets, chosen.best.theta
     scene, period = chosen.scene(theta), onsets.period
     w = np.linspace(0.0, np.pi, ANGLES + 2)[1:-1]
@@ -276,7 +309,7 @@ def _further(
     stiffness, damping = scene.boundary(w / period)
     # Walls softer than a tenth of K_max are hard to measure.
     real = (damping >= 0) & (stiffness > 0.1 * stiffest)
-    real[real] = find_edges(scene, stiffness[real], damping[real])
+    real[real] = are_on_boundary(scene, stiffness[real], damping[real])
     if not real.any():
         return None
     stiffness, damping, w = stiffness[real], damping[real], w[real]

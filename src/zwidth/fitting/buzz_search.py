@@ -10,25 +10,26 @@ import numpy as np
 from zwidth.fitting.buzzing import Followed, Onsets
 from zwidth.scenes.scene import Scene
 
-AS_GOOD = 5.99  # a device fits equally well if the sum of squares rises by less, in units of the noise variance
-EXACT = 1e-12  # relative noise below that of any measurement, to distinguish exact walls from equal ones
-BESIDE = 1e-6  # the boundary is between walls that are softer and stiffer by this share
+AS_GOOD = 5.99  # devices fit equally well if their sums of squares differ by less, in noise variances
+EXACT = 1e-12  # lower limit of the estimated relative noise, below that of any measurement; for exact walls
+BESIDE = 1e-6  # relative change of K on both sides of the boundary at which stability is checked
 DELTAS = np.geomspace(1e-4, 30.0, 45)  # initial values of b T/m; lower ones are added for low frequencies
-STARTS = 6  # number of initial values
+STARTS = 6  # largest number of initial values
 BLIND = 1e6  # condition number above which the parameters are not identifiable
-# Tolerances of the first search and of the final one, and their most function evaluations
-NEARLY, CONVERGED, MOST_STEPS = 1e-4, 1e-12, (100, 40)
+NEARLY = 1e-4  # relative tolerance of the first search from an initial value
+CONVERGED = 1e-12  # relative tolerance of the final search
+MOST_STEPS = (100, 40)  # largest number of function evaluations of a final and of a first search
 NAMES = ("mass", "damping", "delay")
 
 
 class Candidate(NamedTuple):
-    """A local optimum: theta, sum of squares, residuals, parameters fixed at 0, and if all walls were found."""
+    """A local minimum of the weighted sum of squares."""
 
-    theta: np.ndarray
+    theta: np.ndarray  # (ln m, delta, d)
     squares: float
-    residuals: np.ndarray
-    held: tuple[str, ...]
-    found: bool
+    residuals: np.ndarray  # weighted, shape (walls, 2)
+    held: tuple[str, ...]  # names of the parameters fixed at 0
+    found: bool  # the device has a wall for each measured one
 
 
 def weigh(slopes: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -53,7 +54,7 @@ def _list_dampings(onsets: Onsets) -> np.ndarray:
 def _solve(
     onsets: Onsets, weights: np.ndarray, start: np.ndarray, held: tuple[int, ...], tolerance: float = CONVERGED
 ) -> Candidate:
-    """Return the local optimum near a start, with the parameters ``held`` fixed at 0."""
+    """Return the local minimum near an initial value, with the parameters at the indices ``held`` fixed at 0."""
     from scipy.optimize import least_squares
 
     free = [k for k in range(3) if k not in held]
@@ -68,7 +69,7 @@ def _solve(
         walls = onsets.follow(at)
         ratios = np.stack([np.log(walls.kappa / onsets.kappa), np.log(walls.w / onsets.w)], -1)
         good = walls.found & np.all(np.isfinite(ratios), -1)
-        # Use a large constant residual if no such wall is found.
+        # Assign a large constant residual to a measured wall for which the device has none.
         return at, np.where(good[:, None], ratios, 10.0) * weights, walls, good
 
     @np.errstate(all="ignore")
@@ -94,7 +95,7 @@ def _solve(
 
 
 def _refine(onsets: Onsets, weights: np.ndarray, near: Candidate, start: np.ndarray) -> list[Candidate]:
-    """Return the local optimum; if damping or delay would be negative, the optima with these fixed at 0."""
+    """Return the local minimum; if its damping or delay is negative, the minima with one or both fixed at 0."""
     if near.found:
         free = _solve(onsets, weights, near.theta, ())
         if min(free.theta[1:3]) >= 0:
@@ -104,7 +105,7 @@ def _refine(onsets: Onsets, weights: np.ndarray, near: Candidate, start: np.ndar
 
 
 class RigidFit(NamedTuple):
-    """The best rigid device, and all that fit equally well; none if no device has the walls on its boundary."""
+    """The best rigid device, and all that fit equally well: none if no device has the walls on its boundary."""
 
     onsets: Onsets
     best: Candidate
@@ -113,7 +114,7 @@ class RigidFit(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """The variance of the walls in units of the weights."""
+        """Noise variance of the weighted residuals: 1 if the noise is given; otherwise estimated."""
         return 1.0 if self.known_noise else max(self.best.squares / self.freedom, EXACT**2)
 
     @property
@@ -122,13 +123,13 @@ class RigidFit(NamedTuple):
         return 2 * self.onsets.w.size - 3
 
     def scene(self, theta: np.ndarray) -> Scene:
-        """Return the loop of one of the devices."""
+        """Return the loop of a device theta."""
         return self.onsets.normalize(theta).to_scene(self.onsets.period, self.onsets.velocity, self.onsets.system)
 
 
 def find_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> RigidFit:
     """Return the best rigid device, and all others that fit equally well."""
-    # Half a turn by the delay, plus a reserve for noise.
+    # In a stable loop the delay changes the phase by at most pi; add 20 % for noise.
     longest = 1.2 * np.pi / float(onsets.w.max())
     starts = onsets.starts(_list_dampings(onsets), longest, STARTS)
     near = sorted(((_solve(onsets, weights, start, (), NEARLY), start) for start in starts), key=lambda x: x[0].squares)
@@ -150,15 +151,15 @@ def find_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> Rigid
 
 @np.errstate(all="ignore")
 def _is_onset(fit: RigidFit, each: Candidate) -> bool:
-    """Return whether stability ends at the fitted walls as K rises; on other lobes it has ended at lower K."""
+    """Return whether stability ends at the fitted walls; the boundary curve also runs through the unstable region."""
     onsets = fit.onsets
     kappa, period = onsets.follow(each.theta).kappa, onsets.period
     if not np.all(kappa > 0):
         return False
-    return bool(np.all(find_edges(fit.scene(each.theta), kappa / period**2, onsets.rub / period)))
+    return bool(np.all(are_on_boundary(fit.scene(each.theta), kappa / period**2, onsets.rub / period)))
 
 
-def find_edges(scene: Scene, stiffness: np.ndarray, virtual_damping: np.ndarray) -> np.ndarray:
-    """Return which walls are stable if slightly softer and unstable if slightly stiffer."""
+def are_on_boundary(scene: Scene, stiffness: np.ndarray, virtual_damping: np.ndarray) -> np.ndarray:
+    """Return a mask of the walls that are stable if slightly softer and unstable if slightly stiffer."""
     softer = scene.is_stable(stiffness * (1 - BESIDE), virtual_damping)
     return softer & ~scene.is_stable(stiffness * (1 + BESIDE), virtual_damping)

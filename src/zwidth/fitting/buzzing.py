@@ -23,31 +23,31 @@ from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate, Velocity
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
-# Newton's method for w, relative to w
-STEPS = 25  # most iterations
-LONGEST = 0.15  # longest step
-CONVERGED = 1e-9  # last step; convergence is quadratic
-FOUND = 1e-6  # a longer last step means that no solution was found
+# Newton iteration that solves the imaginary part of the equation for the frequency w, in rad per sample.
+STEPS = 25  # largest number of iterations
+LONGEST = 0.15  # largest step, relative to w, so that the iteration stays close to the measured frequency
+CONVERGED = 1e-9  # relative step at which the iteration ends; because convergence is quadratic, w is then exact
+FOUND = 1e-6  # largest relative last step of a solution
 
 
 class Followed(NamedTuple):
-    """kappa and w of the walls of a device, if w converged, and the function that differentiates ln kappa and ln w."""
+    """Walls of a device at the measured dampings."""
 
-    kappa: np.ndarray
-    w: np.ndarray
-    found: np.ndarray
-    slopes: Callable[[], np.ndarray]  # shape (walls, 2, 3)
+    kappa: np.ndarray  # K T^2, kg
+    w: np.ndarray  # rad per sample
+    found: np.ndarray  # mask of the walls for which the iteration converged
+    slopes: Callable[[], np.ndarray]  # returns the derivatives of ln kappa and ln w in theta, shape (walls, 2, 3)
 
 
 @dataclass(frozen=True)
 class Onsets:
-    """Measured walls: ``kappa = K T^2`` in kg, ``rub = B T`` in kg and w; velocity estimate and period of the loop."""
+    """Measured walls, and the velocity estimate and period of their loop."""
 
-    kappa: np.ndarray
-    rub: np.ndarray
-    w: np.ndarray
+    kappa: np.ndarray  # K T^2, kg
+    rub: np.ndarray  # B T, kg
+    w: np.ndarray  # rad per sample
     velocity: Velocity
-    period: float
+    period: float  # s
     system: UnitSystem = LINEAR
 
     @cached_property
@@ -68,7 +68,7 @@ class Onsets:
             rest, slope = (self.rub * f.value - mass * q.value).imag, (self.rub * f.slope - mass * q.slope).imag
             step = np.clip(-rest / slope, -LONGEST * w, LONGEST * w)
             w = np.minimum(w + step, 0.5 * (w + np.pi))
-            # A step that is NaN stays NaN.
+            # Do not iterate on walls whose step is NaN, because it stays NaN.
             if not np.any(np.abs(step) > CONVERGED * w):
                 break
         at = circle(w)
@@ -85,8 +85,14 @@ class Onsets:
         return Followed(kappa, w, np.abs(step) <= FOUND * w, differentiate)
 
     def starts(self, deltas: np.ndarray, longest: float, count: int) -> list[np.ndarray]:
-        """Return initial values of theta: the lowest minima over damping and delay, with the mass in closed form."""
-        # The mass is the mean of the magnitudes. In a stable loop the delay turns the phase by at most half a turn.
+        """Return initial values of theta: the lowest local minima of the squared errors of the complex equation.
+
+        Args:
+            deltas: grid of delta.
+            longest: largest d of the grid of delays.
+            count: largest number of initial values.
+        """
+        # For each delta and d, the least squares of the logarithmic errors determine ln m: the mean of the real parts.
         from scipy.ndimage import minimum_filter
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)

@@ -1,4 +1,4 @@
-"""Which device a log asks for: a rigid one, or with an amplifier's lag and resonances, by Schwarz's criterion."""
+"""Selection of the structure of a device by Schwarz's criterion: rigid, or with an actuator lag and resonances."""
 
 from __future__ import annotations
 
@@ -13,34 +13,39 @@ from zwidth.fitting.hidden_lag import LagTest, score_lags
 from zwidth.fitting.output_error import CLOSELY, NEARLY, FittedModel, refine, settle
 from zwidth.fitting.structure import Recordings
 
-# So many parts, lags and resonances, are added at most; so many positions of each log tell which one.
-_MOST, _TOLD = 4, 2500
-# Steps from every start, and then from the best one of each kind of device.
-_BEGUN, _COMPARED = 20, 40
-# Sums of what the fit leaves may spread so many times more than noise's, before it is doubted.
-ALIKE = 1.5
-# Smaller residuals, as a share of the way moved, are rounding.
-EXACT = 1e-9
-# What two numbers more explain of noise in 19 of 20 cases.
-_BY_CHANCE = 5.99
-# Time constants that lags are started from, in periods; a second order's damping ratio.
-_LAGS, _RATIO = (0.3, 1.5), 0.7
-# So many resonances are started from, their frequencies so far apart.
-_PARTED, _APART = 2, float(np.exp(0.2))
+_MOST = 4  # largest number of parts that are added: orders of the actuator lag, and resonances
+_TOLD = 2500  # positions of each log with which the candidates are compared
+_BEGUN = 20  # iterations from each initial value
+_COMPARED = 40  # further iterations of the best candidate of each structure
+ALIKE = 1.5  # largest excess (`FittedModel.excess`) of residuals that count as white noise
+EXACT = 1e-9  # residuals below this size, relative to the range of positions, are rounding errors
+_BY_CHANCE = 5.99  # reduction of -2 log(likelihood) by two superfluous parameters, exceeded with probability 5 %
+# Initial values of actuator lags.
+_LAGS = (0.3, 1.5)  # time constants, in periods
+_RATIO = 0.7  # damping ratio of a second-order lag
+# Initial values of resonances.
+_PARTED = 2  # number of initial frequencies
+_APART = float(np.exp(0.2))  # least ratio of two initial frequencies
 
 Choice = tuple[FittedModel, HiddenPole | None, PoleBank | None, LagTest | None]
 
 
 def choose_structure(best: FittedModel) -> Choice:
-    """Add what explains the residuals best as long as they show a pole; then what they still show, and of lags."""
-    # Where that leaves no noise, parts explain nothing: then the rigid device with what its residuals show.
+    """Add actuator lags and resonances to a rigid device as long as the residuals require them.
+
+    If the residuals of the final model are not white noise, the rigid device is returned.
+
+    Returns:
+        The selected model, the pole that it still lacks or that it may have instead of its lag, the scores of all
+        poles, and the test for lags; None for what was not found or not tested.
+    """
     way = max(float(np.ptp(log.position)) for log in best.model.logs)
     if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * way**2:
         return best, None, None, None
     rigid = best, pole, bank, lags = _look(best)
     rival = None
     for _ in range(_MOST):
-        # A lag has no size of its own, and so is seen where a pole of any size is not.
+        # The signature of a lag has a known amplitude, so its test can detect a lag that the score of a pole does not.
         late = lags is not None and lags.projection.max() ** 2 > 2.0 * np.log(best.count)
         if bank is None or rival or (pole is None and not late):
             break
@@ -56,15 +61,17 @@ def choose_structure(best: FittedModel) -> Choice:
 
 
 def _look(best: FittedModel) -> Choice:
-    """What the residuals show; of lags where they show no pole and the device has none."""
+    """Test the residuals for missing poles; without any, and if the model has no lag, also for lags."""
     pole, bank = detect_missing_pole(best)
     return best, pole, bank, None if pole or best.model.lag else score_lags(best)
 
 
 def _grow(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, HiddenPole | None]:
-    """The likeliest device with one part more, None where none is as likely as without; and what else it may be."""
-    # A resonance that a log hardly shows looks like a lag, which has fewer numbers, but quite another K_max. So a lag
-    # is doubted where the further numbers of a resonance explain more than chance does.
+    """Return the best model with one part more, and a resonance that may replace its lag.
+
+    The model is None if Schwarz's criterion prefers the present one. A weak resonance resembles a lag, which has fewer
+    parameters, but a very different K_max. Therefore the resonance is returned if it fits significantly better.
+    """
     begun: dict[tuple[int, int], tuple[float, Recordings, np.ndarray]] = {}
     for lag, modes, start in _start(best, bank):
         model = replace(best.model, lag=lag, modes=modes).begin(_TOLD)
@@ -74,7 +81,7 @@ def _grow(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, Hidden
     tried = []
     for _, model, start in begun.values():
         theta, squares, _ = refine(model, start, (), _COMPARED, CLOSELY)
-        # -2 times its logarithmic likelihood, and Schwarz's criterion.
+        # Schwarz's criterion: -2 log(likelihood) plus log(count) per parameter.
         misfit = model.measured.size * np.log(squares)
         tried.append((misfit + theta.size * np.log(model.measured.size), misfit, model, theta))
     _, least, model, theta = min(tried, key=lambda trial: trial[0])
@@ -91,7 +98,7 @@ def _grow(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, Hidden
 
 
 def _start(best: FittedModel, bank: PoleBank) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Devices with one part more: the amplifier's order, how many modes, and theta to begin with."""
+    """Yield models with one part more: the order of the lag, the number of modes, and the initial theta."""
     model, theta = best.model, best.theta
     lag, modes, logs, first = model.lag, model.modes, len(model.logs), model.parts.stop
     if lag == 0:

@@ -91,21 +91,22 @@ def read_log(
     """Read the time, the position and the force of a log.
 
     Args:
-        file: columns between commas, semicolons, tabs or blanks, in UTF-8, UTF-16 or Latin-1, packed by gzip or not,
-            with a preamble and a line of units or not; of NumPy, .npz or .npy; of MATLAB, .mat up to version 7.
-        columns: the column of ``time``, ``position`` and ``force`` by its header, or its header without the unit, or
-            its number where a file has no names; ``COLUMN:unit`` where the header has none, or a wrong one. Of what is
-            left out the column is found by its name. Times may be those of a calendar, ISO 8601. A position in m/s,
-            rad/s or counts/s is summed up: of a velocity that is the difference of two positions, and not filtered.
-        resolution: of the encoder, a length or an angle with its unit, for one count; a number is in m, or in rad with
-            a torque.
-        period: of the samples, in s, where the time is not to be read.
+        file: a text file, also compressed by gzip: columns separated by commas, semicolons, tabs or blanks, in UTF-8,
+            UTF-16 or Latin-1, with or without a preamble and a line of units; a NumPy file, .npz or .npy; or a MATLAB
+            file, .mat up to version 7.
+        columns: the columns of ``time``, ``position`` and ``force``: the header, with or without its unit, or the
+            number of the column if the file has no headers. ``COLUMN:unit`` replaces the unit of the header. Omitted
+            columns are recognized by their headers. Times may be dates in ISO 8601. A column in m/s, rad/s or counts/s
+            is summed to a position; it must be the unfiltered difference of successive positions.
+        resolution: encoder step, a length or an angle with its unit per count; a number is in m, or in rad with a
+            torque.
+        period: sampling period in s; the times are not read.
         usual_period: sampling period in s, used if no column of times is recognized.
-        motor_constant: what a force in A or mA is multiplied with, as "5 N/A" or "0.03 N m/A".
+        motor_constant: factor from a current in A or mA to a force, as "5 N/A" or "0.03 N m/A".
 
     Raises:
-        InputError: a column is missing, or may be several; a unit is unknown; a cell holds no number; a length is
-            paired with a torque; a column of times with their unit contradicts the period.
+        InputError: a column is missing or ambiguous, a unit is unknown, a cell is not a number, a length is combined
+            with a torque, or times with a unit contradict the period.
     """
     table = read_columns(Path(file))
     heads = table.heads

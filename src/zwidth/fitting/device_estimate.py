@@ -53,14 +53,14 @@ class DimensionlessDevice(NamedTuple):
 
     @classmethod
     def of_numbers(cls, values: np.ndarray, period: float, lag: int) -> DimensionlessDevice:
-        """The device of such numbers, along the first axis of ``values``; ``lag`` is an amplifier's order."""
+        """Return the device with the parameters along the first axis of ``values``; ``lag`` is the order of its lag."""
         mass, modes = values[0], values[3 + lag :].reshape(-1, 3, *values.shape[1:])
         ringing = [(2.0 * np.pi * period * hertz, ratio, mass / own) for hertz, ratio, own in modes]
         delays = [part / unit for part, unit in zip(values[3 : 3 + lag], [period, 1.0], strict=False)]
         return cls(mass, values[1] / (mass / period), values[2] / period, delays, ringing)
 
     def to_scene(self, period: float, velocity: Velocity, system: UnitSystem = LINEAR) -> Scene:
-        """Return the scene of the device, without a wall."""
+        """Return the loop of the device, without a wall."""
         lag, (mass, damping, delay, *beside) = len(self.lag), map(float, self.to_numbers(period))
         constant, *ratio = beside[:lag] or [None]
         actuator = Actuator(None, constant, lag, *ratio) if lag else None
@@ -120,7 +120,7 @@ class DeviceEstimate:
 
     @property
     def is_structured(self) -> bool:
-        """Whether it is more than a rigid mass: by an amplifier, or by resonances."""
+        """True if the device has an actuator lag or resonances."""
         return self.actuator is not None or bool(self.modes)
 
     @property

@@ -1,14 +1,15 @@
-"""What an encoder adds to a position, and how far estimates are off for it.
+"""Errors of encoder positions, and the covariance of estimates from such positions.
 
-An encoder of the step q reads q round(y/q) of y = x + n, n noise of the deviation sigma. Its error is a saw of y: over
-the unknown zero of the encoder, errors of two samples correlate as
+An encoder with step q returns q round(y/q) with y = x + n, the position x and noise n of standard deviation sigma. Its
+error e is a sawtooth function of y. Averaged over the unknown zero of the encoder, two samples have the covariance
 
     E[e_i e_k] = sum_h w_h cos(2 pi h (x_i - x_k)/q),    w_h = q^2/(2 pi^2 h^2) exp(-(2 pi h sigma/q)^2),
 
-so samples of a slow motion err alike. Neither knows of n, so that the variance of a sample is sigma^2 + q^2/12.
+so the errors of a slow motion are autocorrelated. Averaged over the zero, e is not correlated with n; therefore the
+variance of one sample is sigma^2 + q^2/12.
 
-Samples of a rest all err the same: least squares that took them for thousands of errors would follow that one. So the
-mean of a stretch that stays within a step counts by its own variance.
+At rest, all samples have the same error. Least squares with independent errors would fit this error. Therefore the mean
+of each stretch within one step is weighted by its own variance.
 """
 
 from __future__ import annotations
@@ -19,21 +20,23 @@ from functools import cached_property
 
 import numpy as np
 
-# Waves of the saw that are followed; the others are taken for white, 1.6 % of its variance.
-_WAVES, _LEAST = 40, 1e-6
-# Lattices of positions.
-_OFF = 0.02  # largest distance of a position from whole steps, in steps
-_EXACT = 1e-4  # the same for a column that is rounded to whole steps, which leaves only rounding errors of float64
-_ROUNDINGS = 5.0  # least encoder step, in steps of the rounded column; finer ones are not distinguished from it
+# Fourier series of the covariance.
+_WAVES = 40  # terms h that are computed; the rest, about 1.5 % of q^2/12, counts as white noise
+_LEAST = 1e-6  # smallest weight w_h, relative to the variance of a sample; the series ends there
+# Detection of the step, of which all positions are integer multiples except for a common offset.
+_OFF = 0.02  # largest distance of a position from a multiple, in steps
+_EXACT = 1e-4  # the same for the rounding step of a column, with rounding errors of float64 only
+_ROUNDINGS = 5.0  # least encoder step, in rounding steps of the column; finer ones are not distinguished from these
 _MOST = 1e7  # largest range of positions, in steps
-_CHANCE = 1e-6  # largest probability that positions which are no whole steps look like ones
-_PICKS = 100  # positions that refine a step
+_CHANCE = 1e-6  # largest probability that random positions are as close to multiples
+_PICKS = 100  # positions that refine the estimate of a step
 
 
 def find_steps(position: np.ndarray) -> tuple[float, float]:
-    """Return the encoder step and the step of the column, as of an angle in degrees with three decimals.
+    """Return the encoder step and the rounding step of the column; 0 for a step that does not exist.
 
-    Both are equal if the column has encoder counts; 0 if there is no such step.
+    An angle printed in degrees with three decimals has the rounding step 0.001 deg. Both steps are equal if the column
+    contains encoder counts.
     """
     values = np.unique(position)
     # Subtracting a common offset leaves errors of the size of the spacing of float64.
@@ -43,27 +46,31 @@ def find_steps(position: np.ndarray) -> tuple[float, float]:
 
 
 def find_resolution(position: np.ndarray) -> float:
-    """Return the encoder step, of which all positions are whole multiples except for a common offset; 0 if none."""
+    """Return the encoder step, of which all positions are integer multiples except for a common offset; 0 if none."""
     return find_steps(position)[0]
 
 
 def _find_lattice(values: np.ndarray, off: float, slack: float) -> float:
-    """Return the largest step whose whole multiples are all values, 0 if there is none, by Euclid's algorithm.
+    """Return the largest step of which all values are integer multiples, except for a common offset; 0 if none.
+
+    Applies Euclid's algorithm to the differences of neighboring values, with tolerances.
 
     Args:
-        values: positions, sorted, each once.
-        off: largest distance of a value from a whole multiple, in steps.
-        slack: largest distance in SI units, if that is more; steps below ``_ROUNDINGS`` times of it do not count.
+        values: sorted positions without duplicates.
+        off: largest distance of a value from a multiple, in steps.
+        slack: largest distance in SI units, if larger than ``off`` steps. Steps below ``_ROUNDINGS * slack`` are not
+            searched for.
     """
     gaps = np.diff(values)
     if gaps.size < 2:
         return float(gaps.sum())
-    gaps = gaps[gaps > 2.0 * slack]  # smaller ones are rounding errors of equal positions
+    gaps = gaps[gaps > 2.0 * slack]  # smaller gaps are rounding errors of equal positions
     span, rest = float(np.ptp(values)), gaps
     picks = (values - values[0])[np.unique(np.geomspace(1, values.size - 1, _PICKS).astype(int))]
     while rest.size and span <= _MOST * (least := float(rest.min())) and least >= (_ROUNDINGS - 1.0) * slack:
         step = smallest = float(np.mean(rest[rest <= least + 2.0 * slack]))
-        # Refine by ever larger distances, because rounding errors of small ones are large relative to them.
+        # Refine the step from distances of n steps in ascending order: their rounding error is divided by n, but n is
+        # known only if the step is accurate enough.
         for way in picks.tolist():
             step = way / max(1.0, np.round(way / step))
         chance = (2.0 * max(off, slack / step)) ** (values.size - 1)
@@ -75,23 +82,26 @@ def _find_lattice(values: np.ndarray, off: float, slack: float) -> float:
 
 
 def fits_steps(position: np.ndarray, step: float, off: float = _OFF, slack: float = 0.0) -> bool:
-    """Return whether positions are whole multiples of a step, except for a common offset."""
+    """Return whether positions are integer multiples of a step, except for a common offset."""
     ratios = (position - position[0]) / step
     return bool(np.all(np.abs(ratios - np.round(ratios)) <= max(off, slack / step)))
 
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """Of positions that are where ``position`` says, of this variance a sample, read with steps of ``resolution``."""
+    """Noise of logged positions: white noise plus the quantization error of an encoder."""
 
-    position: np.ndarray
-    variance: float
-    resolution: float
+    position: np.ndarray  # x of each sample
+    variance: float  # of a sample, sigma^2 + q^2/12
+    resolution: float  # encoder step q; 0 for white noise only
 
     @cached_property
     def _rests(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Samples of stretches within a step that err alike; where among them each begins, and how many it has."""
-        # Last, how many times white noise's variance their means have.
+        """The stretches within one encoder step whose mean has a larger variance than that of white noise.
+
+        Four arrays: indices of the samples of all these stretches; and for each stretch its offset in that array, its
+        number of samples, and the variance of its mean divided by that of white noise.
+        """
         starts, first = [], np.inf
         for k, place in enumerate(self.position.tolist()):
             if not abs(place - first) < self.resolution:
@@ -106,11 +116,11 @@ class MeasurementNoise:
 
     @property
     def count(self) -> int:
-        """How many samples of white noise have squares as large as these, weighed."""
+        """Number of samples of white noise with the same expected sum of squares as the weighted samples."""
         return int(self.position.size + np.sum(1.0 - self._rests[-1]))
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Columns over samples in which the mean of every stretch is so small that it counts by its own variance."""
+        """Return columns over samples, with the mean of each stretch of `_rests` scaled to white noise."""
         rows, starts, sizes, alike = self._rests
         if not rows.size:
             return columns
@@ -119,7 +129,7 @@ class MeasurementNoise:
         return weighed
 
     def spread(self, slopes: np.ndarray) -> np.ndarray:
-        """``J^T C J`` for columns J, with C the covariance of the samples."""
+        """Return ``J^T C J`` for columns J, with the covariance C of the samples."""
         plain = slopes.T @ slopes
         total = self.variance * plain
         for wave, weight in self._waves():
@@ -128,16 +138,16 @@ class MeasurementNoise:
         return total
 
     def spread_each(self, columns: np.ndarray) -> np.ndarray:
-        """The diagonal of `spread`."""
+        """Return the diagonal of `spread`."""
         plain = np.sum(columns**2, 0)
         total = self.variance * plain
         for wave, weight in self._waves():
-            # Real and imaginary parts, for a product with complex numbers would copy the columns as such.
+            # Use real and imaginary parts, because a complex product would convert the columns to complex numbers.
             total = total + weight * (np.sum((columns.T @ wave.view(float).reshape(-1, 2)) ** 2, 1) - plain)
         return total
 
     def spread_of_sums(self, count: int, weights: MeasurementNoise) -> float:
-        """The mean square of sums of ``count`` neighbors, weighed as those of other positions would be."""
+        """Return the mean square of sums of ``count`` neighboring samples, after they are weighted by ``weights``."""
         starts = np.arange(0, self.position.size - count + 1, count)
         total = self.variance * count
         for wave, weight in self._waves():
@@ -146,7 +156,7 @@ class MeasurementNoise:
         return total
 
     def _waves(self) -> Iterator[tuple[np.ndarray, float]]:
-        """``e^(2 pi j h x/q)`` and w_h, as long as they count."""
+        """Yield ``e^(2 pi j h x/q)`` and w_h for h = 1, 2, ... until w_h is negligible."""
         if not self.resolution:
             return
         sigma = np.sqrt(max(0.0, self.variance / self.resolution**2 - 1.0 / 12.0))

@@ -22,7 +22,7 @@ _LAGS, _SHARE = 60, 0.25
 
 
 def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = ()) -> dict[str, dict[str, Any]]:
-    """Every table of a fit, as `zwidth.figures.draw_device_fit` takes them."""
+    """Return all tables of a fit, in the form that `zwidth.figures.draw_device_fit` requires."""
     found: dict[str, dict[str, Any]] = {}
     for name, table in (("boundary", trace_boundary(fit)), ("walls", tabulate_walls(fit, points))):
         rows = next(iter(table.values())).size
@@ -33,7 +33,7 @@ def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = (
 
 
 def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
-    """Every sample of the logs: measured, modelled, and what is left."""
+    """Return the measured position, the modeled position and the residual of every sample."""
     logs = [np.full(motion.time.size, k, int) for k, motion in enumerate(fit.motions, start=1)]
     names = {"force": "force", "position": "position", "modelled": "position"}
     units = {"time": "s"} | {name: unit_of(quantity, fit.unit_system) for name, quantity in names.items()}
@@ -44,7 +44,7 @@ def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
-    """Autocorrelation of the residuals over the lag, all logs together, with the 95 % band of white noise."""
+    """Return the autocorrelation of the residuals of all logs over the lag, with the 95 % band of white noise."""
     rests = [motion.position - motion.modelled for motion in fit.motions]
     rests = [rest[np.isfinite(rest)] for rest in rests]
     most = int(min(_LAGS, *(_SHARE * rest.size for rest in rests)))
@@ -59,9 +59,11 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
-    """The stiffest stable wall at each damping B >= 0, and between which stiffnesses it lies with 95 %."""
-    # The band is pointwise: the quantiles of devices drawn around the estimate, by a fixed seed; NaN where the records
-    # leave the device open. A damping at which a device has no stable wall counts as 0.
+    """Return the largest stable stiffness at each damping B >= 0, with its pointwise 95 % interval.
+
+    The interval is computed from random devices around the estimate; NaN if the records do not determine the device. A
+    device without a stable wall at a damping counts as stiffness 0.
+    """
     outlines = fit.nominal.stable_region()
     if not outlines:
         raise InputError("scene: no wall of the fitted device is stable; measure again")
@@ -82,13 +84,15 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Up to which stiffness every softer wall is stable, for devices, a row each, and dampings; 0 where none is."""
+    """Return the stiffness up to which all walls are stable, a row per device, a column per damping; 0 if none."""
     return fit.nominal.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).row_ends(damping)
 
 
 def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str, np.ndarray]:
-    """The stiffest wall, the one to set, and walls that buzzed: errors, frequencies, and distances from the fit."""
-    # Distances are in units of the noise, stiffness and frequency apart.
+    """Return the stiffest, the recommended and the measured walls, with errors, frequencies and residuals.
+
+    The residuals of stiffness and frequency are in units of their noise.
+    """
     top, choice, lost = fit.nominal.max_stiffness(), fit.recommended, (np.nan,) * 4
     rows: list[tuple[Any, ...]] = [("stiffest", float(top.stiffness), float(top.virtual_damping), *lost)]
     rows += [] if choice.status != Status.OK else [("set", choice.stiffness, choice.virtual_damping, *lost)]

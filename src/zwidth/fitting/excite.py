@@ -1,7 +1,8 @@
-"""A force to play from which `zwidth.respond` finds a response: sines, dense and strong where walls are decided.
+"""Design of a multisine force for the measurement of a frequency response with `zwidth.respond`.
 
-The record has five stretches of three equal periods, each with other phases: the first period of each dies away, and
-what the stretches leave of one another is the error.
+The frequencies are dense, and the amplitudes large, where the response decides the stability of walls. The record has
+five stretches with different phases. Each consists of three equal periods, of which the first contains the transient.
+The differences between the stretches yield the standard errors.
 """
 
 from __future__ import annotations
@@ -26,37 +27,38 @@ from zwidth.words.quantities import POSITIVE
 from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
-# Stretches of other phases, and periods of each.
-_STRETCHES, _PERIODS = 5, 3
-# Lines lie so far apart, as a share of their frequency, where nothing is known; and up to this share of half the rate.
-_SPACING, _HIGHEST = 0.006, 0.98
-# The lowest line, in Hz, and as lines of a period at least.
-_LOWEST, _FIRST = 1.0, 3
-# Below this frequency, in Hz, less force keeps the motion within reach.
-_SOFT = 20.0
-# What share of the distance to the edge the gap between lines may take, and the weakest line of the strongest.
-_GAP, _WEAKEST = 0.03, 0.01
-# The walls for which the second record is made, of the stiffest.
-_SHARES = np.linspace(0.3, 0.9, 7)
-# Steps towards a small peak, and where each cuts, of the peak.
-_CLIPS, _CUT = 60, 0.75
-_FEWEST_SAMPLES = 600
+_STRETCHES = 5  # stretches with different phases
+_PERIODS = 3  # periods per stretch
+# Frequency grid.
+_SPACING = 0.006  # spacing relative to the frequency, without a response
+_HIGHEST = 0.98  # highest frequency, relative to the Nyquist frequency
+_LOWEST = 1.0  # Hz; lowest frequency
+_FIRST = 3  # lower limit of the lowest frequency, in cycles per period
+_SOFT = 20.0  # Hz; amplitudes below this frequency are reduced to limit the motion
+# Second record, designed from a response.
+_GAP = 0.03  # largest uncertainty between two frequencies, relative to the distance from instability
+_WEAKEST = 0.01  # smallest amplitude, relative to the largest
+_SHARES = np.linspace(0.3, 0.9, 7)  # stiffnesses of the walls for which it is designed, relative to the largest
+# Reduction of the peaks of the force.
+_CLIPS = 60  # iterations
+_CUT = 0.75  # clipping level, relative to the peak
+_FEWEST_SAMPLES = 600  # least number of samples per period
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """A force to play, sample by sample, and what it will tell.
+    """A force to command sample by sample, and the expected accuracy of the measured response.
 
     For a rotary device, forces are torques in N m, and rad replaces m.
 
     Attributes:
-        force: in N, one number a sample.
-        period: of the samples, in s.
-        cycle: after which the force repeats within a stretch, in s.
-        frequency, amplitude: of its lines, in Hz and N.
-        deviation: expected of each line, in m/N.
-        expected: with a response to start from: the safe wall that the record should tell, a `StiffestWall`.
-        limit: with a response: the stiffest wall of that response itself.
+        force: force in N at each sample.
+        period: sampling period in s.
+        cycle: period of the force within a stretch, in s.
+        frequency, amplitude: frequencies in Hz and amplitudes in N of the sines.
+        deviation: expected deviation of the response at each frequency, in m/N.
+        expected: expected safe wall of the new record, a `StiffestWall`; None without a response.
+        limit: stiffest wall of the given response; None without one.
     """
 
     force: np.ndarray
@@ -94,30 +96,31 @@ def excite(
     seed: int = 0,
     rotary: bool | None = None,
 ) -> Excitation:
-    """Design the force to play for `zwidth.respond`.
+    """Design the force to command for `zwidth.respond`.
 
     Args:
-        period: of the controller, in s.
-        force: the largest to command, in N.
-        resolution: step of the encoder, in m: what the expected deviation rests on.
-        duration: of the whole record, in s.
-        response: of a first record; then lines are dense where it turns, and strong where a wall next to the stiffest
-            is nearly unstable. Without it all lines from 1 Hz to nearly half the rate are equally strong.
-        velocity: the velocity estimate of the walls that are meant; the backward difference by default.
-        seed: of the phases.
+        period: sampling period of the controller in s.
+        force: largest force to command, in N.
+        resolution: encoder step in m, from which the expected deviation is computed.
+        duration: duration of the whole record in s.
+        response: response of a first record. The frequencies are then dense where it changes fast, and the amplitudes
+            large where walls close to the stiffest are nearly unstable. Without it, frequencies from 1 Hz to almost the
+            Nyquist frequency have equal amplitudes.
+        velocity: velocity estimate of the intended walls; the backward difference by default.
+        seed: seed of the random phases.
         rotary: True if the force is a torque in N m and the resolution an angle in rad. By default, the response or
             the units of force and resolution decide; numbers without units are those of a linear device.
 
     Returns:
-        Excitation: ``force`` to play at every period, ``cycle``, the lines with the ``deviation`` to expect, and with a
-        response ``expected``, the safe wall that the record should tell, and ``limit``, K_max of that response.
+        Excitation: ``force`` for each sample, its ``cycle``, the frequencies with the expected ``deviation``; with a
+        response also ``expected``, the expected safe wall, and ``limit``, the stiffest wall of that response.
 
     Raises:
-        InputError: the record is too short for the rate, or a number is out of range.
+        InputError: the record is too short for the sampling rate, or a number is out of range.
 
     Numerics:
-        Encoder errors are taken as white, of variance ``resolution^2/12``. Phases are chosen so that peaks stay small:
-        by clipping and restoring the amplitudes again and again (van der Ouderaa, Schoukens, Renneboog 1988).
+        Encoder errors are modeled as white noise of variance ``resolution^2/12``. The phases are optimized for small
+        peaks, by repeated clipping and restoring of the amplitudes (van der Ouderaa, Schoukens, Renneboog 1988).
 
     References:
         Pintelon, Schoukens 2012, section 5.3. Van der Ouderaa et al. 1988, IEEE Trans. Instrum. Meas. 37:145-147.
@@ -162,10 +165,10 @@ def _design(
     scene = None if response is None else Scene(response, Timing(period), velocity=velocity)
     limit = None if scene is None else find_nominal_limit(scene)
     if scene is None or limit is None or limit.status != Status.OK:
-        lines = _lay_lines(count, period, np.full(count // 2, _SPACING))
+        lines = _build_frequency_grid(count, period, np.full(count // 2, _SPACING))
         shape = np.minimum(1.0, lines / (count * period) / _SOFT)
     else:
-        lines, shape = _lay_second(scene, limit, count)
+        lines, shape = _design_second(scene, limit, count)
     rng = np.random.default_rng(seed)
     stretches = [_make_period(lines, shape, count, rng) for _ in range(_STRETCHES)]
     scale = most / max(float(np.abs(one).max()) for one in stretches)
@@ -181,8 +184,8 @@ def _design(
     return Excitation(played, period, count * period, hertz, amplitude, deviation, expected, limit, system.rotary)
 
 
-def _lay_lines(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
-    """Whole numbers of turns a period; spacing is a share of the frequency, for each number."""
+def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
+    """Return the frequencies in cycles per period; ``spacing`` is relative, one value per frequency."""
     line, lines = max(_FIRST, int(np.ceil(_LOWEST * count * period))), []
     while line < _HIGHEST * count / 2:
         lines.append(line)
@@ -191,30 +194,30 @@ def _lay_lines(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
 
 
 def _answer_at(scene: Scene, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The measured response between its lines in m/N, the velocity estimate, and the gap there in m/N."""
+    """Return the interpolated response in m/N, the velocity estimate and the interpolation error in m/N."""
     c = cast("MeasuredLoop", scene.loop).walls.curve
     S, F = c.at(np.clip(w, c.w[0], c.w[-1]))
     unit = scene.units.stiffness * 4.0 * np.sin(0.5 * w) ** 2
     return S / unit, F, np.interp(w, c.w, np.maximum(c.gap - 0.5 * c.band, 0.0)) / unit
 
 
-def _lay_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lines and amplitudes for walls near the stiffest: dense where gaps count, strong where the edge is near."""
+def _design_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies and relative amplitudes of a second record, for walls close to the stiffest one."""
     period, units = scene.timing.period, scene.units
     all_lines = np.arange(1, count // 2)
     answer, F, gap = _answer_at(scene, 2.0 * np.pi * all_lines / count)
     wall = limit.stiffness + limit.virtual_damping * units.stiffness / units.virtual_damping * F
     distance = np.min([np.abs(1.0 / (share * wall) + answer) for share in _SHARES], axis=0)
     spacing = _SPACING * np.minimum(1.0, np.sqrt(_GAP * distance / np.maximum(gap, 1e-300)))
-    # Next to a sharp place lines are dense as well.
+    # Limit the ratio of neighboring spacings to 2.
     spacing = np.minimum(spacing, np.minimum(np.roll(spacing, 1), np.roll(spacing, -1)) * 2.0)
-    lines = _lay_lines(count, period, np.append(spacing[:1], spacing))
+    lines = _build_frequency_grid(count, period, np.append(spacing[:1], spacing))
     shape = distance.min() / distance[lines - 1]
     return lines, np.maximum(shape / shape.max(), _WEAKEST)
 
 
 def _make_period(lines: np.ndarray, shape: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """One period of a sum of sines with small peaks, begun where a mass that rests does not run away."""
+    """Return one period of a multisine with small peaks, shifted so that a mass at rest does not drift."""
     spectrum = np.zeros(count // 2 + 1, complex)
     phase = np.exp(2j * np.pi * rng.random(lines.size))
     for _ in range(_CLIPS):
@@ -225,6 +228,6 @@ def _make_period(lines: np.ndarray, shape: np.ndarray, count: int, rng: np.rando
         phase = cut / np.abs(cut)
     spectrum[lines] = 0.5 * count * shape * phase
     wave = np.fft.irfft(spectrum, count)
-    # A resting mass keeps its place on average where the periodic velocity passes 0.
+    # A mass at rest does not drift if the force begins where its periodic velocity is 0.
     speed = np.cumsum(wave)
     return np.roll(wave, -1 - int(np.argmin(np.abs(speed - speed.mean()))))

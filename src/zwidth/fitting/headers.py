@@ -46,10 +46,10 @@ _INSTEAD = {
 }
 # Words of headers that name a unit of time.
 _UNIT_WORDS = {"millis": "ms", "micros": "us", "nanos": "ns", "secs": "s", "seconds": "s"}
-# A time in two columns. Last words of the header of the second column (fractions of a second), with the unit.
+# A time in two columns. Last words of the header of the column with fractions of a second, and the unit.
 _PARTS: dict[str, str] = dict.fromkeys(("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"), "ns")
 _PARTS |= dict.fromkeys(("usec", "usecs", "microsec", "microseconds", "us"), "us")
-# Words that end the header of the other column of such a pair (whole seconds).
+# Last words of the header of the column with whole seconds.
 _WHOLE = ("sec", "secs", "seconds", "s")
 
 

@@ -21,7 +21,8 @@ lags. No model with a candidate is fitted. Steps, explained in docs/theory/hidde
 5. Lags: `bound_lag` returns the longest first-order actuator lag that the data cannot distinguish from pure delay.
 
 Unless stated otherwise, times are in sampling periods, frequencies are relative to the sampling rate, and ``theta`` is
-the parameter vector of `fitting.structure.Recordings`.
+the parameter vector of `fitting.structure.Recordings`. J are the derivatives of the positions in theta, W the weights
+of the samples.
 
 References:
     Rao 1948, Proc. Cambridge Philos. Soc. 44, 50-57 (score test). Schwarz 1978, Annals of Statistics 6, 461-464
@@ -46,17 +47,18 @@ from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.measured_curve import LEAST_DAMPING_RATIO
 from zwidth.scenes.scene import Scene
 
-# The pole bank. Frequencies are relative to the sampling rate.
+# Grid of the pole bank. Frequencies are relative to the sampling rate.
 MIN_FREQUENCY = 0.005
 MAX_FREQUENCY = 0.49  # just below the Nyquist frequency
-# Ratio of neighboring frequencies for each damping ratio; damping ratio 1.0 denotes real poles, i.e. actuator lags.
+# Keys: damping ratios of the poles; 1.0 stands for real poles (actuator lags). Values: ratio of successive frequencies.
 FREQUENCY_SPACING = {LEAST_DAMPING_RATIO: 1.01, 0.03: 1.06, 0.2: 1.06, 1.0: 1.06}
 BOUNDED_RATIOS = (LEAST_DAMPING_RATIO, 0.03)  # damping ratios of the undetected modes that bound the response
-ABSORBED_NORM = 1e-6  # a filtered force is absorbed by the model if less than this share of its norm is left
+# The model absorbs a pole if a smaller share of the norm of the filtered force is orthogonal to the columns of W J.
+ABSORBED_NORM = 1e-6
 
 # Detection of a missing pole.
-N_CANDIDATES = 3  # highest scores that are tested with autocorrelated errors, because those errors can mimic one pole
-CANDIDATE_SPACING = 1.1  # least ratio of the frequencies of two candidates
+N_CANDIDATES = 3  # highest scores tested with autocorrelated errors; more than one, because these can mimic a pole
+CANDIDATE_SPACING = 1.1  # least ratio of the frequencies of two tested poles
 MAX_SAMPLES = 20_000  # leading samples inspected per log
 BATCH_SIZE = 400_000  # values per batch of filtered forces; bounds the memory
 
@@ -67,8 +69,8 @@ N_NEIGHBORS = 15  # poles on each side from which the local standard error is es
 # Frequency grid of the response, relative to the sampling rate.
 MIN_RESPONSE_FREQUENCY = 2e-4
 N_BELOW_BANK = 40  # frequencies below the pole bank
-BAND_PHASE_STEP = 0.3  # rad; most phase by the delay between two frequencies of the band
-INTERPOLATION_PHASE_STEP = 0.06  # rad; largest phase change by the delay per grid step, for linear interpolation
+BAND_PHASE_STEP = 0.3  # rad; largest phase change by the delay per grid step, for the deviation of a response
+INTERPOLATION_PHASE_STEP = 0.06  # rad; the same for linear interpolation
 RESONANCE_OFFSETS = np.sinh(np.linspace(-4.0, 4.0, 61))  # grid around a resonance, in half-widths
 DIFFERENCE_STEP = 1e-6  # relative step of finite differences in theta
 
@@ -95,22 +97,24 @@ class HiddenPole(NamedTuple):
 
 
 class PoleBank(NamedTuple):
-    """Score test of the residuals for the candidate poles, along the first axis; standard errors are of white noise."""
+    """Score test of the residuals for all candidate poles, one array entry per pole, with white-noise errors."""
 
     ratio: np.ndarray  # damping ratio of each pole, 1 for real poles
     frequency: np.ndarray  # natural frequency
     score: np.ndarray  # reduction of the sum of squares, in noise variances; chi-square for white noise alone
     signature_size: np.ndarray  # norm of the signature of the unit mode, in standard errors
     projection: np.ndarray  # residuals projected onto that signature, in standard errors
-    error_inflation: np.ndarray  # standard error under the encoder's autocorrelation over that of white noise; >= 1
-    absorbed: np.ndarray  # bias of the fitted parameters by the unit mode; a column per parameter
+    error_inflation: (
+        np.ndarray
+    )  # standard error with autocorrelated encoder errors, divided by that with white noise; >= 1
+    absorbed: np.ndarray  # bias of theta if the unit mode is omitted from the model; one column per parameter
 
     def select(self, mask: np.ndarray) -> PoleBank:
-        """Return the poles of a mask."""
+        """Return the poles selected by a boolean mask."""
         return PoleBank(*(field[mask] for field in self))
 
     def bound_mass_ratios(self) -> np.ndarray:
-        """Return the largest mass ratio of an undetected mode, for each of the complex poles of one damping ratio."""
+        """Return an upper bound of |r| of an undetected mode, for each complex pole of one damping ratio."""
         # The expected score of a complex pole is 2 for white noise. Therefore half the mean score of the neighboring
         # poles is the local noise variance, relative to the assumed one.
         width = 2 * N_NEIGHBORS + 1
@@ -124,7 +128,7 @@ def detect_missing_pole(fit: FittedModel) -> tuple[HiddenPole | None, PoleBank]:
     """Search the residuals of a fit for a pole that the model lacks.
 
     Args:
-        fit: A model at its least squares.
+        fit: The fitted model, at the minimum of its sum of squares.
 
     Returns:
         The pole with the highest score that satisfies Schwarz's criterion (BIC), or None; and the scores of all poles.
@@ -168,7 +172,7 @@ def rank_poles(bank: PoleBank, spacing: float) -> Iterator[tuple[float, float, f
 
 
 def bound_response(fit: FittedModel, scene: Scene, bank: PoleBank) -> MeasuredDevice:
-    """Return the response of the fitted device, with the largest change by an undetected mode as its deviation."""
+    """Return the frequency response of the fitted device; its deviation is the largest effect of an undetected mode."""
     banks = [bank.select(bank.ratio == ratio) for ratio in BOUNDED_RATIOS]
     grid = np.unique(np.concatenate([_build_frequency_grid(scene, BAND_PHASE_STEP), banks[0].frequency]))
     response, derivatives = _evaluate_response(fit, scene.timing.period, grid)
@@ -186,16 +190,16 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
 
     Args:
         fit: The fitted model.
-        scene: The fitted device in its loop.
+        scene: The loop of the fitted device.
         bank: Scores of all poles.
 
     Returns:
         Odds and samples, for prior odds of one; None if no wall with virtual damping B >= 0 is stable.
     """
     odds, modes, mass_ratio = _draw_modes(bank.select(bank.ratio < 1.0))
-    # The first sample, with mass ratio 0, is the device without a further mode; its K_max is the reference.
+    # The first sample has mass ratio 0: the device without a further mode. Its K_max is the reference.
     frequency, damping_ratio = modes.frequency[:, None], modes.ratio[:, None]
-    # A grid common to all samples, and for each sample a fine grid around its own resonance.
+    # Join a grid for all samples with a fine grid around the resonance of each sample.
     common = _build_frequency_grid(scene, INTERPOLATION_PHASE_STEP)[None]
     local = frequency * (1.0 + damping_ratio * RESONANCE_OFFSETS[::2])
     local = np.clip(local, MIN_RESPONSE_FREQUENCY, MAX_FREQUENCY)
@@ -221,8 +225,8 @@ def _draw_modes(bank: PoleBank) -> tuple[float, PoleBank, np.ndarray]:
     damping ratio within `PRIOR_FREQUENCIES`; and the mass ratios `PRIOR_MASS_RATIOS` with either sign.
 
     Returns:
-        The posterior odds of one mode against none; and for each of `N_SAMPLES` equally likely samples, preceded by one
-        with mass ratio 0, its pole and its mass ratio.
+        The posterior odds of one mode against none, and the poles and mass ratios of the samples: a first one with mass
+        ratio 0, then `N_SAMPLES` equally likely ones.
     """
     in_range = (bank.frequency >= PRIOR_FREQUENCIES[0]) & (bank.frequency <= PRIOR_FREQUENCIES[1])
     ratios, which = np.unique(bank.ratio, return_inverse=True)
@@ -230,7 +234,8 @@ def _draw_modes(bank: PoleBank) -> tuple[float, PoleBank, np.ndarray]:
     sign_prior = [1.0 - NEGATIVE_PROBABILITY, NEGATIVE_PROBABILITY]
     mass_ratio_prior = np.repeat(sign_prior, PRIOR_MASS_RATIOS.size) / PRIOR_MASS_RATIOS.size
     mass_ratios = np.concatenate([PRIOR_MASS_RATIOS, -PRIOR_MASS_RATIOS])
-    # In standard errors with autocorrelation the projection is normal with variance 1; a mode shifts its mean from 0.
+    # Relative to its standard error with autocorrelation, the projection is normal with variance 1. Its mean is the
+    # shift, which is 0 without a mode.
     shift = np.outer(bank.signature_size / bank.error_inflation, mass_ratios)
     likelihood_ratio = np.exp((bank.projection / bank.error_inflation)[:, None] * shift - 0.5 * shift**2)
     cumulative = np.cumsum(np.outer(pole_prior, mass_ratio_prior) * likelihood_ratio)
@@ -264,7 +269,7 @@ def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarr
 
 
 def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the response of the fitted device, and its derivatives in the device's parameters along the last axis."""
+    """Return the response of the fitted device, and along a last axis its derivatives in the device parameters."""
     points = circle(2.0 * np.pi * grid.ravel())
 
     def evaluate(theta: np.ndarray) -> np.ndarray:
@@ -273,7 +278,7 @@ def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tup
 
     count, response = fit.model.parts.stop, evaluate(fit.theta)
     steps = np.abs(fit.theta[:count])
-    steps[1:3] = np.maximum(steps[1:3], 1e-3)  # damping and delay may be 0 and need a least step
+    steps[1:3] = np.maximum(steps[1:3], 1e-3)  # damping and delay may be 0
     steps *= DIFFERENCE_STEP
     units = np.eye(count, fit.theta.size)
     shifted = [evaluate(fit.theta + step * unit) for step, unit in zip(steps, units, strict=True)]
@@ -294,7 +299,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
 
     Args:
         fit: The fitted model.
-        basis: Orthonormal basis of the directions that the parameters absorb.
+        basis: Orthonormal basis of the columns of W J.
         residuals: Weighted residuals, orthogonal to ``basis``.
         noise_variance: Variance of white noise.
     """
@@ -341,7 +346,7 @@ def _expand_unit_modes(fit: FittedModel, poles: np.ndarray) -> tuple[np.ndarray,
     ``(1 - e^(-f p))/p`` times that force. The position is the imaginary part, multiplied by g/|p|.
 
     Returns:
-        The gains of the real and the imaginary part of the filtered force, a row each; and the gain of the latest
+        The gains of the real and the imaginary part of the filtered force, one row each; and the gain of the latest
         force, to be subtracted. They are 0 for real poles, of which only the score is used.
     """
     unit, held = fit.theta[0] / np.abs(poles) / poles, np.exp(-(fit.theta[2] % 1.0) * poles)
@@ -356,7 +361,7 @@ def _build_poles(ratio: float, frequency: np.ndarray) -> Any:
 
 
 def _filter_forces(fit: FittedModel, poles: np.ndarray) -> np.ndarray:
-    """Filter the forces of all logs by each pole, delayed by the integer part of the delay, and weight the samples.
+    """Filter the forces of all logs with each pole, delay them by the integer delay, and weight the samples.
 
     Returns:
         An array of shape (parts, samples, poles): the real and, for complex poles, the imaginary part.

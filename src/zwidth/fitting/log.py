@@ -27,23 +27,19 @@ from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
-# By default the longest delay, in periods.
-_LONGEST = 20
-# The lightest and the heaviest device, the longest way and the largest force, linear and rotary: beyond, a unit is
-# suspected.
+_LONGEST = 20  # default of the largest delay, in periods
+# Smallest and largest mass, largest range of positions and largest force, in SI units, by "is rotary". A value outside
+# causes a warning about its unit.
 _USUAL = {False: (2e-3, 10.0, 3.0, 1e3), True: (1e-8, 10.0, 100.0, 300.0)}
-# Positions beyond the past forces.
-_FEWEST = 20
-# Fewer positions than this are explained by other devices as well, far outside of the errors.
-_FEW = 60
-# So many positions of all logs are fitted, minutes of a record: more would cost gigabytes and narrow errors alone.
-_MOST = 200_000
+_FEWEST = 20  # least number of fitted positions per stretch; the positions before them only provide past forces
+_FEW = 60  # fewer fitted positions cause a warning, because very different devices may fit equally well
+_MOST = 200_000  # largest number of fitted positions of all logs; more need gigabytes and only reduce the errors
 _FINER = 0.3  # residuals below this share of the quantization noise of an encoder exclude its step
-# A slope of less than so many of its standard errors is none.
-_SEEN = 5.0
-# So much of the motion's squares may stay unexplained by anything, where it is so far from noise.
-_UNEXPLAINED, _SMOOTH = 0.01, 5.0
-# What to do about a device that is more than the model.
+_SEEN = 5.0  # least effect of the force on the positions, in standard errors
+# A fit is refused if both limits are exceeded.
+_UNEXPLAINED = 0.01  # residual sum of squares, relative to that of the motion without a force
+_SMOOTH = 5.0  # excess of the residuals over white noise (`FittedModel.excess`)
+# Remedy for residuals with dynamics that the model lacks.
 _RECORD_NEXT = (
     "the device has dynamics that the model lacks, so K_max stays open; play a force of zwidth.excite and use "
     "zwidth.respond, which needs no model"
@@ -61,52 +57,53 @@ def fit_log(
     resample: bool = False,
     rotary: bool = False,
 ) -> DeviceFit:
-    """Find mass, damping and delay from a log of free motion under a force that a computer commands.
+    """Fit mass, damping and delay of a device to a log of its free motion under commanded forces.
 
-    ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, the force held from sample to sample, least squares of the
-    positions. The constant force f0 and the friction F_c are always sought, and widen the errors of the others: left
-    out where a log hardly shows them, they would bias the rest by many standard errors. An amplifier's lag, of first or
-    second order, and resonances are added where Schwarz's criterion asks for them.
+    The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with the force held between samples; the positions
+    are fitted by least squares. The constant force f0 and the friction F_c are always fitted, which increases the
+    errors of the other parameters. Omitting them if the log hardly shows them would bias the others by many standard
+    errors. An actuator lag of first or second order and resonances are added if Schwarz's criterion requires them.
 
     Args:
-        time: of the samples in s, evenly spaced, or their period alone. Where samples are missing, what lies before and
-            behind a gap is fitted as two logs. With lists of arrays for all three, several logs of one device.
-        position: measured at the samples, in m.
-        force: commanded at the samples, in N, positive towards growing positions.
-        velocity: how the loop whose K_max is asked for estimates its velocity; the backward difference by default.
-        max_delay: the longest delay looked for, in s; 20 periods by default. So much of the beginning serves only as
-            past force. Of all logs the first 200,000 samples are fitted.
-        resolution: step of the encoder, in m; found from the positions where left out; 0 for none.
-        resample: whether times off by up to a quarter of a period are those of a clock that wavers: the samples are
-            taken as they are, even, with the period of all times; 5 % otherwise.
-        rotary: whether the position is an angle in rad and the force a torque in N m; then mass is an inertia in kg m²,
-            damping in N m s/rad, and so on.
+        time: times of the samples in s, evenly spaced, or only the sampling period. The parts before and after missing
+            samples are fitted as two logs. Lists of arrays for time, position and force are several logs of one device.
+        position: sampled positions in m.
+        force: commanded forces at the same samples in N, positive in the direction of increasing positions.
+        velocity: velocity estimate of the loop for which K_max is computed; the backward difference by default.
+        max_delay: largest delay of the search in s; 20 periods by default. The positions within this time from the
+            start are not fitted, because past forces are unknown. At most 200,000 samples of all logs are fitted.
+        resolution: encoder step in m; by default determined from the positions; 0 for none.
+        resample: accept timestamp jitter of up to a quarter of the period instead of 5 %. The samples are treated as
+            evenly spaced, with the period that fits all times.
+        rotary: True if the position is an angle in rad and the force a torque in N m. The mass is then an inertia in
+            kg m², the damping in N m s/rad, and so on.
 
     Returns:
-        DeviceFit: the errors of ``friction`` and ``offset`` are NaN where the log leaves open how much is of which, as
-        of a mass that slides one way only; ``doubts`` as of a unit or of residuals that are no noise: then there is no
-        safe wall; ``status``: UNREACHABLE if the delay is at the end of the search range, NOT_CONVERGED, UNDECIDED if
-        the residuals are not white noise: then K_max is NaN; ``response`` bounds the safe wall.
+        DeviceFit: the errors of ``friction`` and ``offset`` are NaN if the log does not distinguish them, as for motion
+        in one direction only; ``doubts``: warnings, as about a unit or residuals that are not white noise; with a
+        warning there is no safe wall; ``status``: UNREACHABLE if the delay is at the end of the search range;
+        NOT_CONVERGED; UNDECIDED, with K_max NaN, if the residuals are not white noise; ``response`` bounds the safe
+        wall.
 
     Raises:
-        InputError: times are uneven, the force or the position never changes, the device runs away from its force, most
-            of the motion is of another force, or the log cannot tell the numbers apart.
+        InputError: times are uneven, the force or the position never changes, the fitted mass is negative, another
+            force causes most of the motion, or the log does not determine mass, damping and delay.
 
     Numerics:
-        Closed forms between samples, turns and sticking included, exact derivatives, Levenberg's and Marquardt's steps
-        in NumPy: a log of 3,000 samples takes about half a second, and unlike in JAX nothing is compiled for its
-        length. Friction makes false optima, one for every turn or rest that is missed: starts of no friction and of 0.3
-        to 35 % of the largest force are followed from the first 300 samples to ever more. Where none at all explains
-        the log nearly as well, the errors reach to it; they know that an encoder errs alike in neighboring samples, of
-        which a rest counts as one. A resonance more than the log asks for counts as likely as none before the log is
-        known: the interval of K_max is that of 200 devices with one, weighed by how the residuals fit it, and of the
-        device without. How often the intervals hold the true device is measured in docs/fitting.md.
+        Closed forms between samples, including reversals and sticking; exact derivatives; Levenberg-Marquardt steps in
+        NumPy. A log of 3,000 samples takes about half a second, without compilation. Friction causes local minima, one
+        for each missed reversal or rest. Therefore fits begin with no friction and with 0.3 to 35 % of the largest
+        force, for the first 300 samples, and continue with more and more samples. If a fit without friction is almost
+        as good, the errors include it. They account for the autocorrelated errors of the encoder; all samples of a rest
+        count as one. The prior odds of one more resonance are 1: the interval of K_max is that of 200 devices with such
+        a resonance, weighted by their likelihood, and of the device without it (docs/theory/hidden.md).
+        docs/fitting.md lists how often the intervals contain the true values.
 
     References:
         Ljung 1999, System Identification, section 4.2 (output error). Leeb, Poetscher 2005, Econometric Theory 21,
-        21-59 (intervals after a choice of models do not hold). Hoeting, Madigan, Raftery, Volinsky 1999, Statistical
+        21-59 (invalid intervals after model selection). Hoeting, Madigan, Raftery, Volinsky 1999, Statistical
         Science 14, 382-417 (intervals over all models). Schwarz 1978, Annals of Statistics 6, 461-464 (further
-        numbers that explain no more than chance). Widrow, Kollar 2008, Quantization Noise (an encoder's error). Hulin,
+        parameters). Widrow, Kollar 2008, Quantization Noise (quantization errors). Hulin,
         Preusche, Hirzinger 2006, eq. (9).
 
     Example:
@@ -168,7 +165,7 @@ def _fit(
     unexplained = _find_unexplained(best, pole, period, system) if bank else []
     doubts = odd + doubts + _doubt(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
-    # The device that bears K_max is another one then.
+    # The true device has another K_max then.
     status = Status.UNDECIDED if status == Status.OK and unexplained else status
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
@@ -200,32 +197,32 @@ def _fit(
 
 
 def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float, system: UnitSystem) -> list[str]:
-    """What the residuals show beyond noise, with the record to make next."""
+    """Return a warning with cause and remedy if the residuals are not white noise, or if the lag may be a resonance."""
     cause = explain_residuals(best, system) if pole is not None or best.excess > ALIKE else ""
     if cause:
         remedy = "log the force with more digits" if "rounded" in cause else _RECORD_NEXT
         return [f"the residuals are not white noise: {cause}; {remedy}"]
     if pole is not None and pole.instead:
         near = with_unit(pole.frequency / period, "Hz", 3)
-        what = f"an amplifier's lag explains the log, and so does a resonance near {near}, whose K_max is another one"
+        what = f"an actuator lag and a resonance near {near}, with another K_max, fit equally well"
         return [f"{what}: {SEE_MORE}"]
     if pole is not None:
-        kind = "most like a resonance near" if pole.rings else "with a lag, most like one of"
-        what = f"they follow the force{',' if pole.rings else ''} {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
+        kind = "a resonance near" if pole.rings else "an actuator lag with a corner frequency near"
+        what = f"they indicate {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
     elif best.excess > ALIKE:
-        what = f"their sums spread {plain(np.sqrt(best.excess), 2)} times as far, as a hand or a compliance would cause"
+        what = f"their sums are {plain(np.sqrt(best.excess), 2)} times as large, as with a hand or a compliance"
     else:
         return []
     return [f"the residuals are not white noise: {what}; {_RECORD_NEXT}"]
 
 
 def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
-    """A force over the mass as a force, and its standard error."""
+    """Return a force with its standard error; ``k`` is the index of the force, divided by the mass, in theta."""
     g = best.theta[0]
     value, those = best.theta[k] / g, [0, k]
     slope = np.array([-value / g, 1.0 / g])
     error = float(np.sqrt(slope @ best.covariance[np.ix_(those, those)] @ slope))
-    # At the least friction that is looked for there is none.
+    # The lower bound of the friction in the search means no friction.
     none = k == -1 and value <= 2.0 * LEAST * best.model.largest
     return 0.0 if none else float(value), error
 
@@ -233,8 +230,8 @@ def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
 def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[list[float], list[str]]:
     """Return the candidates for the encoder step, coarsest first, and warnings about a given step.
 
-    An ideal sensor is rounded to the step of the column only. A constant force moves it by nearly whole multiples of a
-    much larger step, which the positions do not distinguish from an encoder step; the residuals do.
+    Positions of an ideal sensor have only the rounding step of the column. Under a constant force they may nevertheless
+    be near integer multiples of a much larger step. Only the residuals distinguish this step from an encoder step.
     """
     if resolution is None:
         columns = zip(*read.steps, strict=True)
@@ -244,7 +241,7 @@ def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[li
     if step and not all(fits_steps(log.position, step, slack=column) for log, (_, column) in pairs):
         text = with_unit(step, system["m"])
         return [0.0], [
-            f"the positions are no multiples of {text}, so their errors are treated as noise: check resolution"
+            f"the positions are not multiples of {text}, so their errors are treated as noise: check resolution"
         ]
     return [step], []
 
@@ -258,9 +255,9 @@ def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[
 
 
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:
-    """Raise `InputError` where the force explains nothing of the motion, the contrary of it, or too little."""
+    """Raise `InputError` if the force explains too little of the motion, or if the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
-    # What there would be without any force, not even friction.
+    # Residuals of the motion without any force, friction included.
     alone = model.follow(np.append(theta[:-2], [0.0, 0.0])).slopes[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
@@ -279,7 +276,7 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
         )
     if theta[0] <= 0 and (cause.reversed or left < _UNEXPLAINED):
         raise InputError(
-            "force: the device runs away from it, as if its mass were "
+            "force: the device accelerates against it, as with a mass of "
             f"{with_unit(period**2 / theta[0], system['kg'])}; turn the sign of the "
             "force, or of the position; a velocity given as a position looks so too"
         )
@@ -291,14 +288,13 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
         )
     if unexplained:
         raise InputError(
-            f"force: it leaves {plain(100 * np.sqrt(left), 2)} % of the motion unexplained, and that is smooth, not "
-            "noise: something else pushes, as a hand, a spring, a stop or gravity along the way, the motor gives less "
-            "than is commanded, a column holds something else, as a velocity or the other one's numbers, or samples "
-            "are missing; record every sample of the device left alone"
+            f"force: {plain(100 * np.sqrt(left), 2)} % of the motion is unexplained and no noise: another force, a "
+            "saturated motor, a wrong column or missing samples; record every sample of the free device"
         )
 
 
 def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Recording, ...]) -> list[str]:
+    """Return warnings about units, and about parameters that the log hardly determines."""
     mass, damping, delay = scene.device.mass, scene.device.damping, scene.timing.delay
     doubts, residuals, units = [], best.residuals, scene.unit_system
     lightest, heaviest, farthest, strongest = _USUAL[units.rotary]
@@ -320,25 +316,25 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
         doubts.append(MASS_OPEN)
     if residuals.size < _FEW:
         doubts.append(
-            f"only {residuals.size} positions count, for those before serve as past force: so few may suit quite "
-            "another device, and the errors do not say so; record longer, or give a shorter max_delay"
+            f"only {residuals.size} positions are fitted, because earlier ones only provide past forces: the errors "
+            "may be larger; record longer, or give a shorter max_delay"
         )
     size = float(residuals @ residuals)
     if size <= EXACT**2 * residuals.size * way**2:
-        # Nothing but rounding is left.
+        # The residuals are rounding errors.
         return doubts
     if damping == 0:
-        doubts.append("the damping is 0 at best: a negative one would fit better")
+        doubts.append("the damping is 0 at best: a negative damping would fit better")
     elif errors[1] > VAGUE * damping:
         span = max(log.force.size for log in logs)
         doubts.append(
             f"the damping is hardly seen, its standard error is {with_unit(errors[1], units['N s/m'], 2)}; record "
-            f"longer than these {span} samples, or let the device run faster"
+            f"more than {span} samples, or a faster motion"
         )
     if delay == 0 and (away := best.step_beyond(2)) < -BEYOND:
         doubts.append(
-            f"the delay is 0 at best: the position would have to precede the force to fit better, by {plain(-away, 2)} "
-            "standard errors; is a column shifted?"
+            f"the delay is 0 at best: a negative delay would fit better, by {plain(-away, 2)} standard errors; check "
+            "for a shifted column"
         )
     return doubts
 
@@ -351,7 +347,7 @@ def _place(
     skip: int,
     period: float,
 ) -> tuple[FittedMotion, ...]:
-    """Every log beside its fit, NaN at the first samples, behind a gap as well, and where it is too long."""
+    """Return each log with its fitted positions, NaN for samples that are not fitted (first ones, and after gaps)."""
     motions, parts = [], iter(best.model.split(best.motion.position))
     for log, place, own in zip(logs, places, stretches, strict=True):
         modelled = np.full(log.force.size, np.nan)

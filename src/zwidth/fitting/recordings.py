@@ -15,14 +15,14 @@ from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SI_RANGE
 from zwidth.words.unit_system import UnitSystem
 
-# How far a sample's time may lie from an even one, as a share of the period, unasked and where a wavering clock is
-# asked for, less than what a missing sample looks like; how far periods of logs may differ beyond their errors.
-_UNEVEN, _WAVERING, _SAME = 0.05, 0.25, 1e-5
-_SURE = 5.0
-# Samples that a stretch at one end lasts before it is suspected; a force of so many values varies, as a share.
-_STUCK, _MANY = 25, 0.1
-# A step of so many usual ones lacks a sample.
-_MISSING = 1.5
+# Largest distance of a time from an evenly spaced one, in periods.
+_UNEVEN = 0.05  # without timestamp jitter
+_WAVERING = 0.25  # with timestamp jitter; less than the distance that a missing sample causes
+_SAME = 1e-5  # largest relative difference of the periods of two logs, in addition to their errors
+_SURE = 5.0  # standard errors of a period that its difference from another may have
+_STUCK = 25  # least duration in samples of a constant maximum or minimum that causes a warning
+_MANY = 0.1  # a force varies if the ratio of its values below the maximum to the samples at the maximum is larger
+_MISSING = 1.5  # least ratio of a time step to the median step at which samples are missing
 
 
 class ReadLogs(NamedTuple):
@@ -153,20 +153,20 @@ def _place(clock: np.ndarray, wavering: bool, notes: list[str]) -> tuple[np.ndar
 
 
 def find_even(place: np.ndarray, least: int) -> list[slice]:
-    """The stretches of a log in which no sample is missing, of so many samples or more."""
+    """Return the stretches of a log without missing samples that have at least ``least`` samples."""
     runs = find_runs(np.diff(place) == 1).tolist()
     return [slice(first, last + 1) for first, last in runs if last + 1 - first >= least]
 
 
 def find_stretches(log: Recording, system: UnitSystem) -> list[str]:
-    """What hints at an end stop, a saturated sensor, or a saturated motor, a sentence each."""
+    """Return warnings about an end stop, a saturated sensor or a saturated motor."""
     doubts = []
     for end, way in ((log.position.max(), 1.0), (log.position.min(), -1.0)):
         first, last = _longest_run((log.position == end) & (log.force * way > 0))
         if last - first >= _STUCK:
             doubts.append(
-                f"the position stays at {with_unit(end, system['m'], 4)} from sample {first} to {last - 1} though the "
-                "force pushes on: an end stop, a saturated sensor, or friction that holds; leave such stretches out"
+                f"the position stays at {with_unit(end, system['m'], 4)} from sample {first} to {last - 1} despite a "
+                "force: end stop, saturated sensor or static friction; omit such stretches"
             )
     for end in (log.force.max(), log.force.min()):
         at_end = log.force == end
@@ -175,7 +175,7 @@ def find_stretches(log: Recording, system: UnitSystem) -> list[str]:
         if inside > _MANY * at_end.size and last - first >= _STUCK:
             doubts.append(
                 f"the force stays at {with_unit(end, system['N'], 4)} from sample {first} to {last - 1} and varies "
-                "elsewhere: is that what the motor gave, or where it saturates? Log the force that is given"
+                "elsewhere: if the motor saturates, log the force after saturation"
             )
     return doubts
 

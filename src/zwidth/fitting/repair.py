@@ -107,7 +107,7 @@ def repair_log(
         notes.append(f"left out {_count(bad.size, 'position glitch', 'es')}, the first at sample {row[bad[0]]}")
         clock = None if clock is None else clock[kept]
         row, position, force = row[kept], position[kept], force[kept]
-    # Unwrapping would shift rounded positions by a modulus that is no multiple of their step.
+    # Find the steps before unwrapping, because the modulus need not be a multiple of a rounding step.
     steps = find_steps(position)
     if modulus:
         # Count wraps after the removal of glitches, because a glitch may hide a wrap.
@@ -299,7 +299,7 @@ def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
     wild = np.zeros(position.size, bool)
     if position.size < 4 * _REACH or not moving.size:
         return wild
-    # Add encoder steps because slow motion has hardly any other second differences.
+    # Add encoder steps, because in slow motion they cause most of the second differences.
     limit = _FAR * float(np.quantile(moving, 0.9)) + _STEPS * float(moving.min())
     # The median excludes the moves into, within and out of a glitch.
     usual = _filter_median(moves, _REACH + 1)

@@ -23,14 +23,14 @@ from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.circle import CirclePoints, Jet
 from zwidth.words.types import Array
 
-# A double pole has no partial fractions.
+# Poles closer than this are moved apart, because partial fractions require distinct poles.
 _DOUBLE = 1e-5
 # Dampings of a column, as shares of its end, then refined so often.
 _DAMPINGS, _REFINED, _TIMES = 33, 9, 3
 
 
 class RequiredWall:
-    """``q = -1/G`` of devices, arrays that broadcast with the frequencies.
+    """``q = -1/G`` of devices; the arguments are arrays that broadcast with the frequencies.
 
     A rigid device has ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``. ``lag`` contains the time constant of the
     actuator in periods and, for second order, its damping ratio; ``modes`` frequencies in rad per sample, damping
@@ -68,12 +68,12 @@ class RequiredWall:
         return Jet(q, q * (1j * self.whole + slopes))
 
     def add(self, at: CirclePoints) -> Array:
-        """Return the part of the response that lag and modes add."""
+        """Return the part of the frequency response that is due to lag and modes."""
         above, below = at.before * self.late + self.full, at.before - self.turns
         return (self.residues * (np.exp(-1j * (self.whole + 1.0) * at.w) * above / below)).sum(0)
 
     def moves(self, at: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of q of the rigid mass in delta and d."""
+        """Return the derivatives of q of the rigid mass with respect to delta and d."""
         by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
         total = _answer(self.plant, at)
         return (

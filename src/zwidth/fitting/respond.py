@@ -48,16 +48,16 @@ _LONGEST_GAP = 4  # longest step across missing samples, in samples
 
 @dataclass(frozen=True)
 class ResponseEstimate:
-    """A measured response and what it rests on.
+    """A measured frequency response and its quality.
 
     Attributes:
-        device: the `zwidth.MeasuredDevice`, with deviation.
-        period: of the samples, in s.
-        coherence: of each line, 0 to 1: what share of the motion's power follows the force.
-        cycle: period of the force, in s; None where it does not repeat.
-        records: stretches of one periodic force that count, or pieces of a force that does not repeat.
-        noise: of one sampled position in m, where the force repeats.
-        doubts: sentences on what makes the response doubtful.
+        device: the response with its deviation, a `zwidth.MeasuredDevice`.
+        period: sampling period in s.
+        coherence: proportion of the power of the motion that follows the force, 0 to 1, at each frequency.
+        cycle: period of the force in s; None for a force that is not periodic.
+        records: number of stretches of periodic force, or number of segments of a force that is not periodic.
+        noise: standard deviation of a sampled position in m, for a periodic force.
+        doubts: warnings, one sentence each.
         notes: interpretations of the columns of the logs and repairs of their rows, one clause each.
     """
 
@@ -80,15 +80,15 @@ def respond(
     resolution: Any = None,
     rotary: bool = False,
 ) -> ResponseEstimate:
-    """Find the frequency response of a device, with its deviation, from a log of commanded force and sampled position.
+    """Estimate the frequency response of a device, with its deviation, from commanded forces and sampled positions.
 
     Args:
-        time: of the samples in s, evenly spaced, or their period alone. With lists of arrays for all three, several
-            logs.
-        position: that the program read, in m.
-        force: that the program commanded, in N: of that sample. `zwidth.excite` makes one.
-        cycle: period of the force in s; found from the force where left out, which must repeat itself exactly for that.
-        resolution: step of the encoder in m; found from the positions where left out.
+        time: times of the samples in s, evenly spaced, or only the sampling period. Lists of arrays for time, position
+            and force are several logs.
+        position: sampled positions in m.
+        force: forces in N commanded at the same samples, such as those of `zwidth.excite`.
+        cycle: period of the force in s; by default determined from a force that repeats exactly.
+        resolution: encoder step in m; by default determined from the positions.
         rotary: True if the position is an angle in rad and the force a torque in N m. The response is then in
             rad/(N m).
 
@@ -97,12 +97,13 @@ def respond(
         ``records``, ``noise``, ``doubts``.
 
     Raises:
-        InputError: times are uneven, force or position never change, or nothing of the motion follows the force.
+        InputError: times are uneven, force or position never changes, or the motion does not follow the force.
 
     Numerics:
-        The first period of each stretch is left out, for what went before still moves in it. Errors are those among
-        stretches of other phases, else among periods, averaged over neighboring lines; one force that only repeats
-        meets the same steps of the encoder each time, so that then their whole error is added.
+        The first period of each stretch is omitted, because it contains the transient. Standard errors are computed
+        from the differences between stretches with different phases, or else between periods, and averaged over
+        neighboring frequencies. If the same force is repeated, the encoder errors are the same in each period;
+        therefore the full quantization error is added.
 
     References:
         Pintelon, Schoukens 2012, sections 2.5 and 4.3 (averages over periods and phases). Welch 1967, IEEE Trans. Audio
@@ -134,8 +135,8 @@ def _respond(
     doubts = []
     if step and all(np.ptp(log.position) < _STEPS * step for log in logs):
         doubts.append(
-            f"the position moves by less than {_STEPS} steps of {with_unit(step, system['m'])}; push harder, for an "
-            "encoder hides smaller motions"
+            f"the position moves by less than {_STEPS} encoder steps of {with_unit(step, system['m'])}; record with a "
+            "larger force"
         )
     count = given or _find_period(logs[0].force)
     if count is None:

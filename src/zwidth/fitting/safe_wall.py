@@ -1,14 +1,15 @@
-"""The stiffest wall that nearly all devices bear that records of one device allow.
+"""Search for the stiffest wall that is stable on nearly all devices that agree with the records of one device.
 
-Raised from below: a device bears (K, B) where every softer wall of that B is stable as well. On a rigid device all rows
-and columns of the stable set are intervals (docs/theory/one-lobe.md), so that at each K the dampings that most devices
-bear are counted from the ends of their columns, and K is halved between what they bear and what they do not.
+A wall (K, B) is safe on a device if all softer walls with the same B are stable, too, because users raise K from below.
+For a rigid device, the lines of constant K and of constant B intersect the stable set in intervals
+(docs/theory/one-lobe.md). The search bisects K; for each K, the ends of the stable intervals of B determine the B that
+is stable on most devices.
 
-With a velocity filter rows are computed on a grid of frequencies (`zwidth.fitting.required_wall`). Eigenvalues then
-decide the stability of the wall on every device.
+With a velocity filter, the lines of constant B are computed on a grid of frequencies (`zwidth.fitting.required_wall`).
+Eigenvalues then decide the stability of the wall on every device.
 
-A log bounds resonances as well: how large one may be and not show. The fitted response with that radius decides walls
-as a measured one does (docs/theory/measured.md), and a wall counts that it decides too.
+A log also bounds undetected resonances. The wall must be stable for all responses within the radius of the fitted
+response (docs/theory/measured.md).
 """
 
 from __future__ import annotations
@@ -32,32 +33,31 @@ from zwidth.words.quantities import SI_RANGE
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
-# How many devices are drawn at the most, and times the loop's own number: to find a wall, and only to confirm one.
-_SAMPLES, _FOUND, _CONFIRMED = 8000, 5, 2
-# K is known to this share, and is 0 where it is less than that share of what each device bears at its best B.
-_CLOSE, _NOTHING = 1e-3, 1e-4
-# Below the edge of the device that binds.
-_BELOW = 1e-9
-# Frequencies: of slow loops, evenly, and more for each period of delay.
-_SLOWEST, _SLOW, _EVEN, _EVEN_PER_PERIOD = 1e-4, 60, 400, 40
-# The longest delay looked at, in periods, and for each period of the estimated one.
-_FARTHEST = (20.0, 1.5)
+_SAMPLES = 8000  # largest number of random devices
+_FOUND = 5  # number of random devices for a search, in multiples of ``LinearLoop.draws``
+_CONFIRMED = 2  # the same to confirm a wall
+_CLOSE = 1e-3  # relative accuracy of K
+_NOTHING = 1e-4  # K below this ratio to K_max of the devices counts as 0
+_BELOW = 1e-9  # relative distance of K below the limit of the active device
+# Frequency grid, in rad per sample.
+_SLOWEST = 1e-4  # lowest frequency
+_SLOW = 60  # number of low frequencies on a logarithmic grid, for slow loops
+_EVEN = 400  # number of frequencies on an even grid
+_EVEN_PER_PERIOD = 40  # further frequencies on this grid per period of delay
+_FARTHEST = (20.0, 1.5)  # largest delay of a device in periods: a constant, and a factor of the estimated delay
 # Judged at K and at this share of it; how many devices eigenvalues may judge otherwise than the grid.
 _SOFTER, _ASTRAY = (1.0, 0.5, 0.1), 2e-3
 
 
 @shown(resonance="Hz")
 class SafeWall(NamedTuple):
-    """K in N/m, B in N s/m, the share of drawn devices that bear it, and the `zwidth.Status`, with NaN if not OK.
+    """A wall that is stable on nearly all devices that agree with the records; NaN if the status is not OK."""
 
-    ``resonance`` is the frequency in Hz of one that may hide in the log and bounds the wall, NaN where none does.
-    """
-
-    stiffness: float
-    virtual_damping: float
-    share: float
-    status: int
-    resonance: float = np.nan
+    stiffness: float  # K in N/m
+    virtual_damping: float  # B in N s/m
+    share: float  # proportion of the random devices on which the wall is stable
+    status: int  # code of `zwidth.Status`
+    resonance: float = np.nan  # frequency in Hz of the undetected resonance that limits the wall; NaN if none does
 
 
 _UNDECIDED = SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
@@ -158,12 +158,12 @@ class _RigidDevices(RigidVariants):
         return float(0.5 * (places[order][first] + places[order][first + 1]))
 
     def share(self, stiffness: float, virtual_damping: float) -> float:
-        """Of the devices on which the wall is stable; softer ones are so with it."""
+        """Return the proportion of devices on which the wall, and therefore every softer one, is stable."""
         return float(self.labels(stiffness, virtual_damping).mean())
 
 
 class _SearchedDevices:
-    """Rigid devices with a velocity filter, by their boundaries on a grid of frequencies; only B >= 0 counts."""
+    """Random rigid devices with a velocity filter: stability from a grid of frequencies, for B >= 0."""
 
     def __init__(self, drawn: np.ndarray, fit: DeviceEstimate) -> None:
         period, scene = fit.period, fit.nominal
@@ -209,7 +209,7 @@ class _SearchedDevices:
 def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damping: float) -> np.ndarray:
     """Which devices bear a wall and softer ones of its damping, by the eigenvalues of their closed loops."""
     estimate, devices = fit.velocity.estimate(fit.period), fit.normalize(drawn)
-    A, B, _ = (np.moveaxis(part, -1, 0) for part in _lay_chain(devices, estimate).realize())
+    A, B, _ = (np.moveaxis(part, -1, 0) for part in _build_chain(devices, estimate).realize())
     whole, f = np.floor(devices.d).astype(int), estimate_matrices(estimate)
     rate, size = np.concatenate([A, B[..., None]], -1), B.shape[-1]
     times = np.stack([np.ones_like(devices.d), whole + 1.0 - devices.d], -1)
@@ -228,7 +228,7 @@ def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damp
     return borne
 
 
-def _lay_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
+def _build_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
     """The bodies, modes and amplifiers of all devices as arrays."""
     modes = tuple(Resonance(turns, ratio, 1.0 / share) for turns, ratio, share in devices.modes)
     lag = 1.0 / devices.lag[0] if devices.lag else None

@@ -31,11 +31,12 @@ COLORS = {"STABLE": "green", "SET": "green", "UNSTABLE": "red", "NO WALL": "red"
 COLORS |= dict.fromkeys(("MARGINAL", "UNDECIDED", "CAUTION"), "yellow")
 _NARROW = 60  # smallest width with a separate column for labels
 _COLUMN = re.compile(r" {2,}")
-# A space within a quantity, as in "B = 3 N s/m"; after some words as well, where it does no harm.
+# Spaces within quantities such as "B = 3 N s/m", at which lines do not break; also harmless matches after words.
 _BESIDE = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
 
 def row(label: str, text: str) -> str:
+    """Return a line of a printed result with a long label."""
     return f"{label:<20}  {text}"
 
 
@@ -45,7 +46,7 @@ def line(label: str, text: str) -> str:
 
 
 def print_json(result: Any) -> None:
-    """Print what a machine reads; null stands for what is not known or not finite."""
+    """Print a result as JSON, with null for values that are unknown or not finite."""
     click.echo(json.dumps(to_json(result), indent=2, allow_nan=False))
 
 
@@ -72,7 +73,7 @@ def print_folded(lines: Iterable[str], indent: int = 24) -> None:
 
 
 def tell(result: Any, lines: Iterable[str], as_json: bool, indent: int = 24) -> None:
-    """Print an answer for machines, or its lines for people."""
+    """Print a result as JSON, or its lines."""
     if as_json:
         print_json(result)
     else:
@@ -102,27 +103,27 @@ def part_lines(scene: Scene) -> list[str]:
 
 
 def unit_of(path: str) -> str:
-    """The SI unit of a parameter by its path; nothing for whole numbers."""
+    """Return the SI unit of a parameter of a linear device by its path; "" for numbers without a unit."""
     return PARAMETERS[path].unit.removeprefix("1") if path in PARAMETERS else ""
 
 
 def word_of(verdict: Assessment) -> str:
-    """The verdict in one word."""
+    """Return the verdict in one word."""
     if verdict.stable is None:
         return "undecided"
     return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
 
 
 def spell_radius(radius: float) -> str:
-    """A spectral radius with its name, six decimals where it is near the circle."""
+    """Return a spectral radius in words, with six decimals unless it is very large."""
     return f"spectral radius {f'{radius:.6f}' if radius < 1e4 else plain(radius)}"
 
 
 def pole_words(constant: float, frequency: float) -> str:
-    """How the slowest pole moves: its time constant in s, negative for a growing one, and its frequency in Hz."""
+    """Return the decay of the dominant pole in words, from its time constant in s (negative: growth) and frequency."""
     swing = f", oscillating at {with_unit(frequency, 'Hz')}" if frequency else ""
     if isnan(constant):
-        return f"its rate is lost in rounding, next to the boundary or to poles of one size{swing}"
+        return f"has a rate below numerical resolution, near the boundary or poles of equal magnitude{swing}"
     if not isfinite(constant):
         return f"neither decays nor grows{swing}"
     verb = "decays" if constant >= 0 else "grows"
@@ -130,7 +131,7 @@ def pole_words(constant: float, frequency: float) -> str:
 
 
 def coded_period_notes(scene: Scene) -> list[str]:
-    """A line where the estimate was written for another period than the loop's."""
+    """Return a note if the velocity estimate was designed for a period other than that of the loop."""
     coded, period = getattr(scene.velocity, "coded_period", None), scene.timing.period
     if coded is None or abs(coded / period - 1) < 1e-9:
         return []
@@ -146,14 +147,14 @@ def coded_period_notes(scene: Scene) -> list[str]:
 
 
 def scene_notes(scene: Scene) -> list[str]:
-    """What is remarkable of a scene beside its verdict."""
+    """Return notes on a scene in addition to its verdict."""
     from zwidth.scenes.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
-    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *_compare_with_limit(scene)]
+    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *compare_with_limit(scene)]
 
 
-def _compare_with_limit(scene: Scene) -> list[str]:
+def compare_with_limit(scene: Scene) -> list[str]:
     """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
     limit = scene.safe_limit
     return [] if limit is None or isinstance(scene.wall, NoWall) else [*limit_cautions(scene), *limit.warnings]
@@ -162,8 +163,7 @@ def _compare_with_limit(scene: Scene) -> list[str]:
 def limit_cautions(scene: Scene) -> list[str]:
     """Return the caution that a wall exceeds the safe limit of its scene; an empty list if it does not."""
     limit, wall = scene.safe_limit, scene.wall
-    allowed = limit is None or isinstance(wall, NoWall)
-    if limit is None or allowed or limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
+    if limit is None or isinstance(wall, NoWall) or limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
         return []
     return [f"this wall exceeds the safe limit: the real device may be unstable. {limit.describe(scene.unit_system)}"]
 
@@ -177,20 +177,38 @@ def spell_diagnosis(found: Diagnosis | None) -> list[tuple[str, str]]:
     return [(label, f"{found.word}: {found.explain()}"), *([("", f"to stop it: {advice}")] if advice else [])]
 
 
+def spell_alarm(diagnosis: Diagnosis | None, *alarms: str) -> str:
+    """Return the words with which a headline points to cautions: an oscillation, if diagnosed, and ``alarms``."""
+    oscillation = [] if diagnosis is None or diagnosis.cause == "none" else [diagnosis.word.lower()]
+    words = [*oscillation, *filter(None, alarms)]
+    return f"; CAUTION: {', '.join(words)}" if words else ""
+
+
 def diagnosis_lines(found: Diagnosis | None) -> list[str]:
     """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
     return [line(*each) for each in spell_diagnosis(found)]
 
 
+def hardware_lines(hardware: str) -> list[str]:
+    """Return the line with encoder, friction and motor of a file, in words; no line for an empty text."""
+    return [line("hardware", hardware)] if hardware else []
+
+
 def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
-    """Return the caution about a delay that is 0 only because it was not given; ``silent`` names such options."""
-    # A measured response usually contains the delay.
-    if "delay" not in silent or scene.timing.delay or isinstance(scene.device, MeasuredDevice):
+    """Return the cautions about a delay and a friction that are 0 only because they were not given.
+
+    ``silent`` names the options that were not given.
+    """
+    # A measured response usually contains the delay, and no model to simulate.
+    if isinstance(scene.device, MeasuredDevice):
         return []
-    return [
-        "no delay given: the results hold only if the force acts at the sample; if it acts one period later, add "
-        "--delay '1 periods'"
-    ]
+    cautions = {
+        "delay": "no delay given: the results hold only if the force acts at the sample; if it acts one period later, "
+        "add --delay '1 periods'",
+        "friction": "no friction given: the encoder is simulated without friction, which can stop a limit cycle; give "
+        "the device's friction by --friction",
+    }
+    return [text for name, text in cautions.items() if name in silent and not (name == "delay" and scene.timing.delay)]
 
 
 def note_lines(notes: list[str]) -> list[str]:
@@ -200,10 +218,10 @@ def note_lines(notes: list[str]) -> list[str]:
 class Slope(NamedTuple):
     """The derivative of K_max with respect to one parameter, and the effect of a small change in words."""
 
-    name: str
-    value: float
-    unit: str
-    words: str
+    name: str  # path of the parameter
+    value: float  # derivative of K_max
+    unit: str  # unit of the derivative
+    words: str  # effect of a small change
 
     def line(self) -> str:
         """Return the derivative as a printed line."""
@@ -222,10 +240,10 @@ def list_slopes(scene: Scene) -> list[Slope]:
     found, system = [], scene.unit_system
     for path, slope in per.items():
         unit, value = system[unit_of(path)], float(slope)
-        # A delay is counted in periods, a damping one by one.
+        # The scale of a delay is the period, because a delay may be 0; that of a linear damping is 1 N s/m.
         size = scene.timing.period if path == "delay" else values[path]
         by_one = not size or unit == "N s/m"
-        # A power of ten near one percent, as people can picture it.
+        # Use the power of ten nearest to one percent of the scale as step.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
         effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
         if isfinite(value) and (change := value * step):

@@ -1,4 +1,4 @@
-"""Runs: a configuration in, a folder of stores, tables, figures and texts out, and the report of it."""
+"""Runs: compute the studies of a configuration into a folder of stores, tables, figures and texts, and report them."""
 
 from zwidth.runs.run import ProgressCallback, RunResult, StudyEvent, StudyResult, plan_run, run
 

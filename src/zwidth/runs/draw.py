@@ -1,4 +1,8 @@
-"""Figures from the store of a sweep: which of its variables are drawn, over what, within which exact edges."""
+"""Draw figures from the store of a sweep: choose its variables, their axes and slices, and add exact boundaries.
+
+A *plane* is a figure of an output over two parameters; *edges* are the exact boundaries of the stable and of the
+passive walls, drawn as lines on a plane of walls. A *slice* is the part of a sweep at given values of some parameters.
+"""
 
 from __future__ import annotations
 
@@ -27,43 +31,47 @@ from zwidth.words.quantities import ANY, OUTPUTS, VARIABLES
 if TYPE_CHECKING:
     import xarray
 
-_PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})
-FOLDER = "figures"
-
-# Fewer values than this along both axes are curves rather than a surface.
-_SURFACE = 6
+_PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})  # dimensions of a plane of walls
+FOLDER = "figures"  # default folder of the figures, next to the stores
+_MIN_SURFACE = 6  # values along the shorter axis from which an output of devices is drawn as a plane, not as curves
 
 
 def make_edges(store: Store) -> Edges:
-    """What gives the outlines of the stable and the passive walls of a part of a sweep, at one device and delay."""
-    # The part is one of `zwidth.figures.grid.prepare`. Outlines are in its units, stiffness first. Of what is not a
-    # plane of walls, and where nothing is proved, there are none.
+    """Return a function that computes the edges of the stable and the passive walls for a part of a sweep.
+
+    The part must contain one device and be prepared by `zwidth.figures.grid.prepare`. The function returns outlines by
+    name ("stable", "passive") in the units of the part, stiffness first; none if the part is not a plane of walls, or
+    if the parameters of its device are invalid.
+    """
     grid = store.plan.grid
-    known, dims = grid.coordinates(), [dim.replace(".", "_") for dim in grid.device_dims]
-    at_device = cache(lambda place: _outline(store, place))
+    coordinates, dims = grid.coordinates(), [dim.replace(".", "_") for dim in grid.device_dims]
+    outlines_of_device = cache(lambda indices: _compute_outlines(store, indices))
 
     def edges(part: xarray.Dataset) -> dict[str, Outlines]:
         walls = {str(dim) for dim in part.dims}
         if walls not in _PLANES:
             return {}
-        places = [_find_place(known[dim][1], part[dim]) if dim in part.coords else 0 for dim in dims]
+        indices = [_find_index(coordinates[dim][1], part[dim]) if dim in part.coords else 0 for dim in dims]
         order = sorted(walls, key=lambda dim: dim not in ("alpha", "stiffness"))
         factors = [part[dim].attrs["factor"] for dim in order]
-        found = at_device(tuple(places))
-        return {name: [(points * factors, hole) for points, hole in outlines] for name, outlines in found.items()}
+        outlines_by_name = outlines_of_device(tuple(indices))
+        return {
+            name: [(points * factors, hole) for points, hole in outlines] for name, outlines in outlines_by_name.items()
+        }
 
     return edges
 
 
-def _find_place(values: np.ndarray, coordinate: xarray.DataArray) -> int:
-    """The index of a part's value among those of the sweep."""
+def _find_index(values: np.ndarray, coordinate: xarray.DataArray) -> int:
+    """Return the index of the value of a part among the values of the sweep."""
     if values.dtype.kind == "U":
         return values.tolist().index(str(coordinate.values))
     return int(np.argmin(np.abs(values - float(coordinate) / coordinate.attrs["factor"])))
 
 
-def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:
-    parameters = store.plan.grid.scene_block(tuple(slice(k, k + 1) for k in place)).parameters
+def _compute_outlines(store: Store, indices: tuple[int, ...]) -> dict[str, Outlines]:
+    """Compute the edges of one device of a sweep, given by its index along each device dimension; none if invalid."""
+    parameters = store.plan.grid.scene_block(tuple(slice(k, k + 1) for k in indices)).parameters
     try:
         return find_edges(store.study.make_scene({name: float(values[0]) for name, values in parameters.items()}))
     except InputError:
@@ -82,34 +90,47 @@ def draw_stores(
     progress: Callable[[Path], None] = lambda file: None,
     note: Callable[[str], None] = lambda text: None,
 ) -> tuple[Path, ...]:
-    """Draw the sweeps in a store, or in all stores of a folder, into ``figures`` beside them if ``out`` is left out."""
-    # ``at`` chooses slices, by name: the nearest value that the sweep has to one in the units of the store or with one,
-    # as "1 ms", or the label of a device; of a parameter that is not given up to three values are shown. ``progress``
-    # is called with every file, ``note`` with what a reader should know: other values than those wanted, stores without
-    # a figure.
+    """Draw figures of the sweep in a store, or of all sweeps in a folder.
+
+    Args:
+        path: Store, or folder with stores.
+        out: Folder of the figures; by default ``figures`` next to the stores.
+        at: Slices, as values by name of the parameter: a number in the units of the store, a quantity with its unit
+            such as "1 ms", or the label of a device. The nearest value of the sweep is drawn. Of a parameter without a
+            value, up to three values are drawn.
+        formats: File formats.
+        dpi: Resolution of pixel graphics.
+        size: Width, or width and height, of the figures.
+        style: Matplotlib style sheet.
+        progress: Called with the path of every figure.
+        note: Called with messages for the user: another value than the requested one, missing chunks, no figure.
+
+    Returns:
+        The paths of the figures.
+    """
     folder = Path(os.fsdecode(path))
     if (folder / RUN_FILE).is_file() and not any(folder.glob(f"*{SUFFIX}")):
         remedy = "to change their look, run again: zwidth run CONFIG --overwrite --size 85mm --dpi 300"
-        raise StoreError(f"{folder}: contains no sweep; the figures of its studies exist already; {remedy}")
+        raise StoreError(f"{folder}: contains no sweep; the figures of its studies already exist; {remedy}")
     stores = list_stores(folder)
     beside = folder.parent if stores == [folder] else folder
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))
-    # As stores spell them.
+    # Stores contain underscores in place of the dots of parameter names.
     wanted = {name.replace(".", "_"): value for name, value in (at or {}).items()}
     datasets = {store: open_dataset(store).reset_coords(drop=True) for store in stores}
     for store in (store for store, data in datasets.items() if not data.attrs["complete"]):
         note(f"{store.name}: chunks are missing and left blank; 'zwidth run CONFIG --resume' computes them")
-    known = dict.fromkeys(str(dim) for data in datasets.values() for dim in data.dims)
-    unknown = [name for name in wanted if name not in known]
+    varied = dict.fromkeys(str(dim) for data in datasets.values() for dim in data.dims)
+    unknown = [name for name in wanted if name not in varied]
     if unknown:
-        raise InputError(f"at: no sweep in {folder} varies {unknown[0]!r}; choose from {', '.join(known)}")
-    slices = {store: _cut(store, data, wanted, note) for store, data in datasets.items()}
+        raise InputError(f"at: no sweep in {folder} varies {unknown[0]!r}; choose from {', '.join(varied)}")
+    slices = {store: _select_slice(store, data, wanted, note) for store, data in datasets.items()}
     files = []
     with style_sheet(style, size):
         for store, data in slices.items():
-            drawn = list(figures_of(data, make_edges(Store(store))))
+            drawn = list(list_figures(data, make_edges(Store(store))))
             if not drawn:
-                note(f"{store.name}: no figure, for {_explain_absence(data)}")
+                note(f"{store.name}: no figure, because {_explain_absence(data)}")
             for name, draw in drawn:
                 target.mkdir(parents=True, exist_ok=True)
                 stem = target / f"{store.name.removesuffix(SUFFIX)}_{name}"
@@ -120,19 +141,20 @@ def draw_stores(
 
 
 def _explain_absence(data: xarray.Dataset) -> str:
-    # A store lists its dimensions in any order.
+    """Return the reason why a sweep has no figure."""
+    # Use the declared order of the variables, because the order in a store differs between file systems.
     varied = [name for name in ("device", *VARIABLES) if data.sizes.get(name, 0) > 1]
-    return f"it varies over {', '.join(varied)}, which draws none of its outputs" if varied else "it is a single point"
+    return f"no figure shows its outputs over {', '.join(varied)}" if varied else "it is a single point"
 
 
-def figures_of(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The name of each figure of a sweep, or of a part of one, and what draws it."""
-    # A store lists its variables in any order.
+def list_figures(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """Yield the name of each figure of a sweep or slice, and the function that draws it."""
+    # Use the declared order of the outputs, because the order in a store differs between file systems.
     for name in OUTPUTS:
         if name not in data or name == "kind" or (name == "passive" and "stable" in data):
             continue
         over = choose_axes(data, name)
-        few = OUTPUTS[name].family == "device" and min((data.sizes[axis] for axis in over), default=0) < _SURFACE
+        few = OUTPUTS[name].family == "device" and min((data.sizes[axis] for axis in over), default=0) < _MIN_SURFACE
         if len(over) == 2 and not few:
             yield name, partial(draw_plane, data, name, edges=edges)
         elif over and OUTPUTS[name].dtype == "float64":
@@ -141,28 +163,32 @@ def figures_of(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[tup
         yield "boundaries", partial(draw_outlines, data, edges=edges)
 
 
-def _cut(
+def _select_slice(
     store: Path, data: xarray.Dataset, wanted: Mapping[str, float | str], note: Callable[[str], None]
 ) -> xarray.Dataset:
-    """The slice of a sweep that is nearest to what is wanted of it."""
-    found = {str(dim): _nearest(data, str(dim), wanted[str(dim)]) for dim in data.dims if dim in wanted}
-    for dim, (place, exact) in found.items():
+    """Return the slice of a sweep at the values nearest to the requested ones; report differing values by ``note``."""
+    nearest = {str(dim): _find_nearest(data, str(dim), wanted[str(dim)]) for dim in data.dims if dim in wanted}
+    for dim, (index, exact) in nearest.items():
         if not exact:
-            taken = _spell(float(data[dim][place]), data[dim].attrs["units"])
-            note(f"{store.name}: {dim} = {taken}, the nearest to {wanted[dim]} that the sweep has")
-    return data.isel({dim: place for dim, (place, _) in found.items()})
+            drawn = _format_value(float(data[dim][index]), data[dim].attrs["units"])
+            note(f"{store.name}: {dim} = {drawn}, the value of the sweep nearest to {wanted[dim]}")
+    return data.isel({dim: index for dim, (index, _) in nearest.items()})
 
 
-def _spell(value: float, unit: str) -> str:
+def _format_value(value: float, unit: str) -> str:
+    """Return a value with its unit; no unit if it is 1."""
     return f"{short(value)} {unit}".removesuffix(" 1")
 
 
-def _nearest(data: xarray.Dataset, dim: str, value: float | str) -> tuple[int, bool]:
-    """The index of the value that the sweep has and that is closest to the one wanted, and whether it is that."""
+def _find_nearest(data: xarray.Dataset, dim: str, value: float | str) -> tuple[int, bool]:
+    """Return the index of the value of the sweep nearest to the requested one, and whether the two are equal.
+
+    Raise `InputError` if the requested value lies outside the range of the sweep by more than half a step.
+    """
     if dim == "device":
         labels = [str(label) for label in data["device"].values]
         if str(value) not in labels:
-            raise InputError(f"at: there is no device {str(value)!r}; choose from {', '.join(labels)}")
+            raise InputError(f"at: no device {str(value)!r} in the sweep; choose from {', '.join(labels)}")
         return labels.index(str(value)), True
     unit = data[dim].attrs["units"]
     try:
@@ -175,11 +201,11 @@ def _nearest(data: xarray.Dataset, dim: str, value: float | str) -> tuple[int, b
     if not np.isfinite(wanted):
         raise InputError(f"at: {dim}: got {value!r}; write a finite number")
     values = np.asarray(data[dim].values, dtype=float)
-    place, ordered = int(np.argmin(np.abs(values - wanted))), np.sort(values)
-    # Half a step beyond either end; a single value has none.
+    index, ordered = int(np.argmin(np.abs(values - wanted))), np.sort(values)
+    # Allow half a step beyond either end. A single value has no step.
     steps = np.diff(ordered) if values.size > 1 else np.zeros(1)
     slack = 1e-9 * abs(wanted)
     if not ordered[0] - 0.5 * steps[0] - slack <= wanted <= ordered[-1] + 0.5 * steps[-1] + slack:
-        has = " to ".join(_spell(float(end), unit) for end in dict.fromkeys((ordered[0], ordered[-1])))
-        raise InputError(f"at: {dim}: got {_spell(wanted, unit)}, the sweep has {has}; choose a value that it has")
-    return place, bool(np.isclose(values[place], wanted, rtol=1e-9, atol=0.0))
+        limits = " to ".join(_format_value(float(end), unit) for end in dict.fromkeys((ordered[0], ordered[-1])))
+        raise InputError(f"at: {dim}: got {_format_value(wanted, unit)}, the sweep has {limits}; choose such a value")
+    return index, bool(np.isclose(values[index], wanted, rtol=1e-9, atol=0.0))

@@ -1,8 +1,8 @@
-"""The record of a run: what ran, from what, in which versions, and which files are its own.
+"""The record of a run, ``run.json``: its studies, inputs, package versions, outcomes, and the files it has written.
 
-``run.json`` is written anew after every study, so that a run that ends at any moment leaves a true account. A study's
-files are made in a hidden folder, named in the record, and only then given their names: no file of the run is ever half
-written under its name, and no file that the record does not name is ever replaced or removed.
+The record is written again after every study, so that a run that is killed at any moment leaves a correct record. The
+files of a study are created in a hidden folder, then entered in the record, and only then moved to their names. So no
+file of a run is ever incomplete under its name, and a file that is not in the record is never replaced or removed.
 """
 
 from __future__ import annotations
@@ -25,41 +25,37 @@ from zwidth.sweep.files import (
     ELSEWHERE,
     LOCKS,
     check_folder,
-    digest,
+    hash_json,
     is_plain_name,
-    versions,
+    list_versions,
 )
 from zwidth.sweep.store import SUFFIX
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
 from zwidth.words.files import remove_quietly, write_whole
 from zwidth.words.formatting import describe
 
-RUN_FILE = "run.json"
-CONFIG_FILE = "config.yaml"
-INPUTS = "inputs"
-RUN_FORMAT = 2
-_SEAL = "record_sha256"
-_MOVE = f"move it away, or {ELSEWHERE}"
-
-# Recorded in addition to the packages that can change a result.
-_PACKAGES = ("scipy", "matplotlib", "optimistix", "jaxopt")
-
-# As `hidden_beside` calls what is not finished.
-_HALF_MADE = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
-# What may name a file; a device may be named otherwise than by its table.
-_KEYS = ("csv", "device")
+RUN_FILE = "run.json"  # the record
+CONFIG_FILE = "config.yaml"  # copy of the configuration, with the names of the copied inputs
+INPUTS = "inputs"  # folder with copies of the files that the configuration reads
+RUN_FORMAT = 2  # format version of the record
+_CHECKSUM = "record_sha256"  # key of the checksum of the record
+_MOVE = f"move it away, or {ELSEWHERE}"  # remedy for files of the user, for messages
+_PACKAGES = ("scipy", "matplotlib", "optimistix", "jaxopt")  # recorded together with the packages that affect results
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.partial")  # names of incomplete files and folders, made by `hidden_beside`
+_KEYS = ("csv", "device")  # keys of the configuration whose value may be the name of a file
 
 
 class Record:
-    """The record in the folder of a run, whether it exists or not."""
+    """The record in the folder of a run; empty if the folder contains none."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.content: dict[str, Any] = {}
-        self.damaged = False  # whether the record was not what was written
+        self.damaged = False  # True if the checksum of the record is wrong
         self._read()
 
     def _read(self) -> None:
+        """Read the record; raise `StoreError` if it cannot be used."""
         where, remedy = self.folder / RUN_FILE, f"{ELSEWHERE}, or remove it"
         try:
             content = json.loads(where.read_text(encoding="utf-8"))
@@ -69,11 +65,11 @@ class Record:
             raise StoreError(f"{where}: cannot be read ({error}); {remedy}") from error
         if not isinstance(content, dict) or not isinstance(content.get("studies"), list):
             raise StoreError(f"{where}: no record of a run; {remedy}")
-        seal = content.pop(_SEAL, None)
-        if seal is not None and digest(content) != seal:
+        checksum = content.pop(_CHECKSUM, None)
+        if checksum is not None and hash_json(content) != checksum:
             self.damaged = True
             if content.get("format") == RUN_FORMAT:
-                # Which files are the run's can be believed, for they are made anew; what was found cannot.
+                # Keep the lists of files, because the studies are computed again anyway; discard the results.
                 entries = [entry for entry in content["studies"] if isinstance(entry, dict)]
                 content["studies"] = [
                     {**entry, "state": "open"}
@@ -87,50 +83,62 @@ class Record:
 
     @property
     def exists(self) -> bool:
+        """True if the folder contains a record."""
         return bool(self.content)
 
     def entry(self, name: str) -> dict[str, Any] | None:
+        """Return the entry of a study; None if the record has none."""
         return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
 
-    def check_free(self, config: str, *, overwrite: bool, going_on: bool) -> None:
-        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with."""
-        # A run without its record is known by its configuration: the one of the text ``config``.
+    def check_free(self, config: str, *, overwrite: bool, resume: bool) -> None:
+        """Raise `StoreExistsError` if the folder is not empty, unless its content is a run to be replaced or resumed.
+
+        Args:
+            config: Text of the configuration, which identifies a run whose record is lost.
+            overwrite: An existing run may be replaced.
+            resume: An existing run may be resumed.
+        """
         if (self.folder.exists() or self.folder.is_symlink()) and not self.folder.is_dir():
             raise StoreExistsError(f"out: {self.folder} is a file, a folder is needed; choose another with --out DIR")
         check_folder(self.folder)
-        if going_on or not self.folder.is_dir():
+        if resume or not self.folder.is_dir():
             return
-        # What a run without a record leaves; stores are refused or replaced one by one: they say what they are.
-        names, known = [path.name for path in self.folder.iterdir()], (LOCKS, CONFIG_FILE, "figures")
-        strange = [name for name in names if not name.endswith((SUFFIX, ".partial")) and name not in known]
-        why = ""
-        if strange and not self.exists and not self._holds_config(config):
-            why = f"is not empty and holds no run (no {RUN_FILE}), and no {CONFIG_FILE} of this configuration; "
-            why += ELSEWHERE
+        # Names that a run without a record may leave. Stores are checked one by one later, because each of them
+        # contains its study.
+        names, expected = [path.name for path in self.folder.iterdir()], (LOCKS, CONFIG_FILE, "figures")
+        strange = [name for name in names if not name.endswith((SUFFIX, ".partial")) and name not in expected]
+        fault = ""
+        if strange and not self.exists and not self._contains_config(config):
+            fault = f"is not empty and contains no run (no {RUN_FILE}), and no {CONFIG_FILE} of this configuration; "
+            fault += ELSEWHERE
         elif self.exists and not overwrite:
-            why = f"already holds a run; {ELSEWHERE}, go on with it with --resume, or replace it with --overwrite"
+            fault = f"already contains a run; {ELSEWHERE}, continue it with --resume, or replace it with --overwrite"
         elif strange and not overwrite:
-            why = f"holds a run of this configuration without its record {RUN_FILE}; replace its files with "
-            why += f"--overwrite, keep its sweeps with --resume, or {ELSEWHERE}"
-        if why:
-            raise StoreExistsError(f"out: {self.folder} {why}")
+            fault = f"contains a run of this configuration without its record {RUN_FILE}; replace its files with "
+            fault += f"--overwrite, keep its sweeps with --resume, or {ELSEWHERE}"
+        if fault:
+            raise StoreExistsError(f"out: {self.folder} {fault}")
 
-    def _holds_config(self, text: str) -> bool:
+    def _contains_config(self, text: str) -> bool:
+        """Return whether the folder contains a configuration file with the given text."""
         with suppress(OSError):
             return (self.folder / CONFIG_FILE).read_bytes() == text.encode("utf-8")
         return False
 
     def check_same(self, inputs: dict[str, dict[str, Any]]) -> None:
-        """Refuse to go on with a run that other releases made, or whose studies, given by name, had other inputs."""
+        """Raise `StoreError` if the run cannot be resumed: it was computed by other releases or from other inputs.
+
+        ``inputs`` contains the present inputs of each study, by its name.
+        """
         if not self.exists:
             return
         if self.content.get("format") != RUN_FORMAT:
             raise StoreError(
-                f"{self.folder}: an earlier release made this run and kept no checksums to go on from; start again "
+                f"{self.folder}: run of an earlier release without checksums, which cannot be resumed; start again "
                 f"with --overwrite, or {ELSEWHERE}"
             )
         if self.damaged:
-            # Everything is computed again, and stores know by themselves what they are for.
+            # Skip the comparison, because all studies are computed again, and each store contains its own study.
             return
         where = self.folder / RUN_FILE
         for name, now in inputs.items():
@@ -140,31 +148,35 @@ class Record:
         refuse_versions(where, self.content.get("versions", {}))
 
     def start(self, **about: Any) -> None:
+        """Write the start of a run: the attributes ``about``, the time and the package versions."""
         about |= {"format": RUN_FORMAT, "started": datetime.now(UTC).isoformat(timespec="seconds")}
-        about |= {"precision": "float64", "versions": versions(*_PACKAGES)}
+        about |= {"precision": "float64", "versions": list_versions(*_PACKAGES)}
         self._update({**about, "started": self.content.get("started", about["started"])})
 
     def keep_config(self, text: str, inputs: Mapping[str, bytes]) -> None:
-        """Write the configuration beside its results, and the files that it reads; what is somebody's own stays."""
-        # Where the folder held this configuration and no record, the record was lost: the run's files are its own.
-        path, place = self.folder / CONFIG_FILE, self.folder / INPUTS
+        """Write the configuration and the files that it reads into the folder; never replace files of the user."""
+        path, input_dir = self.folder / CONFIG_FILE, self.folder / INPUTS
         digests = {name: hashlib.sha256(data).hexdigest() for name, data in inputs.items()}
-        wanted = {name: data for name, data in inputs.items() if file_hash(place / name) != digests[name]}
-        known = {} if place.is_symlink() else self.content.get("inputs", {})
-        strange = [name for name in wanted if name not in known and (place.is_symlink() or (place / name).exists())]
+        missing = {name: data for name, data in inputs.items() if hash_file(input_dir / name) != digests[name]}
+        recorded = {} if input_dir.is_symlink() else self.content.get("inputs", {})
+        strange = [
+            name for name in missing if name not in recorded and (input_dir.is_symlink() or (input_dir / name).exists())
+        ]
         if strange:
-            raise StoreExistsError(f"out: {place / strange[0]} was not written by this run; {_MOVE}")
-        own = CONFIG_FILE in self.files()
-        lost = not own and self._holds_config(text)
-        self._update(({"inputs": {**known, **digests}} if digests else {}) | ({"lost": True} if lost else {}))
-        for name, data in wanted.items():
-            write_whole(place / name, data)
-        if own or lost or not path.exists():
+            raise StoreExistsError(f"out: {input_dir / strange[0]} was not written by this run; {_MOVE}")
+        written = CONFIG_FILE in self.files()
+        # If the folder contains this configuration but no record of it, the record was lost. Then files with the names
+        # of the run's files belong to the run.
+        lost = not written and self._contains_config(text)
+        self._update(({"inputs": {**recorded, **digests}} if digests else {}) | ({"lost": True} if lost else {}))
+        for name, data in missing.items():
+            write_whole(input_dir / name, data)
+        if written or lost or not path.exists():
             self._update({"config_file": CONFIG_FILE})
             write_whole(path, text.encode("utf-8"))
 
     def note(self, entry: dict[str, Any]) -> None:
-        """Write down how a study went, in place of what was there before."""
+        """Write the outcome of a study to the record, replacing its earlier entry."""
         self._update({}, entry)
 
     def _update(self, about: dict[str, Any], entry: dict[str, Any] | None = None) -> None:
@@ -173,28 +185,31 @@ class Record:
         studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
         content["studies"] = [*studies, *([] if entry is None else [entry])]
         self.content = content
-        sealed = json.dumps(content | {_SEAL: digest(content)}, indent=2) + "\n"
-        write_whole(self.folder / RUN_FILE, sealed.encode())
+        text = json.dumps(content | {_CHECKSUM: hash_json(content)}, indent=2) + "\n"
+        write_whole(self.folder / RUN_FILE, text.encode())
 
     def faults(self, name: str) -> list[str]:
-        """The files of a study that are not what was written."""
+        """Return the damaged and missing files of a study, each with its fault."""
         entry = self.entry(name)
         files = entry["files"] if entry else {}
         return [
             f"{file} is {'damaged' if (self.folder / file).exists() else 'missing'}"
             for file, expected in files.items()
-            if expected is not None and file_hash(self.folder / file) != expected
+            if expected is not None and hash_file(self.folder / file) != expected
         ]
 
     def keep(self, stage: Path, entry: dict[str, Any]) -> None:
-        """Give the files in ``stage`` their names; when the study is done, take away what else it had before."""
-        # A file of somebody's own that has one of these names is a `StoreExistsError`.
+        """Move the files of a study from the folder ``stage`` to their names, and write its entry to the record.
+
+        If the study is done, files that it had written earlier and does not have any more are removed. Raise
+        `StoreExistsError` if a file of the user has one of the names.
+        """
         before = self.entry(entry["name"]) or {}
-        files = {path.name: file_hash(path) for path in sorted(stage.iterdir())}
+        files = {path.name: hash_file(path) for path in sorted(stage.iterdir())}
         for file in files:
             if (self.folder / file).exists() and file not in self.files() and not self.content.get("lost"):
                 raise StoreExistsError(f"out: {self.folder / file} was not written by this run; {_MOVE}")
-        # First the names, so that a run that is killed between two files still knows them for its own.
+        # Write the names first, so that the record of a run killed between two files contains all of them.
         both = {**before.get("files", {}), **files}
         self.note({**entry, "state": "open", "files": both})
         for file in files:
@@ -205,28 +220,29 @@ class Record:
         self.note({**entry, "files": both})
 
     def files(self) -> set[str]:
-        """All files that the run has written, by the record."""
-        found = {RUN_FILE}
+        """Return the names of all files that the run has written, according to the record."""
+        names = {RUN_FILE}
         if self.content.get("config_file"):
-            found.add(CONFIG_FILE)
+            names.add(CONFIG_FILE)
         for entry in self.content.get("studies", ()):
-            found |= {str(file) for file in entry.get("files", ())}
-        return found
+            names |= {str(file) for file in entry.get("files", ())}
+        return names
 
     def clear(self) -> None:
-        """Remove what the run has written, the record last; whatever else is in the folder stays."""
+        """Remove all files that the run has written, the record last; keep all other files."""
         if self.exists:
             self._remove(sorted(self.files() - {RUN_FILE}))
-            place = self.folder / INPUTS
-            if not place.is_symlink():
+            input_dir = self.folder / INPUTS
+            if not input_dir.is_symlink():
                 for name in self.content.get("inputs", {}):
-                    (place / name).unlink(missing_ok=True)
+                    (input_dir / name).unlink(missing_ok=True)
                 with suppress(OSError):
-                    place.rmdir()
+                    input_dir.rmdir()
             self._remove([RUN_FILE])
             self.content = {}
 
     def _remove(self, names: Iterable[str]) -> None:
+        """Remove files and stores of the folder; keep folders that are not stores."""
         for name in names:
             path = self.folder / name
             if name.endswith(SUFFIX) and (path / "zarr.json").is_file() and not path.is_symlink():
@@ -234,15 +250,15 @@ class Record:
             elif not path.is_dir():
                 path.unlink(missing_ok=True)
 
-    def sweep_up(self) -> None:
-        """Remove what runs that were killed have left half made."""
+    def remove_leftovers(self) -> None:
+        """Remove the incomplete files and folders of killed runs."""
         for left in self.folder.glob(".*.partial"):
-            if _HALF_MADE.fullmatch(left.name):
+            if _TEMPORARY.fullmatch(left.name):
                 remove_quietly(left)
 
 
 def _find_fault(content: Any) -> str:
-    """What keeps a JSON value from being the record of a run."""
+    """Return the reason why a JSON value is no record of a run; "" if it is one."""
     kinds = {"studies": list, "versions": dict, "inputs": dict}
     if not all(isinstance(content.get(key, kind()), kind) for key, kind in kinds.items()):
         return "no record of a run"
@@ -251,19 +267,20 @@ def _find_fault(content: Any) -> str:
         if not isinstance(entry, dict) or not isinstance(entry.get("files", {}), dict):
             return "a damaged record of a run"
         names += [entry.get("name"), *entry.get("files", ())]
-    # All that a run removes or replaces is named there.
+    # Refuse names outside the folder, because a run removes and replaces the files named in its record.
     outside = [name for name in names if not isinstance(name, str) or not is_plain_name(name)]
-    return f"names {describe(outside[0])}, which is no file of its folder" if outside else ""
+    return f"lists {describe(outside[0])}, which is not the name of a file in its folder" if outside else ""
 
 
 def find_config(folder: Path) -> Path:
-    """The configuration that a run keeps beside its results."""
+    """Return the path of the configuration in the folder of a run; raise `InputError` if there is none."""
     if CONFIG_FILE not in Record(folder).files():
         raise InputError(f"{folder}: no run with a recorded configuration ({RUN_FILE}, {CONFIG_FILE}); name a file")
     return folder / CONFIG_FILE
 
 
-def file_hash(path: Path) -> str:
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file; "" for links and for files that cannot be read."""
     with suppress(OSError):
         if not path.is_symlink():
             with open(path, "rb") as stream:
@@ -272,30 +289,37 @@ def file_hash(path: Path) -> str:
 
 
 def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[str, str]]:
-    """What a run keeps so that it can be repeated from its own folder, of a configuration's text without faults."""
-    # The text with the names of the copies; the copies' bytes by their names in the folder of inputs; and, by the names
-    # that the configuration has, those that the text has now. A copy's own name stays as it is.
+    """Collect the files that a valid configuration reads, so that the run can be repeated from its own folder.
+
+    Args:
+        text: Text of the configuration.
+        folder: Folder to which the names in the configuration are relative.
+
+    Returns:
+        The text with the names of the copies in place of the original names, the content of each copy by its name in
+        the folder of inputs, and the path of each copy by the original name.
+    """
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}
-    places = find_values(text, "csv") + [place for place in find_values(text, "device") if place[0].endswith(SUFFIXES)]
-    places.sort(key=lambda place: place[1])
-    for name, _, _ in places:
+    spans = find_values(text, "csv") + [span for span in find_values(text, "device") if span[0].endswith(SUFFIXES)]
+    spans.sort(key=lambda span: span[1])
+    for name, _, _ in spans:
         if name not in names and (folder / name).is_file():
             copy = _choose_name(name, files)
             files[copy] = (folder / name).read_bytes()
             names[name] = f"{INPUTS}/{copy}"
-    for name, first, last in reversed(places):
+    for name, first, last in reversed(spans):
         if name in names:
             text = f"{text[:first]}{names[name]}{text[last:]}"
     return text, files, names
 
 
 def _choose_name(name: str, taken: dict[str, bytes]) -> str:
-    """A name that any file system and YAML take as it is; files of one name in different folders are told apart."""
+    """Return a name for the copy of a file; it is valid on all file systems and in YAML, and differs from ``taken``."""
     plain = re.sub(r"[^A-Za-z0-9._-]", "_", PurePath(name).name)
     stem, suffix = PurePath(plain).stem, PurePath(plain).suffix
     number = 1
-    # Some file systems do not tell cases apart.
+    # Compare in lower case, because some file systems do not distinguish upper and lower case.
     while plain.lower() in {each.lower() for each in taken}:
         number += 1
         plain = f"{stem}-{number}{suffix}"
@@ -303,7 +327,7 @@ def _choose_name(name: str, taken: dict[str, bytes]) -> str:
 
 
 def rename_inputs(value: Any, names: dict[str, str]) -> Any:
-    """A configuration's JSON with other names of its files."""
+    """Return the JSON of a configuration with the names of its files replaced, given the new name by the old one."""
     if isinstance(value, list):
         return [rename_inputs(item, names) for item in value]
     if not isinstance(value, dict):

@@ -37,14 +37,14 @@ class SceneMargins(Margins):
 
 
 class SceneAnswers(SceneParts):
-    """The questions of `zwidth.Scene` about walls; of the scene they need its parts, loop and boundary.
+    """The methods of `zwidth.Scene` that evaluate walls.
 
-    Without a stiffness and a damping each means the scene's own wall (`zwidth.parts.wall.resolve_wall`). A quantity
-    may be a text with a unit, "10 kN/m".
+    Without a stiffness and a damping, each method evaluates the wall of the scene (`zwidth.parts.wall.resolve_wall`). A
+    quantity may be a text with a unit, such as "10 kN/m".
     """
 
     def normalize_walls(self, stiffness: Walls = None, virtual_damping: Walls = None) -> tuple[np.ndarray, np.ndarray]:
-        """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
+        """Return alpha and beta of walls in SI units, as arrays that broadcast; by default of the wall of the scene."""
         units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping, self.unit_system)
         if are_numbers(*both):
             both = np.float64(both[0]), np.float64(both[1])
@@ -170,14 +170,15 @@ class SceneAnswers(SceneParts):
         return self.loop.labels(*walls)
 
     def stable_stiffness(self, virtual_damping: ArrayLike | None = None) -> np.ndarray:
-        """The stable intervals of the stiffness at a damping, several where there are several.
+        """Return all stable intervals of the stiffness at a damping.
 
         Args:
-            virtual_damping: B in N s/m, a number or an array; that of the scene's own wall where left out, 0 without.
+            virtual_damping: B in N s/m, a number or an array; by default that of the wall of the scene, or 0 without a
+                wall.
 
         Returns:
-            Array (n, 2) in N/m, or with the shape of the damping in front and NaN where a row has fewer intervals. The
-            ends are not stable themselves.
+            Array of shape (n, 2) in N/m; for an array of dampings, of shape (*shape, n, 2), with NaN if a damping has
+            fewer intervals. The intervals are open.
         """
         given = self.wall.virtual_damping if virtual_damping is None else virtual_damping
         damping = read_texts("virtual_damping", given, self.unit_system["N s/m"])
@@ -186,13 +187,13 @@ class SceneAnswers(SceneParts):
         return both.reshape(*beta.shape, *both.shape[1:])
 
     def stable_damping(self, stiffness: Wall = None) -> np.ndarray:
-        """The stable intervals of the virtual damping at one stiffness, several where there are several.
+        """Return all stable intervals of the virtual damping at one stiffness.
 
         Args:
-            stiffness: K in N/m; that of the scene's own wall where left out.
+            stiffness: K in N/m; by default that of the wall of the scene.
 
         Returns:
-            Array (n, 2) in N s/m. The ends are not stable themselves.
+            Array of shape (n, 2) in N s/m. The intervals are open.
         """
         stiffness = resolve_wall(self.wall, None, None, self.unit_system)[0] if stiffness is None else stiffness
         alpha, _ = one_wall(*self.normalize_walls(stiffness, 0.0))

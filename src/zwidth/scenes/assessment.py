@@ -112,7 +112,7 @@ def assess(scene: SceneOptima) -> Assessment:
         >>> verdict.stable, verdict.passive
         (True, False)
     """
-    # First of all, for it refuses more poles than can be computed at once.
+    # Compute the dominant pole first, because this raises an error if the loop has too many poles.
     slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
     stands, best, known = scene.margins(), scene.max_stiffness(), not find_obstacle(**vars(scene.device))
     margin = float(scene.passivity_margin()) if known else math.nan

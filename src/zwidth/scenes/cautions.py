@@ -75,7 +75,7 @@ def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
 
 
 def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[Any], bool], otherwise: str) -> str:
-    """Return the first options with an accepted wall, that wall and its cost in stiffness; ``otherwise`` if none."""
+    """Return the first of the options whose wall is accepted, with this wall and its cost; ``otherwise`` if none is."""
     for words, wanted in options.items():
         scene = recommendation.scene
         wall = choose_wall(scene, wanted, recommendation.stiffest, recommendation.stiffness, COARSE)

@@ -31,7 +31,7 @@ from zwidth.loops.linear.rows import Island, bound_intervals, label_walls, stabl
 from zwidth.loops.rigid.boundary import boundary, boundary_point, stable_region
 from zwidth.loops.rigid.margins import margins, margins_kernel
 from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.outermost_poles import slowest_pole
+from zwidth.loops.rigid.outermost_poles import find_dominant_pole
 from zwidth.loops.rigid.passivity import passivity_margin
 from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.ridge import alpha_max, slopes_kernel, stiffness_slopes
@@ -67,14 +67,14 @@ class LinearLoop:
     """The loop of any scene with a linear velocity estimate; alpha and beta are arrays of one shape."""
 
     scene: Any
-    # The stiffest walls that were found: a scene is asked for them often.
+    # Cache of the stiffest walls, by "negative damping allowed".
     _ridges: dict[bool, BoundRidge | None] = field(default_factory=dict, init=False, repr=False)
 
-    # Random devices per interactive question: one maximum stiffness takes some 10 to 50 ms.
+    # Number of random devices in an interactive computation; one maximum stiffness takes some 10 to 50 ms.
     draws: ClassVar[int] = 200
     # True if the methods that take walls work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
-    # The most periods of window and delay that a search affords: its cost grows with their square.
+    # Largest window and delay in a search, in periods; its run time increases with their square.
     most_periods: ClassVar[float] = 128
 
     @cached_property
@@ -227,7 +227,7 @@ class LinearLoop:
         return RidgePoint(alpha, beta, omega, np.int32(found.kind), np.int32(status))
 
     def ridge(self, negative: bool) -> tuple[BoundRidge | None, Status]:
-        """Return the stiffest wall of plain numbers with its active constraints, or None, and a status."""
+        """Return the stiffest wall with its active constraints, None if there is none, and a status; not traceable."""
         border = self.border
         if negative not in self._ridges:
             try:
@@ -288,7 +288,7 @@ class RigidLoop(LinearLoop):
 
     def slowest(self, alpha: float, beta: float) -> SlowestMotion:
         with np.errstate(all="ignore"):
-            slowest = slowest_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
+            slowest = find_dominant_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
         # A row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
         return SlowestMotion(alpha == 0 and bool(self.row(np.array([beta])).size), *slowest)
 
@@ -369,7 +369,7 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
         per["period"] = per["period"] + scene.timing.d * per["delay"]
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
-        # A spring to ground that is not there yet has no closed form.
+        # The derivative with respect to the stiffness of the operator has no closed form.
         ridge = scene.loop.ridge(negative)[0]
         per["operator.stiffness"] = math.nan if ridge is None else find_slope(scene, ridge, "operator.stiffness")
     per = {path: float(slope) for path, slope in per.items()}

@@ -122,11 +122,12 @@ def _present_value(scene: SceneAnswers, parameter: str) -> float:
 
 
 def _range(scene: SceneAnswers, parameter: str, now: float, within: tuple[Any, Any] | None) -> tuple[float, float]:
+    """Return the range of a parameter to search: ``within`` if given, otherwise around the present value ``now``."""
     if within is None:
         timing = scene.timing
         if not now > 0:
             raise InputError(f"within: {parameter} is 0 now; give the range to search, as within=(0.1, 10)")
-        # The cost grows with the square of the delay in periods, and a filter has no cut-off from half its rate on.
+        # The run time increases with the square of the delay in periods; a cutoff is below the Nyquist frequency.
         fixed = 0.0 if timing.in_periods else timing.delay
         longest = max(float(timing.delay / timing.period), _MOST_PERIODS)
         ends = {

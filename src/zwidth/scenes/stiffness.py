@@ -66,7 +66,7 @@ def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kin
 def move_max_stiffness(
     mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses
 ) -> tuple[Array, tuple[Array, ...]]:
-    """`max_stiffness_kernel`, and how it moves with each of mass, period, delta and d."""
+    """Return `max_stiffness_kernel` and its derivatives with respect to mass, period, delta and d."""
     found = slopes_kernel(delta, d, kind)
     scale = (mass / period) / period
     value = found.point.alpha * scale
@@ -131,9 +131,9 @@ def sensitivities(
 
 def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensitivities:
     xp = namespace(mass, delta, d)
-    # Traced: compute the slopes in delta and d only once, not again for each quantity.
+    # If traced, compute the derivatives in delta and d once, not again for each quantity.
     found = slopes_kernel(delta, d, kind) if xp is np else compile_traced(slopes_kernel, (kind,))(delta, d)
-    # An array's entry beyond the range of its quantity is NaN in delta or d; the quantities tell why.
+    # Array entries out of range are NaN in delta or d; compute their status from the quantities.
     given = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
     status = xp.where(given == Status.OK, found.point.status, given).astype(np.int32)
     return Sensitivities(*stiffness_slopes(found, mass, period, delta, d), status)

@@ -37,8 +37,14 @@ class Variants:
         return np.array([bool(scene.is_stable(stiffness, damping)) for scene in self.scenes()])
 
     def row_ends(self, damping: np.ndarray) -> np.ndarray:
-        """Up to which K every softer wall is stable, for each variant and each B of a row; 0 where none is."""
+        """Return the largest K up to which walls are stable, for each variant and each B; 0 if no wall is stable.
+
+        The stable interval starts at K = 0, or is the softest one with K > 0 if the device is unstable without a wall.
+        """
         rows = (np.moveaxis(scene.stable_stiffness(damping), -1, 0) for scene in self.scenes())
+        if self.scene.loop.least_stiffness(-np.inf) is not None:
+            ends = np.array([np.min(np.where(high > 0, high, np.inf), -1, initial=np.inf) for _, high in rows])
+            return np.where(np.isfinite(ends), ends, 0.0)
         firsts = (np.where(reaches_down(low, high), high, 0.0) for low, high in rows)
         return np.array([first.max(-1, initial=0.0) for first in firsts])
 
@@ -81,7 +87,7 @@ class RigidVariants(Variants):
 
     @np.errstate(all="ignore")
     def column_ends(self, stiffness: float, side: str) -> np.ndarray:
-        """The least or the largest B with which each variant bears a K; NaN where none does."""
+        """Return the smallest or the largest stable B of each variant at a K; NaN if no B is stable."""
         alpha = stiffness * self.period / self.rate
         point = self.ask(lambda *at: boundary_point(*at[:2], alpha=at[2], side=side).beta, self.delta, self.d, alpha)
         return point * self.rate
@@ -93,7 +99,7 @@ class RigidVariants(Variants):
 
     @staticmethod
     def ask(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-        """A function of arrays, in pieces for each of which NumPy is quicker than a compiler."""
+        """Evaluate a function of arrays in pieces that are small enough to be faster in NumPy than compiled."""
         whole = np.broadcast_arrays(*arrays)
         pieces = -(-whole[0].size // FEW)
         split = [np.array_split(array.ravel(), pieces if pieces <= _MOST_PIECES else 1) for array in whole]

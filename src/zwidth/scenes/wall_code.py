@@ -97,11 +97,11 @@ def write_wall(
 ) -> str:
     """Return a wall as source code (`zwidth.scenes.recommendation.Recommendation.code`)."""
     check_choice("language", language, ("c", "python"))
-    program = lay_program(scene, cautions, max_force)
+    program = build_program(scene, cautions, max_force)
     return _write_c(program) if language == "c" else _write_python(program)
 
 
-def lay_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
+def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
     """Return the wall of a scene and its velocity estimate as statements."""
     period = float(scene.timing.period)
     estimate = scene.velocity.estimate(period)
@@ -157,7 +157,7 @@ def _write_c(program: WallProgram) -> str:
         [
             "/* " + program.head.replace("\n", "\n   "),
             *_describe_call(program.system),
-            "Call wall_start once, then wall_force once a period. */",
+            "Call wall_start once, then wall_force once per period. */",
         ]
     )
     opened = "void wall_start(Wall *wall, double x)\n{\n", "double wall_force(Wall *wall, double x)\n{\n"
@@ -176,7 +176,7 @@ def _write_python(program: WallProgram) -> str:
         [
             '    """' + program.head.replace("\n", "\n    ") + "\n",
             *_describe_call(program.system),
-            "Make one, then call force once a period.",
+            "Make one, then call force once per period.",
             '"""',
         ]
     )

@@ -84,7 +84,7 @@ class BoundaryStudy(CurvesStudy):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Take delta and d from the device; a faulty one is reported at its own place."""
+        """Take delta and d from the device; errors of the device are reported at its fields."""
         if "device" not in raw:
             return raw
         try:
@@ -146,7 +146,7 @@ class BoundaryStudy(CurvesStudy):
 
 
 def outline_device(device: PhysicalDevice, label: str) -> Outcome:
-    """Return the outlines of a device with parts, with islands and holes distinguished, and its stiffest wall."""
+    """Return the outlines of the stable set of a device with parts, islands and holes included, and its K_max."""
     outlines, walls = tabulate_sets({label: device.to_scene()})
     if not outlines:
         return Outcome(notes=("no wall of this device is stable",))
@@ -156,7 +156,7 @@ def outline_device(device: PhysicalDevice, label: str) -> Outcome:
 
 
 def outline(delta: float, d: float) -> dict[str, Any]:
-    """Return the edge of the stable set of one device, as columns."""
+    """Return the boundary of the stable set of one device, as columns."""
     region = stable_region(delta, d)
     columns = {"omega": region.omega, "alpha": region.alpha, "beta": region.beta}
     columns["piece"] = np.array([Piece(int(code)).name.lower() for code in region.piece])
@@ -165,7 +165,7 @@ def outline(delta: float, d: float) -> dict[str, Any]:
 
 def stable_intervals(deltas: np.ndarray, delays: np.ndarray) -> list[dict[str, Any]]:
     """Return the stable interval of the virtual damping for alpha -> 0 over delta, as columns per delay."""
-    # At the smallest alpha in range.
+    # Use the smallest alpha in range, because alpha = 0 is on the stability boundary.
     upper = boundary_point(deltas, delays[:, None], alpha=WALL_RANGE[0], side="upper").beta
     shared = {"delta": deltas, "beta_lower": -deltas}
     rows = zip(delays, np.asarray(upper), strict=True)

@@ -85,7 +85,7 @@ class DesignStudy(ComputedStudy):
     """How many times the wanted stiffness the stiffest stable wall is to reach, 1 or more."""
 
     within: Ends | None = None
-    """The two ends of the range that is searched; a thirtieth to 30 times the present value where left out, and
+    """The two ends of the search range. Default: a thirtieth to 30 times the present value, and
     delays of no more than 1,000 periods."""
 
     num: Count = 61
@@ -98,7 +98,7 @@ class DesignStudy(ComputedStudy):
     """Of the tolerances: anywhere within the share, or with the share as standard deviation."""
 
     samples: Count | None = None
-    """Devices drawn for each wanted stiffness; 10000, or 200 of a device with parts, where left out."""
+    """Number of random devices for each required stiffness. Default: 10000, or 200 for a device with parts."""
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
@@ -248,7 +248,7 @@ class FiltersStudy(ComputedStudy):
     """Device in SI units. Its velocity estimate is replaced."""
 
     damping: Annotated[Axis, axis_of("damping")] | None = None
-    """Physical damping of the device, in N s/m or with a unit; the device's own where left out."""
+    """Physical damping of the device, in N s/m or with a unit. Default: that of the device."""
 
     cutoff: Annotated[Axis, axis_of("velocity.cutoff")] | None = None
     """Cut-offs of a low-pass, in Hz or with a unit."""

@@ -32,7 +32,7 @@ from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, member
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
-from zwidth.config.values import Quantity, find_system
+from zwidth.config.values import Quantity
 from zwidth.parts.wall import NoWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
@@ -105,7 +105,7 @@ class FigureLook(Strict, what="the look of figures"):
     """Width of every figure, as 85 mm of a journal's column; type is no smaller for it."""
 
     format: Literal["png", "svg", "pdf"] | None = None
-    """Kind of file; PNG and SVG where left out."""
+    """Format of the files. Default: PNG and SVG."""
 
     dpi: Annotated[float, Quantity(allowed=Range(10, 2400))] | None = None
     """Resolution in dots per inch of PNG files and of the maps in SVG and PDF files. Default: 180 for PNG."""
@@ -128,13 +128,13 @@ class Config(Strict, what="a configuration"):
     """Version of the format, 1."""
 
     name: Name
-    """Name of the configuration; results go to a folder of this name unless told otherwise."""
+    """Name of the configuration, and by default of the folder for the results."""
 
     description: str = ""
     """Free text."""
 
     scene: SceneField | None = None
-    """Device, timing and wall that supply what a study leaves out."""
+    """Device, timing and wall, the default values of the studies."""
 
     figure: FigureLook | None = None
     """Width, format and resolution of the studies' figures; for sweeps use the options of `zwidth figures`."""
@@ -142,18 +142,11 @@ class Config(Strict, what="a configuration"):
     studies: Annotated[tuple[_AnyStudy, ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""
 
-    _rotary: bool = PrivateAttr(default_factory=lambda: find_system().rotary)
-
     _place: _Place = PrivateAttr(default_factory=lambda: _Place(find_file("").absolute()))
 
     @property
-    def rotary(self) -> bool:
-        """True if its devices are rotary."""
-        return self._rotary
-
-    @property
     def folder(self) -> Path:
-        """Where the files are that it names."""
+        """The folder to which file names in the configuration are relative."""
         return self._place.folder
 
     @classmethod

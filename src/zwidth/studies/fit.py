@@ -129,16 +129,16 @@ class FitStudy(ComputedStudy):
     """Sampling period T in s or with a unit; of buzzing walls alone, or of logs in place of their times."""
 
     noise: Fraction | None = None
-    """Relative noise of stiffness and frequency of buzzing walls; estimated where left out."""
+    """Relative noise of stiffness and frequency of buzzing walls. Default: estimated."""
 
     max_delay: Annotated[float, Quantity("s", POSITIVE)] | None = None
-    """The longest delay looked for in logs, in s or with a unit; 20 periods where left out."""
+    """Longest delay to search for in logs, in s or with a unit. Default: 20 periods."""
 
     resample: bool = False
     """Whether times off by up to a quarter of a period are taken for those of a clock that wavers, samples as even."""
 
     velocity: VelocityField | None = None
-    """How the loop estimates its velocity; the difference of two samples where left out."""
+    """Velocity estimate of the loop. Default: the difference of two samples."""
 
     _motions: tuple[LoggedMotion, ...] = PrivateAttr(default=())
 

@@ -213,7 +213,7 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
 
 
 def describe_outcomes(motion: Any, stable: np.ndarray, bounds: tuple[float, float]) -> str:
-    """Describe how many linearly stable and unstable walls end at rest, in a limit cycle or with a larger amplitude."""
+    """Return the numbers of linearly stable and unstable walls at rest, in a limit cycle or at a larger amplitude."""
     wide = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > bounds[1])
     rest = ~wide & (motion.amplitude < bounds[0])
     known = motion.status == Status.OK

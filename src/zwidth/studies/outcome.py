@@ -27,12 +27,12 @@ from zwidth.words.unit_system import LINEAR, UnitSystem
 
 Item = TypeVar("Item")
 
-# Whom a study that takes long tells how many of its parts are done, and of how many.
+# Receives the number of finished parts and of all parts during a long study.
 LISTENER: ContextVar[Callable[[int, int], None]] = ContextVar("LISTENER", default=lambda done, total: None)
 
 
 def track(parts: Sequence[Item]) -> Iterator[Item]:
-    """The parts of a study one by one; whoever listens to it is told how many are done."""
+    """Yield the parts of a study, and report the number of finished ones to ``LISTENER``."""
     for done, part in enumerate(parts):
         LISTENER.get()(done, len(parts))
         yield part
@@ -43,17 +43,17 @@ class Outcome:
     """The result of one study."""
 
     table: dict[str, np.ndarray] = field(default_factory=dict)  # columns of the study's CSV file, all of one length
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)  # of the study's npz file
-    # What draws each figure and returns its Axes, by what its file name adds to the study's name.
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)  # arrays of the study's npz file
+    # Functions that draw a figure and return its Axes, by the suffix of the file name after the name of the study.
     figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
     documents: dict[str, str] = field(default_factory=dict)  # texts by file name
-    answer: tuple[str, ...] = ()  # what was found, in a line or two for a terminal
-    notes: tuple[str, ...] = ()  # what a reader of the results must know, such as points without an answer
+    answer: tuple[str, ...] = ()  # main results, in one or two lines for a terminal
+    notes: tuple[str, ...] = ()  # restrictions of the results, such as points without a result
 
     def write(
         self, folder: Path, name: str, system: UnitSystem = LINEAR, formats: Sequence[str] = ("png", "svg")
     ) -> None:
-        """Write everything, data before figures; columns have the names of linear units, and are renamed here."""
+        """Write all files, data before figures, and convert column names from linear units to those of ``system``."""
         for file, text in self.documents.items():
             (folder / file).write_text(text, encoding="utf-8")
         if self.table:
@@ -72,11 +72,11 @@ class ComputedStudy(Study):
     plan, and `compute`. `zwidth.studies.register` makes it known.
     """
 
-    # Whether the results depend on the scene beyond what the study has taken from it.
+    # True if the results depend on the scene in addition to the values that `fill` takes from it.
     reads_scene: ClassVar[bool] = False
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """Compute everything, in the file's scene and perhaps as its only study of this kind; drawing comes later."""
+        """Compute all results in the scene of the file; ``alone``: no other study of this kind. Drawing comes later."""
         raise NotImplementedError
 
 
@@ -94,7 +94,7 @@ class WallsStudy(ComputedStudy):
     """What the studies of walls share that are a share of the maximum stiffness or given outright."""
 
     walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
-    """Walls, any number for one device; of several devices one for all, or one for each. The scene's where left out."""
+    """Walls: any number for one device; for several devices, one for all or one each. Default: that of the scene."""
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
@@ -161,7 +161,7 @@ def _name_column(name: str, system: UnitSystem) -> str:
 
 
 def csv_text(table: dict[str, np.ndarray], system: UnitSystem = LINEAR) -> str:
-    """Return a table as CSV: numbers with all their digits, and texts that no spreadsheet takes for formulas."""
+    """Return a table as CSV: numbers with all digits, and texts that spreadsheets do not evaluate as formulas."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([_name_column(name, system) for name in table])

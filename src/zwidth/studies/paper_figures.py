@@ -1,8 +1,8 @@
 """Figs. 6 and 10 of the paper: exact fractional delays and, in addition, the paper's z^(1+d) with real d.
 
-For integer d both are the same. For other d, z^d has several branches, so poles are not defined. On the principal
-branch the boundary is the closed form of integer delays at a real lag d, in the letters of `loops.rigid.ridge_newton`:
-``s = sin(omega/2)``.
+For integer d both models are equal. For other d, z^d has several branches, and poles are not defined. On the principal
+branch, the boundary is the closed form for integer delays, evaluated at real d. Symbols as in
+`loops.rigid.ridge_newton`: ``s = sin(omega/2)``; ``lag`` is the delay d.
 
 References:
     Hulin, Preusche, Hirzinger 2006, sections V and VII.
@@ -23,23 +23,32 @@ from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
-from zwidth.loops.rigid.ridge_newton import Curve, Start, expand_curve, guess_start, stationarity, wall, wave
+from zwidth.loops.rigid.ridge_newton import (
+    Curve,
+    Start,
+    evaluate_stationarity,
+    evaluate_wall,
+    evaluate_wave,
+    expand_curve,
+    guess_start,
+)
 from zwidth.studies.boundary import stable_intervals
 from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table
 from zwidth.words.quantities import WALL_RANGE
 
-_STEPS = 16  # Newton steps; enough for the shortest delays, with the maximum close to omega = pi
+_STEPS = 16  # Newton steps; sufficient for the shortest delays, whose maximum is close to omega = pi
 
 
 def _find_maximum(curve: Curve, lag: Any, start: Start) -> Any:
-    """Return s at the maximum of alpha along the boundary, for a fractional lag."""
-    # For short delays the maximum is close to omega = pi, where the condition behaves like A + B q - C d q^(-3/2).
+    """Return s at the maximum of alpha along the boundary, for a fractional delay."""
+    # For short delays the maximum is close to omega = pi, where q = 1 - s^2 solves A + B q = C d q^(-3/2). Therefore q
+    # is of the order of d^(2/3), and the search starts below s = 1.
     rest = 0.3 * np.minimum(lag, 0.05) ** (2.0 / 3.0)
     lower, upper = 0.5 * start.scale, np.minimum(np.sqrt(1.0 - rest), 1.05 * start.scale)
 
     def fall(s: Any) -> tuple[Any, Any]:
-        value, slope = stationarity(s, curve, lag)
+        value, slope = evaluate_stationarity(s, curve, lag)
         return -value, -slope
 
     return newton(fall, lower, upper, np.clip(start.s, lower, upper), _STEPS)[0]
@@ -50,8 +59,8 @@ def maximize_alpha(delta: np.ndarray, d: float) -> tuple[Any, Any, Any]:
     if d.is_integer():
         return alpha_max(delta, d)[:3]
     curve, lag = expand_curve(held_plant(delta)), np.full_like(delta, d)
-    at = wave(_find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta)), lag, False)
-    return *wall(at, curve), 2.0 * at.half
+    at = evaluate_wave(_find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta)), lag, False)
+    return *evaluate_wall(at, curve), 2.0 * at.half_omega
 
 
 def limit_slope(d: float) -> float:
@@ -59,19 +68,19 @@ def limit_slope(d: float) -> float:
     if d.is_integer():
         return float(stiffness_slope(d))
     zero, lag = np.zeros(1), np.full(1, d)
-    # For delta -> infinity the velocity follows the force without delay: delta N(z) becomes z.
+    # For delta -> infinity the velocity is proportional to the force, without dynamics: delta N(z) becomes z.
     curve = expand_curve(Plant(c=zero, em=zero + 1.0, a2=zero + 1.0, a1=zero, a0=zero, gap=zero + 1.0))
     s = _find_maximum(curve, lag, guess_start(zero, lag, zero, strength=zero + 1.0))
-    return float(wall(wave(s, lag, False), curve)[0][0])
+    return float(evaluate_wall(evaluate_wave(s, lag, False), curve)[0][0])
 
 
 def find_upper_damping(delta: np.ndarray, d: float) -> np.ndarray:
     """Return the largest stable beta for alpha -> 0 with the paper's z^(1+d), for a fractional d."""
     curve, lag = expand_curve(held_plant(delta)), np.full_like(delta, d)
     top = _find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta))
-    limit = np.full_like(delta, np.sin(0.5 * np.pi / max(1.0, d + 0.5)))  # an upper bound of the end of the lobe
-    s = bisect(lambda s: wall(wave(s, lag, False), curve)[0] > WALL_RANGE[0], top, limit)
-    return wall(wave(s, lag, False), curve)[1]
+    limit = np.full_like(delta, np.sin(0.5 * np.pi / max(1.0, d + 0.5)))  # upper bound of s on the stability lobe
+    s = bisect(lambda s: evaluate_wall(evaluate_wave(s, lag, False), curve)[0] > WALL_RANGE[0], top, limit)
+    return evaluate_wall(evaluate_wave(s, lag, False), curve)[1]
 
 
 class _PaperStudy(CurvesStudy):

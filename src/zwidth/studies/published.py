@@ -113,7 +113,7 @@ def _with_lag() -> str:
     before, after = (wall.max_stiffness() for wall in walls)
     return (
         f"for b = 0 it lowers K_max from {with_unit(before.stiffness, 'N/m')} to "
-        f"{with_unit(after.stiffness, 'N/m')}, B there from {with_unit(before.virtual_damping, 'N s/m')} to "
+        f"{with_unit(after.stiffness, 'N/m')} and its B from {with_unit(before.virtual_damping, 'N s/m')} to "
         f"{with_unit(after.virtual_damping, 'N s/m')}"
     )
 

@@ -82,7 +82,7 @@ def slope_table(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 @register
 class PassivityStudy(CurvesStudy):
-    """What passivity costs: the largest passive and the largest stable stiffness over delta."""
+    """Largest passive and largest stable stiffness over delta."""
 
     method = "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms."
     reads_scene = True
@@ -100,12 +100,12 @@ class PassivityStudy(CurvesStudy):
 
 
 def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
-    """alpha and beta of the passive set's edge for delta = 1, from the smallest beta to the largest."""
+    """Return alpha and beta on the boundary of the passive set for delta = 1, by increasing beta."""
     return passive_edge(Scene(Device(1.0, 1.0), Timing(1.0, d)))
 
 
 def find_edges(scene: Scene) -> dict[str, Outlines]:
-    """Where the stable walls of a scene end, and the passive ones of a rigid device."""
+    """Return the outlines of the stable set of a scene and, for a rigid device, of the passive set."""
     edges: dict[str, Outlines] = {"stable": [(np.stack(piece[:2], -1), piece.hole) for piece in scene.stable_region()]}
     if not scene.parts_beyond and scene.device.damping > 0:
         edges["passive"] = [(np.stack(passive_edge(scene), -1), False)]
@@ -113,8 +113,10 @@ def find_edges(scene: Scene) -> dict[str, Outlines]:
 
 
 def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0) -> Iterator[dict[str, Any]]:
-    """Return the edge of the passive set of each device with damping, as columns."""
-    # ``share`` is the part of the damping that is the device's own: a hand's does not count.
+    """Yield the boundary of the passive set of each device with damping, as columns.
+
+    ``share`` is the proportion of the damping that belongs to the device and not to an operator.
+    """
     for d in delays:
         alpha, beta = unit_outline(float(d))
         for delta in deltas[share * deltas > 0]:
@@ -123,7 +125,7 @@ def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0)
 
 
 def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:
-    """Return the passive interval of the virtual damping for alpha -> 0 over delta, as columns."""
+    """Yield the passive interval of the virtual damping for alpha -> 0 over delta, as columns."""
     for d in delays:
         _, beta = unit_outline(float(d))
         yield {"curve": "passive", "d": d, "delta": deltas,

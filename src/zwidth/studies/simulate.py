@@ -41,7 +41,7 @@ class Circumstances(Strict):
     """Length of the motion, in s or in periods."""
 
     velocity: SimulatedVelocityField | None = None
-    """How the velocity is estimated; as the device has it where left out."""
+    """Velocity estimate. Default: that of the device."""
 
     start_position: Annotated[float, quantity_of("start_position")] = 0.0
     start_velocity: Annotated[float, quantity_of("start_velocity")] = 0.0
@@ -96,7 +96,7 @@ class Circumstances(Strict):
 
 
 class SimulatedStudy(ComputedStudy):
-    """What the studies that simulate share."""
+    """Base of the studies that simulate."""
 
     from_scene = ("device", *HARDWARE)
     takes_parts = True

@@ -1,4 +1,4 @@
-"""Sweeps: chunks of a grid, who computes them, and the stores that keep them.
+"""Parameter sweeps: division of a grid into chunks, computation of the chunks, and the stores of their results.
 
-The modules are imported by name, so that a plan does not wait for JAX or a store.
+Import the modules by name. This package imports none of them, so that planning a sweep loads neither JAX nor Zarr.
 """

@@ -1,4 +1,8 @@
-"""Read access to a store that reports missing and damaged files."""
+"""Read access to the store of a sweep that raises errors for missing and damaged files.
+
+`zwidth.open_dataset` reads through `CheckedStore`. A *chunk* is one block of the grid of a sweep (`sweep.plan`); each
+variable of the store has one file per chunk, which ends with a checksum (`sweep.store`).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from typing import TYPE_CHECKING
 from zarr.core.buffer.core import default_buffer_prototype
 from zarr.storage import LocalStore
 
-from zwidth.sweep.files import content
+from zwidth.sweep.files import read_or_empty
 from zwidth.sweep.store import Store
 from zwidth.words.errors import StoreError
 
@@ -19,32 +23,37 @@ if TYPE_CHECKING:
 
 
 class CheckedStore(LocalStore):
-    """Files of a store for Zarr, with an error for each missing or damaged file.
+    """The files of a store for Zarr, with an error for each missing or damaged file.
 
-    Zarr itself would replace a missing file by fill values and would not name a damaged one. Unfinished chunks are
-    listed once and then stay absent, so that all variables of a chunk are consistent even if a run adds chunks.
+    Zarr itself would replace a missing file by fill values, and its error for a damaged file would not name that file.
+    The unfinished chunks are listed once, when the store is opened, and then stay absent: all variables of a chunk
+    remain consistent even if a run completes that chunk in the meantime.
     """
 
     def __init__(self, store: Store) -> None:
         super().__init__(store.path, read_only=True)
-        self._kept = store
+        self._checked_store = store
         self._absent = {file for task in store.missing() for file in store.files(task)}
 
     @property
     def complete(self) -> bool:
+        """True if all chunks were finished when the store was opened."""
         return not self._absent
 
     def get_sync(
         self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return the content of a file; raise `StoreError` if a file of values is missing or damaged."""
+        """Return the content of a file, None if the file is absent; raise `StoreError` if a file of values is damaged.
+
+        A missing file of a finished chunk is an error, too. Files of unfinished chunks are absent.
+        """
         assert byte_range is None, "chunks are read as a whole"
-        file, is_chunk = self._kept.path / key, "c" in key.split("/")
-        # Take the checked description of the group, because one of the two files with it may be damaged.
-        data = json.dumps(self._kept.description).encode() if key == "zarr.json" else content(file)
+        file, is_chunk = self._checked_store.path / key, "c" in key.split("/")
+        # Use the description whose checksum was verified, because one of the two files that contain it may be damaged.
+        data = json.dumps(self._checked_store.description).encode() if key == "zarr.json" else read_or_empty(file)
         if file in self._absent or not (data or is_chunk):
             return None
-        if is_chunk and (fault := self._kept.find_fault(file, data)):
+        if is_chunk and (fault := self._checked_store.find_fault(file, data)):
             raise StoreError(f"{file}: {fault}; 'zwidth run CONFIG --resume' computes it again")
         return (prototype or default_buffer_prototype()).buffer.from_bytes(data)
 

@@ -1,8 +1,13 @@
-"""The outputs of one block of a sweep.
+"""Compute the outputs of one block of a sweep over rigid devices.
 
-A point's value must not depend on which other points its chunk holds, nor on who computes it. Every kernel therefore
-runs on pieces of one fixed size, of points that share what decides its shape: two compilations of one kernel, for
-batches of two sizes, may round differently, and so may NumPy at the end of a list.
+The *family* of an output is "wall" (one value per wall) or "device" (one value per device). A block contains D devices
+with A x B walls each: A normalized stiffnesses alpha and B normalized dampings beta per device, with the normalized
+physical damping delta and the delay of d sampling periods (`sweep.grid`).
+
+The value of a point must depend neither on the other points of its chunk nor on the process that computes it. But two
+compilations of a kernel for two batch sizes may round differently, and so may NumPy in the last elements of an array,
+outside its vectorized loop. Therefore every kernel runs on *pieces* of one fixed size, and all points of a piece belong
+to the same compiled variant of the kernel.
 """
 
 from __future__ import annotations
@@ -32,29 +37,38 @@ from zwidth.words.status import Status
 Columns: TypeAlias = list[np.ndarray]
 Leaves: TypeAlias = Sequence[np.ndarray]
 
-# Small where a point is expensive, for a sweep of a few points pays for a whole piece; the last one is for rows.
-_PIECE = 1 << 9
-_ROW_PIECE = 1 << 12
-_WALL_PIECE = 1 << 12
-# Points whose columns are laid out at one time; more of them run one after the other.
-_LAID_OUT = 1 << 20
-# Walls or rows of a whole grid with which NumPy is done before a compiler, and all that it needs, is ready.
-_FEW = 1 << 20
-# Walls of one device that are worth a map.
-_SMALLEST_PLANE = 1 << 8
+# Piece sizes in points. A sweep of a few points costs as much as a full piece, so expensive kernels have small pieces.
+_PIECE = 1 << 9  # ridge and margins
+_LINE_PIECE = 1 << 12  # stability limits of lines of constant beta
+_WALL_PIECE = 1 << 12  # passivity
+MAX_EXPANDED = 1 << 20  # points whose parameters are expanded to full arrays at once; bounds the memory
+# Walls or lines of the whole grid up to which NumPy finishes before JAX has been imported and has compiled the kernel.
+MAX_NUMPY = 1 << 20
+MIN_GRID_WALLS = 1 << 8  # walls of one device from which the poles are tracked across the grid instead of one by one
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
 
 _map_pieces = partial(map_blocks, threads=1, within=nullcontext, exact=True)
 
 
-def compute(family: Family, outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
-    """Every output of a family on a block, and its status; walls in shape (D, A, B), devices in shape (D,)."""
-    found = _devices(block) if family == "device" else _walls(outputs, block, accuracy)
-    return {name: found[name] for name in (*outputs, STATUS_OF[family])}
+def compute_block(family: Family, outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
+    """Compute outputs of one family on a block, and their status.
+
+    Args:
+        family: "wall" or "device".
+        outputs: Names of the outputs.
+        block: Normalized parameters of the block.
+        accuracy: Largest error of the spectral radius.
+
+    Returns:
+        The arrays by name, of shape (D, A, B) for walls and (D,) for devices, and the status of the family.
+    """
+    values = _compute_devices(block) if family == "device" else _compute_walls(outputs, block, accuracy)
+    return {name: values[name] for name in (*outputs, STATUS_OF[family])}
 
 
-def _devices(block: Block) -> dict[str, np.ndarray]:
+def _compute_devices(block: Block) -> dict[str, np.ndarray]:
+    """Return all outputs of the family "device", of shape (D,): the maximum stiffness and its status."""
     alpha, beta, _, kind, status = _map_pieces(alpha_max, (block.delta, block.d), _PIECE)
     rate = block.mass / block.period
     return {
@@ -67,83 +81,102 @@ def _devices(block: Block) -> dict[str, np.ndarray]:
     }
 
 
-def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
+def _compute_walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
+    """Return the requested outputs of the family "wall", of shape (D, A, B), and their status."""
     shape = (block.delta.size, block.alpha.shape[1], block.beta.shape[1])
-    found: dict[str, np.ndarray] = {}
-    unproved, period = False, block.period[:, None, None]
+    values: dict[str, np.ndarray] = {}
+    not_certified, period = False, block.period[:, None, None]
     if RADIUS_OUTPUTS & set(outputs):
-        if block.all_alpha.shape[1] * block.all_beta.shape[1] >= _SMALLEST_PLANE:
+        if block.all_alpha.shape[1] * block.all_beta.shape[1] >= MIN_GRID_WALLS:
             area = Area(block.all_alpha, block.all_beta, block.delta, block.d, (block.betas, block.alphas))
             poles = area_poles(area, accuracy, with_rate=True)
-            radius, proved, rate = (leaf.transpose(0, 2, 1) for leaf in poles)
+            radius, certified, rate = (leaf.transpose(0, 2, 1) for leaf in poles)
         else:
             listed = partial(
-                list_poles, accuracy=accuracy, with_rate=True, route=_route(block.rows * block.all_alpha.shape[1])
+                list_poles,
+                accuracy=accuracy,
+                with_rate=True,
+                route=_choose_route(block.lines * block.all_alpha.shape[1]),
             )
-            radius, proved, rate = _by_device(listed, block, shape, leaves=3)
-        found["spectral_radius"], unproved = radius, proved == 0
-        # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
-        found |= {"decay_rate": rate / period, "margin": -np.expm1(-rate), "settling_time": decay_time(rate) * period}
+            radius, certified, rate = _apply_to_walls(listed, block, shape, leaves=3)
+        values["spectral_radius"], not_certified = radius, certified == 0
+        # Compute these from the decay rate, because the spectral radius rounds to 1 for slow decay.
+        values |= {"decay_rate": rate / period, "margin": -np.expm1(-rate), "settling_time": decay_time(rate) * period}
     if MARGIN_OUTPUTS & set(outputs):
-        compute = partial(_margins, "delay_margin" in outputs, "modulus_margin" in outputs)
-        found |= dict(zip(_MARGINS, _by_device(compute, block, shape, leaves=4), strict=True))
-        found["delay_margin"] = found["delay_margin"] * period
+        compute = partial(_compute_margins, "delay_margin" in outputs, "modulus_margin" in outputs)
+        values |= dict(zip(_MARGINS, _apply_to_walls(compute, block, shape, leaves=4), strict=True))
+        values["delay_margin"] = values["delay_margin"] * period
     if "stable" in outputs:
-        found["stable"] = _stable(block, shape)
+        values["stable"] = _decide_stability(block, shape)
     if {"passive", "passivity_margin"} & set(outputs):
-        (margin,) = _by_device(_passivity, block, shape, one_delay=True)
-        found |= {"passivity_margin": margin, "passive": margin > 0}
-    # Of a wall that is unstable margins are NaN.
-    numbers = [found[name] for name in outputs if OUTPUTS[name].dtype == "float64" and name not in MARGIN_OUTPUTS]
+        (margin,) = _apply_to_walls(_compute_passivity, block, shape, one_delay=True)
+        values |= {"passivity_margin": margin, "passive": margin > 0}
+    # Leave out the margins: they are NaN for unstable walls, which is no failure.
+    numbers = [values[name] for name in outputs if OUTPUTS[name].dtype == "float64" and name not in MARGIN_OUTPUTS]
     device = block.delta[:, None, None], block.d[:, None, None]
     walls = block.alpha[:, :, None], block.beta[:, None, :]
-    found["status"] = status = status_of_results(shape, numbers, walls, device)
-    status[unproved & (status == Status.OK)] = Status.NOT_CONVERGED
-    return found
+    values["status"] = status = status_of_results(shape, numbers, walls, device)
+    status[not_certified & (status == Status.OK)] = Status.NOT_CONVERGED
+    return values
 
 
-def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
-    """Which walls are stable: those below the limit of their row."""
+def _decide_stability(block: Block, shape: tuple[int, ...]) -> np.ndarray:
+    """Return whether each wall is stable: whether alpha is below the limit on its line of constant beta."""
     stable = np.empty(shape, dtype=bool)
-    limit = _limits(block)
+    limit = _compute_limits(block)
     for plane, alpha, ends in zip(stable, block.alpha, limit, strict=True):
         np.less(alpha[:, None], ends, out=plane)
         plane[~(alpha > 0)] = False
     return stable
 
 
-def _route(count: int) -> Route:
-    """NumPy, or a compiler: one of them for the whole grid, for they may differ in the last place."""
-    return "numpy" if count <= _FEW else "jax"
+def _choose_route(count: int) -> Route:
+    """Return "numpy" for small grids and "jax" for large ones, given the number of points of the whole grid.
+
+    The size of a chunk must not decide: the results of both may differ in the last digit, so that the value of a point
+    would depend on the division into chunks.
+    """
+    return "numpy" if count <= MAX_NUMPY else "jax"
 
 
-def _limits(block: Block) -> np.ndarray:
-    """The stiffest stable alpha of every device and beta, shape (D, B)."""
+def _compute_limits(block: Block) -> np.ndarray:
+    """Return the largest stable alpha of every device and beta, of shape (D, B)."""
     columns = [part.ravel() for part in np.broadcast_arrays(block.beta, block.delta[:, None], block.d[:, None])]
     limit = np.empty(block.beta.size)
-    # Delays below one period have a kernel of their own: with both in a piece, its size would vary.
+    # `row_limits` uses another kernel for d < 1. With both ranges of d in a piece, their batch sizes would vary.
     for long in (False, True):
-        # As `row_limits` itself tells them apart: a delay that is NaN is not long.
+        # The same comparison as in `row_limits`, which does not count d = NaN as a long delay.
         index = np.flatnonzero((columns[2] >= 1) == long)
         if index.size:
-            by_rows = partial(row_limits, route=_route(block.rows))
-            limit[index] = _map_pieces(by_rows, [column[index] for column in columns], _ROW_PIECE)
+            by_rows = partial(row_limits, route=_choose_route(block.lines))
+            limit[index] = _map_pieces(by_rows, [column[index] for column in columns], _LINE_PIECE)
     return limit.reshape(block.beta.shape)
 
 
-def _by_device(
+def _apply_to_walls(
     function: Callable[[Columns], Leaves],
     block: Block,
     shape: tuple[int, ...],
     leaves: int = 1,
     one_delay: bool = False,
 ) -> Leaves:
-    """Apply a function of columns, of one delay or of all of them, to the walls of a block; it gives so many arrays."""
+    """Apply a function to all walls of a block, with a bounded number of walls per call.
+
+    Args:
+        function: Maps flat arrays of alpha, beta, delta and d to a sequence of ``leaves`` flat arrays.
+        block: Block with D devices and A x B walls each.
+        shape: (D, A, B).
+        leaves: Number of arrays that the function returns.
+        one_delay: Pass only walls with the same delay in one call.
+
+    Returns:
+        The arrays of the function, each of shape (D, A, B).
+    """
     results = tuple(np.empty(shape) for _ in range(leaves))
-    rows = min(shape[1], max(1, _LAID_OUT // shape[2]))
+    rows = min(shape[1], max(1, MAX_EXPANDED // shape[2]))
     delays, which = np.unique(block.d if one_delay else np.zeros(block.d.size), return_inverse=True)
     for group in (np.flatnonzero(which == index) for index in range(delays.size)):
-        step = max(1, _LAID_OUT // (rows * shape[2]))
+        step = max(1, MAX_EXPANDED // (rows * shape[2]))
         for start, row in product(range(0, group.size, step), range(0, shape[1], rows)):
             devices, alphas = group[start : start + step], slice(row, row + rows)
             walls = block.alpha[devices, alphas, None], block.beta[devices, None, :]
@@ -155,17 +188,21 @@ def _by_device(
     return results
 
 
-def _margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Leaves:
-    """The four margins; the two that take a search are NaN where nobody asks for them."""
+def _compute_margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Leaves:
+    """Return the four stability margins; the delay and modulus margins, which need a search, only if requested.
 
-    def of_piece(*piece: np.ndarray) -> Leaves:
+    A margin that was not requested is NaN.
+    """
+
+    def compute_piece(*piece: np.ndarray) -> Leaves:
         with np.errstate(all="ignore"):
-            found = margins_kernel(*piece, with_delay=with_delay, with_modulus=with_modulus)
-        return tuple(np.asarray(getattr(found, name)) for name in _MARGINS)
+            margins = margins_kernel(*piece, with_delay=with_delay, with_modulus=with_modulus)
+        return tuple(np.asarray(getattr(margins, name)) for name in _MARGINS)
 
-    return _map_pieces(of_piece, columns, _PIECE)
+    return _map_pieces(compute_piece, columns, _PIECE)
 
 
-def _passivity(columns: Columns) -> Leaves:
+def _compute_passivity(columns: Columns) -> Leaves:
+    """Return the passivity margin of walls with the same delay."""
     *walls, d = columns
     return (_map_pieces(partial(margin_at_one_delay, d=float(d[0])), walls, _WALL_PIECE),)

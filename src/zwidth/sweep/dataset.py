@@ -1,4 +1,7 @@
-"""The results of a sweep: as a dataset, in other formats, and verified file by file."""
+"""Open the results of a sweep as an xarray dataset, export them to netCDF and CSV, and verify their files.
+
+A *store* is the Zarr group ``<study>.zarr`` with the results of one sweep (`sweep.store`), divided into chunks.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.sweep.store import (
-    SEAL,
+    CHECKSUM,
     Store,
     check_installed,
     find_store,
@@ -26,25 +29,26 @@ from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 if TYPE_CHECKING:
     import xarray
 
-MAX_CSV_POINTS = 1_000_000
+MAX_CSV_POINTS = 1_000_000  # rows of an exported table; spreadsheets open about as many
 
 
 def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
-    """Open the results of a sweep, without reading them yet.
+    """Open the results of a sweep; values are read on first access.
 
-    Every file is compared with its checksum when it is read, values when they are asked for. What is damaged or missing
-    is a `StoreError` that names it; `zwidth.run` with ``resume`` mends it.
+    Each file is compared with its checksum when it is read. A damaged or missing file raises a `StoreError` that names
+    it; `zwidth.run` with ``resume`` computes it again.
 
     Args:
-        path: a store ``<study>.zarr``, or the folder of a run that holds only one.
+        path: A store ``<study>.zarr``, or the folder of a run that contains exactly one store.
 
     Returns:
-        An `xarray.Dataset` backed by dask, one dask chunk a chunk of the store. ``attrs["complete"]`` is 1 where every
-        chunk is there; the points of the others have the status 255, "not computed".
+        An `xarray.Dataset` backed by dask, with one dask chunk per chunk of the store. ``attrs["complete"]`` is 1 if
+        all chunks are computed, otherwise 0; points of missing chunks have the status 255, "not computed".
 
     Raises:
-        StoreError: there is no store, there are several, or its descriptions or coordinates are damaged.
-        InputError: the libraries for stores are not installed.
+        StoreError: The path contains no store or several stores, or the description or the coordinates of the store
+            are damaged.
+        InputError: A library needed for stores is not installed.
 
     Example:
         >>> import tempfile, zwidth
@@ -61,35 +65,35 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     check_installed()
     import xarray
 
-    # Loads Zarr.
+    # Import here, because this module loads Zarr.
     from zwidth.sweep.checked import CheckedStore
 
     checked = CheckedStore(store)
     with silence_zarr():
         dataset = xarray.open_zarr(checked, consolidated=store.has_checksums, chunks={})
-    # Drop the arrays in which an old store keeps its checksums.
+    # Drop the arrays with the checksums, which stores of the old format contain.
     dataset = dataset[[name for family in store.plan.families for name in family.variables]]
     if "device" in dataset.coords:
-        # Neither netCDF nor pandas knows NumPy's strings of variable length.
+        # Convert the labels, because netCDF and pandas do not support NumPy's strings of variable length.
         labels = np.array([str(label) for label in dataset["device"].values])
         dataset = dataset.assign_coords(device=("device", labels, dataset["device"].attrs))
-    hidden = SEAL, "file_checksums", "coordinates"
+    hidden = CHECKSUM, "file_checksums", "coordinates"
     dataset.attrs = {key: value for key, value in store.attributes.items() if key not in hidden}
     return dataset.assign_attrs(complete=int(checked.complete))
 
 
 def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
-    """Write the results of a sweep into one new netCDF-4 file, chunk by chunk.
+    """Write the results of a sweep to a new netCDF-4 file, chunk by chunk.
 
-    Truth values become bytes, and what is nested in the attributes JSON.
+    Boolean values are written as bytes, and nested attributes as JSON.
     """
-    target = _free_place(file)
+    target = _check_target(file)
     dataset = open_dataset(path)
     packed = {name: {"zlib": True, "complevel": 1} for name, variable in dataset.data_vars.items() if variable.ndim}
     for variable in (dataset, *dataset.variables.values()):
-        variable.attrs = {key: _plain_attribute(value) for key, value in variable.attrs.items()}
+        variable.attrs = {key: _convert_attribute(value) for key, value in variable.attrs.items()}
     with hidden_beside(target) as partial:
-        # One thread: the HDF5 library is not made for several, and lets only one of them in at a time.
+        # Use one thread, because the HDF5 library serializes all calls with a global lock.
         import dask
 
         with dask.config.set(scheduler="synchronous"):  # pyright: ignore[reportPrivateImportUsage]
@@ -98,24 +102,25 @@ def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> Non
 
 
 def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
-    """Write the results of a small sweep as a new table, one row a point, all parameters and outputs in columns.
+    """Write the results of a small sweep to a new CSV table: one row per point, one column per parameter and output.
 
-    Columns in SI units carry their unit, as ``stiffness_N_per_m``; those of normalized quantities none.
+    Names of columns in SI units end with the unit, for example ``stiffness_N_per_m``; normalized quantities have no
+    unit. `StoreError` if the sweep has more than a million points.
     """
-    target = _free_place(file)
+    target = _check_target(file)
     dataset = open_dataset(path)
     points = int(np.prod(list(dataset.sizes.values()), dtype=float))
     if points > MAX_CSV_POINTS:
         remedy = "export to netCDF, or select a part with zwidth.open_dataset"
-        raise StoreError(f"{os.fspath(path)}: {points} points, a table may have {MAX_CSV_POINTS}; {remedy}")
+        raise StoreError(f"{os.fspath(path)}: {points} points, CSV allows at most {MAX_CSV_POINTS}; {remedy}")
     if "device" in dataset.coords:
         labels = [to_cell(str(label)) for label in np.atleast_1d(dataset["device"].values)]
         dataset["device"] = (dataset["device"].dims, np.reshape(labels, dataset["device"].shape))
     rows = dataset if dataset.sizes else dataset.expand_dims("point")
     with hidden_beside(target) as partial:
-        # What a folder lists first differs from one machine to the next; a table has one order.
-        table = rows.to_dataframe(dim_order=sorted(map(str, rows.sizes), key=_place))
-        table = table[sorted(map(str, table.columns), key=_place)]
+        # Sort the columns, because the order in which a store lists its variables differs between file systems.
+        table = rows.to_dataframe(dim_order=sorted(map(str, rows.sizes), key=_rank_variable))
+        table = table[sorted(map(str, table.columns), key=_rank_variable)]
         units = {name: str(values.attrs.get("units", "")) for name, values in rows.variables.items()}
         table.columns = [header(name, units[name]) for name in table.columns]
         table.index.names = [header(str(name), units.get(name, "")) for name in table.index.names]
@@ -126,54 +131,57 @@ def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
 _ORDER = (*VARIABLES, *OUTPUTS)
 
 
-def _place(name: str) -> int:
-    """Where a variable stands in the declared order; others come last."""
+def _rank_variable(name: str) -> int:
+    """Return the position of a variable in the declared order of all variables; undeclared ones come last."""
     return _ORDER.index(name) if name in _ORDER else len(_ORDER)
 
 
-def _plain_attribute(value: Any) -> Any:
+def _convert_attribute(value: Any) -> Any:
+    """Return an attribute in a type that netCDF supports: integer lists as arrays, nested values as JSON."""
     if isinstance(value, list) and all(isinstance(item, int) for item in value):
         return np.array(value, dtype=np.int64 if max(value, default=0) > NOT_COMPUTED else np.uint8)
     return json.dumps(value) if value is None or isinstance(value, dict | list) else value
 
 
-def _free_place(file: str | os.PathLike[str]) -> Path:
+def _check_target(file: str | os.PathLike[str]) -> Path:
+    """Return the path of a file to be written; raise `StoreExistsError` if it exists."""
     target = Path(os.fsdecode(file))
     if target.exists():
-        raise StoreExistsError(f"{target} exists already; choose another name or remove it")
+        raise StoreExistsError(f"{target} already exists; choose another name or remove it")
     return target
 
 
 @dataclass(frozen=True)
 class Verification:
-    """What a store holds, and in which state."""
+    """The result of verifying the files of one store."""
 
     path: Path
-    chunks: int = 0  # how many it is to have
-    done: int = 0  # how many of them are marked as done
-    damaged: tuple[str, ...] = ()  # chunks and files that are not what was written, each with what is wrong
-    error: str = ""  # why the store cannot be read at all; empty where it can
+    chunks: int = 0  # number of chunks of the whole sweep
+    done: int = 0  # number of chunks marked as done
+    damaged: tuple[str, ...] = ()  # damaged and missing chunks and files, each with its fault
+    error: str = ""  # reason why the store cannot be read at all; empty if it can
 
     @property
     def ok(self) -> bool:
-        """Whether everything is there and undamaged."""
+        """True if all chunks are done and no file is damaged."""
         return not self.error and not self.damaged and self.done == self.chunks
 
 
 def verify(path: str | os.PathLike[str]) -> tuple[Verification, ...]:
-    """Read every file of one store, or of all stores in a folder, and compare its checksum; nothing is changed."""
+    """Read every file of one store, or of all stores in a folder, and compare its checksum; change nothing."""
     return tuple(map(_verify_store, list_stores(path)))
 
 
 def _verify_store(path: Path) -> Verification:
+    """Verify one store; an unreadable store is reported in the ``error`` of the result."""
     store = Store(path)
     try:
         if not store.has_checksums:
-            return Verification(path, error="old format; this release does not read its checksums")
+            return Verification(path, error="old format, whose checksums this release cannot read; compute it again")
         tasks = list(store.plan.tasks())
         damaged = [f"{name} is damaged or missing" for name in store.damaged_files()]
     except StoreError as error:
         return Verification(path, error=str(error))
     done = [task for task in tasks if store.is_done(task)]
-    damaged += [f"{task}: {fault}" for task in done if (fault := store.fault_of(task))]
+    damaged += [f"{task}: {fault}" for task in done if (fault := store.find_task_faults(task))]
     return Verification(path, len(tasks), len(done), tuple(damaged))

@@ -1,4 +1,8 @@
-"""An existing dask.distributed cluster as the engine; the only module that imports distributed."""
+"""Compute the chunks of sweeps on the workers of an existing dask.distributed cluster.
+
+A *job* is one chunk of one store (`sweep.jobs`). The workers write the chunks into the stores themselves, so they need
+access to the stores under the same path as this process. Only this module imports distributed.
+"""
 
 from __future__ import annotations
 
@@ -17,31 +21,30 @@ from zwidth.words.errors import InputError, how_to_install
 if TYPE_CHECKING:
     from distributed import Client
 
-_CONNECT_SECONDS = 30
-# A scheduler that tells nothing for so long is asked whether it is there, and has as long to answer.
-_SILENT_SECONDS = 15
-# Workers may wait in a queue of batch jobs; who has none for so long is not to wait for ever.
+_CONNECT_SECONDS = 30  # timeout of the connection to the scheduler
+_REPLY_SECONDS = 15  # a scheduler without a message for this time is queried, and must reply within the same time
+# Longest time without any worker. Workers may start late, because they wait in the queue of a batch system.
 _NO_WORKER_SECONDS = 600
-# Enough to keep every worker busy, few enough that a scheduler never holds a whole sweep.
-_AHEAD = 4
+# Submitted jobs per thread of the workers: keeps every worker busy, and bounds the memory of the scheduler.
+_JOBS_PER_THREAD = 4
 _KILLED = "KilledWorker"
-_GONE = "does not answer any more, or has started again"
+_GONE = "no longer replies, or has been restarted"
 
 
-class _BlindWorkerError(InputError):
-    """A worker that does not see the stores."""
+class _MissingFolderError(InputError):
+    """Error of a worker that has no access to the stores."""
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Client]:
-    """A connection to a scheduler while the block runs; an `InputError` where nobody answers."""
+def connect(address: str) -> Iterator[Client]:
+    """Connect to a scheduler for the duration of the block; raise `InputError` if it does not reply."""
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
         remedy = how_to_install("distributed")
         raise InputError(f"scheduler: needs distributed, which is not installed; install it: {remedy}") from error
 
-    with _terminal_without_logs():
+    with _silence_logs():
         try:
             client = Client(address, timeout=_CONNECT_SECONDS)
         except (OSError, ValueError) as error:
@@ -49,19 +52,19 @@ def connected(address: str) -> Iterator[Client]:
         try:
             yield client
         finally:
-            # One that does not answer is not told.
+            # Ignore the error of a scheduler that no longer replies.
             with suppress(OSError):
-                client.close(timeout=_SILENT_SECONDS)
+                client.close(timeout=_REPLY_SECONDS)
 
 
 @contextmanager
-def _terminal_without_logs() -> Iterator[None]:
-    """Take distributed's own handlers off the terminal: what matters of its log is said in one line of ours."""
+def _silence_logs() -> Iterator[None]:
+    """Remove the log handlers of distributed that write to the terminal, because zwidth reports its errors itself."""
     names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]
     terminal = (sys.stderr, sys.__stderr__)
     before = {logging.getLogger(name): logging.getLogger(name).handlers for name in (*names, "asyncio")}
     for logger, handlers in before.items():
-        # With no handler at all Python itself would write to the terminal.
+        # Add a NullHandler, because Python writes the messages of a logger without any handler to the terminal.
         others = (one for one in handlers if getattr(one, "stream", None) not in terminal)
         logger.handlers = [logging.NullHandler(), *others]
     try:
@@ -71,10 +74,10 @@ def _terminal_without_logs() -> Iterator[None]:
             logger.handlers = handlers
 
 
-def on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[Finished]:
-    """Do jobs on the workers of a scheduler, which must see the stores under the same path."""
-    # A worker that dies may take innocent chunks with it, those that it had just begun: what dask gives up is tried
-    # again at the end, one by one, before it is called a failure.
+def run_on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[Finished]:
+    """Run jobs on the workers of a scheduler and yield their outcomes, in the order of completion."""
+    # dask gives up a job after several deaths of its worker, even if another job on that worker was the cause.
+    # Therefore run such jobs again at the end, one at a time, before reporting a failure.
     given_up = []
     for finished in _submit_jobs(client, jobs, perform):
         if finished.error.startswith(_KILLED):
@@ -86,66 +89,68 @@ def on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[F
 
 
 def _submit_jobs(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finished]:
-    """Keep a bounded number of chunks on the cluster; only their names travel."""
+    """Keep a bounded number of jobs on the cluster and yield their outcomes; only names of chunks are transferred."""
     waiting = iter(jobs)
-    # Of futures that nobody holds, dask forgets the chunks.
-    of_key: dict[str, tuple[Job, Any]] = {}
+    # Keep a reference to each future, because dask cancels the task of a future that has been deleted.
+    jobs_by_key: dict[str, tuple[Job, Any]] = {}
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
-    def hand_out() -> None:
+    def submit_next() -> None:
+        """Submit the next waiting job, if any."""
         job = next(waiting, None)
         if job is not None:
             key = f"{os.path.basename(job.path)}-{job.task.family}-{job.task.index}-{os.urandom(4).hex()}"
-            words = (perform, job.path, job.task.family, job.task.index)
-            future = client.submit(_perform_there, *words, key=key, pure=False)
-            of_key[key] = job, future
+            arguments = (perform, job.path, job.task.family, job.task.index)
+            future = client.submit(_perform_on_worker, *arguments, key=key, pure=False)
+            jobs_by_key[key] = job, future
             future.add_done_callback(ended.put)
 
-    # A cluster that is still starting has no workers yet, and may have more later.
-    for _ in range(_AHEAD * max(4, sum(_ask_for_threads(client).values()))):
-        hand_out()
+    # Assume at least four threads, because a starting cluster has no workers yet.
+    for _ in range(_JOBS_PER_THREAD * max(4, sum(_count_threads(client).values()))):
+        submit_next()
     with_workers = time.monotonic()
-    while of_key:
+    while jobs_by_key:
         try:
-            future = ended.get(timeout=_SILENT_SECONDS)
+            future = ended.get(timeout=_REPLY_SECONDS)
         except queue.Empty:
-            if _ask_for_threads(client):
+            if _count_threads(client):
                 with_workers = time.monotonic()
             elif time.monotonic() - with_workers > _NO_WORKER_SECONDS:
                 raise LostSchedulerError("has no workers") from None
             continue
-        job, _ = of_key.pop(future.key)
+        job, _ = jobs_by_key.pop(future.key)
         if future.status == "cancelled":
             raise LostSchedulerError(_GONE)
-        # Done or not, the store knows: the result is nothing, and may be lost with its worker.
+        # Ignore the result of the future: it is None, and `engine` checks in the stores which chunks are done.
         yield _describe_error(job, future.exception()) if future.status == "error" else Finished(job)
         with_workers = time.monotonic()
-        hand_out()
+        submit_next()
 
 
-def _ask_for_threads(client: Client) -> dict[str, int]:
-    """The threads of every worker; a `LostSchedulerError` where the scheduler does not answer."""
+def _count_threads(client: Client) -> dict[str, int]:
+    """Return the number of threads per worker; raise `LostSchedulerError` if the scheduler does not reply."""
     try:
-        return client.sync(client.scheduler.ncores, callback_timeout=_SILENT_SECONDS)  # pyright: ignore
+        return client.sync(client.scheduler.ncores, callback_timeout=_REPLY_SECONDS)  # pyright: ignore
     except (OSError, AttributeError, RuntimeError) as error:
         raise LostSchedulerError(_GONE) from error
 
 
-def _perform_there(perform: Perform, path: str, family: str, index: int) -> None:
+def _perform_on_worker(perform: Perform, path: str, family: str, index: int) -> None:
+    """Compute one chunk in a worker process; raise `_MissingFolderError` if the worker has no access to the store."""
     if not os.path.isdir(path):
         from distributed import get_worker
 
-        raise _BlindWorkerError(
-            f"scheduler: its worker {get_worker().address} does not see {path}; choose a folder that all machines "
-            "share with --out DIR"
+        raise _MissingFolderError(
+            f"scheduler: its worker {get_worker().address} cannot access {path}; choose a folder shared by all "
+            "machines with --out DIR"
         )
     perform(path, family, index)
 
 
 def _describe_error(job: Job, error: Any) -> Finished:
-    """What dask says of a task that it could not do, in words of ours where its worker died."""
-    if isinstance(error, _BlindWorkerError):
+    """Return the outcome of a job that failed on the cluster; raise the error of a worker without access to stores."""
+    if isinstance(error, _MissingFolderError):
         raise error
     if type(error).__name__ == _KILLED:
-        return Finished(job, f"{_KILLED}: its worker died every time it was tried")
+        return Finished(job, f"{_KILLED}: the worker process died in every attempt")
     return describe_failure(job, error)

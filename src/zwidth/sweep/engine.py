@@ -1,4 +1,9 @@
-"""The engine: stores made, or found and repaired, then computed chunk by chunk: here, in workers or on a cluster."""
+"""Compute the sweeps of a run: create or repair their stores, then compute the missing chunks one by one.
+
+The chunks are computed in this process, in worker processes (`sweep.jobs`) or on a cluster (`sweep.distributed`). Each
+sweep has one store, ``<study>.zarr`` in the folder of the run (`sweep.store`). A chunk is done once its status file is
+in the store; so an interrupted run can be resumed from the stores alone.
+"""
 
 from __future__ import annotations
 
@@ -13,55 +18,55 @@ from pathlib import Path
 from typing import Any
 
 from zwidth.config.sweep import SweepStudy
-from zwidth.sweep.files import ELSEWHERE, differences, versions
-from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, attempt, in_workers
+from zwidth.sweep.files import ELSEWHERE, list_differences, list_versions
+from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, run_in_workers, try_job
 from zwidth.sweep.plan import Plan, Task
-from zwidth.sweep.store import SUFFIX, Store, create
+from zwidth.sweep.store import SUFFIX, Store, create_store
 from zwidth.words.errors import StoreError, StoreExistsError
 from zwidth.words.formatting import describe
 
-_SHOWN_DIFFERENCES = 10
+_SHOWN_DIFFERENCES = 10  # differing keys named in one message
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far the sweeps of a run are, told after every chunk."""
+    """The progress of the sweeps of a run, reported after every chunk."""
 
-    study: str  # the one that the chunk belongs to
-    chunks: int  # done, of all that there are to compute in this run
-    total_chunks: int
-    points: int
-    total_points: int
-    rate: float  # points a second since the start
-    seconds_left: float  # at this rate; NaN before the first chunk
-    error: str = ""  # what went wrong with the chunk; empty where nothing did
+    study: str  # name of the study of this chunk
+    chunks: int  # chunks finished so far in this run
+    total_chunks: int  # chunks to be computed in this run
+    points: int  # points finished so far in this run
+    total_points: int  # points to be computed in this run
+    rate: float  # points per second since the start
+    seconds_left: float  # remaining time at this rate; NaN before the first computed chunk
+    error: str = ""  # error of this chunk; empty if it was computed
 
 
 @dataclass
 class SweepResult:
-    """What became of one sweep."""
+    """The outcome of one sweep."""
 
-    store: Path  # its folder
-    computed: int = 0  # chunks that this run computed
-    skipped: int = 0  # chunks that were done before
-    total: int = 0  # chunks that this run was to see done
-    repaired: tuple[str, ...] = ()  # chunks whose files were damaged, and that were computed again
-    failed: dict[str, str] = field(default_factory=dict)  # chunks that could not be computed, with the reason
+    store: Path  # folder of its store
+    computed: int = 0  # chunks computed by this run
+    skipped: int = 0  # chunks computed by earlier runs
+    total: int = 0  # all chunks of the sweep
+    repaired: tuple[str, ...] = ()  # damaged chunks, computed again, and restored files
+    failed: dict[str, str] = field(default_factory=dict)  # failed chunks, each with its error
 
     @property
     def ok(self) -> bool:
-        """Whether everything that this run was to compute is there."""
+        """True if every chunk of the sweep is computed."""
         return not self.failed and self.computed + self.skipped == self.total
 
 
 @dataclass
 class Sweeps:
-    """The sweeps of one run."""
+    """The outcome of all sweeps of one run."""
 
-    results: dict[str, SweepResult]  # by the name of the study
-    hopeless: str = ""  # the error that ended the run early, for no other chunk would have escaped it, as a full disk
-    interrupted: bool = False  # whether somebody stopped the run
-    lost: str = ""  # why the cluster could not go on
+    results: dict[str, SweepResult]  # by name of the study
+    fatal_error: str = ""  # error that ended the run because it affects every chunk, for example a full disk
+    interrupted: bool = False  # stopped by the user with Ctrl-C
+    lost: str = ""  # error of the cluster that ended the run
 
 
 def compute_sweeps(
@@ -73,19 +78,30 @@ def compute_sweeps(
     scheduler: str | None,
     progress: Callable[[Progress], None],
 ) -> Sweeps:
-    """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there."""
-    # The caller holds the lock of the folder. ``about`` contains the attributes of the stores: name, description,
-    # config and config_sha256 (of config.yaml). The options are those of `zwidth.run`. Raises `InputError` if the
-    # scheduler does not answer or its workers have no access to the folder.
+    """Compute the missing chunks of the stores ``<folder>/<study>.zarr``; create stores that do not exist.
+
+    The caller must hold the lock of the folder.
+
+    Args:
+        plans: The plan of each sweep.
+        folder: Folder of the run.
+        about: Attributes of the stores: name, description, config, and config_sha256 (of config.yaml).
+        workers: Number of worker processes; None for this process.
+        scheduler: Address of a dask.distributed scheduler; None for this machine.
+        progress: Called after every chunk.
+
+    Raises:
+        InputError: The scheduler does not reply, or its workers have no access to the folder.
+    """
     from zwidth.sweep.jobs import perform
 
     with ExitStack() as stack:
         client = None
         if scheduler is not None:
-            # Before anything is made that a scheduler that does not answer would leave behind.
-            from zwidth.sweep.distributed import connected
+            # Connect before creating a store, so that an unreachable scheduler leaves no store behind.
+            from zwidth.sweep.distributed import connect
 
-            client = stack.enter_context(connected(scheduler))
+            client = stack.enter_context(connect(scheduler))
         sweeps, stores, jobs = Sweeps({}), {}, []
         for plan in plans:
             store, repaired = _prepare_store(plan, folder, about)
@@ -97,63 +113,64 @@ def compute_sweeps(
             jobs += missing
         if jobs:
             if client is not None:
-                from zwidth.sweep.distributed import on_cluster
+                from zwidth.sweep.distributed import run_on_cluster
 
-                finished = on_cluster(jobs, client, perform)
+                finished = run_on_cluster(jobs, client, perform)
             elif workers is not None:
-                finished = in_workers(jobs, workers, perform)
+                finished = run_in_workers(jobs, workers, perform)
             else:
-                finished = (attempt(perform, job) for job in jobs)
+                finished = (try_job(perform, job) for job in jobs)
             try:
-                _follow(finished, jobs, stores, sweeps, progress)
+                _collect_outcomes(finished, jobs, stores, sweeps, progress)
             except LostSchedulerError as error:
                 sweeps.lost = f"scheduler: {scheduler} {error}"
-            _count(jobs, stores, sweeps)
+            _count_chunks(jobs, stores, sweeps)
         return sweeps
 
 
-def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool) -> None:
-    """Refuse stores that exist, unless the run goes on with them, and those that `check_same` refuses."""
+def check_stores(studies: Sequence[SweepStudy], folder: Path, *, resume: bool) -> None:
+    """Raise `StoreExistsError` if a store exists and the run does not resume; check existing stores by `check_same`."""
     for study in studies:
         path = store_path(folder, study)
         if not path.exists():
             continue
-        if not going_on:
-            raise StoreExistsError(f"out: {path} exists already; go on with it with --resume, or {ELSEWHERE}")
+        if not resume:
+            raise StoreExistsError(f"out: {path} already exists; continue it with --resume, or {ELSEWHERE}")
         check_same(Store(path), study)
 
 
 def _prepare_store(plan: Plan, folder: Path, about: Mapping[str, Any]) -> tuple[Store, tuple[str, ...]]:
-    """The store of a sweep, made or found, and what was repaired in it."""
+    """Create the store of a sweep, or open and repair an existing one; return the store and the repairs."""
     path = store_path(folder, plan.study)
     if not path.exists():
         attributes = {
             "title": f"{about['name']}: {plan.study.name}",
             "comment": about["description"],
-            "source": f"zwidth {versions()['zwidth']}",
-            "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} made by zwidth run",
+            "source": f"zwidth {list_versions()['zwidth']}",
+            "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} created by zwidth run",
             "precision": "float64",
-            "versions": versions(),
+            "versions": list_versions(),
             "config": about["config"],
             "config_sha256": about["config_sha256"],
             "study": plan.study.model_dump(mode="json", exclude_none=True),
             "plan": plan.as_dict(),
         }
-        return create(path, attributes), ()
+        return create_store(path, attributes), ()
     store = Store(path)
     # Remove unfinished files of a killed run.
     for left in path.rglob("*.partial"):
         left.unlink(missing_ok=True)
-    return store, tuple(f"{plan.study.name}/{what}" for what in repair(store, store.plan.tasks()))
+    return store, tuple(f"{plan.study.name}/{each}" for each in repair_store(store, store.plan.tasks()))
 
 
-def _follow(
+def _collect_outcomes(
     results: Generator[Finished],
     jobs: list[Job],
     stores: dict[str, Store],
     sweeps: Sweeps,
     progress: Callable[[Progress], None],
 ) -> None:
+    """Record the outcomes of all jobs in ``sweeps`` and report the progress; stop at a fatal error or Ctrl-C."""
     start, ended, computed = time.perf_counter(), 0, 0
     total = sum(job.task.points for job in jobs)
     try:
@@ -162,42 +179,43 @@ def _follow(
             points, name = task.points, store.study.name
             ended += points
             if finished.error:
-                sweeps.results[name].failed[store.name(task)] = finished.error
+                sweeps.results[name].failed[store.label(task)] = finished.error
             else:
                 computed += points
             rate = computed / max(time.perf_counter() - start, 1e-9)
             left = (total - ended) / rate if rate else math.nan
             progress(Progress(name, number, len(jobs), ended, total, rate, left, finished.error))
-            if finished.hopeless:
-                sweeps.hopeless = finished.error
+            if finished.fatal:
+                sweeps.fatal_error = finished.error
                 return
     except KeyboardInterrupt:
         sweeps.interrupted = True
     finally:
-        # Ends the workers.
+        # Closing the generator ends the workers.
         results.close()
 
 
-def _count(jobs: list[Job], stores: dict[str, Store], sweeps: Sweeps) -> None:
-    """Count the chunks that are done: not those that an engine calls so, but those that the stores hold."""
-    over = sweeps.hopeless or sweeps.interrupted or sweeps.lost
+def _count_chunks(jobs: list[Job], stores: dict[str, Store], sweeps: Sweeps) -> None:
+    """Count the computed chunks in the stores themselves, not by the reported outcomes."""
+    over = sweeps.fatal_error or sweeps.interrupted or sweeps.lost
     for path, task in jobs:
         store = stores[path]
         sweep = sweeps.results[store.study.name]
-        if store.holds(task):
+        if store.is_visible(task):
             sweep.computed += 1
-            # Somebody else has done it in the meantime, a worker that was given up say.
-            sweep.failed.pop(store.name(task), None)
+            # Another process has computed the chunk in the meantime, for example a worker believed dead.
+            sweep.failed.pop(store.label(task), None)
         elif not over:
-            sweep.failed.setdefault(store.name(task), "it was computed, and is not in the store")
+            sweep.failed.setdefault(store.label(task), "reported as computed but missing from the store")
 
 
 def store_path(folder: Path, study: SweepStudy) -> Path:
+    """Return the path of the store of a sweep in the folder of a run."""
     return folder / f"{study.name}{SUFFIX}"
 
 
 def check_same(store: Store, study: SweepStudy) -> None:
-    """Raise `StoreError` if a store has an old format, or was created for another study or by another release."""
+    """Raise `StoreError` if a store has the old format, or was created from another study or by another release."""
     if not store.has_checksums:
         raise StoreError(f"{store.path}: old format, which can be read but not continued; {ELSEWHERE}")
     now = study.model_dump(mode="json", exclude_none=True)
@@ -205,13 +223,21 @@ def check_same(store: Store, study: SweepStudy) -> None:
     refuse_versions(store.path, store.attributes["versions"])
 
 
-def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> None:
-    """Raise a `StoreError` that names every key in which results were made from another study."""
-    # Ignore the keys delay_model and delay_models of earlier releases with the only model that is left.
-    changed = [each for each in differences(old, new) if each[1:] not in (("held", None), (["held"], None))]
+def refuse_changes(where: Path, name: str, noun: str, old: Any, new: Any) -> None:
+    """Raise a `StoreError` with all differences if results were computed from another study.
+
+    Args:
+        where: File with the recorded study, for the message.
+        name: Name of the study.
+        noun: Noun for the results, "store" or "run".
+        old: Recorded study, as JSON.
+        new: Study of the present configuration, as JSON.
+    """
+    # Ignore the keys delay_model and delay_models of earlier releases if they have the only value still supported.
+    changed = [each for each in list_differences(old, new) if each[1:] not in (("held", None), (["held"], None))]
     if changed:
         lines = [
-            f"{where}: studies[{name}].{key}: the {what} was made with {describe(before)}, the configuration has "
+            f"{where}: studies[{name}].{key}: the {noun} was created with {describe(before)}, the configuration has "
             f"{describe(after)}"
             for key, before, after in changed[:_SHOWN_DIFFERENCES]
         ]
@@ -222,32 +248,32 @@ def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> Non
 
 
 def refuse_versions(where: Path, old: dict[str, str]) -> None:
-    """Refuse to go on with results of other releases: together they are not what either of them would compute."""
-    for key, now in versions().items():
+    """Raise `StoreError` if results were computed by other releases, because a mixture is not reproducible by any."""
+    for key, now in list_versions().items():
         if key != "python" and old.get(key) != now:
-            what = f"{where}: made with {key} {old.get(key)}, now there is {now}"
-            raise StoreError(f"{what}; install the same release, or {ELSEWHERE}")
+            fault = f"{where}: created with {key} {old.get(key)}, now {now} is installed"
+            raise StoreError(f"{fault}; install the same release, or {ELSEWHERE}")
 
 
-def repair(store: Store, tasks: Iterable[Task]) -> list[str]:
-    """Take back the marks of chunks that are damaged, and write damaged coordinates again; returns what was found."""
-    found = []
+def repair_store(store: Store, tasks: Iterable[Task]) -> list[str]:
+    """Restore damaged coordinates and mark damaged chunks as not done; return a list of the repairs."""
+    repairs = []
     names = store.damaged_files()
     if names:
         store.restore(names)
-        found += [f"{name} (restored)" for name in names]
+        repairs += [f"{name} (restored)" for name in names]
     for task in tasks:
-        fault = store.fault_of(task) if store.is_done(task) else ""
+        fault = store.find_task_faults(task) if store.is_done(task) else ""
         if fault:
-            store.forget(task)
-            found.append(f"{task}: {fault}")
-    return found
+            store.unmark(task)
+            repairs.append(f"{task}: {fault}")
+    return repairs
 
 
-def remove(folder: Path, study: SweepStudy) -> None:
-    """Make room for a store to be made again; what is no store of a sweep stays, and is then refused."""
+def remove_store(folder: Path, study: SweepStudy) -> None:
+    """Delete the store of a sweep; keep a folder of that name that is no store, which `check_stores` then refuses."""
     path = store_path(folder, study)
     if path.is_dir() and not path.is_symlink():
         with suppress(StoreError):
-            Store(path).attributes  # noqa: B018  (raises where the store is not one of ours)
+            Store(path).attributes  # noqa: B018  (raises StoreError if the folder is no store)
             shutil.rmtree(path)

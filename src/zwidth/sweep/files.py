@@ -1,4 +1,4 @@
-"""Files and folders of results: checks, checksums, versions, and the lock that limits a folder to one writing run.
+"""Files and folders of results: checks, checksums, package versions, and the lock that admits one writing run.
 
 The lock is an operating system lock on ``DIR/.locks/run``. It ends with its process, even if the process is killed, so
 that the remaining file blocks no later run. On NFS it also excludes runs on other machines.
@@ -23,81 +23,76 @@ from zwidth import __version__
 from zwidth.words.errors import InputError, StoreBusyError
 from zwidth.words.files import REMEDIES
 
-# No chunk of a sweep would escape these.
-_HOPELESS = frozenset(list(REMEDIES)[:6])
-# Packages whose release can change the last digit of a result.
-_PACKAGES = ("jax", "jaxlib", "numpy")
-LOCKS = ".locks"
-"""Name of the folder of locks in a folder of results."""
-ELSEWHERE = "choose another folder with --out DIR"
-"""What helps in every case."""
-
-PATIENCE = 1.0  # s; waiting time for the lock, because a killed run needs some time to end
+_FATAL_ERRORS = frozenset(list(REMEDIES)[:6])  # error codes that every further write would meet as well
+_PACKAGES = ("jax", "jaxlib", "numpy")  # packages whose version can change the last digit of a result
+LOCKS = ".locks"  # folder of the locks, within a folder of results
+ELSEWHERE = "choose another folder with --out DIR"  # the remedy that always helps, for messages
+LOCK_TIMEOUT = 1.0  # s; waiting time for the lock, because a killed run needs some time to end
 # Error codes of file systems that do not support locks.
 _NO_LOCKS = frozenset({errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK})
 
 
-def hopeless(error: BaseException | None) -> bool:
-    """Whether an exception comes from an error of the system that everything else would meet as well."""
+def is_fatal(error: BaseException | None) -> bool:
+    """Return whether an exception was caused by a system error that every further write would meet, as a full disk."""
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None:
-            return error.errno in _HOPELESS
+            return error.errno in _FATAL_ERRORS
         error = error.__cause__ or error.__context__
     return False
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder for results that cannot be made or written, as far as can be told without writing."""
-    nearest = existing(folder)
+    """Raise `InputError` if a folder for results cannot be created or written; test this without writing."""
+    nearest = find_existing(folder)
     if not nearest.is_dir():
-        where = "is a file" if nearest == folder.absolute() else f"cannot be made, for {nearest} is a file"
+        where = "is a file" if nearest == folder.absolute() else f"cannot be created because {nearest} is a file"
         raise InputError(f"out: {folder} {where}; {ELSEWHERE}")
     if not os.access(nearest, os.W_OK | os.X_OK):
-        where = "is read-only" if nearest == folder.absolute() else f"cannot be made, for {nearest} is read-only"
-        raise InputError(f"out: {folder} {where}, at least to you; {ELSEWHERE}")
+        where = "is" if nearest == folder.absolute() else f"cannot be created because {nearest} is"
+        raise InputError(f"out: {folder} {where} not writable for you; {ELSEWHERE}")
 
 
 def is_plain_name(name: str) -> bool:
-    """Whether a name is that of a file in a folder, and leads nowhere else."""
+    """Return whether a string names a file within a folder, that is, contains no path to any other folder."""
     return Path(name).name == name and name not in ("", "..") and "\0" not in name
 
 
-def existing(folder: Path) -> Path:
-    """The folder itself or the nearest path above it that exists."""
+def find_existing(folder: Path) -> Path:
+    """Return the folder itself if it exists, otherwise its nearest existing parent."""
     folder = folder.absolute()
     return next(path for path in (folder, *folder.parents) if path.exists())
 
 
-def content(path: Path) -> bytes:
-    """What a file holds; nothing where there is none."""
+def read_or_empty(path: Path) -> bytes:
+    """Return the content of a file; empty if there is no such file."""
     with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return path.read_bytes()
     return b""
 
 
-def digest(value: Any) -> str:
-    """The SHA-256 of a JSON value, whatever the order of its keys."""
+def hash_json(value: Any) -> str:
+    """Return the SHA-256 of a JSON value, independent of the order of its keys."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return hashlib.sha256(text.encode("ascii")).hexdigest()
 
 
-def versions(*more: str) -> dict[str, str]:
-    """The releases that results depend on, and those of more packages."""
-    found = {"zwidth": __version__, "python": platform.python_version()}
+def list_versions(*more: str) -> dict[str, str]:
+    """Return the versions of Python, zwidth, the packages that results depend on, and ``more`` packages, by name."""
+    versions = {"zwidth": __version__, "python": platform.python_version()}
     for name in (*_PACKAGES, *more):
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            versions[name] = version(name)
+    return versions
 
 
-def differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Where two JSON values differ: the dotted path, the old and the new value; None for one that is absent."""
+def list_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield the differences of two JSON values: dotted path, old value and new value; an absent value is None."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys((*old, *new)):
-            yield from differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
+            yield from list_differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for index, (before, after) in enumerate(zip(old, new, strict=True)):
-            yield from differences(before, after, f"{path}[{index}]")
+            yield from list_differences(before, after, f"{path}[{index}]")
     elif old != new:
         yield path, old, new
 
@@ -109,20 +104,20 @@ def lock_folder(folder: Path) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     check_folder(folder)
-    place = folder / LOCKS
-    if place.is_symlink():
-        raise InputError(f"out: {place} is a link; remove it, or {ELSEWHERE}")
-    place.mkdir(parents=True, exist_ok=True)
-    holder = place / "holder"
-    # Writable by all, because other users of the folder lock it too. No fallback to lock files, because the lock file
-    # of a killed run would block later runs.
-    lock = FileLock(place / "run", timeout=PATIENCE, mode=0o666, fallback_to_soft=False)
+    lock_dir = folder / LOCKS
+    if lock_dir.is_symlink():
+        raise InputError(f"out: {lock_dir} is a link; remove it, or {ELSEWHERE}")
+    lock_dir.mkdir(parents=True, exist_ok=True)
+    holder = lock_dir / "holder"
+    # Make the file writable by all, because other users of the folder lock it too. Do not fall back to plain lock
+    # files, because the one of a killed run would block later runs.
+    lock = FileLock(lock_dir / "run", timeout=LOCK_TIMEOUT, mode=0o666, fallback_to_soft=False)
     try:
         lock.acquire()
     except Timeout:
-        who = content(holder).decode(errors="replace")
+        who = read_or_empty(holder).decode(errors="replace")
         fault = f"another run is writing to this folder{who and f' ({who})'}"
-        raise StoreBusyError(f"out: {folder}: {fault}; wait until it ends, stop that process, or {ELSEWHERE}") from None
+        raise StoreBusyError(f"out: {folder}: {fault}; wait until it ends, stop it, or {ELSEWHERE}") from None
     except OSError as error:
         # Continue without a lock if the file system has none: each file of a store is still either complete or absent.
         if error.errno not in _NO_LOCKS:
@@ -130,7 +125,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
     try:
         since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")
         who = f"process {os.getpid()} on {socket.gethostname()}, since {since} UTC"
-        # Ignore errors, because this file only serves messages. Remove it first, because it may be a link.
+        # Ignore errors, because this file is used only in messages. Remove it first, because it may be a link.
         with suppress(OSError):
             holder.unlink(missing_ok=True)
             holder.write_text(who, encoding="utf-8")

@@ -1,4 +1,10 @@
-"""The grid of a sweep: its dimensions, their values, and the normalized parameters of any block of it."""
+"""The grid of a sweep: its dimensions, their values, and the parameters of any block of the grid.
+
+A sweep varies parameters of walls (stiffness K and virtual damping B, or their normalized values alpha and beta) and
+parameters of devices. A *block* of the grid contains D devices with the same A values of stiffness and B values of
+virtual damping each. In a *physical* sweep the parameters are in SI units and are normalized here; in a normalized
+sweep they are used as given: alpha, beta, delta (physical damping), d (delay in sampling periods).
+"""
 
 from __future__ import annotations
 
@@ -15,44 +21,44 @@ from zwidth.words.quantities import PARAMETERS, WALL, Family
 
 
 class Block(NamedTuple):
-    """A block of the grid, normalized: D devices with A x B walls each, every alpha with every beta."""
+    """The normalized parameters of a block: D devices with A x B walls each, every alpha with every beta."""
 
-    delta: np.ndarray  # shape (D,)
-    d: np.ndarray  # shape (D,)
-    all_alpha: np.ndarray  # of the whole grid, shape (D, ..), likewise beta
-    all_beta: np.ndarray
-    alphas: slice  # which of them are the block's
-    betas: slice
-    mass: np.ndarray  # in SI units, shape (D,); 1 in a normalized sweep, likewise the period
-    period: np.ndarray
-    rows: int  # of one beta, in the whole grid
+    delta: np.ndarray  # normalized physical damping, shape (D,)
+    d: np.ndarray  # delay in sampling periods, shape (D,)
+    all_alpha: np.ndarray  # every alpha of the whole grid, shape (D, number of alphas)
+    all_beta: np.ndarray  # every beta of the whole grid, shape (D, number of betas)
+    alphas: slice  # alphas of the block
+    betas: slice  # betas of the block
+    mass: np.ndarray  # kg, or kg m^2 for a rotary device; 1 in a normalized sweep; shape (D,)
+    period: np.ndarray  # sampling period, s; 1 in a normalized sweep; shape (D,)
+    lines: int  # number of lines of constant beta in the whole grid
 
     @property
     def alpha(self) -> np.ndarray:
-        """Those of its walls, shape (D, A)."""
+        """The alphas of the block, shape (D, A)."""
         return self.all_alpha[:, self.alphas]
 
     @property
     def beta(self) -> np.ndarray:
-        """Those of its walls, shape (D, B)."""
+        """The betas of the block, shape (D, B)."""
         return self.all_beta[:, self.betas]
 
 
 class SceneBlock(NamedTuple):
-    """A block of the grid as it is given: D devices by their parameters, with A x B walls each."""
+    """The parameters of a block as given in the configuration: D devices with A x B walls each."""
 
-    parameters: dict[str, np.ndarray]  # each of shape (D,)
-    stiffness: np.ndarray  # shape (D, A); alpha in a normalized sweep, likewise beta
-    virtual_damping: np.ndarray  # shape (D, B)
+    parameters: dict[str, np.ndarray]  # parameters of the devices by name, each of shape (D,)
+    stiffness: np.ndarray  # N/m, or N m/rad; alpha in a normalized sweep; shape (D, A)
+    virtual_damping: np.ndarray  # N s/m, or N m s/rad; beta in a normalized sweep; shape (D, B)
 
 
 class Grid:
-    """The dimensions of a sweep, those of walls last, and what lies at each of their points."""
+    """The grid of a sweep: its dimensions, those of devices before those of walls, and the parameters of its points."""
 
     def __init__(self, study: SweepStudy) -> None:
         self.axes, self.unit_system = study.axes, study.unit_system
         self.physical = study.axes.physical
-        self.of_wall = ("stiffness", "virtual_damping") if self.physical else ("alpha", "beta")
+        self.wall_names = ("stiffness", "virtual_damping") if self.physical else ("alpha", "beta")
         sizes = study.axes.sizes
         self.wall_dims = tuple(name for name in sizes if name in WALL)
         self.device_dims = tuple(name for name in sizes if name not in WALL)
@@ -60,92 +66,112 @@ class Grid:
         self.sizes = sizes
 
     def dims_of(self, family: Family) -> tuple[str, ...]:
+        """Return the names of the dimensions of a family of outputs."""
         return self.dims if family == "wall" else self.device_dims
 
     def shape_of(self, family: Family) -> tuple[int, ...]:
+        """Return the number of values along each dimension of a family of outputs."""
         return tuple(self.sizes[name] for name in self.dims_of(family))
 
     @cached_property
     def _values(self) -> dict[str, np.ndarray]:
-        """Every parameter that is given, as a flat array."""
+        """The values of every given parameter, as flat arrays by name."""
         table = self.axes.devices
         columns = {name: table.values(name) for name in table.columns} if table else {}
-        own = {name: getattr(self.axes, name) for name in PARAMETERS}
-        return columns | {name: axis.values() for name, axis in own.items() if axis is not None}
+        axes = {name: getattr(self.axes, name) for name in PARAMETERS}
+        return columns | {name: axis.values() for name, axis in axes.items() if axis is not None}
 
     def coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]]:
-        """Dimensions, values and attributes of every parameter by its name in a store, and the labels of devices."""
+        """Return the coordinate variables of a store: dimensions, values and attributes by name of the variable.
+
+        They are the given parameters and, if the devices come from a table, the labels of the devices.
+        """
         table = self.axes.devices
-        found: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
+        variables: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
         if table is not None:
             labels = table.labels or tuple(str(row) for row in range(1, table.size + 1))
-            found["device"] = (("device",), np.array(labels), {"long_name": f"{LABEL} of the device"})
+            variables["device"] = (("device",), np.array(labels), {"long_name": f"{LABEL} of the device"})
         for name, values in self._values.items():
             in_periods = name == "delay" and self.axes.delay_in_periods
             units = "sampling periods" if in_periods else self.unit_system[PARAMETERS[name].unit]
             attributes = {"long_name": PARAMETERS[name].long_name, "units": units}
             variable, dim = PARAMETERS[name].variable, self._dim_of(name)
             dims = () if dim is None else (dim.replace(".", "_"),)
-            found[variable] = (dims, values if dims else values[0], attributes)
-        return found
+            variables[variable] = (dims, values if dims else values[0], attributes)
+        return variables
 
-    def scene_block(self, place: tuple[slice, ...]) -> SceneBlock:
-        """A block as its parameters are given; ``place`` has a slice for every dimension, or for those of devices."""
-        slices = dict(zip(self.dims, place, strict=False))
+    def scene_block(self, slices: tuple[slice, ...]) -> SceneBlock:
+        """Return a block with its parameters as given.
+
+        ``slices`` has one slice per dimension, or only those of the device dimensions: then the first value of each
+        wall dimension is used.
+        """
+        by_dim = dict(zip(self.dims, slices, strict=False))
         for name in self.wall_dims:
-            slices.setdefault(name, slice(0, 1))
-        shape = tuple(len(range(*slices[name].indices(self.sizes[name]))) for name in self.device_dims)
-        parameters = {name: self._device(name, slices, shape) for name in self.axes.given if name not in WALL}
-        walls = [self._wall(name, slices, shape) for name in self.of_wall]
+            by_dim.setdefault(name, slice(0, 1))
+        shape = tuple(len(range(*by_dim[name].indices(self.sizes[name]))) for name in self.device_dims)
+        parameters = {name: self._device_values(name, by_dim, shape) for name in self.axes.given if name not in WALL}
+        walls = [self._wall_values(name, by_dim, shape) for name in self.wall_names]
         return SceneBlock(parameters, *(np.broadcast_to(part, (math.prod(shape), part.shape[1])) for part in walls))
 
-    def block(self, place: tuple[slice, ...]) -> Block:
-        """The same normalized, with the walls of the whole grid."""
+    def block(self, slices: tuple[slice, ...]) -> Block:
+        """Return a block with normalized parameters, including the walls of the whole grid; slices as above."""
         alphas = betas = slice(0, 1)
-        if len(place) == len(self.dims):
-            slices = dict(zip(self.dims, place, strict=True))
+        if len(slices) == len(self.dims):
+            by_dim = dict(zip(self.dims, slices, strict=True))
             alphas, betas = (
-                slice(*slices.get(name, alphas).indices(self.sizes.get(name, 1))[:2]) for name in self.of_wall
+                slice(*by_dim.get(name, alphas).indices(self.sizes.get(name, 1))[:2]) for name in self.wall_names
             )
-            place = (*place[: len(self.device_dims)], *[slice(None)] * len(self.wall_dims))
-        given = self.scene_block(place)
-        rows, none = self.size_of("device") * given.virtual_damping.shape[1], np.zeros(len(given.stiffness))
+            slices = (*slices[: len(self.device_dims)], *[slice(None)] * len(self.wall_dims))
+        given = self.scene_block(slices)
+        lines, zeros = self.size_of("device") * given.virtual_damping.shape[1], np.zeros(len(given.stiffness))
         if not self.physical:
             delta, d = given.parameters["delta"], given.parameters["d"]
-            return Block(delta, d, *given[1:], alphas, betas, none + 1.0, none + 1.0, rows)
-        mass, damping, delay = (given.parameters.get(name, none) for name in ("mass", "damping", "delay"))
+            return Block(delta, d, *given[1:], alphas, betas, zeros + 1.0, zeros + 1.0, lines)
+        mass, damping, delay = (given.parameters.get(name, zeros) for name in ("mass", "damping", "delay"))
         rate = given.parameters.get("rate")
         period = given.parameters["period"] if rate is None else 1.0 / rate
         in_periods = self.axes.delay_in_periods
-        # Beyond float64 is a status of the point, not a warning.
+        # Suppress warnings, because a parameter that overflows is reported in the status of its point.
         with np.errstate(all="ignore"):
-            device = normalize(mass=mass, damping=damping, period=period, delay=none if in_periods else delay)
+            device = normalize(mass=mass, damping=damping, period=period, delay=zeros if in_periods else delay)
             units = {"mass": mass[:, None], "period": period[:, None]}
             alpha = normalize(**units, stiffness=given.stiffness).alpha
             beta = normalize(**units, virtual_damping=given.virtual_damping).beta
         d = delay if in_periods else device.d
-        return Block(device.delta, d, alpha, beta, alphas, betas, mass, period, rows)
+        return Block(device.delta, d, alpha, beta, alphas, betas, mass, period, lines)
 
-    def _device(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
-        """A parameter of the devices of a block, flat; 0 where it is not given."""
+    def _device_values(self, name: str, by_dim: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
+        """Return the values of a parameter for all devices of a block, flat; 0 if the parameter is not given.
+
+        Args:
+            name: Name of the parameter.
+            by_dim: Slice of the block by name of the dimension.
+            shape: Number of values of the block along each device dimension.
+        """
         values = self._values.get(name, np.zeros(1))
         dim = self._dim_of(name)
         if dim is not None:
             axis = self.device_dims.index(dim)
-            values = values[slices[dim]].reshape([-1 if index == axis else 1 for index in range(len(shape))])
+            values = values[by_dim[dim]].reshape([-1 if index == axis else 1 for index in range(len(shape))])
         return np.broadcast_to(values, shape or (1,)).ravel()
 
-    def _wall(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
-        """A parameter of the walls of a block: one row for all devices, or one column with an entry a device."""
+    def _wall_values(self, name: str, by_dim: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
+        """Return the values of a wall parameter of a block; arguments as for `_device_values`.
+
+        The shape is (1, number of values) if the parameter is a dimension of the walls, otherwise (D, 1).
+        """
         if name in self.wall_dims:
-            return self._values[name][slices[name]][None, :]
-        return self._device(name, slices, shape)[:, None]
+            return self._values[name][by_dim[name]][None, :]
+        return self._device_values(name, by_dim, shape)[:, None]
 
     def _dim_of(self, name: str) -> str | None:
+        """Return the dimension along which a parameter varies, None if it is constant."""
         table = self.axes.devices
         if table is not None and name in table.columns:
             return "device"
         return name if name in self.sizes else None
 
     def size_of(self, family: Family) -> int:
+        """Return the number of points of a family of outputs."""
         return math.prod(self.shape_of(family))

@@ -1,4 +1,8 @@
-"""Chunks of stores, from nothing to done: in this process, or in workers, replaced when something kills them."""
+"""Compute single chunks of stores, in this process or in worker processes that are replaced if they are killed.
+
+A *job* is one chunk of one store. `perform` computes and writes it; sweeps over rigid devices use the kernels of
+`sweep.compute`, sweeps over devices with further parts evaluate one scene per device (`compute_scenes`).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ import numpy as np
 from zwidth.config.sweep import SweepStudy
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.scenes.scene import Scene
-from zwidth.sweep.files import content, hopeless
+from zwidth.sweep.files import is_fatal, read_or_empty
 from zwidth.sweep.grid import SceneBlock
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
@@ -28,19 +32,19 @@ from zwidth.words.errors import InputError, ZwidthError
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, Family
 from zwidth.words.status import Status
 
+# Function that computes one chunk, given the path of the store, the family and the index of the chunk. It is `perform`,
+# or a failing replacement in tests.
 Perform: TypeAlias = Callable[[str, str, int], None]
-"""What computes one chunk: `zwidth.sweep.jobs.perform`, or in a test something that fails."""
 
-MAX_ATTEMPTS = 3
-"""How often a chunk is tried whose worker is killed."""
-# Never fork a process in which JAX may have started: its threads do not survive, its locks do.
+MAX_ATTEMPTS = 3  # attempts at a chunk whose worker process is killed
+# Spawn the workers instead of forking: a fork after the start of JAX inherits its locks but not the threads that
+# release them.
 _CONTEXT = multiprocessing.get_context("spawn")
-# Seconds that a worker may take to end by itself.
-_PATIENCE = 3.0
+_STOP_TIMEOUT = 3.0  # s; a worker that has not ended by itself after this time is killed
 
 
 class LostSchedulerError(ZwidthError):
-    """An engine that cannot go on; the message follows on its name."""
+    """Loss of the cluster during a run; the message continues a sentence that begins with the scheduler's address."""
 
 
 class Job(NamedTuple):
@@ -51,15 +55,15 @@ class Job(NamedTuple):
 
 
 class Finished(NamedTuple):
-    """How one chunk went: no error, or what went wrong; ``hopeless`` where the other chunks would fare the same."""
+    """The outcome of one job."""
 
     job: Job
-    error: str = ""
-    hopeless: bool = False
+    error: str = ""  # error message; empty if the job succeeded
+    fatal: bool = False  # the error would affect every other job, too
 
 
-def attempt(perform: Perform, job: Job) -> Finished:
-    """Do one job; whatever goes wrong is told, for the other jobs do not depend on it."""
+def try_job(perform: Perform, job: Job) -> Finished:
+    """Run one job and return its outcome; return an exception as an error, because the other jobs are independent."""
     try:
         perform(job.path, job.task.family, job.task.index)
     except Exception as error:
@@ -68,37 +72,44 @@ def attempt(perform: Perform, job: Job) -> Finished:
 
 
 def describe_failure(job: Job, error: BaseException) -> Finished:
-    return Finished(job, f"{type(error).__name__}: {error}", hopeless(error))
+    """Return the outcome of a job that raised an exception."""
+    return Finished(job, f"{type(error).__name__}: {error}", is_fatal(error))
 
 
 @lru_cache(maxsize=4)
 def _open_store(path: str, described: bytes) -> Store:
-    """A store that this process works on; its description tells it from another one that took its place."""
+    """Open a store, or return the one opened earlier if its description is the same.
+
+    The description identifies the store; the path alone does not, because a store may have been replaced.
+    """
     return Store(Path(path))
 
 
 def perform(path: str, family: str, index: int) -> None:
-    """Compute and write one chunk of a store, by its number in a family of outputs, unless it is done already."""
-    # Not by the file's number, which the next store may get.
-    store = _open_store(path, content(Path(path) / "zarr.json"))
+    """Compute and write one chunk of a store, given by its index within a family of outputs, unless it is done."""
+    # Identify the store by its description and not by an inode number, which a later store may reuse.
+    store = _open_store(path, read_or_empty(Path(path) / "zarr.json"))
     task = Task(plan := store.plan.family(family), index)
     if store.is_done(task):
         return
     if store.study.with_parts:
-        block = store.plan.grid.scene_block(task.place)
+        block = store.plan.grid.scene_block(task.slices)
         values = compute_scenes(plan.family, plan.outputs, store.study, block)
     else:
-        # Loads JAX, which a process that only hands out work has no use for.
-        from zwidth.sweep.compute import compute
+        # Import here, because this module loads JAX, which the parent process of workers does not need.
+        from zwidth.sweep.compute import compute_block
 
-        values = compute(plan.family, plan.outputs, store.plan.grid.block(task.place), store.study.accuracy)
-    # A scheduler that restarts, or a run that goes on, may have handed it out twice.
+        values = compute_block(plan.family, plan.outputs, store.plan.grid.block(task.slices), store.study.accuracy)
+    # Check again, because a restarted scheduler or a resumed run may have assigned the chunk twice.
     if not store.is_done(task):
         store.write(task, values)
 
 
-def in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generator[Finished]:
-    """Do jobs in ``count`` processes; a job whose worker dies is tried again, at the end and a few times at most."""
+def run_in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generator[Finished]:
+    """Run jobs in ``count`` worker processes and yield their outcomes, in the order of completion.
+
+    A job whose worker dies is run again after all other jobs, in at most `MAX_ATTEMPTS` attempts.
+    """
     waiting = deque(jobs)
     deaths: Counter[Job] = Counter()
     workers = [_Worker(number, count, perform) for number in range(min(count, len(waiting)))]
@@ -123,56 +134,58 @@ def in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generator[F
                     waiting.append(job)
                 else:
                     why = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-                    yield Finished(job, f"its worker died each of {MAX_ATTEMPTS} times ({why})")
+                    yield Finished(job, f"the worker process died in all {MAX_ATTEMPTS} attempts ({why})")
     finally:
         for worker in workers:
             worker.stop()
 
 
 class _Worker:
-    """One process of ``count``, and what it is doing."""
+    """One of ``count`` worker processes, and its current job."""
 
     def __init__(self, number: int, count: int, perform: Perform) -> None:
         self.number = number
         self.job: Job | None = None
-        self.pipe, theirs = _CONTEXT.Pipe()
-        self.process = _CONTEXT.Process(target=_work, args=(theirs, number, count, perform), daemon=True)
+        self.pipe, child_pipe = _CONTEXT.Pipe()
+        self.process = _CONTEXT.Process(target=_run_worker, args=(child_pipe, number, count, perform), daemon=True)
         self.process.start()
-        theirs.close()
+        child_pipe.close()
 
     def start(self, job: Job) -> None:
+        """Send a job to the process."""
         self.job = job
-        # Where the worker is dead already, its sentinel says so.
+        # Ignore the error if the process is dead, because `run_in_workers` detects its death by the sentinel.
         with suppress(OSError):
             self.pipe.send(job)
 
     def result(self) -> Finished | None:
-        """How the job went; None where the worker died over it."""
+        """Return the outcome of the current job; None if the process died."""
         self.job = None
         with suppress(EOFError, OSError):
             return self.pipe.recv() if self.pipe.poll() else None
         return None
 
     def stop(self) -> None:
-        """End the process; what it was writing is not there yet under its name."""
-        # An idle one ends by itself when nobody can send it anything any more.
+        """End the process. An interrupted write is harmless, because a file gets its name only when it is complete."""
+        # An idle process ends by itself when its pipe is closed.
         if self.job is None:
             self.pipe.close()
         else:
             self.process.terminate()
-        self.process.join(_PATIENCE)
+        self.process.join(_STOP_TIMEOUT)
         self.process.kill()
         self.process.join()
         self.pipe.close()
 
 
-def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
-    # Ctrl-C reaches the whole group of processes; the parent decides what becomes of it.
+def _run_worker(pipe: Connection, number: int, count: int, perform: Perform) -> None:
+    """Run jobs received through a pipe until it is closed; this is the main function of worker ``number``."""
+    # Ignore Ctrl-C, which is sent to all processes of the group: the parent ends the workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Ends as a program does, so that Python has no leaked semaphore to complain about.
+    # Exit normally on SIGTERM, so that Python's resource tracker does not report leaked semaphores.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # Its share of the processors: JAX would start a thread on each of them in every worker.
+    # Restrict the worker to its share of the processors: otherwise JAX starts one thread per processor in each worker.
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
     if 1 < count <= len(available):
         os.sched_setaffinity(0, available[number::count])
@@ -181,11 +194,11 @@ def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
             job: Any = pipe.recv()
         except (EOFError, OSError):
             return
-        pipe.send(attempt(perform, job))
+        pipe.send(try_job(perform, job))
 
 
 def _end_with_parent() -> None:
-    """A parent that is killed cannot end its workers."""
+    """End this worker as soon as its parent has ended, because a killed parent cannot end its workers."""
     parent = multiprocessing.parent_process()
     assert parent is not None, "a worker has a parent"
     parent.join()
@@ -193,60 +206,84 @@ def _end_with_parent() -> None:
 
 
 @lru_cache(maxsize=64)
-def _keep(scene: Scene) -> Scene:
-    """The scene that has laid out its boundary already, where an equal one has."""
+def _reuse_equal_scene(scene: Scene) -> Scene:
+    """Return an equal scene from the cache if there is one, because its stability boundary is already computed."""
     return scene
 
 
 def compute_scenes(
     family: Family, outputs: tuple[str, ...], study: SweepStudy, block: SceneBlock
 ) -> dict[str, np.ndarray]:
-    """Every output of a family on a block, and its status; walls in shape (D, A, B), devices in shape (D,)."""
+    """Compute outputs of one family on a block with one scene per device, and their status.
+
+    Args:
+        family: "wall" or "device".
+        outputs: Names of the outputs.
+        study: The sweep, which creates the scenes.
+        block: Parameters of D devices with A x B walls each.
+
+    Returns:
+        The arrays by name, of shape (D, A, B) for walls and (D,) for devices, and the status of the family.
+    """
     devices = block.stiffness.shape[0]
     shape = (devices, block.stiffness.shape[1], block.virtual_damping.shape[1]) if family == "wall" else (devices,)
-    found = {
+    results = {
         name: np.zeros(shape, bool) if OUTPUTS[name].dtype == "bool" else np.full(shape, np.nan) for name in outputs
     }
     status = np.full(shape, Status.OK, np.uint8)
     for k in range(devices):
         values = {name: float(column[k]) for name, column in block.parameters.items()}
         try:
-            scene = _keep(study.make_scene(values))
+            scene = _reuse_equal_scene(study.make_scene(values))
             if family == "wall":
                 walls = block.stiffness[k][:, None], block.virtual_damping[k][None, :]
-                one, told = _compute_walls(scene, outputs, *walls)
+                outputs_k, status_k = _compute_walls(scene, outputs, *walls)
             else:
-                top = scene.max_stiffness()
-                one, told = {"stiffness_max": top.stiffness, "virtual_damping_at_max": top.virtual_damping}, top.status
+                best = scene.max_stiffness()
+                outputs_k, status_k = (
+                    {"stiffness_max": best.stiffness, "virtual_damping_at_max": best.virtual_damping},
+                    best.status,
+                )
         except InputError:
             status[k] = Status.INVALID_INPUT
             continue
         except (ZwidthError, ArithmeticError):
             status[k] = Status.NOT_CONVERGED
             continue
-        status[k] = told
+        status[k] = status_k
         for name in outputs:
-            found[name][k] = one[name]
-    return {**found, STATUS_OF[family]: status}
+            results[name][k] = outputs_k[name]
+    return {**results, STATUS_OF[family]: status}
 
 
 def _compute_walls(
     scene: Scene, outputs: tuple[str, ...], stiffness: np.ndarray, virtual_damping: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The outputs of one device's walls, and their status."""
-    found: dict[str, np.ndarray] = {}
+    """Compute outputs of the walls of one device.
+
+    Args:
+        scene: The device.
+        outputs: Names of the outputs.
+        stiffness: K or alpha, of shape (A, 1).
+        virtual_damping: B or beta, of shape (1, B).
+
+    Returns:
+        The outputs by name and the status, all of shape (A, B).
+    """
+    results: dict[str, np.ndarray] = {}
     alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
     status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
     if "stable" in outputs:
-        # With a row a damping its intervals serve all of its walls. A measured response leaves some of them undecided.
+        # Transpose, because `decide` computes the stable intervals of K once per row, here once per damping. Walls of
+        # a measured response may be undecided, which their status reports.
         labels = scene.loop.decide(alpha.T, beta.T, "auto", (stiffness.T, virtual_damping.T))
-        found["stable"], status = np.asarray(labels.stable).T, np.asarray(labels.status).T
+        results["stable"], status = np.asarray(labels.stable).T, np.asarray(labels.status).T
     unknown = np.zeros(status.shape, bool)
     if "spectral_radius" in outputs:
-        found["spectral_radius"] = radius = np.asarray(scene.spectral_radius(stiffness, virtual_damping))
+        results["spectral_radius"] = radius = np.asarray(scene.spectral_radius(stiffness, virtual_damping))
         unknown |= np.isnan(radius)
     if "passive" in outputs:
         margin = np.asarray(scene.passivity_margin(stiffness, virtual_damping))
-        found["passive"] = margin > 0
+        results["passive"] = margin > 0
         unknown |= np.isnan(margin)
-    return found, np.where(unknown & (status == Status.OK), Status.NOT_CONVERGED, status)
+    return results, np.where(unknown & (status == Status.OK), Status.NOT_CONVERGED, status)

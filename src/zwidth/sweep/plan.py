@@ -1,4 +1,9 @@
-"""The plan of a sweep: its chunks, its methods, what it will take, and whether that fits."""
+"""Plan a sweep: divide its grid into chunks, choose the methods, and estimate time, memory and disk space.
+
+The outputs of a sweep belong to two *families*, "wall" (one value per wall) and "device" (one value per device). Each
+family has its own grid, which is divided into *chunks*: rectangular blocks that are computed, written and repaired as a
+unit. The plan depends only on the study, so that every machine computes the same chunks by the same methods.
+"""
 
 from __future__ import annotations
 
@@ -14,126 +19,123 @@ from typing import Any
 import numpy as np
 
 from zwidth.config.sweep import SweepStudy
-from zwidth.sweep.files import ELSEWHERE, check_folder, existing
+from zwidth.sweep.files import ELSEWHERE, check_folder, find_existing
 from zwidth.sweep.grid import Grid
 from zwidth.words.errors import ResourceError
 from zwidth.words.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
-MEMORY = 2**28
-"""Bytes that one chunk may take while it is computed, beside what an idle worker takes."""
-
-IDLE_MEMORY = 500 * 2**20
-"""Bytes that a worker takes before its first chunk: Python, JAX and its compiled kernels."""
-
-# What a killed worker loses is the chunk it was at.
-_CHUNK_SECONDS = 10.0
-_LARGEST_CHUNK = 2**25
-# Enough chunks to share among workers and to show progress, none so small that its files cost more than its points.
-_FEWEST_CHUNKS = 16
-_SMALLEST_CHUNK = 2**15
-_LAID_OUT_BYTES = 96 * 2**20
-
-# A guess below this says no more than that.
-_INSTANT = 0.01
-
-# To lay out the boundary of a device with parts.
-_SCENE_SECONDS = 0.1
+MEMORY = 2**28  # bytes available to one chunk during its computation, in addition to `IDLE_MEMORY`
+IDLE_MEMORY = 500 * 2**20  # bytes of a worker before its first chunk: Python, JAX and compiled kernels
+_CHUNK_SECONDS = 10.0  # longest computation of a chunk on one core, which is lost if the worker is killed
+_MAX_CHUNK = 2**25  # points
+_MIN_CHUNKS = 16  # desired number of chunks, so that workers share the work and the progress is visible
+_MIN_CHUNK = 2**15  # points; in smaller chunks writing the files takes longer than computing the points
+_BUFFER_BYTES = 96 * 2**20  # parameters and results of the points that `sweep.compute` processes at once
+_MIN_SECONDS = 0.01  # estimates below this are printed as "less than"
+_SCENE_SECONDS = 0.1  # time to compute the stability boundary of one device with parts
 
 
 @dataclass(frozen=True)
 class FamilyPlan:
-    """How the outputs of one family are cut into chunks."""
+    """The division of the outputs of one family into chunks."""
 
     family: Family
     outputs: tuple[str, ...]
-    dims: tuple[str, ...]
-    shape: tuple[int, ...]
-    chunks: tuple[int, ...]
+    dims: tuple[str, ...]  # names of the dimensions of the grid
+    shape: tuple[int, ...]  # points along each dimension
+    chunks: tuple[int, ...]  # points of a chunk along each dimension
 
     @property
     def counts(self) -> tuple[int, ...]:
+        """Number of chunks along each dimension."""
         return tuple(-(-size // chunk) for size, chunk in zip(self.shape, self.chunks, strict=True))
 
     @property
     def count(self) -> int:
+        """Number of chunks."""
         return math.prod(self.counts)
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """The outputs and the status: every one of them has a file for each chunk."""
+        """The outputs and the status of the family; each of them has one file per chunk."""
         return (*self.outputs, STATUS_OF[self.family])
 
     @property
     def extent(self) -> str:
-        """Its dimensions and their sizes, for messages."""
+        """The dimensions and their sizes, for messages."""
         return " x ".join(f"{dim} {size}" for dim, size in zip(self.dims, self.shape, strict=True)) or "one point"
 
 
 @dataclass(frozen=True)
 class Task:
-    """One chunk of one family of outputs: what is computed, written and repaired as a whole."""
+    """One chunk of one family of outputs, computed, written and repaired as a unit."""
 
     plan: FamilyPlan
     index: int
 
     @property
     def family(self) -> Family:
+        """Family of the outputs."""
         return self.plan.family
 
     @property
     def position(self) -> tuple[int, ...]:
-        """Its number along each dimension."""
+        """Index of the chunk along each dimension."""
         return tuple(map(int, np.unravel_index(self.index, self.plan.counts))) if self.plan.counts else ()
 
     @property
-    def place(self) -> tuple[slice, ...]:
+    def slices(self) -> tuple[slice, ...]:
+        """Range of the grid that the chunk covers, one slice per dimension."""
         starts = zip(self.position, self.plan.chunks, self.plan.shape, strict=True)
-        return tuple(slice(at * chunk, min((at + 1) * chunk, size)) for at, chunk, size in starts)
+        return tuple(slice(index * chunk, min((index + 1) * chunk, size)) for index, chunk, size in starts)
 
     @property
     def points(self) -> int:
-        return math.prod(part.stop - part.start for part in self.place)
+        """Number of points."""
+        return math.prod(part.stop - part.start for part in self.slices)
 
     def __str__(self) -> str:
-        parts = zip(self.plan.dims, self.place, strict=True)
-        place = ", ".join(f"{dim} {part.start}:{part.stop}" for dim, part in parts)
-        return f"{self.family}/{self.index}{f' ({place})' if place else ''}"
+        parts = zip(self.plan.dims, self.slices, strict=True)
+        ranges = ", ".join(f"{dim} {part.start}:{part.stop}" for dim, part in parts)
+        return f"{self.family}/{self.index}{f' ({ranges})' if ranges else ''}"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep will do."""
+    """The plan of a sweep: chunks, methods and estimated costs."""
 
     study: SweepStudy
     grid: Grid
     families: tuple[FamilyPlan, ...]
-    methods: dict[str, tuple[str, str]]  # of every output that has a choice, and why it is that one
-    model: str  # what is modelled, in words
-    memory: int  # bytes that a chunk takes while it is computed, at most
-    disk: int  # bytes that the store takes, estimated from above
-    seconds: float  # on one core, a rough guess
+    methods: dict[str, tuple[str, str]]  # method and reason for each output with a choice of methods
+    model: str  # description of the model
+    memory: int  # bytes; upper bound for one chunk during its computation
+    disk: int  # bytes; upper estimate for the store
+    seconds: float  # rough estimate of the computing time on one core
 
     def family(self, name: str) -> FamilyPlan:
+        """Return the plan of one family by its name."""
         return next(family for family in self.families if family.family == name)
 
     def tasks(self) -> Iterator[Task]:
-        """Every chunk, in the order of the work."""
+        """Yield every chunk, in the order of computation."""
         for family in self.families:
             yield from (Task(family, index) for index in range(family.count))
 
     @property
     def extent(self) -> str:
-        """The axes of the largest family and how many values each has, for messages."""
+        """The dimensions of the largest family and their sizes, for messages."""
         return max(self.families, key=lambda family: math.prod(family.shape)).extent
 
     def as_dict(self) -> dict[str, Any]:
-        """What a store keeps of the plan: later work on it must follow the same."""
+        """Return the part of the plan that a store records, because later work on the store must use the same."""
         return {
             "chunks": {family.family: list(family.chunks) for family in self.families},
             "methods": {name: method for name, (method, _) in sorted(self.methods.items())},
         }
 
     def lines(self) -> Iterator[str]:
+        """Yield the lines of the printed plan."""
         yield f"study {self.study.name}"
         for family in self.families:
             chunk = " x ".join(map(str, family.chunks))
@@ -144,13 +146,13 @@ class Plan:
         yield f"  model      {self.model}"
         for name, (method, reason) in sorted(self.methods.items()):
             yield f"  method     {name} by {method}: {reason}"
-        yield f"  memory     {_size(self.memory)} a chunk, and {_size(IDLE_MEMORY)} a worker"
-        yield f"  disk       {_size(self.disk)} at most"
-        yield f"  time       {_time(self.seconds)} on one core"
+        yield f"  memory     {_format_size(self.memory)} per chunk, and {_format_size(IDLE_MEMORY)} per worker"
+        yield f"  disk       {_format_size(self.disk)} at most"
+        yield f"  time       {_format_time(self.seconds)} on one core"
 
 
 def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
-    """Cut a study into chunks of so many bytes, by the points a second of each output."""
+    """Plan a sweep with chunks of at most ``memory`` bytes, using the computing speed of each output in points/s."""
     grid = Grid(study)
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
@@ -160,35 +162,38 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
             slowness += _SCENE_SECONDS * grid.size_of("device") / grid.size_of(family)
         per_point = _bytes_per_point(outputs)
         size = grid.size_of(family)
-        target = min((memory - _LAID_OUT_BYTES) // per_point, _LARGEST_CHUNK, int(_CHUNK_SECONDS / slowness))
-        target = max(1, min(target, max(size // _FEWEST_CHUNKS, _SMALLEST_CHUNK)))
+        target = min((memory - _BUFFER_BYTES) // per_point, _MAX_CHUNK, int(_CHUNK_SECONDS / slowness))
+        target = max(1, min(target, max(size // _MIN_CHUNKS, _MIN_CHUNK)))
         shape = grid.shape_of(family)
         families.append(FamilyPlan(family, outputs, grid.dims_of(family), shape, chunk_shape(shape, target)))
         seconds += size * slowness
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
-    # Numbers hardly shrink, truth values are packed, a status is nearly always 0.
+    # Assume that compression does not reduce float64 values, that booleans take 1 bit, and a status, mostly 0, 1 bit.
     bits = [1 + sum(64 if OUTPUTS[name].dtype == "float64" else 1 for name in plan.outputs) for plan in families]
     disk = sum(math.prod(plan.shape) * each for plan, each in zip(families, bits, strict=True)) // 8 + 2**16
     longest, model = study.axes.most_periods, "device with parts, held delay"
     if not study.with_parts:
-        part = "" if longest == math.floor(longest) else ", also in part of a period"
+        part = "" if longest == math.floor(longest) else ", also fractional"
         model = f"damped mass, zero-order hold, held delay{part}: polynomials of degree up to {math.ceil(longest) + 3}"
-    return Plan(study, grid, tuple(families), choose_methods(study), model, largest + _LAID_OUT_BYTES, disk, seconds)
+    return Plan(study, grid, tuple(families), choose_methods(study), model, largest + _BUFFER_BYTES, disk, seconds)
 
 
-def kept_plan(study: SweepStudy, kept: dict[str, Any]) -> Plan:
-    """The plan that a store was made with, from what it keeps of it."""
+def restore_plan(study: SweepStudy, recorded: dict[str, Any]) -> Plan:
+    """Return the plan of an existing store from the part that the store records (`Plan.as_dict`)."""
     fresh = make_plan(study)
-    families = tuple(replace(plan, chunks=tuple(kept["chunks"][plan.family])) for plan in fresh.families)
+    families = tuple(replace(plan, chunks=tuple(recorded["chunks"][plan.family])) for plan in fresh.families)
     return replace(fresh, families=families)
 
 
 def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
-    """Cut a grid into chunks of about equal size and at most ``target`` points; fast dimensions stay whole first."""
+    """Return the shape of chunks of about equal size and at most ``target`` points; the first dimensions are divided.
+
+    The last dimensions stay undivided as far as possible, because their points are adjacent in memory.
+    """
     chunks, room = [], target
     for size in reversed(shape):
         chunk = max(1, min(size, room))
-        # Equal parts: no chunk is a sliver.
+        # Divide the dimension into equal parts, so that no chunk is much smaller than the others.
         chunk = -(-size // -(-size // chunk)) if size else 1
         chunks.append(chunk)
         room = room // chunk if chunk == size else 1
@@ -196,62 +201,70 @@ def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
 
 
 def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
-    """The method of every output that has a choice, and why; it depends on the study alone, never on the machine."""
+    """Return method and reason for each output with a choice of methods; they depend only on the study."""
     methods = {}
     if study.with_parts:
-        reason = "one boundary for each device, on which the poles that cross are counted along every row"
+        reason = "one stability boundary per device; unstable poles are counted along lines of constant B"
         return {name: ("crossings", reason) for name in study.outputs if name in ("stable", "stiffness_max")}
     if "stable" in study.outputs:
-        methods["stable"] = ("crossover", "no pole is needed: the end of each row in closed form, then a comparison")
+        methods["stable"] = ("crossover", "stability limit of each line of constant B in closed form, without poles")
     if RADIUS_OUTPUTS & set(study.outputs):
-        proof = f"each value proved to {study.accuracy:g} by counts of poles inside circles, at a cost flat in d"
+        proof = f"certified to {study.accuracy:g} by counting poles inside circles; the cost does not depend on d"
         methods["spectral_radius"] = ("newton", proof)
     return methods
 
 
 def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collection[str] = ()) -> None:
-    """Refuse, before any work, what cannot fit on the disk or in memory; ``begun`` studies have their disk space."""
+    """Raise `ResourceError` if sweeps do not fit on the disk or into memory, before any of them starts.
+
+    Args:
+        plans: The plan of each sweep.
+        folder: Folder of the results.
+        workers: Number of worker processes.
+        begun: Names of the studies whose stores exist, and hence do not count for the disk space.
+    """
     check_folder(folder)
     if not plans:
         return
-    free = shutil.disk_usage(existing(folder)).free
+    free = shutil.disk_usage(find_existing(folder)).free
     new = [plan for plan in plans if plan.study.name not in begun]
     disk = sum(plan.disk for plan in new)
     if disk > free:
         largest = max(new, key=lambda plan: plan.disk)
         raise ResourceError(
-            f"out: {folder} has {_size(free)} free, but the results may take {_size(disk)}, most of them of "
-            f"studies[{largest.study.name}].axes ({largest.extent}); {ELSEWHERE}, fewer outputs or fewer values on an "
-            "axis"
+            f"out: {folder} has {_format_size(free)} free, but the results may take {_format_size(disk)}, most "
+            f"of them for studies[{largest.study.name}].axes ({largest.extent}); {ELSEWHERE}, fewer outputs or fewer "
+            "axis values"
         )
-    total = _machine_memory()
+    total = _available_memory()
     memory = max(workers * (plan.memory + IDLE_MEMORY) for plan in plans)
     if memory > total:
         raise ResourceError(
-            f"workers: {workers} of them may take {_size(memory)} of memory, but there are {_size(total)}; "
-            "choose fewer with --workers N"
+            f"workers: {workers} workers may take {_format_size(memory)} of memory, but {_format_size(total)} are "
+            "available; choose fewer with --workers N"
         )
 
 
-def _machine_memory() -> int:
-    """The memory that this process may use: the machine's, or less in a container."""
+def _available_memory() -> int:
+    """Return the memory available to this process in bytes: that of the machine, or the limit of a container."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    # Else no container, or one without a limit.
+    # The file is missing outside containers, and contains "max" if there is no limit.
     with suppress(OSError, ValueError):
         return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
     return total
 
 
 def _bytes_per_point(outputs: tuple[str, ...]) -> int:
-    """Memory for a point of a chunk: results, what they are made of, and copies while they are written."""
+    """Return the bytes per point of a chunk: results, intermediate values, and copies during writing."""
     floats = sum(OUTPUTS[name].dtype == "float64" for name in outputs)
-    hidden = 56 if RADIUS_OUTPUTS & set(outputs) else 0
-    hidden += 32 if MARGIN_OUTPUTS & set(outputs) else 0
-    hidden += 8 if {"passive", "passivity_margin"} & set(outputs) else 0
-    return 8 * floats + hidden + (16 if floats else 0) + len(outputs) + 4
+    intermediate = 56 if RADIUS_OUTPUTS & set(outputs) else 0
+    intermediate += 32 if MARGIN_OUTPUTS & set(outputs) else 0
+    intermediate += 8 if {"passive", "passivity_margin"} & set(outputs) else 0
+    return 8 * floats + intermediate + (16 if floats else 0) + len(outputs) + 4
 
 
-def _size(count: float) -> str:
+def _format_size(count: float) -> str:
+    """Return a number of bytes with a binary prefix."""
     for unit in ("B", "KiB", "MiB", "GiB"):
         if count < 1024:
             return f"{count:.3g} {unit}"
@@ -259,9 +272,10 @@ def _size(count: float) -> str:
     return f"{count:.3g} TiB"
 
 
-def _time(seconds: float) -> str:
-    if seconds < _INSTANT:
-        return f"less than {_INSTANT:g} s"
+def _format_time(seconds: float) -> str:
+    """Return an estimated time with its unit."""
+    if seconds < _MIN_SECONDS:
+        return f"less than {_MIN_SECONDS:g} s"
     for limit, unit, length in ((120, "s", 1.0), (7200, "min", 60.0), (172800, "h", 3600.0)):
         if seconds < limit:
             return f"about {seconds / length:.2g} {unit}"

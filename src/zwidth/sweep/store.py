@@ -1,10 +1,10 @@
-"""The store of one sweep: a Zarr group that xarray opens, which knows what is in it and whether that is whole.
+"""The store of one sweep: a Zarr group ``<study>.zarr`` with checksums, which xarray can open.
 
-A chunk of the plan is a chunk of every variable of its family, so that no two tasks write the same file. The status
-file is written last: its existence marks the chunk as done. Every file appears under its name only when it is complete,
-even if the program is killed. After a power failure this is not guaranteed, because writes are not synchronized with
-the disk. Therefore every file of values ends with a checksum (Zarr's codec crc32c). The description of the group
-contains the descriptions of all arrays and has a checksum as well.
+A *task* is one chunk of the plan (`sweep.plan`), and at the same time one chunk of every variable of its family, so no
+two tasks write the same file. The status file is written last: its existence marks the chunk as done. Every file
+appears under its name only when it is complete, even if the program is killed. After a power failure this is not
+guaranteed, because writes are not synchronized with the disk. Therefore every file of values ends with a checksum
+(Zarr's codec crc32c). The description of the group contains the descriptions of all arrays and has a checksum as well.
 
 Only this module, which writes, and `dataset` with `checked`, which read, import zarr or xarray.
 """
@@ -24,24 +24,24 @@ from typing import Any
 import numpy as np
 
 from zwidth.config.sweep import SweepStudy
-from zwidth.sweep.files import content, digest
-from zwidth.sweep.plan import Plan, Task, kept_plan
+from zwidth.sweep.files import hash_json, read_or_empty
+from zwidth.sweep.plan import Plan, Task, restore_plan
 from zwidth.words.errors import InputError, StoreError, how_to_install
 from zwidth.words.files import hidden_beside, remove_quietly, write_whole
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.words.status import Status
 
-SUFFIX = ".zarr"
+SUFFIX = ".zarr"  # suffix of the name of a store, which is a folder
 FORMAT = 2  # format version of new stores
 OLD_FORMAT = 1  # format of earlier releases, whose checksums are kept in separate arrays and no longer read
-SEAL = "attributes_sha256"  # attribute with the checksum of the description
+CHECKSUM = "attributes_sha256"  # attribute with the checksum of the description
 # Zarr reads the first file; the second is a copy, because one flipped bit in a single file would lose the whole store.
 _DESCRIPTIONS = ("zarr.json", "zwidth.json")
 
 
 @contextmanager
 def silence_zarr() -> Iterator[None]:
-    """Keep back what zarr says about every codec and type that is not in its core specification."""
+    """Suppress the warnings of zarr about codecs and types outside its core specification."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*Zarr", category=UserWarning)
         warnings.filterwarnings("ignore", message=".*Zarr", category=FutureWarning)
@@ -49,14 +49,14 @@ def silence_zarr() -> Iterator[None]:
 
 
 def check_installed() -> None:
-    """Raise an `InputError` that says what to install where a library that stores are made with is missing."""
+    """Raise an `InputError` with the installation command if a library needed for stores is missing."""
     for name in ("dask", "h5netcdf", "h5py", "xarray", "zarr"):
         if find_spec(name) is None:
             raise InputError(f"sweep: needs {name}, which is not installed; install it: {how_to_install('store')}")
 
 
 class Store:
-    """A store on the disk, in a folder ``<study>.zarr``."""
+    """A store on disk, in a folder ``<study>.zarr``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -68,7 +68,7 @@ class Store:
         for name in _DESCRIPTIONS:
             try:
                 description = json.loads((self.path / name).read_text(encoding="utf-8"))
-                if _seal(description) == description["attributes"][SEAL]:
+                if _compute_checksum(description) == description["attributes"][CHECKSUM]:
                     break
                 faults.append(f"{name} is damaged, its checksum is wrong")
             except FileNotFoundError:
@@ -81,38 +81,43 @@ class Store:
             raise StoreError(f"{self.path}: {'; '.join(faults)}; start again in a new folder")
         if (version := description["attributes"].get("zwidth_format")) not in (OLD_FORMAT, FORMAT):
             raise StoreError(f"{self.path}: format {version}, this release reads format {FORMAT}; use another release")
-        # Ignore a key of earlier releases: every delay of a sweep was exact ("held").
+        # Ignore a key of earlier releases, whose only value was "held" (exact fractional delay).
         description["attributes"]["study"].pop("delay_model", None)
         return description
 
     @property
     def attributes(self) -> dict[str, Any]:
+        """Attributes of the group."""
         return self.description["attributes"]
 
     @property
     def has_checksums(self) -> bool:
+        """False for stores of the old format, whose files do not end with checksums."""
         return self.attributes["zwidth_format"] != OLD_FORMAT
 
     @cached_property
     def study(self) -> SweepStudy:
+        """The sweep whose results the store contains."""
         return SweepStudy.model_validate(self.attributes["study"])
 
     @cached_property
     def plan(self) -> Plan:
-        return kept_plan(self.study, self.attributes["plan"])
+        """The plan by which the results are computed."""
+        return restore_plan(self.study, self.attributes["plan"])
 
     @cached_property
     def _arrays(self) -> dict[str, Any]:
+        """The Zarr arrays of all variables, by name."""
         import zarr
 
         with silence_zarr():
             group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=True)
             arrays: dict[str, Any] = {name: group[name] for family in self.plan.families for name in family.variables}
-        # To look whether a chunk holds its fill value alone takes Zarr longer than to write it.
+        # Write chunks that contain only the fill value, too: detecting them takes Zarr longer than writing them.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 
-    def name(self, task: Task) -> str:
-        """A chunk by its study, for messages."""
+    def label(self, task: Task) -> str:
+        """Return the name of a chunk together with its study, for messages."""
         return f"{self.study.name}/{task}"
 
     def files(self, task: Task) -> list[Path]:
@@ -120,54 +125,56 @@ class Store:
         key = "/".join(("c", *map(str, task.position)))
         return [self.path / name / key for name in task.plan.variables]
 
-    def flag(self, task: Task) -> Path:
+    def status_file(self, task: Task) -> Path:
         """Return the file whose existence marks a chunk as done, which is the status file."""
         return self.files(task)[-1]
 
     def is_done(self, task: Task) -> bool:
-        return self.flag(task).exists()
+        """Return whether a chunk is marked as done."""
+        return self.status_file(task).exists()
 
-    def holds(self, task: Task) -> bool:
-        """The same of a chunk that another machine may have done just now."""
+    def is_visible(self, task: Task) -> bool:
+        """Return whether a chunk is marked as done, even if another machine has just written it."""
         if not self.is_done(task):
-            # A network file system remembers for a while that a file was not there, unless its folder is read again.
-            for folder in reversed(self.flag(task).parents[: len(task.position) + 1]):
+            # List the folders, because network file systems cache for a while that a file does not exist.
+            for folder in reversed(self.status_file(task).parents[: len(task.position) + 1]):
                 with suppress(OSError):
                     os.listdir(folder)
         return self.is_done(task)
 
     def missing(self) -> list[Task]:
-        """The chunks that are not marked as done, in the order of the work."""
+        """Return the chunks that are not marked as done, in the order of computation."""
         return [task for task in self.plan.tasks() if not self.is_done(task)]
 
     def write(self, task: Task, values: Mapping[str, np.ndarray]) -> None:
         """Write all variables of a chunk, the status last."""
-        shape = tuple(part.stop - part.start for part in task.place)
+        shape = tuple(part.stop - part.start for part in task.slices)
         with silence_zarr():
             for name, file in zip(task.plan.variables, self.files(task), strict=True):
-                # Zarr would read what is left of a damaged chunk at the edge of the grid before it replaces it.
+                # Remove an old file first, because Zarr would read it (possibly damaged) before overwriting a chunk
+                # at the edge of the grid, which the grid fills only in part.
                 remove_quietly(file)
-                self._arrays[name][task.place or ...] = np.ascontiguousarray(values[name]).reshape(shape)
+                self._arrays[name][task.slices or ...] = np.ascontiguousarray(values[name]).reshape(shape)
 
     def count_statuses(self) -> dict[str, np.ndarray]:
-        """How many points of each family have each status; those of damaged chunks are not counted."""
+        """Count the points of each family by status value; leave out damaged and missing chunks."""
         counts = {family.family: np.zeros(NOT_COMPUTED, int) for family in self.plan.families}
         for task in self.plan.tasks():
             name = STATUS_OF[task.family]
-            if self.is_done(task) and not self.find_fault(self.flag(task)):
+            if self.is_done(task) and not self.find_fault(self.status_file(task)):
                 with silence_zarr():
-                    status = np.asarray(self._arrays[name][task.place or ...])
-                # Nearly all are 0.
+                    status = np.asarray(self._arrays[name][task.slices or ...])
+                # Count only the nonzero values by bincount, because nearly all are 0.
                 failed = status[status.view(bool)]
                 counts[task.family][Status.OK] += status.size - failed.size
                 counts[task.family] += np.bincount(failed, minlength=NOT_COMPUTED)
         return counts
 
-    def forget(self, task: Task) -> None:
-        """Take back that a chunk is done."""
-        remove_quietly(self.flag(task))
+    def unmark(self, task: Task) -> None:
+        """Remove the mark of a chunk as done."""
+        remove_quietly(self.status_file(task))
 
-    def fault_of(self, task: Task) -> str:
+    def find_task_faults(self, task: Task) -> str:
         """Return the names of the damaged and missing variables of a chunk that is marked as done; "" if none."""
         faults = zip(task.plan.variables, map(self.find_fault, self.files(task)), strict=True)
         return ", ".join(f"{name} is {fault}" for name, fault in faults if fault)
@@ -176,7 +183,7 @@ class Store:
         """Return "missing" or "damaged" for a file of values with content ``data``; "" if its checksum is correct."""
         import google_crc32c
 
-        data = content(file) if data is None else data
+        data = read_or_empty(file) if data is None else data
         if not data:
             return "damaged" if file.exists() else "missing"
         right = google_crc32c.value(data[:-4]).to_bytes(4, "little") == data[-4:]
@@ -184,16 +191,16 @@ class Store:
 
     def damaged_files(self) -> list[str]:
         """Return the names of damaged coordinate files, and those of the description if its two copies differ."""
-        places = ((name, len(dims)) for name, (dims, *_) in self.plan.grid.coordinates().items())
-        names = ["/".join((name, "c", *["0"] * count)) for name, count in places]
+        n_dims = ((name, len(dims)) for name, (dims, *_) in self.plan.grid.coordinates().items())
+        names = ["/".join((name, "c", *["0"] * count)) for name, count in n_dims]
         damaged = [name for name in names if self.find_fault(self.path / name)]
-        first, second = (content(self.path / name) for name in _DESCRIPTIONS)
+        first, second = (read_or_empty(self.path / name) for name in _DESCRIPTIONS)
         return damaged if first == second else [*_DESCRIPTIONS, *damaged]
 
     def restore(self, names: list[str]) -> None:
-        """Write such files again; they follow from the store's attributes."""
+        """Write damaged files of coordinates or the description again, which the attributes of the store determine."""
         attributes = self.attributes
-        with _build_beside(self.path, attributes) as fresh:
+        with _temporary_store(self.path, attributes) as fresh:
             for name in names:
                 (self.path / name).parent.mkdir(parents=True, exist_ok=True)
                 if (self.path / name).is_dir():
@@ -201,45 +208,45 @@ class Store:
                 os.replace(fresh / name, self.path / name)
 
 
-def create(path: Path, attributes: dict[str, Any]) -> Store:
+def create_store(path: Path, attributes: dict[str, Any]) -> Store:
     """Create an empty store, which appears under its name only when it is complete."""
-    with _build_beside(path, attributes) as fresh:
+    with _temporary_store(path, attributes) as fresh:
         os.rename(fresh, path)
     return Store(path)
 
 
 @contextmanager
-def _build_beside(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
-    """A complete store without chunks, beside ``path``; what is left of it goes when the block ends."""
+def _temporary_store(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
+    """Create an empty store with a temporary name in the folder of ``path``; remove it when the block ends."""
     import zarr
 
-    plan = kept_plan(SweepStudy.model_validate(attributes["study"]), attributes["plan"])
+    plan = restore_plan(SweepStudy.model_validate(attributes["study"]), attributes["plan"])
     grid = plan.grid
     with hidden_beside(path) as fresh:
         with silence_zarr():
-            _build(fresh, plan)
+            _write_arrays(fresh, plan)
             zarr.consolidate_metadata(fresh, zarr_format=3)
-        # The coordinates that are no dimension, as CF lists them.
+        # List the coordinates that are not dimensions in an attribute, as the CF conventions require.
         auxiliary = " ".join(
             name for name in grid.coordinates() if name not in {dim.replace(".", "_") for dim in grid.dims}
         )
         described = {"Conventions": "CF-1.11", "zwidth_format": FORMAT, "coordinates": auxiliary, **attributes}
         document = json.loads((fresh / "zarr.json").read_text(encoding="utf-8")) | {"attributes": described}
-        document["attributes"] = described | {SEAL: _seal(document)}
+        document["attributes"] = described | {CHECKSUM: _compute_checksum(document)}
         for name in _DESCRIPTIONS:
             write_whole(fresh / name, json.dumps(document, indent=2).encode())
         yield fresh
 
 
-def _seal(description: dict[str, Any]) -> str:
+def _compute_checksum(description: dict[str, Any]) -> str:
     """Return the checksum of a description, computed without its checksum attribute."""
-    attributes = {key: value for key, value in description["attributes"].items() if key != SEAL}
+    attributes = {key: value for key, value in description["attributes"].items() if key != CHECKSUM}
     old = attributes.get("zwidth_format") == OLD_FORMAT
-    return digest(attributes if old else {**description, "attributes": attributes})
+    return hash_json(attributes if old else {**description, "attributes": attributes})
 
 
-def _build(path: Path, plan: Plan) -> None:
-    """Write the coordinates and describe the variables."""
+def _write_arrays(path: Path, plan: Plan) -> None:
+    """Write the coordinates, and create the variables without values."""
     import zarr
     from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
     from zarr.codecs.numcodecs import PackBits
@@ -254,14 +261,14 @@ def _build(path: Path, plan: Plan) -> None:
             chunks=values.shape,
             dtype=values.dtype,
             compressors=[ZstdCodec(level=3), Crc32cCodec()],
-            # NaN, which no value is: a chunk of zeros would otherwise not be written, and not be found missing.
+            # NaN is no valid value. With the default 0, Zarr would not write chunks of zeros, which then seem missing.
             fill_value="" if values.dtype.kind == "T" else np.nan,
             dimension_names=dims,
             attributes=attributes,
         )
         array[...] = values
     small, blosc = [ZstdCodec(level=3), Crc32cCodec()], BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
-    keeping: dict[str, dict[str, Any]] = {
+    encodings: dict[str, dict[str, Any]] = {
         "bool": {"filters": [PackBits()], "compressors": small, "fill_value": False},
         "float64": {"compressors": [blosc, Crc32cCodec()], "fill_value": np.nan},
         "uint8": {"compressors": small, "fill_value": NOT_COMPUTED},
@@ -278,26 +285,27 @@ def _build(path: Path, plan: Plan) -> None:
             if output.dtype == "float64":
                 attributes["units"] = plan.grid.unit_system[output.units_in(plan.grid.physical)]
             attributes["ancillary_variables"] = STATUS_OF[family.family]
-            group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
-        kept = common | keeping["uint8"]
-        group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **kept)
+            group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **encodings[output.dtype])
+        status_options = common | encodings["uint8"]
+        group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **status_options)
 
 
 def list_stores(path: str | os.PathLike[str]) -> list[Path]:
-    """The stores at a path: the path itself, or those in the folder, one at least."""
+    """Return the store at a path, or all stores in the folder; raise `StoreError` if there is none."""
     folder = Path(os.fsdecode(path))
     if (folder / "zarr.json").is_file() or folder.name.endswith(SUFFIX):
         return [folder]
-    found = sorted(found for found in folder.glob(f"*{SUFFIX}") if not found.name.startswith("."))
-    if not found:
-        what = "holds no store of a sweep" if folder.is_dir() else "no such folder"
-        raise StoreError(f"{folder}: {what}; name the folder of a run with a study of kind 'sweep', or a store in it")
-    return found
+    stores = sorted(store for store in folder.glob(f"*{SUFFIX}") if not store.name.startswith("."))
+    if not stores:
+        fault = "contains no store of a sweep" if folder.is_dir() else "no such folder"
+        raise StoreError(f"{folder}: {fault}; name the folder of a run with a study of kind 'sweep', or a store in it")
+    return stores
 
 
 def find_store(path: str | os.PathLike[str]) -> Store:
+    """Return the store at a path, or the only store in the folder; raise `StoreError` if there are none or several."""
     first, *others = list_stores(path)
     if others:
         names = ", ".join(store.name for store in (first, *others))
-        raise StoreError(f"{os.fsdecode(path)}: holds several stores; name one of {names}")
+        raise StoreError(f"{os.fsdecode(path)}: contains several stores; name one of {names}")
     return Store(first)

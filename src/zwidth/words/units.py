@@ -365,6 +365,12 @@ def read_quantity(
     return amount, unit
 
 
+def read_share(text: str) -> float:
+    """Convert a fraction such as "2%" or "0.02" to a number; raise `ValueError` for other texts."""
+    text = text.strip()
+    return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+
+
 # Dimensions of the columns of logs and frequency responses.
 _COLUMN_DIMENSIONS = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
 # Further units of these columns.

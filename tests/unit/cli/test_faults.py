@@ -17,7 +17,7 @@ SCENE = ["--mass", "100 g", "--rate", "1 kHz"]
         (["check", "--stiffness", "1 kN/m"], "Error: give --mass or --device, and --rate or --period; see zwidth"),
         (["check", *SCENE, "--stiffness", "1 kN"], "Error: --stiffness: got '1 kN'; "),
         (["run", "nowhere.yaml"], "Error: nowhere.yaml: no such file; check the path"),
-        (["report", "nowhere"], "Error: nowhere: holds no run"),
+        (["report", "nowhere"], "Error: nowhere: contains no run"),
     ],
 )
 def test_a_fault_is_one_line(arguments, message, capsys, tmp_path, monkeypatch):

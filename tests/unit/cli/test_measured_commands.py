@@ -180,7 +180,7 @@ def test_a_rotary_device_is_measured_from_the_file_to_play_to_the_safe_wall(tmp_
     loop = ["--rate", "1 kHz", "--force", "10 mN m", "--resolution", "2000 counts", "--duration", "15 s"]
     said = call("excite", *loop, "--out", tmp_path / "play.csv")
     assert "up to 10.00 mN m" in said
-    assert "rad/(N m) to expect" in said
+    assert "rad/(N m) expected" in said
     with (tmp_path / "play.csv").open() as played:
         assert next(played) == "time [s],torque [N m]\n"
     time, torque = np.genfromtxt(tmp_path / "play.csv", delimiter=",", skip_header=1).T

@@ -1,4 +1,4 @@
-"""Onsets of devices with an actuator lag or a resonance: refused, or only walls that are stable on the true device."""
+"""Walls measured on devices with an actuator lag or a resonance: refused, or fitted with stable walls to set."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def describe_device(lag, modes):
 
 
 def differ(function, theta):
-    """Return derivatives by central differences, along a last axis."""
+    """Return the derivatives along a last axis, by central differences."""
     steps = 1e-6 * np.eye(theta.size)
     return np.stack([(function(theta + step) - function(theta - step)) / 2e-6 for step in steps], -1)
 
@@ -132,7 +132,7 @@ def test_walls_of_a_rigid_mass_are_not_refused(seed, noise):
 
 
 def test_the_interval_at_an_unmeasured_damping_includes_the_measured_stiffness():
-    """A resonance of 270 Hz lowers the boundary beyond the measured walls, and does not change these."""
+    """A resonance of 270 Hz lowers the boundary at dampings above the measured ones only."""
     true = OtherDevice.of(OTHERS["compliance of 300 Hz, encoder at the motor"])
     walls = [(494.7, 0.0, 10.92), (4044.0, 8.053, 33.66), (6577.0, 16.11, 45.92), (8703.0, 24.16, 54.96)]
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=0.02)

@@ -88,7 +88,7 @@ def test_an_encoder_is_found_in_a_column_of_rounded_degrees(decimals, wrapped, u
     angle = step * np.round(np.cumsum(np.cumsum(np.random.default_rng(decimals).standard_normal(1500))) / 20.0)
     angle = np.round(np.mod(angle, 360.0) if wrapped else angle, decimals)
     found = find_steps(unit * angle)
-    # The rounded ends of the record determine the step.
+    # The estimated step has the rounding error of the ends of the record.
     assert found[0] / unit == pytest.approx(step, abs=10.0**-decimals / 100.0)
     assert found[1] / unit == pytest.approx(10.0**-decimals, rel=1e-6)
 

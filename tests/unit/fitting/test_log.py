@@ -179,7 +179,7 @@ def test_a_lag_that_swings_is_modelled_and_a_hand_refused():
     # In its band, though it is no continuous lag.
     assert np.all(np.abs(device.response - exact) < device.deviation)
     hand = np.cumsum(0.2 * rng.standard_normal(600))
-    with pytest.raises(InputError, match="something else pushes, as a hand"):
+    with pytest.raises(InputError, match="unexplained and no noise: another force"):
         zwidth.fit_log(PERIOD, move(0.1, 2.0, 1e-3, force + hand), force)
 
 
@@ -217,7 +217,7 @@ TIMES = PERIOD * np.arange(200)
         ),
         (TIMES, PLACES, 0.0 * FORCE + 2, "it is 2.000 N all the time"),
         (TIMES, 0.0 * PLACES, FORCE, "position: it never changes"),
-        (TIMES, PLACES, -FORCE, "runs away"),
+        (TIMES, PLACES, -FORCE, "accelerates against"),
         (TIMES, PLACES[:-1], FORCE, "shapes differ"),
         (TIMES, np.full(200, np.nan), FORCE, "position: it contains no number"),
         (TIMES[:30], PLACES[:30], np.resize([1.0, -1.0], 30), "record longer"),

@@ -204,13 +204,13 @@ def test_a_rounded_force_column_is_named():
     assert fit.status == Status.UNDECIDED
     assert any("the force column is rounded to 100 µN m" in doubt for doubt in fit.doubts)
     assert not any("resonance" in doubt for doubt in fit.doubts)
-    # One warning states one fact.
+    # Each doubt is printed as a separate warning.
     assert [label for label, _ in summarize_fit(fit)].count("WARNING") == len(fit.doubts)
 
 
 @pytest.mark.parametrize("unit, decimals", [("deg", 3), ("rad", 5)])
 def test_an_ideal_wrapped_angle_has_the_step_of_its_column(unit, decimals, tmp_path):
-    """A constant torque moves a knob without damping by whole multiples of its first move."""
+    """A constant torque moves a knob without damping by integer multiples of its first displacement."""
     torque = 0.02 * np.repeat(np.random.default_rng(2).choice([-1.0, 1.0], 15), 40)
     place = 6.2 + respond_from_rest(1.2e-5, 1e-12, 0.0, 1e-3, torque)
     turn, size = (360.0, 180.0 / np.pi) if unit == "deg" else (2.0 * np.pi, 1.0)

@@ -157,7 +157,7 @@ def test_every_device_has_its_boundary(plane):
 def test_a_single_value_is_no_figure(plane, draw):
     with pytest.raises(InputError, match="'stable' varies over"):
         draw(plane.isel(beta=0, delta=0, d=0), "stable")
-    with pytest.raises(InputError, match="holds no boundaries of several devices"):
+    with pytest.raises(InputError, match="contains no boundaries of several devices"):
         draw_outlines(plane.isel(delta=0, d=0))
 
 
@@ -170,7 +170,7 @@ def test_slices_are_the_nearest_values(folder, capsys, tmp_path, monkeypatch):
         draw_stores(folder / "devices.zarr", tmp_path, at={"rate": "2kHz"}, note=notes.append)
         draw_stores(folder / "plane.zarr", tmp_path, at={"delta": "0.12", "d": 0.9})
         draw_stores(folder / "devices.zarr", tmp_path, at={"device": "heavy"})
-    assert notes == ["devices.zarr: rate = 2000 Hz, the nearest to 2.1 kHz that the sweep has"]
+    assert notes == ["devices.zarr: rate = 2000 Hz, the value of the sweep nearest to 2.1 kHz"]
     drawn = dict(found)
     assert titles(drawn["plane_stable"]) == [r"$d = 1$,  $\delta = 0.1$"]
     assert titles(drawn["devices_stiffness_max"]) == ["heavy"]
@@ -212,7 +212,7 @@ def test_what_is_not_computed_is_left_blank_and_said(tmp_path):
         ({"rate": "2 ms"}, "at: rate: got '2 ms'; the units allowed are Hz, kHz, MHz"),
         ({"delay": "1 ms"}, "at: delay: got '1 ms'; write a number in sampling periods"),
         ({"delta": "nan"}, "at: delta: got 'nan'; write a finite number"),
-        ({"device": "x"}, "at: there is no device 'x'; choose from light, heavy"),
+        ({"device": "x"}, "at: no device 'x' in the sweep; choose from light, heavy"),
     ],
 )
 def test_slices_that_do_not_exist_are_refused(folder, tmp_path, at, says):
@@ -222,7 +222,7 @@ def test_slices_that_do_not_exist_are_refused(folder, tmp_path, at, says):
 
 
 def test_a_folder_without_stores_is_refused(tmp_path, capsys):
-    with pytest.raises(StoreError, match="holds no store of a sweep"):
+    with pytest.raises(StoreError, match="contains no store of a sweep"):
         draw_stores(tmp_path)
     assert main_of("figures", tmp_path) == 2
     assert main_of("figures", tmp_path, "--at", "delta") == 2

@@ -55,9 +55,9 @@ def drawn(monkeypatch, tmp_path):
     [
         ("0.2", 0.2, []),
         (0.2 * (1 + 1e-12), 0.2, []),
-        ("0.21", 0.2, ["ridge.zarr: mass = 0.2 kg, the nearest to 0.21 that the sweep has"]),
-        ("0.64", 0.5, ["ridge.zarr: mass = 0.5 kg, the nearest to 0.64 that the sweep has"]),
-        ("0.06", 0.1, ["ridge.zarr: mass = 0.1 kg, the nearest to 0.06 that the sweep has"]),
+        ("0.21", 0.2, ["ridge.zarr: mass = 0.2 kg, the value of the sweep nearest to 0.21"]),
+        ("0.64", 0.5, ["ridge.zarr: mass = 0.5 kg, the value of the sweep nearest to 0.64"]),
+        ("0.06", 0.1, ["ridge.zarr: mass = 0.1 kg, the value of the sweep nearest to 0.06"]),
     ],
 )
 def test_a_value_that_the_sweep_has_not_is_told(folder, drawn, wanted, taken, told):
@@ -72,7 +72,7 @@ def test_a_value_beyond_half_a_step_is_refused(folder, drawn, wanted):
         drawn(folder / "ridge.zarr", {"mass": wanted})
     # A single value has no steps.
     with pytest.raises(InputError, match=r"at: mass: got 0.11 kg, the sweep has 0.1 kg; choose"):
-        draw._nearest(open_dataset(folder / "ridge.zarr").isel(mass=[0]), "mass", 0.11)
+        draw._find_nearest(open_dataset(folder / "ridge.zarr").isel(mass=[0]), "mass", 0.11)
 
 
 def test_curves_over_the_axes_that_are_wanted(folder):
@@ -151,7 +151,7 @@ def test_kinds_of_files_that_cannot_be_are_refused(folder, tmp_path, capsys, wor
 
 def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys):
     assert main_of("figures", folder / "point.zarr", "--out", tmp_path / "out") == 1
-    assert "point.zarr: no figure, for it is a single point" in capsys.readouterr().err
+    assert "point.zarr: no figure, because it is a single point" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

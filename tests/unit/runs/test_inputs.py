@@ -81,7 +81,7 @@ def test_results_of_a_table_that_has_changed_are_not_kept(tmp_path):
     assert zwidth.run(config, out=tmp_path / "out", resume=True).studies[0].state == "kept"
     assert zwidth.run(tmp_path / "out" / "config.yaml", out=tmp_path / "out", resume=True).studies[0].state == "kept"
     poses.write_text("x,y,mass [kg],damping\n0,0,0.1,1\n1,0,0.3,1\n", encoding="utf-8")
-    with pytest.raises(StoreError, match=r"studies\[w\].poses.csv: the run was made with 'inputs/arm.csv, sha256 "):
+    with pytest.raises(StoreError, match=r"studies\[w\].poses.csv: the run was created with 'inputs/arm.csv, sha256 "):
         zwidth.run(config, out=tmp_path / "out", resume=True)
 
 

@@ -45,9 +45,9 @@ def test_a_record_that_names_files_elsewhere_is_refused(tmp_path, both, name, wh
         (entry if where == "files" else record)[where][name] = "0"
     (out / "run.json").write_text(json.dumps(record), encoding="utf-8")
     before = tree(victim), tree(out)
-    with pytest.raises(StoreError, match="which is no file of its folder; choose another folder"):
+    with pytest.raises(StoreError, match="which is not the name of a file in its folder; choose another folder"):
         run(both, out=out, **options)
-    with pytest.raises(StoreError, match="no file of its folder"):
+    with pytest.raises(StoreError, match="not the name of a file in its folder"):
         write_report(out)
     assert (tree(victim), tree(out)) == before
 
@@ -113,7 +113,7 @@ def test_a_lost_record_is_told_and_written_anew(finished, both, options):
 def test_another_configurations_files_are_not_taken_for_a_lost_runs(finished, config, options):
     (finished / "run.json").unlink()
     before = tree(finished)
-    with pytest.raises(StoreExistsError, match="holds no run"):
+    with pytest.raises(StoreExistsError, match="contains no run"):
         run(config, out=finished, **options)
     assert tree(finished) == before
 

@@ -91,7 +91,7 @@ def test_another_configuration_is_refused_before_anything_is_computed(finished, 
     both.write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(StoreError) as caught:
         run(both, out=finished, resume=True)
-    assert f"{key}: the run was made with" in str(caught.value)
+    assert f"{key}: the run was created with" in str(caught.value)
     assert "change the configuration back, or choose another folder with --out DIR" in str(caught.value)
     assert contents(finished) == before
 
@@ -112,7 +112,7 @@ def test_a_study_that_is_added_is_computed_and_one_that_is_removed_stays(finishe
 def test_another_release_is_refused(finished, both, monkeypatch):
     monkeypatch.setattr("zwidth.sweep.files.__version__", "99.0")
     with pytest.raises(
-        StoreError, match=r"run\.json: made with zwidth .*, now there is 99\.0; install the same release"
+        StoreError, match=r"run\.json: created with zwidth .*, now 99\.0 is installed; install the same release"
     ):
         run(both, out=finished, resume=True)
 
@@ -121,7 +121,7 @@ def test_a_run_of_an_earlier_release_is_replaced_but_not_resumed(finished, both)
     record = record_of(finished)
     record["format"] = 1
     (finished / "run.json").write_text(json.dumps(record), encoding="utf-8")
-    with pytest.raises(StoreError, match="kept no checksums to go on from; start again with --overwrite"):
+    with pytest.raises(StoreError, match="without checksums, which cannot be resumed; start again with --overwrite"):
         run(both, out=finished, resume=True)
     assert run(both, out=finished, overwrite=True).ok
 

@@ -97,7 +97,7 @@ def test_a_run_is_never_overwritten_unasked(config, tmp_path):
     out = tmp_path / "out"
     run(config, out=out)
     before = (out / "run.json").read_bytes()
-    with pytest.raises(StoreExistsError, match=r"already holds a run.*--out") as caught:
+    with pytest.raises(StoreExistsError, match=r"already contains a run.*--out") as caught:
         run(config, out=out)
     assert str(out) in str(caught.value)
     assert (out / "run.json").read_bytes() == before
@@ -112,7 +112,7 @@ def test_a_folder_without_a_run_is_not_touched(config, tmp_path):
     out.mkdir()
     (out / "thesis.txt").write_text("words", encoding="utf-8")
     for overwrite in (False, True):
-        with pytest.raises(StoreExistsError, match="holds no run"):
+        with pytest.raises(StoreExistsError, match="contains no run"):
             run(config, out=out, overwrite=overwrite)
     assert [file.name for file in out.iterdir()] == ["thesis.txt"]
     with pytest.raises(StoreExistsError, match="is a file"):
@@ -215,7 +215,7 @@ def test_a_strangers_store_of_the_same_name_is_never_replaced(both, tmp_path):
     store = tmp_path / "out" / "swept.zarr"
     zarr.create_group(store).create_array("mine", data=np.arange(3.0))
     for overwrite in (False, True):
-        with pytest.raises(StoreExistsError, match=r"swept\.zarr exists already"):
+        with pytest.raises(StoreExistsError, match=r"swept\.zarr already exists"):
             run(both, out=tmp_path / "out", overwrite=overwrite)
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name != ".locks"] == ["swept.zarr"]
     np.testing.assert_array_equal(zarr.open_array(store, path="mine")[:], [0, 1, 2])

@@ -137,7 +137,7 @@ def test_walls_alone_are_fitted_as_in_python():
     evidence = outcome.figures[""].keywords
     walls = {**evidence["walls"], "stiffness_N_per_m": np.where(evidence["walls"]["kind"] == "set", 14897.0, 1e4)}
     _, boundary = outcome.figures[""](walls=walls)
-    assert any("wall to set: $K = 14.89$ kN/m" in text.get_text() for text in boundary.get_legend().get_texts())
+    assert any("recommended wall: $K = 14.89$ kN/m" in text.get_text() for text in boundary.get_legend().get_texts())
     assert list(outcome.documents) == ["f_boundary.csv", "f_walls.csv", "f_scene.yaml"]
 
 

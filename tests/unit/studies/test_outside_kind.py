@@ -64,7 +64,9 @@ def test_it_is_run_resumed_and_refused_like_every_other(config, tmp_path, capsys
     assert '<p class="soft">Closed forms, without delay.</p>' in zwidth.write_report(out).read_text(encoding="utf-8")
     assert [study.state for study in zwidth.run(config, out=out, resume=True).studies] == ["kept"]
     config.write_text(CONFIG.replace("0.5", "0.6"), encoding="utf-8")
-    with pytest.raises(StoreError, match=r"studies\[r\]\.delta: the run was made with 0.5, the configuration has 0.6"):
+    with pytest.raises(
+        StoreError, match=r"studies\[r\]\.delta: the run was created with 0.5, the configuration has 0.6"
+    ):
         zwidth.run(config, out=out, resume=True)
 
 

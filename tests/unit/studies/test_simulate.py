@@ -175,9 +175,9 @@ def test_figures_draw_the_motions(impact):
     assert len(energies) == 3
     lines = {line.get_label(): line.get_ydata() for line in energies[2].lines}
     rows = select(table, label="1.05 of K_max")
-    np.testing.assert_allclose(lines["given by the wall"], rows["wall_work_J"] * 1e3)
+    np.testing.assert_allclose(lines["work of the wall"], rows["wall_work_J"] * 1e3)
     # There is no friction, and nothing of it is drawn.
-    assert "taken by friction" not in lines
+    assert "dissipated by friction" not in lines
 
 
 def test_a_motion_without_end_does_not_hide_the_others():

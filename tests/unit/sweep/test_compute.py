@@ -6,7 +6,7 @@ from sweeping import study, sweep_of
 
 import zwidth
 from methods.problems import exact_radius
-from zwidth.sweep.compute import compute
+from zwidth.sweep.compute import compute_block
 from zwidth.sweep.grid import Grid
 from zwidth.words.status import Status
 
@@ -30,7 +30,7 @@ def grid():
 
 
 def found_in(grid, place, accuracy=1e-9):
-    return compute("wall", OUTPUTS, grid.block(place), accuracy)
+    return compute_block("wall", OUTPUTS, grid.block(place), accuracy)
 
 
 def all_of(grid):
@@ -87,5 +87,5 @@ def test_points_where_the_model_is_not_computed_say_so():
     )
     assert set(told.status.ravel().tolist()) == {Status.OK, Status.OUT_OF_RANGE}
     for output in outputs:
-        found = compute("wall", (output,), block, 1e-9)
+        found = compute_block("wall", (output,), block, 1e-9)
         np.testing.assert_array_equal(found["status"], told.status, err_msg=output)

@@ -89,7 +89,7 @@ def test_a_chunk_that_always_kills_its_worker_is_named_and_the_exit_code_is_1(
     assert "7 of 8 chunks done" in out
     assert "Error: chunk map/wall/2 (" in err
     assert err.count(" failed: ") == 1
-    assert ") failed: KilledWorker: its worker died every time it was tried" in err
+    assert ") failed: KilledWorker: the worker process died in every attempt" in err
     assert "Traceback" not in err
 
 
@@ -144,7 +144,7 @@ def test_a_scheduler_that_dies_or_falls_silent_ends_the_run_in_one_line(
     ours = [line for line in err.splitlines() if not line.startswith(("map ", "[1/1] map "))]
     go_on = f"go on with: zwidth run {path} --out {out} --resume --scheduler {address}"
     assert ours == [
-        f"Error: scheduler: {address} does not answer any more, or has started again; what is done is kept, {go_on}"
+        f"Error: scheduler: {address} no longer replies, or has been restarted; what is done is kept, {go_on}"
     ]
     told = int(out_text.split(" of 8 chunks done")[0])
     # What it was at may have been finished since.
@@ -160,4 +160,4 @@ def test_a_chunk_is_done_when_the_store_says_so(cluster, tmp_path):
         result = run_sweeps(config_of(), out, perform=doing_nothing, **engine)
         assert not result.ok
         assert (result.computed, result.total) == (0, 8)
-        assert set(result.failed.values()) == {"it was computed, and is not in the store"}
+        assert set(result.failed.values()) == {"reported as computed but missing from the store"}

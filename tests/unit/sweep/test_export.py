@@ -46,7 +46,7 @@ def test_netcdf_holds_the_same(folder, tmp_path):
         np.testing.assert_array_equal(read.stable, data.stable)
         np.testing.assert_array_equal(read.status, data.status)
         np.testing.assert_array_equal(read.mass, data.mass)
-    with pytest.raises(StoreExistsError, match=r"map\.nc exists already"):
+    with pytest.raises(StoreExistsError, match=r"map\.nc already exists"):
         to_netcdf(folder / "map.zarr", tmp_path / "map.nc")
     assert [path.name for path in tmp_path.iterdir()] == ["map.nc"]
 
@@ -62,14 +62,14 @@ def test_a_table_has_a_row_a_point(folder, tmp_path, monkeypatch):
     assert not {"stiffness", "mass", "rate"} & set(rows[0])
     assert rows[-1]["stable"] == "False"
     monkeypatch.setattr(dataset, "MAX_CSV_POINTS", 5)
-    with pytest.raises(StoreError, match="6 points, a table may have 5; export to netCDF"):
+    with pytest.raises(StoreError, match="6 points, CSV allows at most 5; export to netCDF"):
         to_csv(folder / "map.zarr", tmp_path / "again.csv")
 
 
 def test_a_folder_of_several_stores_asks_for_one(folder, tmp_path):
-    with pytest.raises(StoreError, match=r"holds several stores; name one of map\.zarr, other\.zarr"):
+    with pytest.raises(StoreError, match=r"contains several stores; name one of map\.zarr, other\.zarr"):
         open_dataset(folder)
-    with pytest.raises(StoreError, match="holds no store of a sweep"):
+    with pytest.raises(StoreError, match="contains no store of a sweep"):
         open_dataset(tmp_path)
     with pytest.raises(StoreError, match=r"it has no zarr\.json"):
         open_dataset(tmp_path / "missing.zarr")

@@ -33,7 +33,7 @@ with lock_folder(Path(sys.argv[1])):
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch):
-    monkeypatch.setattr(files, "PATIENCE", 0.1)
+    monkeypatch.setattr(files, "LOCK_TIMEOUT", 0.1)
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_a_second_run_is_refused_and_told_who_holds_the_folder(holder, tmp_path)
     message = str(caught.value)
     assert message.startswith(f"out: {tmp_path}: another run is writing to this folder (process {process.pid} on ")
     assert f" on {socket.gethostname()}, since 20" in message
-    assert message.endswith(" UTC); wait until it ends, stop that process, or choose another folder with --out DIR")
+    assert message.endswith(" UTC); wait until it ends, stop it, or choose another folder with --out DIR")
     assert list(tmp_path.glob("*.zarr")) == []
 
 
@@ -135,7 +135,7 @@ def test_a_store_in_the_place_of_another_is_computed_as_itself(tmp_path):
     shutil.copytree(tmp_path / "second" / "map.zarr", path, dirs_exist_ok=True)
     store = Store(path)
     for task in store.plan.tasks():
-        store.flag(task).unlink()
+        store.status_file(task).unlink()
         perform(str(path), task.family, task.index)
     assert_same(path.parent, tmp_path / "second")
 
@@ -171,7 +171,7 @@ COUNT = """
 import sys, time
 from pathlib import Path
 from zwidth.sweep import files
-files.PATIENCE = 60.0
+files.LOCK_TIMEOUT = 60.0
 folder, number = Path(sys.argv[1]), Path(sys.argv[1]) / "number"
 for _ in range(10):
     with files.lock_folder(folder):

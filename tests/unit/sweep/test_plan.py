@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sweeping import config_of, study, sweep_of
 
 from zwidth.runs import plan_run
-from zwidth.sweep.plan import MEMORY, FamilyPlan, Plan, Task, check_resources, chunk_shape, kept_plan, make_plan
+from zwidth.sweep.plan import MEMORY, FamilyPlan, Plan, Task, check_resources, chunk_shape, make_plan, restore_plan
 from zwidth.words.errors import ResourceError
 
 HUGE = {
@@ -35,8 +35,8 @@ def test_chunks_cover_every_point_once(shape, target):
     count = np.zeros(shape, int)
     for index in range(plan.count):
         task = Task(plan, index)
-        count[task.place] += 1
-        assert task.points == count[task.place].size
+        count[task.slices] += 1
+        assert task.points == count[task.slices].size
     assert (count == 1).all()
     assert plan.count == math.prod(plan.counts)
 
@@ -51,8 +51,8 @@ def test_a_chunk_stays_within_its_memory(outputs, memory):
 def test_the_plan_that_a_store_keeps_is_the_plan():
     small = sweep_of(study(outputs=("stable", "alpha_max")))
     plan = make_plan(small, memory=2**27)
-    assert kept_plan(small, plan.as_dict()).families == plan.families
-    assert kept_plan(small, plan.as_dict()).methods == plan.methods
+    assert restore_plan(small, plan.as_dict()).families == plan.families
+    assert restore_plan(small, plan.as_dict()).methods == plan.methods
 
 
 def test_a_map_of_a_thousand_million_points_takes_megabytes():
@@ -64,10 +64,10 @@ def test_a_map_of_a_thousand_million_points_takes_megabytes():
 
 def test_what_does_not_fit_is_refused(tmp_path):
     plans = plans_of(study(axes=HUGE, outputs=("spectral_radius", "margin", "passivity_margin")))
-    says = r"free, but the results may take 2\.\d+ TiB, most of them of studies\[map\]\.axes \(.* x beta \d+\)"
+    says = r"free, but the results may take 2\.\d+ TiB, most of them for studies\[map\]\.axes \(.* x beta \d+\)"
     with pytest.raises(ResourceError, match=says):
         check_resources(plans, tmp_path / "not" / "there", workers=1)
-    with pytest.raises(ResourceError, match=r"workers: 100000 of them may take .*; choose fewer with --workers"):
+    with pytest.raises(ResourceError, match=r"workers: 100000 workers may take .*; choose fewer with --workers"):
         check_resources(plans_of(study()), tmp_path, workers=100_000)
 
 
@@ -90,8 +90,8 @@ def test_the_plan_says_how_radii_are_found_and_what_is_proved_of_them():
     plan = make_plan(sweep_of(study(axes=axes, outputs=("margin", "stable"), accuracy=1e-6)))
     assert plan.as_dict()["methods"] == {"spectral_radius": "newton", "stable": "crossover"}
     lines = "\n".join(plan.lines())
-    assert "spectral_radius by newton: each value proved to 1e-06" in lines
-    assert "stable by crossover: no pole is needed" in lines
+    assert "spectral_radius by newton: certified to 1e-06" in lines
+    assert "stable by crossover: stability limit of each line of constant B" in lines
     assert "polynomials of degree up to 74" in lines
     usual = make_plan(sweep_of(study(axes=HUGE, outputs=("margin",))))
-    assert "proved to 1e-09" in usual.methods["spectral_radius"][1]
+    assert "certified to 1e-09" in usual.methods["spectral_radius"][1]

@@ -253,7 +253,7 @@ def test_devices_given_as_a_whole_are_swept(tmp_path):
 
 @pytest.mark.parametrize("axis", ["mass", "damping", "actuator.cutoff"])
 def test_a_device_given_as_a_whole_holds_its_mass(axis):
-    with pytest.raises(ValueError, match="beside a device given as a whole"):
+    with pytest.raises(ValueError, match="together with a system or response"):
         config_of(study("s", {"period": 1e-3, axis: [1.0, 2.0]}, ("stiffness_max",), device="1 / 0.1 10 0"))
 
 

@@ -167,7 +167,7 @@ def test_a_chunk_that_always_kills_its_worker_is_named(finished, tmp_path):
     result = run_sweeps(config, tmp_path, workers=1, perform=killed_on_2)
     ((chunk, error),) = result.failed.items()
     assert chunk.startswith("map/wall/2 ")
-    assert error == "its worker died each of 3 times (signal SIGKILL)"
+    assert error == "the worker process died in all 3 attempts (signal SIGKILL)"
     assert result.computed == result.total - 1
 
 
@@ -215,7 +215,7 @@ def test_another_configuration_is_refused(finished, change, key, words):
     changed = config_of(study(**change))
     with pytest.raises(StoreError) as caught:
         run_sweeps(changed, folder, resume=True)
-    assert f"studies[map].{key}: the run was made with" in str(caught.value)
+    assert f"studies[map].{key}: the run was created with" in str(caught.value)
     assert words in str(caught.value)
     assert flags(folder) == before
 
@@ -224,7 +224,7 @@ def test_delay_models_of_earlier_releases_do_not_matter_if_held(tmp_path):
     place, new = tmp_path / "a.zarr", {"kind": "sweep", "scene": {"d": 0.5}}
     refuse_changes(place, "a", "store", {**new, "delay_model": "held", "delay_models": ["held"]}, new)
     refuse_changes(place, "a", "store", {**new, "scene": {"d": 0.5, "delay_model": "held"}}, new)
-    with pytest.raises(StoreError, match=r"studies\[a\].delay_models: the store was made with a list of 2 items"):
+    with pytest.raises(StoreError, match=r"studies\[a\].delay_models: the store was created with a list of 2 items"):
         refuse_changes(place, "a", "store", {**new, "delay_models": ["held", "fractional_power"]}, new)
 
 

@@ -1,1 +1,1 @@
-"""The rigid loop by its closed forms: one question a file."""
+"""Stability, poles, margins and passivity of virtual walls on rigid devices, from closed forms."""

@@ -1,4 +1,9 @@
-"""The stability boundary of the rigid loop: closed form, points at one damping or stiffness, outline, area."""
+"""Compute the stability boundary of rigid devices: the curve, points at given beta or alpha, the outline and the area.
+
+The stable walls of a device fill one region of the (alpha, beta) plane. Its outline consists of the stability lobe of
+the boundary curve (`loops.rigid.curve`), of a line of walls with a pole at z = -1 for short delays and strong damping,
+and of alpha = 0, where a pole is at z = 1 (docs/theory/boundary.md, docs/theory/one-lobe.md).
+"""
 
 from __future__ import annotations
 
@@ -10,9 +15,17 @@ import numpy as np
 from zwidth.arrays.evaluate import as_number, check_scalars, evaluate
 from zwidth.arrays.held_mass import DelayClasses, classify_delays, valid_device
 from zwidth.arrays.roots import follow_root, integrate
-from zwidth.loops.rigid.curve import column_end, frequency, lobe, on_line, peak, row_end, wall
+from zwidth.loops.rigid.curve import (
+    build_lobe,
+    compute_corner_line,
+    compute_frequency,
+    evaluate_lobe,
+    find_column_end,
+    find_peak,
+    find_row_end,
+)
 from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.polynomial import Wall, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.polynomial import Wall, build_frequency_loop, find_boundary_wall
 from zwidth.loops.rigid.ridge import ridge_kernel
 from zwidth.parts.checks import check_whole
 from zwidth.words.errors import InputError, check_choice
@@ -58,12 +71,13 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Wall:
 
 
 def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
+    """Return `boundary`, elementwise."""
     xp = namespace(omega, delta, d)
     ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
-    spoiled = nan_with_nan_slopes(ok, omega, delta, d)
+    nan_if_invalid = nan_with_nan_slopes(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
-    curve = frequency_boundary(omega, frequency_loop(delta, d))
-    return Wall(curve.alpha + spoiled, curve.beta + spoiled)
+    curve = find_boundary_wall(omega, build_frequency_loop(delta, d))
+    return Wall(curve.alpha + nan_if_invalid, curve.beta + nan_if_invalid)
 
 
 @shown()
@@ -124,14 +138,14 @@ def boundary_point(
     """
     check_choice("side", side, ("lower", "upper"))
     check_choice("method", method, get_args(PointMethod))
-    given = [(name, value) for name, value in (("beta", beta), ("alpha", alpha)) if value is not None]
-    if len(given) != 1:
-        raise InputError(f"beta, alpha: got {'both' if given else 'none'}; give exactly one of the two")
-    ((name, value),) = given
+    given_lines = [(name, value) for name, value in (("beta", beta), ("alpha", alpha)) if value is not None]
+    if len(given_lines) != 1:
+        raise InputError(f"beta, alpha: got {'both' if given_lines else 'none'}; give exactly one of the two")
+    ((name, value),) = given_lines
     line = side if beta is None else "row"
     arguments = {"delta": delta, "d": d, name: value}
     if method == "optimistix":
-        # Its solvers take a second to import.
+        # Import on demand, because the solvers take a second to import.
         from zwidth.loops.rigid.exact_points import point_kernel
 
         return BoundaryPoint(*evaluate(point_kernel, arguments, line, ridge_kernel, route="jax"))
@@ -141,39 +155,41 @@ def boundary_point(
 def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -> BoundaryPoint:
     """Return the boundary point at the beta ("row") or alpha ("lower", "upper") that ``number`` contains."""
     xp, is_row, zero = namespace(delta, d, number), line == "row", 0.0 * number
-    given = wall_status(*((zero, number) if is_row else (number, zero)), delta, d)
-    curve = lobe(delta, d, kind)
-    fixed, still = frozen((curve, number), xp)
+    input_status = wall_status(*((zero, number) if is_row else (number, zero)), delta, d)
+    curve = build_lobe(delta, d, kind)
+    frozen_curve, frozen_number = frozen((curve, number), xp)
     if is_row:
-        row = store_once(row_end(still, fixed), delta)
-        x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
-        x = follow_root(lambda x, curve, b: wall(x, curve).b - b, x, lambda *_: True, curve, number + delta)
-        at = wall(x, curve)
+        limit = store_once(find_row_end(frozen_number, frozen_curve), delta)
+        x, on_lobe, exists = limit.x, limit.meets_lobe, (limit.meets_lobe | limit.beyond) & (limit.alpha > 0)
+        x = follow_root(lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta)
+        point = evaluate_lobe(x, curve)
         # Return the value that `zwidth.is_stable` compares alpha with, with the derivatives of the curve.
-        alpha = row.alpha if xp is np else frozen(row.alpha, xp) + (at.alpha - frozen(at.alpha, xp))
+        alpha = limit.alpha if xp is np else frozen(limit.alpha, xp) + (point.alpha - frozen(point.alpha, xp))
         beta = number
     else:
-        top = peak(fixed, kind)
-        exists = (still > 0) & (still < top.alpha)
-        goal = xp.where(exists, still, 0.5 * top.alpha)
-        x, cut = store_once(column_end(goal, top, fixed, line == "upper"), delta)
-        on_lobe = ~cut
-        x = follow_root(lambda x, curve, alpha: wall(x, curve).alpha - alpha, x, lambda *_: True, curve, number)
-        at = wall(x, curve)
+        top = find_peak(frozen_curve, kind)
+        exists = (frozen_number > 0) & (frozen_number < top.alpha)
+        target = xp.where(exists, frozen_number, 0.5 * top.alpha)
+        x, on_line = store_once(find_column_end(target, top, frozen_curve, line == "upper"), delta)
+        on_lobe = ~on_line
+        x = follow_root(
+            lambda x, curve, alpha: evaluate_lobe(x, curve).alpha - alpha, x, lambda *_: True, curve, number
+        )
+        point = evaluate_lobe(x, curve)
         # Take no further step, because near the ridge it would be a quotient of rounding errors.
-        alpha, beta = number, at.b - delta
-    omega = frequency(x, curve)
-    if curve.short is not None and line != "lower":
+        alpha, beta = number, point.b - delta
+    omega = compute_frequency(x, curve)
+    if curve.short_curve is not None and line != "lower":
         # On the line with a pole at z = -1, alpha + 2 beta is constant.
-        rest = on_line(curve) - (2.0 * number if is_row else number)
-        alpha = xp.where(on_lobe, alpha, rest) if is_row else alpha
-        beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * rest)
+        line_value = compute_corner_line(curve) - (2.0 * number if is_row else number)
+        alpha = xp.where(on_lobe, alpha, line_value) if is_row else alpha
+        beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * line_value)
         omega = xp.where(on_lobe, omega, np.pi)
     status = xp.where(exists, int(Status.OK), int(Status.NO_BOUNDARY))
-    status = xp.where(given == int(Status.OK), status, given)
+    status = xp.where(input_status == int(Status.OK), status, input_status)
     # Values and derivatives are NaN if the point does not exist.
-    spoiled = nan_with_nan_slopes(status == int(Status.OK), delta, d, number)
-    return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
+    nan_if_missing = nan_with_nan_slopes(status == int(Status.OK), delta, d, number)
+    return BoundaryPoint(alpha + nan_if_missing, beta + nan_if_missing, omega + nan_if_missing, status.astype(np.int32))
 
 
 class Piece(IntEnum):
@@ -195,24 +211,28 @@ class StableRegion(NamedTuple):
 
     @property
     def area(self) -> float:
-        """The area of the polygon, by the shoelace formula."""
+        """Area of the polygon, by the shoelace formula."""
         x, y = self.alpha, self.beta
         return float(0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
 
 
 def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices, Vertices, Vertices]:
     """Return frequencies along the first lobe of the boundary curve, and alpha and beta at these frequencies."""
-    known = {"delta": as_number("delta", delta, 0.0), "d": as_number("d", d, 0.0)}
-    check_scalars(known)
+    device = {"delta": as_number("delta", delta, 0.0), "d": as_number("d", d, 0.0)}
+    check_scalars(device)
     points = check_whole("points", points, 8, 10**7)
     kind = classify_delays(d)
     with np.errstate(all="ignore"):
-        whole = lobe(np.float64(known["delta"]), np.float64(known["d"]), kind)
-        top = peak(whole, kind).x
-        first, last = (float(frequency(x, whole)) for x in (top, whole.end))
+        curve = build_lobe(np.float64(device["delta"]), np.float64(device["d"]), kind)
+        top = find_peak(curve, kind).x
+        first, last = (float(compute_frequency(x, curve)) for x in (top, curve.end))
     # Space the points more closely at both ends and at the ridge, where the curvature is largest.
-    half = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))
-    omega = np.concatenate([first * half, first + (last - first) * half[1:]]) if first < last else last * half
+    half_grid = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))
+    omega = (
+        np.concatenate([first * half_grid, first + (last - first) * half_grid[1:]])
+        if first < last
+        else last * half_grid
+    )
     # The rounding error of the last product may exceed the end.
     omega = np.minimum(omega, last)
     wall = boundary(omega, delta, d)
@@ -253,8 +273,8 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     return StableRegion(alpha, beta, omega, piece)
 
 
-_LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic
-_LOBE_WEIGHT = 16  # time and memory of a point relative to a point of other kernels
+LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic
+LOBE_WEIGHT = 16  # time and memory of a point relative to a point of other kernels
 
 
 def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
@@ -282,25 +302,28 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
         >>> print(f"{stable_area(0.0, 0):.4f}")
         0.9096
     """
-    return evaluate(_area_kernel, {"delta": delta, "d": d}, classify_delays(d), weight=_LOBE_WEIGHT)
+    return evaluate(_area_kernel, {"delta": delta, "d": d}, classify_delays(d), weight=LOBE_WEIGHT)
 
 
 def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
+    """Return `stable_area`, elementwise."""
     xp = namespace(delta, d)
-    curve = lobe(delta, d, kind)
+    curve = build_lobe(delta, d, kind)
     end = frozen(curve.end, xp)
     # From a corner, the outline returns to alpha = 0 along alpha + 2 beta = const.
-    at = wall(end, curve)
-    last = xp.where(curve.to_corner, at.alpha, 0.0)
+    point = evaluate_lobe(end, curve)
+    corner_alpha = xp.where(curve.to_corner, point.alpha, 0.0)
     if xp is not np:
         # Without a corner, the end is a zero of alpha; second derivatives of the area need its derivative.
-        end = end - xp.where(curve.to_corner, 0.0, at.alpha / frozen(xp.where(curve.to_corner, 1.0, at.d_alpha), xp))
+        end = end - xp.where(
+            curve.to_corner, 0.0, point.alpha / frozen(xp.where(curve.to_corner, 1.0, point.d_alpha), xp)
+        )
     # Add an axis for the nodes.
-    at_places = tree_map(lambda value: None if value is None else value[..., None], curve)
+    expanded = tree_map(lambda value: None if value is None else value[..., None], curve)
 
-    def rise(x: Array) -> Array:
-        at = wall(x, at_places)
-        return at.alpha * at.d_b
+    def integrand(x: Array) -> Array:
+        point = evaluate_lobe(x, expanded)
+        return point.alpha * point.d_b
 
-    under_lobe = integrate(rise, (0.0 * end, end), (_LOBE_NODES,))
-    return under_lobe + 0.25 * last * last + nan_with_nan_slopes(valid_device(delta, d), delta, d)
+    under_lobe = integrate(integrand, (0.0 * end, end), (LOBE_NODES,))
+    return under_lobe + 0.25 * corner_alpha * corner_alpha + nan_with_nan_slopes(valid_device(delta, d), delta, d)

@@ -1,4 +1,4 @@
-"""Certified verdicts of the rigid loop: the closed form with a static error bound, then ball arithmetic.
+"""Certify stability verdicts of rigid loops: by the closed form with a static error bound, then by ball arithmetic.
 
 Both steps evaluate the source code of `loops.rigid.crossover`, with other numbers:
 
@@ -25,7 +25,14 @@ from zwidth.arrays.balls import BITS, available
 from zwidth.arrays.evaluate import evaluate_columns
 from zwidth.arrays.held_mass import DelayClasses, DeviceTerms, PhiFunctions, classify_delays, held_plant
 from zwidth.arrays.held_mass import device as discretize
-from zwidth.loops.rigid.crossover import Lag, Verdict, compute_lag, first_zero, long_verdict, short_verdict
+from zwidth.loops.rigid.crossover import (
+    DelayPhase,
+    Verdict,
+    decide_long_delay,
+    decide_short_delay,
+    evaluate_phase,
+    find_first_root,
+)
 from zwidth.loops.rigid.folding import Points
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.words.quantities import WALL_RANGE
@@ -42,7 +49,11 @@ CROSSOVER_WIDTH = 2.0**-39  # largest relative error of the gain crossover u = 1
 CUBIC_TOLERANCE = 2.0**-45  # largest error of the cubic H whose zero is u
 TINY = 2.0**-960  # added to each size; TOLERANCE * TINY exceeds what XLA flushes to zero
 
-UNSTABLE, STABLE, OPEN, EDGE = 0, 1, 2, 3  # codes; EDGE: alpha = 0, and all poles but z = 1 lie inside the circle
+# Codes of `compute_wall_codes`.
+UNSTABLE = 0
+STABLE = 1
+OPEN = 2  # the error bound permits both verdicts
+EDGE = 3  # alpha = 0, and all poles but z = 1 lie inside the unit circle
 
 
 class Sized:
@@ -102,21 +113,21 @@ class Sized:
         return -self > -other
 
 
-def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
+def compute_wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     """Return the code of each wall, elementwise."""
     xp, plant = namespace(alpha, beta, delta), size_device(delta, d, kind)
     wall, verdicts = (Sized(alpha), Sized(beta)), []
     if kind.short:
-        verdicts.append(short_verdict(*wall, plant))
+        verdicts.append(decide_short_delay(*wall, plant))
     if kind.long:
-        verdicts.append(long_verdict(*wall, plant.whole, plant, enclose_zero, size_lag))
+        verdicts.append(decide_long_delay(*wall, plant.whole, plant, enclose_root, size_phase))
     stable, unstable = (xp.where(plant.whole < 1, *pair) for pair in zip(verdicts[0], verdicts[-1], strict=True))
     # At alpha = 0 the verdict is on the poles other than z = 1, for beta > delta (docs/theory, S15b). For alpha > 0 the
     # lobe lies above beta = -delta (L16). P(1) = phi1 alpha < 0 implies a real pole above 1.
-    offset, edge = wall[1] + plant.delta, alpha == 0
-    valid = (edge & (beta > delta)) | ((alpha > 0) & (offset > 0))
+    b, edge = wall[1] + plant.delta, alpha == 0
+    valid = (edge & (beta > delta)) | ((alpha > 0) & (b > 0))
     code = xp.where(stable & valid, xp.where(edge, EDGE, STABLE), OPEN)
-    code = xp.where((unstable & valid) | (alpha < 0) | ((alpha > 0) & (offset < 0)), UNSTABLE, code)
+    code = xp.where((unstable & valid) | (alpha < 0) | ((alpha > 0) & (b < 0)), UNSTABLE, code)
     return code.astype(xp.uint8)
 
 
@@ -134,20 +145,22 @@ def size_device(delta: Array, d: Array, kind: DelayClasses) -> DeviceTerms:
     return sized
 
 
-def enclose_zero(cubic: tuple[Sized, ...]) -> tuple[Sized, Array]:
+def enclose_root(coefficients: tuple[Sized, ...]) -> tuple[Sized, Array]:
     """Return the zero of the cubic, and whether sign changes certify it to `CROSSOVER_WIDTH`."""
-    u = first_zero(tuple(h.value for h in cubic))
-    low, high = (horner(Sized(u * (1.0 + side)), cubic) for side in (-CROSSOVER_WIDTH, CROSSOVER_WIDTH))
-    found = (low.value > CUBIC_TOLERANCE * low.size) & (high.value < -CUBIC_TOLERANCE * high.size)
-    return Sized(u, abs(u) + TINY), found & (u > 0) & (u <= 1.0)
+    u = find_first_root(tuple(h.value for h in coefficients))
+    low, high = (horner(Sized(u * (1.0 + side)), coefficients) for side in (-CROSSOVER_WIDTH, CROSSOVER_WIDTH))
+    changes_sign = (low.value > CUBIC_TOLERANCE * low.size) & (high.value < -CUBIC_TOLERANCE * high.size)
+    return Sized(u, abs(u) + TINY), changes_sign & (u > 0) & (u <= 1.0)
 
 
-def size_lag(u: Sized, whole: Array) -> Lag:
+def size_phase(u: Sized, n: Array) -> DelayPhase:
     """Return the delay phase at the crossover."""
-    lag = compute_lag(u.value, whole)
+    phase = evaluate_phase(u.value, n)
     # The half angle h is at most pi/2, so that h <= pi/2 sin h.
-    cosine, sine = Sized(lag.cosine, 1.0), Sized(lag.sine, 4.0 * roots(lag.rise)[0] + TINY)
-    return Lag(cosine, sine, Sized(lag.rise, 5.0 * lag.rise + TINY), lag.within, lag.beyond)
+    cosine, sine = Sized(phase.cosine, 1.0), Sized(phase.sine, 4.0 * roots(phase.half_sine_squared)[0] + TINY)
+    return DelayPhase(
+        cosine, sine, Sized(phase.half_sine_squared, 5.0 * phase.half_sine_squared + TINY), phase.within, phase.beyond
+    )
 
 
 def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
@@ -155,10 +168,10 @@ def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
     columns = points.columns()
     code = filter_walls(*columns)
     stable, status = code == STABLE, np.zeros(code.shape, np.int32)
-    rest = np.flatnonzero(code >= OPEN)
-    if rest.size:
-        walls = (column if column.size == 1 else column[rest] for column in columns)
-        stable[rest], status[rest] = _decide_rest(code[rest], *walls)
+    open_walls = np.flatnonzero(code >= OPEN)
+    if open_walls.size:
+        walls = (column if column.size == 1 else column[open_walls] for column in columns)
+        stable[open_walls], status[open_walls] = _decide_rest(code[open_walls], *walls)
     return stable.reshape(points.shape), status.reshape(points.shape)
 
 
@@ -166,7 +179,7 @@ def filter_walls(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.n
     """Return the code of each wall; OPEN if out of range."""
     # Find invalid numbers by NumPy, because XLA treats those below 2^-1022 as 0.
     device = (np.where(value < 0, np.nan, value) for value in (delta, d))
-    return evaluate_columns(wall_codes, [*nan_beyond(WALL_RANGE, alpha, beta), *device], classify_delays(d))
+    return evaluate_columns(compute_wall_codes, [*nan_beyond(WALL_RANGE, alpha, beta), *device], classify_delays(d))
 
 
 def _decide_rest(
@@ -175,37 +188,41 @@ def _decide_rest(
     """Return labels and statuses of walls that are at the edge alpha = 0, out of range, or left open by the filter."""
     code, alpha, beta, delta, d = np.broadcast_arrays(code, alpha, beta, delta, d)
     status = wall_status(alpha, beta, delta, d)
-    inside, stable = status == Status.OK, np.zeros(code.shape, bool)
+    in_range, stable = status == Status.OK, np.zeros(code.shape, bool)
     # For alpha = 0 and |beta| <= delta, |beta N| <= |beta| phi1 <= 1 - c <= |z - c| on the circle: apart from z = 1, no
     # pole lies outside.
     edge = (alpha == 0) & ((code == EDGE) | (np.abs(beta) <= delta))
-    status[inside & edge] = Status.ON_BOUNDARY
+    status[in_range & edge] = Status.ON_BOUNDARY
     # Walls with beta <= -delta are unstable: P(1) = 0 and P'(1) = phi1 (delta + beta) < 0, or L16.
-    left = np.flatnonzero(inside & ~edge & (beta > -delta))
-    status[left] = Status.UNDECIDED
-    if left.size and available():
-        walls = zip(*(column[left].tolist() for column in (alpha, beta, delta, d)), strict=True)
-        stable[left], status[left] = zip(*(decide(*wall) for wall in walls), strict=True)
+    open_walls = np.flatnonzero(in_range & ~edge & (beta > -delta))
+    status[open_walls] = Status.UNDECIDED
+    if open_walls.size and available():
+        walls = zip(*(column[open_walls].tolist() for column in (alpha, beta, delta, d)), strict=True)
+        stable[open_walls], status[open_walls] = zip(*(decide(*wall) for wall in walls), strict=True)
     return stable, status
 
 
 def decide(alpha: float, beta: float, delta: float, d: float) -> tuple[bool, Status]:
     """Return label and status of one wall by balls; alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
-    edge = alpha == 0
+    at_edge = alpha == 0
     for bits in BITS:
-        stable, unstable = verdict(alpha, beta, delta, d, bits)
+        stable, unstable = compute_verdict(alpha, beta, delta, d, bits)
         if stable or unstable:
-            return bool(stable and not edge), Status.ON_BOUNDARY if stable and edge else Status.OK
+            return bool(stable and not at_edge), Status.ON_BOUNDARY if stable and at_edge else Status.OK
     return False, Status.UNDECIDED
 
 
-def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Verdict:
+def compute_verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Verdict:
     """Return the verdict at one precision."""
     import flint
 
     with flint.ctx.workprec(bits):
         plant, wall = device(delta, d, bits), (flint.arb(alpha), flint.arb(beta))
-        return short_verdict(*wall, plant) if d < 1 else long_verdict(*wall, int(d), plant, _enclose_zero, _take_lag)
+        return (
+            decide_short_delay(*wall, plant)
+            if d < 1
+            else decide_long_delay(*wall, int(d), plant, _enclose_root_in_balls, _evaluate_phase_in_balls)
+        )
 
 
 @lru_cache(maxsize=64)
@@ -216,8 +233,8 @@ def device(delta: float, d: float, bits: int) -> DeviceTerms:
     # Use 64 more bits, because the phi-functions amplify the rounding error of delta (1 - f).
     with flint.ctx.workprec(bits + 64):
         x, f = flint.arb(delta), flint.arb(d - int(d))
-        at, late, plant = _phi(x), _phi(x * (1 - f)), held_plant(x, f if f != 0 else None, _phi)
-        phis = at.phi1, at.phi2, at.psi, late.phi1, late.psi
+        phis_delta, phis_late, plant = _phi(x), _phi(x * (1 - f)), held_plant(x, f if f != 0 else None, _phi)
+        phis = phis_delta.phi1, phis_delta.phi2, phis_delta.psi, phis_late.phi1, phis_late.psi
         a0 = plant.a0 if f != 0 else None
         return DeviceTerms(x, None, f, plant.c, plant.em, *phis, plant.a2, plant.a1, a0, plant.gap, None)
 
@@ -237,28 +254,30 @@ def _phi(x: flint.arb) -> PhiFunctions:
         return PhiFunctions(c, p1, p2, psi, p2 - psi)
 
 
-def _enclose_zero(cubic: tuple[flint.arb, ...]) -> tuple[flint.arb, bool]:
+def _enclose_root_in_balls(coefficients: tuple[flint.arb, ...]) -> tuple[flint.arb, bool]:
     """Return a ball around the zero of the cubic, and whether sign changes certify it."""
     import flint
 
-    mids = [h.mid() for h in cubic]
-    slopes = [k * h for k, h in enumerate(mids)][1:]
+    midpoints = [h.mid() for h in coefficients]
+    slopes = [k * h for k, h in enumerate(midpoints)][1:]
     with np.errstate(all="ignore"):
-        start = float(first_zero(tuple(map(np.float64, mids))))
+        start = float(find_first_root(tuple(map(np.float64, midpoints))))
     u = flint.arb(start if 0 < start < 2 else 1.0)
     for _ in range(16):  # Newton steps; 10 suffice from 8 correct bits
-        u = (u - horner(u, mids) / horner(u, slopes)).mid()
-    reach = u * flint.arb(2) ** (-flint.ctx.prec // 2)
-    low, high = u - reach, u + reach
-    return flint.arb(u, reach), bool(low > 0 and high < 2 and horner(low, cubic) > 0 and horner(high, cubic) < 0)
+        u = (u - horner(u, midpoints) / horner(u, slopes)).mid()
+    radius = u * flint.arb(2) ** (-flint.ctx.prec // 2)
+    low, high = u - radius, u + radius
+    return flint.arb(u, radius), bool(
+        low > 0 and high < 2 and horner(low, coefficients) > 0 and horner(high, coefficients) < 0
+    )
 
 
-def _take_lag(u: flint.arb, whole: int) -> Lag:
+def _evaluate_phase_in_balls(u: flint.arb, n: int) -> DelayPhase:
     """Return the delay phase at the crossover, in balls."""
     import flint
 
     w = (u / 2).sqrt().asin() * 2
-    phase, pi = w * (whole + 0.5), flint.arb.pi()
+    phase, pi = w * (n + 0.5), flint.arb.pi()
     sine, cosine = phase.sin_cos()
     half = (phase / 2).sin()
-    return Lag(cosine, sine, half * half, phase < pi, w * (whole + 1) > pi)
+    return DelayPhase(cosine, sine, half * half, phase < pi, w * (n + 1) > pi)

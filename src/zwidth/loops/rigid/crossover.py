@@ -1,18 +1,35 @@
-"""Stability of the rigid loop in closed form, decided at its only gain crossover.
+"""Decide the stability of rigid virtual walls in closed form, by a Nyquist test at the single gain crossover.
 
-Notation, on ``z = e^(j w)`` with ``u = 1 - cos w``, ``y = u/2``, and the plant of `arrays.held_mass`: P = T + B with
+The inputs are the normalized stiffness alpha and damping beta of the wall, the normalized physical damping delta of the
+device, and its delay of d = n + f periods (n integer, 0 <= f < 1). The discretized plant (`arrays.held_mass`) yields
+the characteristic polynomial P = T + B and the open loop L = B/T with
 
-    T = z^(1+n) (z - 1)(z - c)                device and delay, d = n + f
-    B = M(z) ((alpha + beta) z - beta)        wall;  M = a2 z + a1 + a0/z
+    T = z^(n+1) (z - 1)(z - c)                device and delay
+    B = M(z) ((alpha + beta) z - beta)        wall,  M = a2 z + a1 + a0/z
 
-The gain crossover, |T| = |B|, is the zero of a cubic in u (a quadratic for integer d), which has one zero in (0, 2) or
-none (docs/theory/one-crossover.md, Theorem 1). There the wall and the point (alpha_w, beta_w) of the boundary curve at
-this w have ``W = alpha + beta u + j beta sin w`` of equal magnitude. The wall is stable if and only if its W has the
-larger argument (S15a): ``beta alpha_w > alpha beta_w``, or ``beta > beta_w``. The curve is computed as in
-`loops.rigid.row_limit`. For d < 1 the crossover is eliminated: the largest stable alpha at each beta has a closed form.
+On the unit circle, z = e^(jw) with 0 < w <= pi, the code uses
 
-The same source code serves arrays of NumPy and JAX, float64 numbers with an error bound, and balls of python-flint
-(`loops.rigid.certified`). With bounds or balls, a comparison is true only if it is certain.
+    y = sin^2(w/2)      u = 1 - cos w = 2 y      W = alpha + beta u + j beta sin w      V = |M|^2
+
+For alpha > 0, |L| decreases strictly with frequency (one-crossover.md, Theorem 1). So there is at most one gain
+crossover, and the phase of the loop at that frequency decides stability (Theorem 2). Two implementations:
+
+d >= 1: Compute the crossover as the root of the cubic |B|^2 - |T|^2 in u (a quadratic for integer d). The point
+    (alpha_w, beta_w) of the stability boundary at this frequency has the same |W| as the wall. The wall is stable if
+    and only if this point lies on the stability lobe and the wall has the larger arg W. The second condition is
+    equivalent to ``beta alpha_w > alpha beta_w`` and to ``beta > beta_w`` (S15a), so arg W itself is not computed.
+
+d < 1: Eliminate the crossover. A line of constant beta meets the stability lobe at the root of a quadratic in y; the
+    wall is stable if and only if alpha is below the boundary there, and below the line of poles at z = -1.
+
+The same source code runs on NumPy and JAX arrays, on float64 numbers with an error bound, and on balls of python-flint
+(both in `loops.rigid.certified`). In the last two a value represents a set of numbers, and a comparison is true only if
+it holds for every number of the set. Therefore ``stable`` and ``unstable`` are decided separately, and both may be
+false.
+
+References:
+    docs/theory/one-crossover.md (Theorems 1 and 2, S15a, S15b), docs/theory/boundary.md (B1: E, H, V),
+    docs/theory/one-lobe.md (L15, L16). Nyquist 1932, Bell Syst. Tech. J. 11 (stability criterion).
 """
 
 from __future__ import annotations
@@ -28,202 +45,313 @@ from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
 from zwidth.words.xp import ARCSINE, COSINE, SINE, find_turn, frozen, horner, namespace, roots, within
 
-# From its start the zero of the cubic is within 11 %; each step squares that.
-_NEWTON_STEPS = 4
-
-
-def short_curve(here: Any) -> tuple[tuple[Any, Any], tuple[Any, Any, Any], tuple[Any, Any, Any]]:
-    """The lobe for a held d < 1 by powers of y, in any arithmetic: ``V b = y (u0 + u1 y)``, V, ``alpha V/(4 y)``."""
-    p1, em, a2, a1, a0, f = here.p1, here.em, here.a2, here.a1, here.a0, here.f
-    t = 1.0 - f
-    # Both coefficients of b are sums of terms of one sign.
-    slack = f * (f * em + p1) + t * (f * here.p1_t + t * here.psi_t) + a0
-    by_b = p1 * slack * 4.0, a0 * (f + t * here.p1_t) * -16.0
-    size = p1 * p1, (a1 * (a2 + a0) + a2 * a0 * 4.0) * -4.0, a2 * a0 * 16.0
-    return by_b, size, (p1 * (em + f * em + p1), (a1 + a0 * 3.0 + a0 * em) * -4.0, a0 * 16.0)
-
-
-def long_curve(here: Any) -> tuple[tuple, tuple, tuple, tuple]:
-    """E, H, V and ``(delta V - E)/y`` rearranged, by powers of y, in any arithmetic; a0 is None for whole d."""
-    p1, em, a2, a1, a0 = here.p1, here.em, here.a2, here.a1, here.a0
-    if a0 is None:
-        return (em * p1, (here.gap - em * a2) * 2.0), (p1 * p1,), (p1 * p1, a1 * a2 * -4.0), (p1 * here.gap * -2.0,)
-    sigma, mu, corner = a2 + a0, a2 - a0, a2 * a0 * 4.0
-    g = em * p1, (p1 + sigma * em - mu * 2.0) * -2.0, a0 * 8.0
-    b1 = p1 * 2.0 - mu * 4.0 + here.delta * (sigma * (sigma - a1) - corner * 2.0) * 2.0
-    b2 = a0 * (1.0 - here.delta * a2 * 2.0) * -8.0
-    return g, (p1 * (p1 + here.f * em), a0 * -4.0), (p1 * p1, (a1 * sigma + corner) * -4.0, corner * 4.0), (b1, b2)
+# Newton steps for the cubic. The starting value is within 11 % of the root and each step squares the relative error:
+# 0.11^16 < 5e-16.
+NEWTON_STEPS = 4
 
 
 class Verdict(NamedTuple):
-    """Two masks; a wall that is not certain is in neither."""
+    """Definite results of a stability test; both fields are false if the test is inconclusive."""
 
     stable: Any
     unstable: Any
 
 
-class Lag(NamedTuple):
-    """The delay phase ``(n + 1/2) w`` at the crossover; a bound of w that is not certain is False."""
+class DelayPhase(NamedTuple):
+    """The phase lag (n + 1/2) w of the integer delay at the gain crossover w (Theorem 2), and certain bounds on w.
 
-    cosine: Any  # of the delay phase
-    sine: Any
-    rise: Any  # square of the sine of half the delay phase
-    within: Any  # (n + 1/2) w <= pi
-    beyond: Any  # w >= pi/(n + 1)
+    ``within`` and ``beyond`` are true only if the stated bound is certain.
+    """
 
-
-# h0, h1, h2, h3 (left out for a quadratic) -> u, and whether it is certainly the only zero in (0, 2)
-Solve = Callable[[tuple[Any, ...]], tuple[Any, Any]]
-# u, n -> Lag
-TakeLag = Callable[[Any, Any], Lag]
+    cosine: Any  # cos((n + 1/2) w)
+    sine: Any  # sin((n + 1/2) w)
+    half_sine_squared: Any  # sin^2((n + 1/2) w/2)
+    within: Any  # (n + 1/2) w <= pi: cosine and sine determine the phase lag uniquely
+    beyond: Any  # w >= pi/(n + 1): above the frequencies of the stability lobe, hence unstable
 
 
-def short_verdict(alpha: Any, beta: Any, here: Any) -> Verdict:
-    """The verdict for d < 1, alpha > 0 and beta > -delta: alpha against the end of its row."""
-    # |L(-1)| < 1 is needed; without it there is no crossover. By far: what follows is then rounding.
-    height, line = here.gap * (alpha + beta * 2.0), (here.c + 1.0) * 2.0
-    below, without = (height < line) & (height > -line), (height > line) | (height < -line)
-    b = beta + here.delta
-    if here.a0 is None:
-        left, right = alpha * here.a1 * (here.p1 + here.a2 * b), here.p1 * b * (1.0 - here.a1 * beta)
-        return Verdict(below & (left < right), without | (left > right))
-    (u0, u1), size, shape = short_curve(here)
-    # Where on the lobe this beta is: lead y^2 - linear y + start = 0, the first zero.
-    start, linear, lead = size[0] * b, u0 - b * size[1], b * size[2] - u1
-    square = linear * linear - start * lead * 4.0
-    y = start * 2.0 / (linear + roots(square)[0])
-    left, right = alpha * horner(y, size), y * horner(y, shape) * 4.0
-    meets, missed = square > 0, (square < 0) | (y > 1.0)
-    reached = meets & (y < 1.0)
-    # Beyond the lobe's end a row is stable up to the line, if the lobe ends at z = -1, or nowhere. It ends before where
-    # alpha would be negative at z = -1, or the line would lie below.
-    end = shape[0] + shape[1] + shape[2]
-    cornered, ended = (end > 0) & (here.gap > 0), (end < 0) | (here.gap < 0)
-    # At the damping of a corner y is 1, or for all that is certain on either side of it.
-    stable = below & ((reached & (left < right)) | (cornered & (missed | (meets & (left < right)))))
-    return Verdict(stable, without | (reached & (left > right)) | (ended & (missed | (left > right))))
+# Coefficients h0, h1, h2[, h3] of `expand_gain_difference` -> the root u, and whether it is certainly the only root in
+# (0, 2).
+RootFinder = Callable[[tuple[Any, ...]], tuple[Any, Any]]
+# u and n -> the phase lag at that frequency.
+DelayPhaseFunction = Callable[[Any, Any], DelayPhase]
 
 
-def gain_cubic(alpha: Any, beta: Any, here: Any) -> tuple[Any, ...]:
-    """``|B|^2 - |T|^2`` by powers of u: positive at u = 0, negative behind its one zero in (0, 2)."""
-    square, spread, tall = here.p1 * here.p1, beta * (alpha + beta) * 2, alpha * alpha
-    bend = (beta - here.delta) * (beta + here.delta) + alpha * beta
-    if here.a0 is None:
-        m1 = here.a1 * here.a2
-        return square * tall, (square * bend - m1 * tall) * 2, m1 * spread * -2 - here.c * 4
-    corner = here.a2 * here.a0 * 4
-    m1 = here.a1 * (here.a2 + here.a0) + corner
-    h2 = corner * tall - m1 * spread * 2 - here.c * 4
-    return square * tall, (square * bend - m1 * tall) * 2, h2, corner * spread
+class ShortDelayCurve(NamedTuple):
+    """The boundary curve (alpha_w, beta_w) for d < 1, as polynomials in y with the lowest power first."""
+
+    damping: tuple[Any, Any]  # V (beta_w + delta)/y
+    modulus: tuple[Any, Any, Any]  # V = |M|^2
+    stiffness: tuple[Any, Any, Any]  # V alpha_w/(4 y)
 
 
-def long_verdict(alpha: Any, beta: Any, whole: Any, here: Any, solve: Solve, take_lag: TakeLag) -> Verdict:
-    """The verdict for d >= 1, alpha > 0 and beta > -delta: the curve where the gain is one."""
-    # At alpha = 0, where a pole is at z = 1, it is on the others, for ``beta > delta`` (docs/theory, S15b).
-    cubic = gain_cubic(alpha, beta, here)
-    u, found = solve(cubic)
+class LongDelayCurve(NamedTuple):
+    """The terms of the boundary curve for d >= 1, as polynomials in y with the lowest power first.
+
+    E and H are those of ``(z - c) conj M = E + j H sin w`` (boundary.md, B1). They do not depend on n.
+    """
+
+    E: tuple[Any, ...]
+    H: tuple[Any, ...]
+    V: tuple[Any, ...]  # |M|^2
+    excess: tuple[Any, ...]  # (delta V - E)/y, from which beta_w + delta is computed without cancellation
+
+
+def expand_short_delay_curve(plant: Any) -> ShortDelayCurve:
+    """Expand the boundary curve for d < 1 in powers of y, in any arithmetic."""
+    p1, em, a2, a1, a0, f = plant.p1, plant.em, plant.a2, plant.a1, plant.a0, plant.f
+    t = 1.0 - f
+    # Every term of this sum is nonnegative, and the next coefficient is a single product: nothing cancels.
+    total = f * (f * em + p1) + t * (f * plant.p1_t + t * plant.psi_t) + a0
+    damping = p1 * total * 4.0, a0 * (f + t * plant.p1_t) * -16.0
+    modulus = p1 * p1, (a1 * (a2 + a0) + a2 * a0 * 4.0) * -4.0, a2 * a0 * 16.0
+    stiffness = p1 * (em + f * em + p1), (a1 + a0 * 3.0 + a0 * em) * -4.0, a0 * 16.0
+    return ShortDelayCurve(damping, modulus, stiffness)
+
+
+def expand_long_delay_curve(plant: Any) -> LongDelayCurve:
+    """Expand the terms of the boundary curve for d >= 1 in powers of y, in any arithmetic; a0 is None for integer d."""
+    p1, em, a2, a1, a0 = plant.p1, plant.em, plant.a2, plant.a1, plant.a0
+    if a0 is None:
+        E = em * p1, (plant.gap - em * a2) * 2.0
+        return LongDelayCurve(E, (p1 * p1,), (p1 * p1, a1 * a2 * -4.0), (p1 * plant.gap * -2.0,))
+    total, difference, product = a2 + a0, a2 - a0, a2 * a0 * 4.0
+    E = em * p1, (p1 + total * em - difference * 2.0) * -2.0, a0 * 8.0
+    H = p1 * (p1 + plant.f * em), a0 * -4.0
+    V = p1 * p1, (a1 * total + product) * -4.0, product * 4.0
+    # The constant terms of delta V - E cancel exactly, because em = 1 - c = delta phi1 and p1 = phi1. The rest is
+    # divided by y.
+    excess0 = p1 * 2.0 - difference * 4.0 + plant.delta * (total * (total - a1) - product * 2.0) * 2.0
+    excess1 = a0 * (1.0 - plant.delta * a2 * 2.0) * -8.0
+    return LongDelayCurve(E, H, V, (excess0, excess1))
+
+
+def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]:
+    """Expand |B|^2 - |T|^2 in powers of u, in any arithmetic.
+
+    There are three coefficients if a0 is None, i.e. for integer d, otherwise four. For alpha > 0 the polynomial is
+    positive at u = 0 and has at most one root in (0, 2), the gain crossover, beyond which it is negative.
+    """
+    p1_squared, cross, alpha_squared = plant.p1 * plant.p1, beta * (alpha + beta) * 2, alpha * alpha
+    # |W|^2 = alpha^2 + cross u. bend = cross/2 - delta^2 is factored, which avoids cancellation near beta = delta.
+    bend = (beta - plant.delta) * (beta + plant.delta) + alpha * beta
+    # V = phi1^2 - 2 m1 u + product u^2
+    if plant.a0 is None:
+        m1 = plant.a1 * plant.a2
+        return p1_squared * alpha_squared, (p1_squared * bend - m1 * alpha_squared) * 2, m1 * cross * -2 - plant.c * 4
+    product = plant.a2 * plant.a0 * 4
+    m1 = plant.a1 * (plant.a2 + plant.a0) + product
+    h2 = product * alpha_squared - m1 * cross * 2 - plant.c * 4
+    return p1_squared * alpha_squared, (p1_squared * bend - m1 * alpha_squared) * 2, h2, product * cross
+
+
+def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
+    """Decide stability for d < 1, alpha > 0 and beta > -delta: compare alpha with the boundary at this beta."""
+    # |L(-1)| < 1 is necessary: otherwise there is no gain crossover. On lines of constant beta that miss the lobe, this
+    # condition alone limits alpha.
+    wall_at_nyquist, device_at_nyquist = plant.gap * (alpha + beta * 2.0), (plant.c + 1.0) * 2.0
+    crosses = (wall_at_nyquist < device_at_nyquist) & (wall_at_nyquist > -device_at_nyquist)
+    crosses_nowhere = (wall_at_nyquist > device_at_nyquist) | (wall_at_nyquist < -device_at_nyquist)
+    b = beta + plant.delta
+    if plant.a0 is None:
+        # d = 0: y has been eliminated. alpha_w = phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)), with a1 = psi, a2 = phi2.
+        left, right = alpha * plant.a1 * (plant.p1 + plant.a2 * b), plant.p1 * b * (1.0 - plant.a1 * beta)
+        return Verdict(crosses & (left < right), crosses_nowhere | (left > right))
+    (u0, u1), modulus, stiffness = expand_short_delay_curve(plant)
+    # The lobe has this beta where V b = y (u0 + u1 y), that is, quadratic y^2 - linear y + constant = 0: at the first
+    # positive root.
+    constant, linear, quadratic = modulus[0] * b, u0 - b * modulus[1], b * modulus[2] - u1
+    discriminant = linear * linear - constant * quadratic * 4.0
+    y = constant * 2.0 / (linear + roots(discriminant)[0])
+    # alpha < alpha_w, both sides multiplied by V.
+    left, right = alpha * horner(y, modulus), y * horner(y, stiffness) * 4.0
+    meets_curve, misses_lobe = discriminant > 0, (discriminant < 0) | (y > 1.0)
+    meets_lobe = meets_curve & (y < 1.0)
+    # A line of constant beta may miss the lobe. If the lobe ends at z = -1 (y = 1) with alpha > 0, the walls on such a
+    # line are stable up to the line of poles at z = -1; if the lobe ends earlier, at alpha = 0, none is stable. It ends
+    # earlier if V alpha_w < 0 at y = 1, or if N(-1) < 0: the line of poles at z = -1 then lies below the stable set.
+    stiffness_at_nyquist = stiffness[0] + stiffness[1] + stiffness[2]
+    ends_at_nyquist = (stiffness_at_nyquist > 0) & (plant.gap > 0)
+    ends_earlier = (stiffness_at_nyquist < 0) | (plant.gap < 0)
+    # At the beta of the corner, where the lobe meets that line, y = 1; the sets of certified arithmetic then contain
+    # values on both sides of 1. For a lobe that ends at z = -1, ``left < right`` implies stability on either side.
+    stable = crosses & (
+        (meets_lobe & (left < right)) | (ends_at_nyquist & (misses_lobe | (meets_curve & (left < right))))
+    )
+    unstable = crosses_nowhere | (meets_lobe & (left > right)) | (ends_earlier & (misses_lobe | (left > right)))
+    return Verdict(stable, unstable)
+
+
+def decide_long_delay(
+    alpha: Any,
+    beta: Any,
+    n: Any,
+    plant: Any,
+    find_root: RootFinder,
+    evaluate_phase: DelayPhaseFunction,
+) -> Verdict:
+    """Decide stability for d >= 1, alpha > 0 and beta > -delta: compare with the boundary at the gain crossover.
+
+    For alpha = 0, where one pole is at z = 1, the verdict applies to the other poles and requires beta > delta (S15b).
+
+    Args:
+        alpha: Normalized stiffness of the wall.
+        beta: Normalized damping of the wall.
+        n: Integer part of the delay in periods.
+        plant: `DeviceTerms` in the arithmetic of alpha and beta.
+        find_root: Finds the crossover in this arithmetic.
+        evaluate_phase: Evaluates the phase lag in this arithmetic.
+
+    Returns:
+        The verdict, elementwise.
+    """
+    gain_difference = expand_gain_difference(alpha, beta, plant)
+    u, certain = find_root(gain_difference)
     y = u * 0.5
-    sine, cosine = roots(y, 1.0 - y)
-    lag = take_lag(u, whole)
-    g, h, v, base = long_curve(here)
-    E, F = horner(y, g), sine * cosine * horner(y, h) * 2.0
-    # Times V cos(w/2): alpha_w = 2 sin(w/2) across, beta_w = turned - cosine E; and b V cos(w/2) without cancellation.
-    ahead = lag.cosine * cosine - lag.sine * sine  # cos((n + 1) w)
-    across = (lag.sine * cosine + lag.cosine * sine) * E + ahead * F
-    turned = lag.sine * F
-    wider = across * beta * sine * 2.0 - (turned - lag.cosine * E) * alpha
-    low = cosine * y * horner(y, base) + E * (lag.rise * 2.0 - y / (cosine + 1.0)) + turned
-    above = (beta + here.delta) * cosine * horner(y, v) - low
-    # On the lobe (n + 1) w and the argument of E + j F, both above 0, have a sum below pi; its sine is ``across``.
-    inside = found & lag.within & (across > 0) & ((E > 0) | (ahead > 0))
-    # Both differences have one sign. The first one is exact where the lobe falls, the second one next to beta = -delta.
-    steep = sine * cosine * beta * 2.0 > alpha
-    stable = inside & ((steep & (wider > 0)) | ((steep ^ True) & (above > 0)))
-    # w > pi/2, or no crossover at all.
-    late = sum(cubic[1:], cubic[0]) > 0
-    return Verdict(stable, late | (found & (lag.beyond | (across < 0) | (wider < 0) | (above < 0))))
+    sin_half, cos_half = roots(y, 1.0 - y)  # of w/2
+    phase = evaluate_phase(u, n)
+    E_terms, H_terms, V_terms, excess = expand_long_delay_curve(plant)
+    # E + j F = (z - c) conj M
+    E, F = horner(y, E_terms), sin_half * cos_half * horner(y, H_terms) * 2.0
+    cos_full = phase.cosine * cos_half - phase.sine * sin_half  # cos((n + 1) w)
+    # The boundary point, multiplied by V cos(w/2) > 0 (boundary.md, B1, second form):
+    #   alpha_w -> 2 sin(w/2) projection
+    #   beta_w  -> sine_F - phase.cosine E
+    #   beta_w + delta -> boundary_offset, rearranged so that nothing cancels
+    projection = (phase.sine * cos_half + phase.cosine * sin_half) * E + cos_full * F
+    sine_F = phase.sine * F
+    cosine_drop = phase.half_sine_squared * 2.0 - y / (cos_half + 1.0)  # cos(w/2) - cos((n + 1/2) w)
+    boundary_offset = cos_half * y * horner(y, excess) + E * cosine_drop + sine_F
+    # The two equivalent criteria, beta alpha_w - alpha beta_w > 0 and beta - beta_w > 0.
+    cross_product = projection * beta * sin_half * 2.0 - (sine_F - phase.cosine * E) * alpha
+    damping_margin = (beta + plant.delta) * cos_half * horner(y, V_terms) - boundary_offset
+    # The lobe ends where (n + 1) w + arg(E + j F) reaches pi. Neither angle is negative; ``projection`` has the sign of
+    # the sine of their sum, and the last condition excludes a sum of 2 pi or more.
+    on_lobe = certain & phase.within & (projection > 0) & ((E > 0) | (cos_full > 0))
+    # Both criteria have the same sign but different rounding errors: the first is accurate near the end of the lobe,
+    # where alpha decreases, the second next to beta = -delta. ``steep`` separates the two parts approximately.
+    # (``^ True`` negates arrays as well as Python's bool.)
+    steep = sin_half * cos_half * beta * 2.0 > alpha
+    stable = on_lobe & ((steep & (cross_product > 0)) | ((steep ^ True) & (damping_margin > 0)))
+    # The gain difference is positive at u = 1: the crossover lies above w = pi/2 >= pi/(n + 1), or does not exist.
+    too_fast = sum(gain_difference[1:], gain_difference[0]) > 0
+    off_lobe = phase.beyond | (projection < 0)
+    return Verdict(stable, too_fast | (certain & (off_lobe | (cross_product < 0) | (damping_margin < 0))))
 
 
-def first_zero(cubic: tuple[Array, ...]) -> Array:
-    """The zero in (0, 1] of a cubic that is positive before it and negative behind, or of a quadratic."""
-    h0, h1, h2, *rest = cubic
-    xp = namespace(*cubic)
-    lead = -(h2 + 0.5 * rest[0]) if rest else -h2
-    size = xp.sqrt(xp.maximum(h1 * h1 + 4.0 * lead * h0, 0.0))
+def find_first_root(coefficients: tuple[Array, ...]) -> Array:
+    """Find the root in (0, 1] of a cubic that changes sign from + to - there; of a quadratic, its first positive root.
+
+    Args:
+        coefficients: h0, h1, h2[, h3], the lowest power first.
+
+    Returns:
+        The root. The value is meaningless if there is no root in (0, 1]; callers must check the signs.
+    """
+    h0, h1, h2, *rest = coefficients
+    xp = namespace(*coefficients)
+    # Start from the quadratic in which the cubic term h3 u^3 is replaced by (h3/2) u^2.
+    negative_h2 = -(h2 + 0.5 * rest[0]) if rest else -h2
+    discriminant_root = xp.sqrt(xp.maximum(h1 * h1 + 4.0 * negative_h2 * h0, 0.0))
+    # Choose the form of the quadratic formula that adds two terms of the same sign.
     falling = h1 < 0
-    zero = xp.where(falling, 2.0 * h0, h1 + size) / xp.where(falling, size - h1, 2.0 * lead)
+    root = xp.where(falling, 2.0 * h0, h1 + discriminant_root) / xp.where(
+        falling, discriminant_root - h1, 2.0 * negative_h2
+    )
     if not rest:
-        return zero
+        return root
     h3 = rest[0]
-    # A start outside (0, 1] only means that the part of the cubic left out matters.
-    zero = xp.where((zero > 0) & (zero < 1.0), zero, 1.0)
-    # Unrolled: XLA then makes one loop over the points out of all steps.
-    for _ in range(_NEWTON_STEPS):
-        value, slope = h0 + zero * (h1 + zero * (h2 + zero * h3)), h1 + zero * (2.0 * h2 + 3.0 * zero * h3)
-        new = zero - value / slope
-        zero = xp.where(new > 0, xp.minimum(new, 1.0), 0.5 * zero)
-    return zero
+    # If the start is outside (0, 1], the cubic term is not small; start from 1 instead.
+    root = xp.where((root > 0) & (root < 1.0), root, 1.0)
+    # Unrolled, because XLA then fuses all steps into a single loop over the points.
+    for _ in range(NEWTON_STEPS):
+        value, slope = h0 + root * (h1 + root * (h2 + root * h3)), h1 + root * (2.0 * h2 + 3.0 * root * h3)
+        new = root - value / slope
+        root = xp.where(new > 0, xp.minimum(new, 1.0), 0.5 * root)
+    return root
 
 
-def _solve(cubic: tuple[Array, ...]) -> tuple[Array, Array]:
-    """Return the zero u of the cubic and a mask of the points with a zero in (0, 1]; other u have no meaning."""
-    u = first_zero(cubic)
-    return u, (sum(cubic[1:], cubic[0]) <= 0) & (u > 0) & (u <= 1.0)
+def _find_crossover(gain_difference: tuple[Array, ...]) -> tuple[Array, Array]:
+    """Find the crossover in floating point, if it lies in (0, 1]: for d >= 1 no wall with u > 1 is stable."""
+    u = find_first_root(gain_difference)
+    return u, (sum(gain_difference[1:], gain_difference[0]) <= 0) & (u > 0) & (u <= 1.0)
 
 
-def compute_lag(u: Array, whole: Array) -> Lag:
-    """Return the delay phase at the crossover ``u = 1 - cos w``."""
-    xp = namespace(u, whole)
-    # Compute the sine of half the angle, because it keeps its digits for slow loops.
-    half = xp.minimum((whole + 0.5) * xp.sqrt(0.5 * u) * horner(2.0 * u - 1.0, ARCSINE), 0.5 * np.pi)
+def evaluate_phase(u: Array, n: Array) -> DelayPhase:
+    """Evaluate the phase lag at the gain crossover ``u = 1 - cos w`` in floating point."""
+    xp = namespace(u, n)
+    # Compute the sine of the half angle, because 1 - cos((n + 1/2) w) must keep its relative accuracy for slow
+    # crossovers.
+    half = xp.minimum((n + 0.5) * xp.sqrt(0.5 * u) * horner(2.0 * u - 1.0, ARCSINE), 0.5 * np.pi)
     square = half * half
     sine, cosine = half * horner(square, SINE), horner(square, COSINE)
-    # The test implies (n + 1/2) w <= pi; its failure implies (n + 1) w >= pi (docs/theory/certified.md, C5).
-    near = u * (whole + 1.0) * (whole + 1.0) < 0.5 * np.pi * np.pi
-    return Lag((cosine - sine) * (cosine + sine), 2.0 * sine * cosine, sine * sine, near, near ^ True)
+    # The test implies (n + 1/2) w <= pi; its failure implies (n + 1) w >= pi, because u <= w^2/2
+    # (docs/theory/certified.md, C5).
+    below_bound = u * (n + 1.0) * (n + 1.0) < 0.5 * np.pi * np.pi
+    return DelayPhase(
+        (cosine - sine) * (cosine + sine), 2.0 * sine * cosine, sine * sine, below_bound, below_bound ^ True
+    )
 
 
-def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
-    """The w at which the gain is one, for margins, and whether there is one, without which w means nothing."""
-    # Of u and 2 - u = 1 + cos w the nearer one is found, which then has all its digits.
-    xp = namespace(alpha, here.delta)
-    cubic = gain_cubic(alpha, beta, here)
-    # At z = -1 the device and its delay must be the larger part; there the cubic starts in y with the opposite sign.
-    one, turned = 2.0 * (1.0 + here.c), alpha + 2.0 * beta
-    other, mu = here.gap * turned, here.a2 - here.a0
-    tall, spread, corner = turned * turned, 2.0 * beta * (alpha + beta), 4.0 * here.a2 * here.a0
-    g1 = 2.0 * (mu * mu - here.gap * (here.a2 + here.a0))
-    behind = (
-        (one - other) * (one + other),
-        here.gap * here.gap * spread - g1 * tall - 2.0 * (here.em * here.em + 8.0 * here.c),
-        4.0 * here.c - corner * tall + g1 * spread,
-        cubic[3],
+def find_gain_crossover(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
+    """Find the gain crossover frequency of a wall with alpha > 0, for stability margins.
+
+    Args:
+        alpha: Normalized stiffness.
+        beta: Normalized damping.
+        plant: Device and delay; a0 must be an array, 0 for integer delays.
+
+    Returns:
+        The crossover w in rad per sample, in (0, pi], differentiable under JAX; and whether it exists. If it does not,
+        w is meaningless.
+    """
+    # Compute the smaller of u = 1 - cos w and v = 2 - u = 1 + cos w, to full relative accuracy.
+    xp = namespace(alpha, plant.delta)
+    in_u = expand_gain_difference(alpha, beta, plant)
+    # |T|^2 - |B|^2 in powers of v. It is positive at v = 0, that is at z = -1, if the crossover exists.
+    device_at_nyquist, W_nyquist = 2.0 * (1.0 + plant.c), alpha + 2.0 * beta
+    wall_at_nyquist, difference = plant.gap * W_nyquist, plant.a2 - plant.a0
+    W_squared, cross, product = W_nyquist * W_nyquist, 2.0 * beta * (alpha + beta), 4.0 * plant.a2 * plant.a0
+    # V = gap^2 + g1 v + product v^2
+    g1 = 2.0 * (difference * difference - plant.gap * (plant.a2 + plant.a0))
+    in_v = (
+        (device_at_nyquist - wall_at_nyquist) * (device_at_nyquist + wall_at_nyquist),
+        plant.gap * plant.gap * cross - g1 * W_squared - 2.0 * (plant.em * plant.em + 8.0 * plant.c),
+        4.0 * plant.c - product * W_squared + g1 * cross,
+        in_u[3],
     )
-    far = sum(cubic[1:], cubic[0]) > 0
-    known = tuple(xp.where(far, *pair) for pair in zip(behind, cubic, strict=True))
-    near = follow_root(
-        lambda x, *powers: horner(x, powers), first_zero(frozen(known, xp)), lambda x, slope, _: slope != 0, *known
+    # Positive at u = 1: the crossover, if it exists, lies above w = pi/2.
+    above_half = sum(in_u[1:], in_u[0]) > 0
+    coefficients = tuple(xp.where(above_half, *pair) for pair in zip(in_v, in_u, strict=True))
+    root = follow_root(
+        lambda x, *powers: horner(x, powers),
+        find_first_root(frozen(coefficients, xp)),
+        lambda x, slope, _: slope != 0,
+        *coefficients,
     )
-    exists = (xp.abs(other) < one) & (near > 0) & (near <= 1.0)
-    u, y = xp.where(far, 2.0 - near, near), xp.where(far, near, 2.0 - near)
-    return find_turn(0.5 * u, 0.5 * y, xp), exists
+    exists = (xp.abs(wall_at_nyquist) < device_at_nyquist) & (root > 0) & (root <= 1.0)
+    u, v = xp.where(above_half, 2.0 - root, root), xp.where(above_half, root, 2.0 - root)
+    return find_turn(0.5 * u, 0.5 * v, xp), exists
 
 
 def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
-    """Return whether each wall is stable, elementwise; False for NaN."""
-    here = device(delta, d, kind)
-    return stable_at(alpha, beta, here, kind)
+    """Return whether each wall is stable, elementwise; False if an argument is NaN or out of range."""
+    return decide_in_floats(alpha, beta, device(delta, d, kind), kind)
 
 
-def stable_at(alpha: Array, beta: Array, here: DeviceTerms, kind: DelayClasses) -> Array:
-    """Return whether each wall is stable on a discretized device."""
-    plain = here._replace(a0=None)
+def decide_in_floats(alpha: Array, beta: Array, plant: DeviceTerms, kind: DelayClasses) -> Array:
+    """Return whether each wall is stable on a discretized plant, elementwise, in floating point."""
+    integer_plant = plant._replace(a0=None)
     if not kind.fractional:
-        here = plain
-    early = short_verdict(alpha, beta, here).stable if kind.short else None
-    if early is not None and kind.fractional:
-        # Use the formula for d = 0, because it is more accurate at the corner.
-        early = namespace(here.f).where(here.f == 0, short_verdict(alpha, beta, plain).stable, early)
-    late = long_verdict(alpha, beta, here.whole, here, _solve, compute_lag).stable if kind.long else early
-    stable = late if early is None else namespace(here.whole).where(here.whole < 1, early, late)
-    return stable & (alpha > 0) & (beta + here.delta > 0) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
+        plant = integer_plant
+    short = decide_short_delay(alpha, beta, plant).stable if kind.short else None
+    if short is not None and kind.fractional:
+        # For d = 0 the formula without y is more accurate next to the corner, where the lobe meets the line of poles at
+        # z = -1.
+        short = namespace(plant.f).where(plant.f == 0, decide_short_delay(alpha, beta, integer_plant).stable, short)
+    if kind.long:
+        long = decide_long_delay(alpha, beta, plant.whole, plant, _find_crossover, evaluate_phase).stable
+    else:
+        long = short
+    stable = long if short is None else namespace(plant.whole).where(plant.whole < 1, short, long)
+    return stable & (alpha > 0) & (beta + plant.delta > 0) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)

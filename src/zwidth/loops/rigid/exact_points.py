@@ -1,15 +1,18 @@
-"""Exact walls by a general solve: a pole pair on the circle and one condition more, by optimistix and jaxopt.
+"""Compute points of the stability boundary by a general nonlinear solver, as an independent check of the closed forms.
 
-The unknowns alpha, beta and omega are real. The third equation says that the wall lies on a given row or column or, for
-the ridge, maximize alpha subject to P(e^(j omega)) = 0, that moving along the curve changes beta only (the stationarity
-of the Lagrangian with the multipliers eliminated):
+The unknowns are alpha, beta and omega, all real. Two equations state that the loop has a pole at e^(j omega); the
+third is a condition on the wall:
 
-    Re P = 0,  Im P = 0,  Im(conj(dP/dbeta) dP/domega) = 0
+    Re P = 0,  Im P = 0,  and  alpha or beta has a given value (a column or a row)
+                          or   Im(conj(dP/dbeta) dP/domega) = 0 (the ridge)
 
-Of the loop nothing is used but its frequency response, affine in (alpha, beta), and that its lobe is met once by a row,
-and by a column once on either side of the ridge: an independent judge of the closed forms of `loops.rigid.curve`
-(any loop whose stable set is bounded by one lobe). jaxopt's bisection brackets, optimistix' Newton method finishes and
-supplies the implicit derivatives.
+The last equation is the stationarity of the Lagrangian for the largest alpha subject to P(e^(j omega)) = 0, without the
+multipliers: along the curve, only beta changes there.
+
+The solver needs only the frequency response of the loop, which is affine in (alpha, beta), and the fact that a row
+meets the lobe once, and a column once on each side of the ridge. So it checks `loops.rigid.curve` independently.
+jaxopt's bisection computes a bracketed start; optimistix's Newton method refines it and provides the implicit
+derivatives.
 """
 
 from __future__ import annotations
@@ -25,77 +28,87 @@ import jax.numpy as jnp
 from zwidth.arrays.roots import polish
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.normalization import device_status, wall_status
-from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, frequency_boundary, frequency_loop
-from zwidth.loops.rigid.ridge_newton import corner, expand_curve
+from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, build_frequency_loop, find_boundary_wall
+from zwidth.loops.rigid.ridge_newton import expand_curve, find_corner
 from zwidth.parts.circle import circle
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.xp import nan_with_nan_slopes, store_once
 
-# Each step halves the bracket: 52 of them leave one unit in the last place of a float64.
-_HALVINGS = 52
+# Bisection steps; 52 leave one unit in the last place of a float64.
+BISECTIONS = 52
 
 
-def bisect(function: Callable[..., Array], lower: Array, upper: Array, *args: Any) -> tuple[Array, Array]:
-    """A sign change of ``function(x, *args)`` between two places, without derivative, and whether there is one."""
+def bracket_root(function: Callable[..., Array], lower: Array, upper: Array, *args: Any) -> tuple[Array, Array]:
+    """Return a zero of ``function(x, *args)`` between two points by bisection, and whether its sign changes."""
     with warnings.catch_warnings():
-        # jaxopt announces at import that it is no longer maintained; a user of zwidth cannot act on that.
+        # Suppress the notice that jaxopt is no longer maintained, because a user of zwidth cannot act on it.
         warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
         from jaxopt import Bisection
 
     lower, upper, args = jax.lax.stop_gradient((lower, upper, args))
-    solver = Bisection(function, lower, upper, _HALVINGS, tol=0.0, check_bracket=False, unroll=False)
+    solver = Bisection(function, lower, upper, BISECTIONS, tol=0.0, check_bracket=False, unroll=False)
     root, state = solver.run(None, *args)
     return jax.lax.stop_gradient(root), state.sign != 0
 
 
-def lobe_end(loop: FrequencyLoop, d: Array) -> Array:
-    """The frequency at which the boundary curve first returns to alpha = 0, pi where it reaches the corner before."""
+def find_lobe_end(loop: FrequencyLoop, d: Array) -> Array:
+    """Return the frequency at which alpha is 0 again on the boundary curve; pi if the lobe ends in the corner."""
     limit = jnp.minimum(jnp.pi, jnp.pi / (d + 0.5))
-    end, found = bisect(lambda omega, loop: frequency_boundary(omega, loop).alpha, 1e-6 * limit, limit, loop)
-    return jnp.where(found & ~corner(expand_curve(loop.plant), loop.lag).reached, end, jnp.pi)
+    end, exists = bracket_root(lambda omega, loop: find_boundary_wall(omega, loop).alpha, 1e-6 * limit, limit, loop)
+    return jnp.where(exists & ~find_corner(expand_curve(loop.plant), loop.n).reached, end, jnp.pi)
 
 
-def frequency_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyLoop) -> Array:
-    """``P(e^(j omega))/e^(j (2 + n) omega)`` as a real pair."""
-    plant, whole = loop
-    at, half = circle(omega), jnp.cos(0.5 * omega)
+def evaluate_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyLoop) -> Array:
+    """Return ``P(e^(j omega))/e^(j (2 + n) omega)`` as a pair of real numbers."""
+    plant, n = loop
+    point, half_cosine = circle(omega), jnp.cos(0.5 * omega)
     # (z - 1)(z - c) + z^-n M (alpha + beta (1 - 1/z))
-    m = 2.0 * (plant.a2 + plant.a0) * half * half - plant.gap + 1j * (plant.a2 - plant.a0) * jnp.sin(omega)
-    pushed = jnp.exp(-1j * whole * omega) * m * (alpha + beta * at.before * jnp.conj(at.z))
-    value = at.before * (at.before + plant.em) + pushed
-    # optimistix wants real unknowns.
+    m = (
+        2.0 * (plant.a2 + plant.a0) * half_cosine * half_cosine
+        - plant.gap
+        + 1j * (plant.a2 - plant.a0) * jnp.sin(omega)
+    )
+    wall_term = jnp.exp(-1j * n * omega) * m * (alpha + beta * point.before * jnp.conj(point.z))
+    value = point.before * (point.before + plant.em) + wall_term
+    # Return real numbers, because optimistix requires real unknowns.
     return jnp.stack([value.real, value.imag])
 
 
-def _residual(line: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Array]) -> Array:
-    """The three equations, of order one, in alpha, beta and omega over ``scales``; ``number`` is that of the line."""
+def _evaluate_conditions(condition: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Array]) -> Array:
+    """Return the three equations, scaled to order 1, in the unknowns alpha, beta and omega divided by ``scales``."""
     loop, number, scales = args
     alpha, beta, omega = unknowns * scales
 
-    def pole(beta: Array, omega: Array) -> Array:
-        return frequency_residual(omega, alpha, beta, loop)
+    def evaluate_pole_conditions(beta: Array, omega: Array) -> Array:
+        return evaluate_residual(omega, alpha, beta, loop)
 
-    if line != "ridge":
-        wall, k = (alpha, beta), int(line == "row")
-        return jnp.append(pole(beta, omega), (wall[k] - number) / scales[k])
+    if condition != "ridge":
+        wall, k = (alpha, beta), int(condition == "row")
+        return jnp.append(evaluate_pole_conditions(beta, omega), (wall[k] - number) / scales[k])
     zero, one = jnp.zeros_like(beta), jnp.ones_like(beta)
-    value, by_beta = jax.jvp(pole, (beta, omega), (one, zero))
-    _, by_omega = jax.jvp(pole, (beta, omega), (zero, one))
-    size = jnp.sqrt(jnp.sum(by_beta**2) * jnp.sum(by_omega**2))
-    size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
-    return jnp.append(value, (by_beta[0] * by_omega[1] - by_beta[1] * by_omega[0]) / size)
+    value, beta_derivative = jax.jvp(evaluate_pole_conditions, (beta, omega), (one, zero))
+    _, omega_derivative = jax.jvp(evaluate_pole_conditions, (beta, omega), (zero, one))
+    scale = jnp.sqrt(jnp.sum(beta_derivative**2) * jnp.sum(omega_derivative**2))
+    scale = jax.lax.stop_gradient(jnp.where(scale > 0, scale, 1.0))
+    return jnp.append(
+        value, (beta_derivative[0] * omega_derivative[1] - beta_derivative[1] * omega_derivative[0]) / scale
+    )
 
 
-def _solve(line: str, start: Array, bracketed: Array, number: Array, loop: FrequencyLoop) -> tuple[Array, Wall]:
-    """The frequency at which the three equations hold, next to a start, and the wall there, differentiable."""
-    wall = jax.lax.stop_gradient(store_once(frequency_boundary(start, loop), start))
+def _solve_conditions(
+    condition: str, start: Array, bracketed: Array, number: Array, loop: FrequencyLoop
+) -> tuple[Array, Wall]:
+    """Return the frequency near a start at which the three equations hold, and the wall there, differentiable."""
+    wall = jax.lax.stop_gradient(store_once(find_boundary_wall(start, loop), start))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
     unknowns = jnp.stack([*wall, start]) / scales
-    omega = polish(lambda *at: _residual(line, *at), unknowns, (loop, number, scales), bracketed)[2]
+    omega = polish(
+        lambda *values: _evaluate_conditions(condition, *values), unknowns, (loop, number, scales), bracketed
+    )[2]
     omega = store_once(omega, start)
-    return omega, frequency_boundary(omega, loop)
+    return omega, find_boundary_wall(omega, loop)
 
 
 @jnp.vectorize
@@ -105,28 +118,28 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
     ok, inputs = status == Status.OK, (delta, d)
     # Replace NaN, because a solver may stop all batch entries at the NaN of one.
     delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
-    loop = store_once(frequency_loop(delta, d), delta)
-    summit = corner(expand_curve(loop.plant), loop.lag)
+    loop = store_once(build_frequency_loop(delta, d), delta)
+    corner = find_corner(expand_curve(loop.plant), loop.n)
 
-    def slope(omega: Array, loop: FrequencyLoop) -> Array:
-        return jax.grad(lambda w: frequency_boundary(w, loop).alpha)(omega)
+    def differentiate_alpha(omega: Array, loop: FrequencyLoop) -> Array:
+        return jax.grad(lambda w: find_boundary_wall(w, loop).alpha)(omega)
 
-    end = store_once(lobe_end(loop, d), d)
-    # Below, the slope is positive; at pi itself it vanishes by symmetry whatever the optimum.
+    end = store_once(find_lobe_end(loop, d), d)
+    # Stay slightly below pi, because at pi the derivative of alpha is 0 by symmetry, also without a maximum.
     upper = jnp.where(end < jnp.pi, end, jnp.pi * (1.0 - 1e-7))
-    start, bracketed = bisect(slope, 1e-6 * end, upper, loop)
+    start, bracketed = bracket_root(differentiate_alpha, 1e-6 * end, upper, loop)
     start = store_once(start, d)
-    omega, smooth = _solve("ridge", start, bracketed, d, loop)
+    omega, smooth = _solve_conditions("ridge", start, bracketed, d, loop)
     # Test the distance from the bracket, because rounding errors can keep Newton's method from its tolerance.
-    converged = summit.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
-    spoiled = nan_with_nan_slopes(ok & converged, *inputs)
+    converged = corner.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
+    nan_if_invalid = nan_with_nan_slopes(ok & converged, *inputs)
     status = jnp.where(ok & ~converged, int(Status.NOT_CONVERGED), status)
-    kind = jnp.where(summit.is_ridge, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
+    kind = jnp.where(corner.is_ridge, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
     kind = jnp.where(status == Status.OK, kind, int(RidgeKind.NONE))
     return (
-        jnp.where(summit.is_ridge, summit.alpha, smooth.alpha) + spoiled,
-        jnp.where(summit.is_ridge, summit.beta, smooth.beta) + spoiled,
-        jnp.where(summit.is_ridge, jnp.pi, omega) + spoiled,
+        jnp.where(corner.is_ridge, corner.alpha, smooth.alpha) + nan_if_invalid,
+        jnp.where(corner.is_ridge, corner.beta, smooth.beta) + nan_if_invalid,
+        jnp.where(corner.is_ridge, jnp.pi, omega) + nan_if_invalid,
         kind.astype(jnp.int32),
         status.astype(jnp.int32),
     )
@@ -136,45 +149,45 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
 def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: Callable[..., Any]) -> tuple[Array, ...]:
     """Return the fields of `zwidth.boundary_point` for one point; ``find_ridge`` computes `alpha_max`."""
     inputs, is_row = (delta, d, number), line == "row"
-    given = wall_status(*((0.0 * number, number) if is_row else (number, 0.0 * number)), delta, d)
-    ok = given == Status.OK
+    input_status = wall_status(*((0.0 * number, number) if is_row else (number, 0.0 * number)), delta, d)
+    ok = input_status == Status.OK
     delta, d, number = (jnp.where(ok, value, 1.0) for value in inputs)
-    loop = frequency_loop(delta, d)
-    ridge, end = jax.lax.stop_gradient(find_ridge(delta, d)), lobe_end(loop, d)
+    loop = build_frequency_loop(delta, d)
+    ridge, end = jax.lax.stop_gradient(find_ridge(delta, d)), find_lobe_end(loop, d)
 
-    def offset(wall: Wall, number: Array) -> Array:
+    def subtract(wall: Wall, number: Array) -> Array:
         return (wall.beta if is_row else wall.alpha) - number
 
-    start, on_lobe = bisect(
-        lambda omega, loop, number: offset(frequency_boundary(omega, loop), number),
+    start, on_lobe = bracket_root(
+        lambda omega, loop, number: subtract(find_boundary_wall(omega, loop), number),
         ridge.omega if line == "upper" else jnp.zeros_like(end),
         ridge.omega if line == "lower" else end,
         loop,
         number,
     )
-    omega, wall = _solve(line, start, on_lobe, number, loop)
-    near = float(jnp.finfo(start.dtype).eps) ** 0.5
-    # Compare values, too, because the bracket does not resolve the low frequency of a very soft wall.
-    hit = jnp.abs(offset(wall, number)) <= 0.1 * near * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
-    converged = hit & (jnp.abs(omega - start) <= 100.0 * near)
-    found = wall.alpha if is_row else wall.beta
-    exists = on_lobe & (found > 0) if is_row else on_lobe
+    omega, wall = _solve_conditions(line, start, on_lobe, number, loop)
+    tolerance = float(jnp.finfo(start.dtype).eps) ** 0.5
+    # Compare the values as well, because for very soft walls the bracket does not resolve the low frequency.
+    matches = jnp.abs(subtract(wall, number)) <= 0.1 * tolerance * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
+    converged = matches & (jnp.abs(omega - start) <= 100.0 * tolerance)
+    value = wall.alpha if is_row else wall.beta
+    exists = on_lobe & (value > 0) if is_row else on_lobe
     if line != "lower":
-        # Below one period a line meets P(-1) = 0 too, where alpha + 2 beta is known.
-        usable = (loop.lag == 0) & (loop.plant.gap > 0)
-        rest = 2.0 * (1.0 + loop.plant.c) / jnp.where(usable, loop.plant.gap, 1.0)
-        rest = rest - 2.0 * number if is_row else 0.5 * (rest - number)
-        is_real = usable & (rest < jnp.where(exists, found, jnp.inf))
-        is_real = is_real & (rest > 0) if is_row else is_real
-        omega, found = jnp.where(is_real, jnp.pi, omega), jnp.where(is_real, rest, found)
+        # For d < 1 the limit may lie on the line of poles at z = -1, where alpha + 2 beta is constant.
+        has_line = (loop.n == 0) & (loop.plant.gap > 0)
+        line_value = 2.0 * (1.0 + loop.plant.c) / jnp.where(has_line, loop.plant.gap, 1.0)
+        line_value = line_value - 2.0 * number if is_row else 0.5 * (line_value - number)
+        is_real = has_line & (line_value < jnp.where(exists, value, jnp.inf))
+        is_real = is_real & (line_value > 0) if is_row else is_real
+        omega, value = jnp.where(is_real, jnp.pi, omega), jnp.where(is_real, line_value, value)
         exists, converged = exists | is_real, converged | is_real
     if is_row:
         # Require a stable wall below the limit.
-        exists = exists & stable_kernel(0.5 * found, number, delta, d)
+        exists = exists & stable_kernel(0.5 * value, number, delta, d)
     else:
         exists = exists & (number > 0) & (number < ridge.alpha)
     status = jnp.where(exists, jnp.where(converged, int(Status.OK), int(Status.NOT_CONVERGED)), int(Status.NO_BOUNDARY))
-    status = jnp.where(ok, status, given)
-    spoiled = nan_with_nan_slopes(status == Status.OK, *inputs)
-    alpha, beta = (found, number) if is_row else (number, found)
-    return alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(jnp.int32)
+    status = jnp.where(ok, status, input_status)
+    nan_if_invalid = nan_with_nan_slopes(status == Status.OK, *inputs)
+    alpha, beta = (value, number) if is_row else (number, value)
+    return alpha + nan_if_invalid, beta + nan_if_invalid, omega + nan_if_invalid, status.astype(jnp.int32)

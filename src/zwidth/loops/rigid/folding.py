@@ -1,9 +1,9 @@
-"""How the four arguments of a method are laid out: the axes each varies along, and the points of one degree.
+"""Arrange the four arguments of a function as compactly as they vary, and group points by the degree of P.
 
-A map over alpha and beta of one device needs the device's coefficients once and the work of a row once a row. The
-methods of this folder see that from the shapes alone, so arguments are kept as small as they came; axes along which an
-argument only repeats itself (broadcast views, `numpy.meshgrid`) are folded back to length 1. For methods whose arrays
-are as long as the polynomial points are grouped by its degree, so that none is padded before its computation.
+On a grid over alpha and beta for one device, the device is computed once and each line of constant beta once. Callers
+recognize this from the shapes; therefore arguments keep their shape, and axes along which an argument is constant
+(broadcast views, `numpy.meshgrid`) are folded to length 1. For functions whose arrays have the length of the
+polynomial, points are grouped by its degree, so that no array is padded before the computation.
 """
 
 from __future__ import annotations
@@ -33,31 +33,40 @@ NAMES: tuple[str, ...] = ("alpha", "beta", "delta", "d")
 
 
 class Degree(NamedTuple):
-    """What decides the shape of the polynomial: whole periods of delay, and whether a fraction remains."""
+    """The delay class that determines the length of the polynomial."""
 
-    whole: int
-    fractional: bool
+    n: int  # integer part of the delay
+    fractional: bool  # the delay has a fractional part
 
     @property
     def poles(self) -> int:
-        """The degree of P: 3 + d for whole d, 4 + n otherwise."""
-        return self.whole + (4 if self.fractional else 3)
+        """Degree of P: 3 + d for integer d, 4 + n otherwise."""
+        return self.n + (4 if self.fractional else 3)
 
 
 def find_degree(d: float) -> Degree:
-    """The `Degree` of one concrete delay; an impossible delay gets the smallest one."""
+    """Return the `Degree` of one concrete delay; that of d = 0 for an invalid delay."""
     if not (np.isfinite(d) and d >= 0):
         return Degree(0, False)
-    whole = int(np.floor(d))
-    return Degree(whole, bool(d != whole))
+    n = int(np.floor(d))
+    return Degree(n, bool(d != n))
 
 
 def map_by_degree(
     kernel: Callable[..., Any], values: tuple[ArrayLike, ...], *static: Any, lead: bool = False, route: Route = "auto"
 ) -> Any:
-    """The vectors ``kernel(alpha, beta, delta, d, degree, *static)`` of points of any delays, as one array."""
-    # Shorter ones are filled with zeros in front (``lead``, for coefficients) or NaN behind (for poles). By "numpy" the
-    # kernel gets all points of a degree.
+    """Return the vectors ``kernel(alpha, beta, delta, d, degree, *static)`` of all points as one array.
+
+    Args:
+        kernel: Function of columns of points of one degree; returns an array (points, length).
+        values: alpha, beta, delta and d, of any delays.
+        *static: Further arguments of the kernel.
+        lead: Fill shorter vectors with leading zeros, for coefficients; otherwise with NaN at the end, for poles.
+        route: Route of `evaluate_columns`; with "numpy" the kernel receives all points of a degree at once.
+
+    Returns:
+        Array of the broadcast shape and a last axis of the greatest length.
+    """
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
     traced = is_traced(*values)
@@ -74,50 +83,50 @@ def map_by_degree(
         delays = arrays[-1]
     shape = np.shape(arrays[0])
     columns: list[Any] = [xp.reshape(array, -1) for array in arrays]
-    # What is beyond the range of the model must not decide the length of all others.
+    # Replace delays out of range by 0, because they must not determine the length of the result.
     defined = np.broadcast_to(np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0), shape).reshape(-1)
-    parts, places = [], []
-    for delay, picked, place in group_by(tuple(columns), 0.5 * (np.floor(defined) + np.ceil(defined))):
+    vectors, indices = [], []
+    for delay, group, index in group_by_value(tuple(columns), 0.5 * (np.floor(defined) + np.ceil(defined))):
         degree = find_degree(delay)
         if traced or route == "numpy":
             with np.errstate(all="ignore"):
-                parts.append(kernel(*picked, degree, *static))
+                vectors.append(kernel(*group, degree, *static))
         else:
-            # In coefficients; a power of two.
+            # Weight of a point relative to 16 coefficients, rounded to a power of two.
             weight = 1 << max(0, degree.poles.bit_length() - 4)
-            parts.append(evaluate_columns(kernel, picked, degree, *static, weight=weight))
-        places.append(np.arange(columns[0].size)[place])
-    (result, *others), longest = parts, max(part.shape[1] for part in parts)
+            vectors.append(evaluate_columns(kernel, group, degree, *static, weight=weight))
+        indices.append(np.arange(columns[0].size)[index])
+    (result, *others), longest = vectors, max(vector.shape[1] for vector in vectors)
     if others:
-        order = np.argsort(np.concatenate(places), kind="stable")
-        result = xp.concatenate([_fill_up(part, longest, lead, xp) for part in parts])[order]
+        order = np.argsort(np.concatenate(indices), kind="stable")
+        result = xp.concatenate([_pad_vectors(vector, longest, lead, xp) for vector in vectors])[order]
     result = result.reshape(*shape, longest)
     return result if traced else to_caller(result, values)
 
 
-def _fill_up(part: Any, longest: int, lead: bool, xp: Any) -> Any:
-    """Vectors as long as the longest one."""
+def _pad_vectors(part: Any, longest: int, lead: bool, xp: Any) -> Any:
+    """Pad vectors to the greatest length."""
     missing = longest - part.shape[1]
     if not lead:
         return xp.pad(part, ((0, 0), (0, missing)), constant_values=xp.nan)
-    # Zeros in front of a polynomial, NaN in front of one that is not defined.
+    # Leading zeros before a valid polynomial, NaN before one of an invalid point.
     front = xp.where(xp.isnan(part[:, :1]), xp.nan, 0.0)
     return xp.concatenate([xp.repeat(front, missing, axis=1), part], axis=1)
 
 
-def few_poles(degree: Degree) -> int:
-    """Up to how many points of a degree NumPy has done before a compiler has begun."""
+def count_uncompiled_points(degree: Degree) -> int:
+    """Return the number of points of a degree up to which NumPy is faster than compiling."""
     return max(1, FEW // max(8, degree.poles**2))
 
 
-# Below this many values an argument is too small for looking for repetition to pay.
-_WORTH_FOLDING = 2048
-# Smaller maps are listed point by point, in padded pieces that share their compilations.
-_WORTH_OWN_SHAPE = 1 << 16
+# Arguments with fewer values are not compared for repetition, because that would not pay.
+MIN_COMPARED_SIZE = 2048
+# Smaller grids are listed point by point, in padded batches that share one compiled program.
+MIN_DENSE_SIZE = 1 << 16
 
 
 class Points(NamedTuple):
-    """Arguments of one rank and their broadcast shape; float64, each of length 1 where it does not vary."""
+    """Float64 arguments of equal rank; each has length 1 along axes on which it is constant."""
 
     alpha: np.ndarray
     beta: np.ndarray
@@ -131,44 +140,44 @@ class Points(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many points there are."""
+        """Number of points."""
         return int(np.prod(self.shape))
 
     def columns(self) -> list[np.ndarray]:
-        """The points listed, one array each; what is the same for all of them stays a single value."""
+        """Return the points as one column per argument; a column has length 1 if the argument is constant."""
         return [a.reshape(1) if a.size == 1 else np.broadcast_to(a, self.shape).reshape(-1) for a in self]
 
     @property
     def is_dense(self) -> bool:
-        """Whether the points form a map large enough to be compiled in its own shape, row by row."""
+        """True if the points form a grid that is large enough to be compiled in its own shape."""
         shape = self.shape
-        return self.size >= _WORTH_OWN_SHAPE and shape[-1] >= 32 and 4 * sum(a.size for a in self) <= self.size
+        return self.size >= MIN_DENSE_SIZE and shape[-1] >= 32 and 4 * sum(a.size for a in self) <= self.size
 
 
 def fold_arguments(values: tuple[Any, Any, Any, Any]) -> tuple[Points, tuple[int, ...]]:
-    """Concrete arguments, checked and folded where they repeat, and the shape that they broadcast to."""
+    """Check and fold concrete arguments; return them with the shape that they broadcast to."""
     arrays = [as_float64(name, value) for name, value in zip(NAMES, values, strict=True)]
     shape = join_shapes(zip(NAMES, (array.shape for array in arrays), strict=True))
-    ranked = [array.reshape((1,) * (len(shape) - array.ndim) + array.shape) for array in arrays]
-    return Points(*map(fold, ranked)), shape
+    aligned = [array.reshape((1,) * (len(shape) - array.ndim) + array.shape) for array in arrays]
+    return Points(*map(fold, aligned)), shape
 
 
-def spread(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """What was computed of folded arguments, in the shape that they broadcast to; a view where something repeats."""
+def restore_shape(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Broadcast the results of folded arguments to the original shape; returns a view if a result is repeated."""
     return values if values.shape == shape else np.broadcast_to(values, shape)
 
 
 def fold(array: np.ndarray) -> np.ndarray:
     """Return the array with every axis along which its values are constant reduced to length 1."""
     # Decide by the size before folding, because folding one axis can make the array too small for a comparison.
-    compare = array.size >= _WORTH_FOLDING
+    compare = array.size >= MIN_COMPARED_SIZE
     for axis in range(array.ndim):
-        if array.shape[axis] > 1 and _repeats(array, axis, compare):
+        if array.shape[axis] > 1 and _is_constant(array, axis, compare):
             array = array[(slice(None),) * axis + (slice(0, 1),)]
     return array
 
 
-def _repeats(array: np.ndarray, axis: int, compare: bool) -> bool:
+def _is_constant(array: np.ndarray, axis: int, compare: bool) -> bool:
     """Return whether the values are constant along an axis: by the stride and, if ``compare``, by comparing values."""
     if array.strides[axis] == 0:
         return True
@@ -179,22 +188,32 @@ def _repeats(array: np.ndarray, axis: int, compare: bool) -> bool:
     return bool(np.array_equal(along[0], along[-1]) and (along == along[0]).all())
 
 
-def group_by(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> Iterator[tuple[Any, tuple[np.ndarray, ...], Any]]:
-    """The values of a key that broadcasts with arguments, the arguments of each, and the place of what they give."""
-    # Where the key varies along one axis the parts keep their layout; along several, the points are listed one by one.
+def group_by_value(
+    arrays: tuple[np.ndarray, ...], key: np.ndarray
+) -> Iterator[tuple[Any, tuple[np.ndarray, ...], Any]]:
+    """Yield the distinct values of a key, with the arguments of each, and the index of their results.
+
+    Args:
+        arrays: Arguments.
+        key: Array that broadcasts with the arguments.
+
+    Yields:
+        The value; the arguments of its points; and the index of these points in the broadcast shape.
+    """
+    # If the key varies along one axis, the groups keep their layout; if along several, the points are listed.
     key = fold(key)
-    # One value is the common case, and of no points it is 0.
+    # A single value is the most frequent case; without any point, yield the value 0.
     values = np.unique(key) if key.size else np.zeros(1)
     varying = [axis for axis, length in enumerate(key.shape) if length > 1]
     if values.size == 1:
         yield values[0], arrays, ...
         return
     if len(varying) > 1:
-        key, *everywhere = np.broadcast_arrays(key, *arrays)
+        key, *all_arrays = np.broadcast_arrays(key, *arrays)
         for value in values:
-            yield value, tuple(array[key == value] for array in everywhere), key == value
+            yield value, tuple(array[key == value] for array in all_arrays), key == value
         return
     for value in values:
         axis, index = varying[0], np.flatnonzero(key.reshape(-1) == value)
-        taken = tuple(array if array.shape[axis] == 1 else array.take(index, axis) for array in arrays)
-        yield value, taken, (slice(None),) * axis + (index,)
+        group = tuple(array if array.shape[axis] == 1 else array.take(index, axis) for array in arrays)
+        yield value, group, (slice(None),) * axis + (index,)

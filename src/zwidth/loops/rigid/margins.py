@@ -1,7 +1,8 @@
-"""How much gain, phase and delay a wall bears: the margins of control engineering, exact for the rigid loop.
+"""Compute the gain, phase, delay and modulus margin of walls on rigid devices.
 
-``|L|`` has one crossover, and the phase there decides (docs/theory/one-crossover.md): each margin is the distance to
-the one place where the loop becomes unstable, and its sign is the verdict.
+The open loop L of `loops.rigid.crossover` has at most one gain crossover, and the phase at this frequency decides
+stability (docs/theory/one-crossover.md). Therefore each margin is the distance to a single point where the loop becomes
+unstable, and its sign agrees with the stability verdict.
 """
 
 from __future__ import annotations
@@ -13,28 +14,39 @@ import numpy as np
 from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.held_mass import ANY, DeviceTerms, device, split_delay
 from zwidth.arrays.roots import false_position, follow_root, narrow_dips
-from zwidth.loops.rigid.crossover import short_curve, stable_at
-from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, gain_frequency, modulus, size_and_phase
+from zwidth.loops.rigid.crossover import decide_in_floats, expand_short_delay_curve
+from zwidth.loops.rigid.modulus import (
+    SAMPLES_WEIGHT,
+    evaluate_at_crossover,
+    evaluate_gain_and_phase,
+    find_modulus_margin,
+)
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.results import Margins
 from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import along, apply_each, epsilon, frozen, horner, namespace, nan_with_nan_slopes, store_once
 
-# Steps of false position at most; every sixth one halves the bracket.
-_STEPS = 240
-# Samples of the fraction of a delay, and by how much closer than 1/delta, in which the held force of a strongly damped
-# device changes, they lie to whole delays; a damping as good as none for that; steps to the lowest place they show.
-_FRACTIONS, _GRADED, _LIGHT, _NARROWED = 64, 50.0, 1e-3, 24
-# alpha, beta, delta, d and any phase.
-_STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
-# Of a stable wall whose margins vanish in rounding.
-_LEAST_MARGIN = float(np.finfo(np.float32).tiny)
-# A phase in radians below which its rounding may matter.
-_SMALL_PHASE = 0.1
-# A damping whose square float64 does not have.
-_NO_DAMPING = 1e-150
-# A phase that says unstable, where |L| is above 1 at every frequency.
-_NO_CROSSOVER = -1e-3
+# Maximum number of steps of false position; every sixth step bisects the bracket.
+FALSE_POSITION_STEPS = 240
+# Samples of the fractional part of the delay, for the delay margin.
+N_FRACTIONS = 64
+# The samples next to an integer delay are closer to it than 1/delta by this factor, because the effect of the
+# fractional delay on a strongly damped device changes within 1/delta periods.
+GRADING = 50.0
+# Below this delta the samples are practically evenly spaced.
+LIGHT_DAMPING = 1e-3
+# Golden-section steps to the lowest point between samples.
+GOLDEN_SECTION_STEPS = 24
+# alpha, beta, delta, d and an arbitrary phase of a stable wall.
+STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
+# Reported for a stable wall whose margin is 0 within rounding error.
+LEAST_MARGIN = float(np.finfo(np.float32).tiny)
+# Phase in rad below which its rounding error may matter.
+SMALL_PHASE = 0.1
+# A damping whose square underflows in float64.
+NEGLIGIBLE_DAMPING = 1e-150
+# Phase assumed if |L| is above 1 at every frequency; negative, because the loop is then unstable.
+NO_CROSSOVER_PHASE = -1e-3
 
 
 def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Margins:
@@ -42,27 +54,27 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
 
     The open loop is ``L = N(z) (alpha z + beta (z - 1))/(z^(2+n) (z - 1)(z - c))``, d = n + f, see `char_poly`.
 
-    - ``gain_margin``: the factor on both stiffness and virtual damping at which the loop becomes unstable. Of an
-      unstable wall: the factor below 1 at which it becomes stable. No stable wall is known that becomes unstable with
+    - ``gain_margin``: the factor on both stiffness and virtual damping at which the loop becomes unstable; for an
+      unstable wall, the factor below 1 at which it becomes stable. No stable wall is known that becomes unstable with
       a smaller gain.
-    - ``phase_margin``: the phase of L at the gain crossover plus 180 degrees. Of an unstable wall: the negative
+    - ``phase_margin``: the phase of L at the gain crossover plus 180 degrees; for an unstable wall, the negative
       distance of this sum from the nearest multiple of 360 degrees. The wall is stable if and only if the phase
       margin is positive (and ``beta > -delta``).
-    - ``delay_margin``: the additional delay, in periods, at which the loop first becomes unstable, with held fractional
-      delays. A still longer delay may be stable again.
+    - ``delay_margin``: the additional delay, in periods, at which the loop first becomes unstable. Fractional delays
+      are exact (zero-order hold). A still longer delay may be stable again.
     - ``modulus_margin``: the smallest distance of L from -1, which is the inverse of the peak sensitivity.
 
     Args:
         alpha: normalized stiffness, > 0.
         beta: normalized virtual damping.
         delta: normalized physical damping, >= 0.
-        d: delay in periods, >= 0, integer or fractional (held). All four broadcast.
+        d: delay in periods, >= 0, integer or fractional. All four broadcast.
 
     Returns:
         Margins of the broadcast shape: ``gain_margin`` (a factor), ``phase_margin`` (degrees), ``delay_margin``
         (periods), ``modulus_margin``, and ``phase_crossover``, ``gain_crossover``, ``modulus_frequency`` in rad per
         sample, at most pi; ``omega/(2 pi T)`` is in Hz. NaN if alpha <= 0 or an argument is out of range.
-        Of an unstable wall ``gain_margin`` is below 1, and 0 (with a NaN ``phase_crossover``) if no factor makes the
+        For an unstable wall ``gain_margin`` is below 1, and 0 (with a NaN ``phase_crossover``) if no factor makes the
         wall stable; ``phase_margin`` is between -180 and 0 degrees; ``delay_margin`` is 0. ``phase_margin`` and
         ``gain_crossover`` are NaN if ``|L|`` is above 1 at every frequency. ``phase_margin`` is also NaN if
         beta <= -delta, because stability then does not depend on the phase.
@@ -91,152 +103,166 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
 def margins_kernel(
     alpha: Array, beta: Array, delta: Array, d: Array, with_delay: bool = True, with_modulus: bool = True
 ) -> Margins:
-    """`margins` of arrays of one shape; the two margins that take a search may be left out, as NaN."""
+    """Return `margins` of arrays of one shape; the two margins that need a search are NaN if they are not requested."""
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d) & (alpha > 0)
-    spoiled = nan_with_nan_slopes(ok, alpha, beta, delta, d)
+    nan_if_invalid = nan_with_nan_slopes(ok, alpha, beta, delta, d)
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
-    # A damping whose square or inverse is beyond what there is moves no margin.
-    delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), _NO_DAMPING)), 0.0, delta)
-    here = store_once(device(delta, d), delta)
-    w, phase, crosses = gain_frequency(alpha, beta, here)
-    stable = store_once(stable_at(*frozen((alpha, beta, here), xp), ANY), delta)
-    gain, phase_crossover = _gain_margin(alpha, beta, here, xp)
+    # A damping whose square or inverse under- or overflows has no effect on the margins.
+    delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), NEGLIGIBLE_DAMPING)), 0.0, delta)
+    plant = store_once(device(delta, d), delta)
+    w, phase, crosses = evaluate_at_crossover(alpha, beta, plant)
+    stable = store_once(decide_in_floats(*frozen((alpha, beta, plant), xp), ANY), delta)
+    gain, phase_crossover = _find_gain_margin(alpha, beta, plant, xp)
     delay = distance = closest = xp.nan * alpha
     if with_delay:
-        # Elsewhere a wall that is stable is asked about.
-        known = zip((alpha, beta, delta, d, phase), _STABLE_WALL, strict=True)
-        *wall, lag, lead = (xp.where(stable, value, other)[()] for value, other in known)
-        delay = xp.where(stable, _delay_margin(tuple(wall), lag, lead, xp), 0.0)
+        # Replace unstable walls by a stable one, so that the search is well defined; its result is not used for them.
+        pairs = zip((alpha, beta, delta, d, phase), STABLE_WALL, strict=True)
+        *wall, delay0, phase0 = (xp.where(stable, value, substitute)[()] for value, substitute in pairs)
+        delay = xp.where(stable, _find_delay_margin(tuple(wall), delay0, phase0, xp), 0.0)
     if with_modulus:
-        distance, closest = modulus(alpha, beta, here)
+        distance, closest = find_modulus_margin(alpha, beta, plant)
     # Phases that differ by 360 degrees are equivalent: reduce the phase margin of an unstable wall to [-180, 0].
     turns = 2.0 * np.pi * xp.round(frozen(phase, xp) / (2.0 * np.pi))
     phase = xp.where(stable, phase, -xp.abs(phase - turns))
-    decided = nan_with_nan_slopes(crosses & (beta > -delta), alpha, beta, delta, d)
+    nan_if_undecided = nan_with_nan_slopes(crosses & (beta > -delta), alpha, beta, delta, d)
     fields = (
-        _on_the_side(gain, 1.0, epsilon(gain), stable, xp),
-        _on_the_side(phase * (180.0 / np.pi), 0.0, _LEAST_MARGIN, stable, xp) + decided,
-        _on_the_side(delay, 0.0, _LEAST_MARGIN, stable, xp),
+        _place_by_verdict(gain, 1.0, epsilon(gain), stable, xp),
+        _place_by_verdict(phase * (180.0 / np.pi), 0.0, LEAST_MARGIN, stable, xp) + nan_if_undecided,
+        _place_by_verdict(delay, 0.0, LEAST_MARGIN, stable, xp),
         distance,
         phase_crossover,
         w + nan_with_nan_slopes(crosses, alpha, beta, delta, d),
         closest,
     )
-    return Margins(*(field + spoiled for field in fields))
+    return Margins(*(field + nan_if_invalid for field in fields))
 
 
-def _on_the_side(margin: Array, edge: float, least: float, stable: Array, xp: Any) -> Array:
-    """A margin on the verdict's side of the edge: within rounding of it the two would contradict each other."""
+def _place_by_verdict(margin: Array, edge: float, least: float, stable: Array, xp: Any) -> Array:
+    """Move a margin to the verdict's side of the edge, because rounding errors could make the two contradict."""
     nearest = xp.where(stable, edge + least, edge)
-    # It keeps its slopes there.
+    # The derivatives of the margin are kept.
     return xp.where((margin < nearest) == stable, nearest + (margin - frozen(margin, xp)), margin)
 
 
-def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple[Array, Array]:
-    """The factor on the wall at which its ray leaves the stable set, and the frequency there."""
-    # The phase of L does not depend on the factor, and the gain crossover rises with it: the first zero of the phase
-    # ends the stable part, or where there is none before z = -1 the line of that, where ``|L(-1)| = 1``.
+def _find_gain_margin(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> tuple[Array, Array]:
+    """Return the factor on the wall at which it becomes unstable, and the frequency there."""
+    # The phase of L does not depend on the factor, and the gain crossover increases with the factor. So the wall is
+    # stable up to the first zero of the phase; if there is none below z = -1, up to ``|L(-1)| = 1``.
 
-    def phase(log_w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:
-        # Times a positive factor: of order one on either side of sqrt(em), where for light damping the phase itself
-        # is below rounding long before it changes sign.
-        w, whole, em = xp.exp(log_w), here.whole, here.em
-        (u0, u1), size, shape = short_curve(here)
-        found = size_and_phase(w, alpha, beta, here)[1]
-        # Below one period it vanishes at z = -1 in any case, and its other zero is lost in rounding beside that: there
-        # the curve is read, which has that one only, by its sign ``beta alpha_w > alpha beta_w``.
+    def evaluate_phase(log_w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> Array:
+        # Multiply the phase by a positive factor that makes it of order 1 on both sides of w = sqrt(em), because for
+        # light damping the phase itself is below its rounding error long before its sign changes.
+        w, n, em = xp.exp(log_w), plant.whole, plant.em
+        (u0, u1), modulus_terms, stiffness_terms = expand_short_delay_curve(plant)
+        phase_at_w = evaluate_gain_and_phase(w, alpha, beta, plant)[1]
+        # For d < 1 the phase vanishes at z = -1 in any case, and its other zero may be lost in rounding errors near
+        # there. Therefore use the sign of ``beta alpha_w - alpha beta_w``, which has only the other zero.
         y = xp.sin(0.5 * w) ** 2
-        terms = 4.0 * beta * y * horner(y, shape), here.delta * alpha * horner(y, size), -alpha * y * (u0 + u1 * y)
-        ahead = sum(terms) / frozen(sum(map(xp.abs, terms)), xp)
-        return xp.where((whole == 0) & (xp.abs(found) < _SMALL_PHASE), ahead, found * ((w + em) / (w * w + em)))
+        terms = (
+            4.0 * beta * y * horner(y, stiffness_terms),
+            plant.delta * alpha * horner(y, modulus_terms),
+            -alpha * y * (u0 + u1 * y),
+        )
+        normalized = sum(terms) / frozen(sum(map(xp.abs, terms)), xp)
+        return xp.where(
+            (n == 0) & (xp.abs(phase_at_w) < SMALL_PHASE), normalized, phase_at_w * ((w + em) / (w * w + em))
+        )
 
-    # Here the phase of an undamped device is still that of its slope, of any other it is above pi/2 - 1/2.
-    whole, em = here.whole, here.em
-    slowness = 1.0 / xp.where(em > 0, em, 1e-9) + whole + 2.0 + xp.abs(beta) / alpha
-    wall, (low, high) = frozen(((alpha, beta, here), (-xp.log(2.0 * slowness), xp.log(np.pi / (whole + 1.0)))), xp)
-    start, end = apply_each(lambda x: phase(x, *wall), [low, high], xp)
-    none = ~(start > 0)
-    ends = low, high, xp.where(none, 1.0, start), -1.0 + 0.0 * low
-    found = false_position(lambda x: phase(x, *wall), *ends, _STEPS, 1e-15)
-    w = xp.minimum(xp.exp(follow_root(phase, found, _falling, alpha, beta, here)), np.pi)
-    first = 1.0 / size_and_phase(w, alpha, beta, here)[0]
-    line = xp.abs(here.gap * (alpha + 2.0 * beta))
-    last = 2.0 * (1.0 + here.c) / xp.where(line > 0, line, 1.0)
-    # From one period on the phase falls to 0 before, but for rounding.
-    at_line = (whole == 0) & (line > 0) & (end > 0)
-    gain = xp.where(none, 0.0, xp.where(at_line, last, first))
-    return gain, xp.where(at_line, np.pi, w) + nan_with_nan_slopes(~none, alpha, beta, here.em)
+    # At the lower end of the bracket, the phase of an undamped device is still linear in w; with damping it is above
+    # pi/2 - 1/2.
+    n, em = plant.whole, plant.em
+    slowness = 1.0 / xp.where(em > 0, em, 1e-9) + n + 2.0 + xp.abs(beta) / alpha
+    wall, (low, high) = frozen(((alpha, beta, plant), (-xp.log(2.0 * slowness), xp.log(np.pi / (n + 1.0)))), xp)
+    start, end = apply_each(lambda x: evaluate_phase(x, *wall), [low, high], xp)
+    never_stable = ~(start > 0)
+    bracket = low, high, xp.where(never_stable, 1.0, start), -1.0 + 0.0 * low
+    log_w = false_position(lambda x: evaluate_phase(x, *wall), *bracket, FALSE_POSITION_STEPS, 1e-15)
+    w = xp.minimum(xp.exp(follow_root(evaluate_phase, log_w, _is_falling, alpha, beta, plant)), np.pi)
+    gain_at_zero = 1.0 / evaluate_gain_and_phase(w, alpha, beta, plant)[0]
+    wall_at_nyquist = xp.abs(plant.gap * (alpha + 2.0 * beta))
+    gain_at_nyquist = 2.0 * (1.0 + plant.c) / xp.where(wall_at_nyquist > 0, wall_at_nyquist, 1.0)
+    # For d >= 1 the phase becomes 0 below z = -1, except for rounding errors.
+    ends_at_nyquist = (n == 0) & (wall_at_nyquist > 0) & (end > 0)
+    gain = xp.where(never_stable, 0.0, xp.where(ends_at_nyquist, gain_at_nyquist, gain_at_zero))
+    return gain, xp.where(ends_at_nyquist, np.pi, w) + nan_with_nan_slopes(~never_stable, alpha, beta, plant.em)
 
 
-def _falling(_: Array, slope: Array, step: Array) -> Array:
-    """At an end of the range there is no zero to follow."""
+def _is_falling(_: Array, slope: Array, step: Array) -> Array:
+    """Return whether the function falls through a zero; at an end of the range there is no zero to follow."""
     return (slope < 0) & (abs(step) < 1e-3)
 
 
-def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> Array:
-    """The periods of delay up to the first loss of stability, for a stable wall."""
-    # With the fraction f fixed the wall bears fewer than ``nu(f) = phase(n = 0)/w_c - 1/2`` whole periods, and one
-    # period more moves nothing but n: the samples of nu serve every period.
-    still = tuple(frozen(value, xp) for value in wall)
-    whole, fraction = split_delay(d)
-    grid = _grade_fractions(still[2], xp)
-    crossings, phases, exist = _bound_undelayed(grid, *(value[..., None] + 0.0 * grid for value in still))
-    periods = _borne(crossings, phases, exist)
+def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> Array:
+    """Return the additional delay, in periods, at which a stable wall first becomes unstable."""
+    # For a fixed fraction f, the wall is stable for integer parts n < nu(f), where nu(f) is the phase margin for n = 0
+    # divided by the gain crossover. The crossover does not depend on n, so the samples of nu serve all n.
+    frozen_wall = tuple(frozen(value, xp) for value in wall)
+    n, fraction = split_delay(d)
+    grid = _grade_fractions(frozen_wall[2], xp)
+    crossings, phases, exist = _evaluate_fraction(grid, *(value[..., None] + 0.0 * grid for value in frozen_wall))
+    limits = _limit_delay(crossings, phases, exist)
 
-    def sample(of: Array, at: Array) -> Array:
-        return xp.take_along_axis(of, at, axis=-1)[..., 0][()]
+    def sample(values: Array, index: Array) -> Array:
+        return xp.take_along_axis(values, index, axis=-1)[..., 0][()]
 
-    # Just before a whole delay a strongly damped device may bear less than at it: there is one such dip at most.
-    dips = (periods[..., 1:-1] <= periods[..., :-2]) & (periods[..., 1:-1] < periods[..., 2:])
+    # Just below an integer delay, a strongly damped device may have a lower limit; there is at most one such minimum.
+    dips = (limits[..., 1:-1] <= limits[..., :-2]) & (limits[..., 1:-1] < limits[..., 2:])
     if xp is not np or dips.any():
-        place = xp.argmax(dips, axis=-1)[..., None] + 1
-        left, middle, right = (sample(grid, place + k) for k in (-1, 0, 1))
+        index = xp.argmax(dips, axis=-1)[..., None] + 1
+        left, middle, right = (sample(grid, index + k) for k in (-1, 0, 1))
         f, least = narrow_dips(
-            lambda f: _borne(*_bound_undelayed(f, *still)), left, middle, right, sample(periods, place), _NARROWED
+            lambda f: _limit_delay(*_evaluate_fraction(f, *frozen_wall)),
+            left,
+            middle,
+            right,
+            sample(limits, index),
+            GOLDEN_SECTION_STEPS,
         )
-        dips = xp.any(dips, axis=-1)[..., None] & (along(np.arange(_FRACTIONS + 1), xp.asarray(d)) == place)
-        grid, periods = xp.where(dips, f[..., None], grid), xp.where(dips, least[..., None], periods)
-    # One period on, f = 0 again, but for n: exactly so, whatever the rounding.
-    periods = xp.concatenate([periods[..., :-1], periods[..., :1] - 1.0], axis=-1)
-    now, part = frozen((whole, fraction), xp)
-    ahead = (grid > part[..., None]) & (periods <= now[..., None])
-    soon = xp.any(ahead, axis=-1)
-    there = xp.where(soon, now, xp.maximum(now + 1.0, xp.ceil(xp.min(periods, axis=-1))))[()]
-    lost = xp.where(soon[..., None], ahead, periods <= there[..., None])
-    place = xp.maximum(xp.argmax(lost, axis=-1), 1)[..., None]
-    excess_of = xp.where(exist, (periods - there[..., None]) * crossings, _NO_CROSSOVER)
-    low, at_low = sample(grid, place - 1), sample(excess_of, place - 1)
-    here_first = soon & (low < part)
-    low = xp.where(here_first, part, low)[()]
-    at_low = xp.where(here_first, frozen(phase, xp), at_low)[()]
+        dips = xp.any(dips, axis=-1)[..., None] & (along(np.arange(N_FRACTIONS + 1), xp.asarray(d)) == index)
+        grid, limits = xp.where(dips, f[..., None], grid), xp.where(dips, least[..., None], limits)
+    # f = 1 is f = 0 with n + 1; use this exact relation, independent of rounding errors.
+    limits = xp.concatenate([limits[..., :-1], limits[..., :1] - 1.0], axis=-1)
+    n_now, f_now = frozen((n, fraction), xp)
+    later = (grid > f_now[..., None]) & (limits <= n_now[..., None])
+    is_this_period = xp.any(later, axis=-1)
+    n_lost = xp.where(is_this_period, n_now, xp.maximum(n_now + 1.0, xp.ceil(xp.min(limits, axis=-1))))[()]
+    unstable = xp.where(is_this_period[..., None], later, limits <= n_lost[..., None])
+    index = xp.maximum(xp.argmax(unstable, axis=-1), 1)[..., None]
+    excesses = xp.where(exist, (limits - n_lost[..., None]) * crossings, NO_CROSSOVER_PHASE)
+    low, excess_low = sample(grid, index - 1), sample(excesses, index - 1)
+    starts_at_d = is_this_period & (low < f_now)
+    low = xp.where(starts_at_d, f_now, low)[()]
+    excess_low = xp.where(starts_at_d, frozen(phase, xp), excess_low)[()]
 
-    def excess(f: Array, there: Array, *wall: Array) -> Array:
-        w, phase, exists = _bound_undelayed(f, *wall)
-        return xp.where(exists, phase - there * w, _NO_CROSSOVER)
+    def excess(f: Array, n_lost: Array, *wall: Array) -> Array:
+        w, phase, exists = _evaluate_fraction(f, *wall)
+        return xp.where(exists, phase - n_lost * w, NO_CROSSOVER_PHASE)
 
-    high, at_high = sample(grid, place), xp.minimum(sample(excess_of, place), 0.0)
-    # The delay is known to a rounding error of the whole of it.
-    width = 4e-16 * (1.0 + there)
-    f = false_position(lambda f: excess(f, there, *still), low, high, at_low, at_high, _STEPS, width)
-    return there + follow_root(excess, f, _falling, there, *wall) - d
+    high, excess_high = sample(grid, index), xp.minimum(sample(excesses, index), 0.0)
+    # The tolerance is the rounding error of the total delay.
+    width = 4e-16 * (1.0 + n_lost)
+    f = false_position(
+        lambda f: excess(f, n_lost, *frozen_wall), low, high, excess_low, excess_high, FALSE_POSITION_STEPS, width
+    )
+    return n_lost + follow_root(excess, f, _is_falling, n_lost, *wall) - d
 
 
 def _grade_fractions(delta: Array, xp: Any) -> Array:
-    """Fractions from 0 to almost 1, along a last axis: at both ends in equal ratios, evenly where damping is light."""
-    share = along(np.arange(_FRACTIONS + 1) / _FRACTIONS, xp.asarray(delta))
-    growth = xp.log1p(_GRADED * xp.maximum(delta, _LIGHT))[..., None]
+    """Return fractions from 0 to almost 1 along a last axis, denser at both ends; equidistant for light damping."""
+    share = along(np.arange(N_FRACTIONS + 1) / N_FRACTIONS, xp.asarray(delta))
+    growth = xp.log1p(GRADING * xp.maximum(delta, LIGHT_DAMPING))[..., None]
     from_end = 0.5 * xp.expm1(2.0 * xp.minimum(share, 1.0 - share) * growth) / xp.expm1(growth)
     return xp.minimum(xp.where(share <= 0.5, from_end, 1.0 - from_end), 1.0 - epsilon(delta))
 
 
-def _borne(w: Array, phase: Array, exists: Array) -> Array:
-    """nu of `_delay_margin`, which no crossover leaves below all periods."""
+def _limit_delay(w: Array, phase: Array, exists: Array) -> Array:
+    """Return nu of `_find_delay_margin`; -inf without a gain crossover, because the loop is then unstable for all n."""
     xp = namespace(w)
     return xp.where(exists, phase / w, -xp.inf)
 
 
-def _bound_undelayed(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
-    """Below one period of delay: the crossover, the phase there, and whether there is one."""
-    return gain_frequency(alpha, beta, store_once(device(delta, f), f))
+def _evaluate_fraction(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
+    """Return the gain crossover, the phase there, and whether it exists, for a delay f < 1."""
+    return evaluate_at_crossover(alpha, beta, store_once(device(delta, f), f))

@@ -1,9 +1,15 @@
-"""The least distance of the rigid loop's Nyquist curve from -1, between bounds that no minimum can lie beyond.
+"""Find the modulus margin of the rigid loop: the least distance ``|1 + L|`` of its Nyquist curve from -1.
 
-``|L|`` falls strictly with the frequency (docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``. So
-once a distance r has been seen, no lower one lies where ``|L| > 1 + r`` or ``|L| < 1 - r``. Within a turn of the phase
-to either side of the gain crossover L is real and negative, at a distance of ``||L| - 1|``: what is beyond is farther.
-The turns that remain are two, however long the delay.
+L = B/T is the open loop of `loops.rigid.crossover`. Its gain |L| decreases strictly with frequency
+(docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``. Both bound the range of frequencies in which
+the minimum can lie:
+
+- If the distance is r at one frequency, the minimum lies where ``1 - r <= |L| <= 1 + r``.
+- Within one turn of the phase on either side of the gain crossover there is a frequency at which L is real and
+  negative. Its distance is ``||L| - 1|``, and all frequencies beyond it are farther from -1.
+
+So at most two turns of the phase have to be searched, whatever the delay: the distance is sampled, and the lowest
+samples are refined by Newton's method.
 """
 
 from __future__ import annotations
@@ -14,146 +20,165 @@ import numpy as np
 
 from zwidth.arrays.held_mass import DeviceTerms
 from zwidth.arrays.roots import follow_root, newton
-from zwidth.loops.rigid.crossover import gain_crossover
+from zwidth.loops.rigid.crossover import find_gain_crossover
 from zwidth.words.types import Array
 from zwidth.words.xp import along, apply_each, frozen, namespace, store_once
 
 
-def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
-    """``|L|`` and its phase above -pi, at w in (0, pi].
+def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
+    """Return the gain ``|L|`` and the phase of L plus pi, at w in (0, pi].
 
-    Notation as in `loops.rigid.crossover`: with ``u = 1 - cos w``, ``s = sin w``, ``W = alpha + beta u + j beta s``, M
-    at e^(j w) and ``Z = s + j (em - u)``,
+    With ``u = 1 - cos w``, ``s = sin w``, ``W = alpha + beta u + j beta s``, M at e^(j w) and ``Z = s + j (em - u)``,
 
         |L|^2 = |W|^2 |M|^2 / (2 u (em^2 + 2 c u))
         phase = arg W + arg M + arg Z - (n + 1/2) w = pi + arg L
 
-    each argument principal and continuous in w, so that the phase needs no unwrapping.
+    The principal values of these arguments are continuous in w, so the phase needs no unwrapping.
     """
     xp = namespace(w, alpha)
-    _, _, u, s, (wall_re, wall_im), (m_re, m_im) = _factors(w, alpha, beta, here)
-    top = (wall_re * wall_re + wall_im * wall_im) * (m_re * m_re + m_im * m_im)
-    size = xp.sqrt(top / (2.0 * u * (here.em * here.em + 2.0 * here.c * u)))
-    phase = xp.arctan2(wall_im, wall_re) + xp.arctan2(m_im, m_re) + xp.arctan2(here.em - u, s)
-    return size, phase - (here.whole + 0.5) * w
+    _, _, u, s, (wall_re, wall_im), (m_re, m_im) = _evaluate_factors(w, alpha, beta, plant)
+    numerator = (wall_re * wall_re + wall_im * wall_im) * (m_re * m_re + m_im * m_im)
+    gain = xp.sqrt(numerator / (2.0 * u * (plant.em * plant.em + 2.0 * plant.c * u)))
+    phase = xp.arctan2(wall_im, wall_re) + xp.arctan2(m_im, m_re) + xp.arctan2(plant.em - u, s)
+    return gain, phase - (plant.whole + 0.5) * w
 
 
-def _factors(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Any, ...]:
-    """sin and cos of w/2, u, s, and the parts of W and of M."""
+def _evaluate_factors(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Any, ...]:
+    """Return sin(w/2), cos(w/2), u, s, and the real and imaginary parts of W and of M."""
     xp = namespace(w, alpha)
     sine, cosine = xp.sin(0.5 * w), xp.cos(0.5 * w)
     u, s = 2.0 * sine * sine, 2.0 * sine * cosine
-    m_re = 2.0 * (here.a2 + here.a0) * cosine * cosine - here.gap
-    return sine, cosine, u, s, (alpha + beta * u, beta * s), (m_re, (here.a2 - here.a0) * s)
+    m_re = 2.0 * (plant.a2 + plant.a0) * cosine * cosine - plant.gap
+    return sine, cosine, u, s, (alpha + beta * u, beta * s), (m_re, (plant.a2 - plant.a0) * s)
 
 
-def gain_frequency(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array, Array]:
-    """The gain crossover, the phase there, and whether there is one, without which both mean nothing."""
-    xp = namespace(alpha, here.delta)
-    w, exists = gain_crossover(alpha, beta, here)
+def evaluate_at_crossover(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array, Array]:
+    """Return the gain crossover, the phase there, and whether the crossover exists; otherwise both are arbitrary."""
+    xp = namespace(alpha, plant.delta)
+    w, exists = find_gain_crossover(alpha, beta, plant)
     w, exists = store_once((xp.where(exists, w, 1.0), exists), alpha)
-    return w, size_and_phase(w, alpha, beta, here)[1], exists
+    return w, evaluate_gain_and_phase(w, alpha, beta, plant)[1], exists
 
 
-# For the samples of a point. Compiled they would take many seconds and then win nothing over NumPy.
+# Weight of a point for `evaluate`, because of its samples. Compilation would take many seconds and gain nothing.
 SAMPLES_WEIGHT = 8
-# Samples over the turns, and over the decades before and behind the crossover; dips that are followed, and how far.
-_TURN, _BEFORE, _BEHIND, _DIPS, _STEPS = 48, 32, 48, 5, 8
+# Sampled frequencies: evenly over the whole range, and logarithmically below and above the gain crossover.
+SAMPLES_PER_TURN = 48
+SAMPLES_BELOW = 32
+SAMPLES_ABOVE = 48
+# Local minima that are refined, the lowest ones first.
+MAX_DIPS = 5
+# Steps of the refinement.
+NEWTON_STEPS = 8
 
 
-def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:
-    """``|1 + L|^2`` at w in (0, pi], by ``L = -W M Z e^(-j (n + 1/2) w)/(2 h |Z|^2)``."""
-    # With h = sin(w/2), the functions of the sampled delay and of w/2 are all that is not arithmetic.
+def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> Array:
+    """Return ``|1 + L|^2`` at w in (0, pi]: ``L = -W M Z e^(-j (n + 1/2) w)/(2 h |Z|^2)`` with h = sin(w/2)."""
     xp = namespace(w, alpha)
-    lag = (2.0 * here.whole + 1.0) * (0.5 * w)
-    sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = _factors(w, alpha, beta, here)
+    delay_phase = (2.0 * plant.whole + 1.0) * (0.5 * w)
+    sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = _evaluate_factors(w, alpha, beta, plant)
     re, im = wall_re * m_re - wall_im * m_im, wall_re * m_im + wall_im * m_re
-    rise = here.em - u
-    re, im = re * s - im * rise, re * rise + im * s
-    turn_re, turn_im = xp.cos(lag), xp.sin(lag)
-    size = 2.0 * sine * (here.em * here.em + 2.0 * here.c * u)
-    ahead, across = (re * turn_re + im * turn_im) / size, (im * turn_re - re * turn_im) / size
-    return (1.0 - ahead) ** 2 + across * across
-
-
-def _slope_and_bend(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
-    """Half the first and half the second derivative of `squared_distance`, by those of log L."""
-    xp = namespace(w, alpha)
-    half_lag, c = here.whole + 0.5, xp.cos(w)
-    sine, cosine, u, s, wall, m = _factors(w, alpha, beta, here)
-    z, lag = c + 1j * s, xp.cos(half_lag * w) - 1j * xp.sin(half_lag * w)
-    wall, m, wall_slope = wall[0] + 1j * wall[1], m[0] + 1j * m[1], beta * (s + 1j * c)
-    total, moved = here.a2 + here.a0, here.a2 - here.a0
-    # The conjugate of Z, whose derivative is z.
-    pole = s + 1j * (u - here.em)
-    by_wall, by_m, by_pole = wall_slope / wall, (1j * moved * c - total * s) / m, z / pole
-    rate = by_wall + by_m - by_pole - 1j * half_lag - 0.5 * cosine / sine
-    bend = beta * xp.conj(z) / wall - by_wall**2 - (total * c + 1j * moved * s) / m - by_m**2
-    bend = bend - 1j * by_pole + by_pole**2 + 0.25 / (sine * sine)
-    loop = -wall * m * lag / (2.0 * sine * pole)
-    slope, back = rate * loop, xp.conj(1.0 + loop)
-    return xp.real(back * slope), xp.abs(slope) ** 2 + xp.real(back * (bend + rate * rate) * loop)
-
-
-def modulus(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
-    """The least ``|1 + L|`` over (0, pi] and its w, for alpha > 0, elementwise."""
-    xp = namespace(alpha, here.c)
-    wall = alpha, beta, here
-
-    def is_dip(w: Array, bend: Array, _: Array) -> Array:
-        return (w < np.pi) & (bend > 0)
-
-    lowest = _lowest(*frozen(wall, xp), xp)
-    w = follow_root(
-        lambda *at: _slope_and_bend(*at)[0], lowest, is_dip, *wall, slope=lambda *at: _slope_and_bend(*at)[1]
+    em_minus_u = plant.em - u
+    re, im = re * s - im * em_minus_u, re * em_minus_u + im * s
+    cos_delay, sin_delay = xp.cos(delay_phase), xp.sin(delay_phase)
+    denominator = 2.0 * sine * (plant.em * plant.em + 2.0 * plant.c * u)
+    minus_re_loop, im_part = (
+        (re * cos_delay + im * sin_delay) / denominator,
+        (im * cos_delay - re * sin_delay) / denominator,
     )
-    return xp.sqrt(xp.maximum(squared_distance(w, *wall), 0.0)), w
+    return (1.0 - minus_re_loop) ** 2 + im_part * im_part
 
 
-def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
-    """w of the minimum."""
+def _differentiate_distance(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
+    """Return half the first and half the second derivative of the squared distance, from the derivatives of log L."""
+    xp = namespace(w, alpha)
+    n_plus_half, c = plant.whole + 0.5, xp.cos(w)
+    sine, cosine, u, s, wall, m = _evaluate_factors(w, alpha, beta, plant)
+    z, delay = c + 1j * s, xp.cos(n_plus_half * w) - 1j * xp.sin(n_plus_half * w)
+    wall, m, wall_slope = wall[0] + 1j * wall[1], m[0] + 1j * m[1], beta * (s + 1j * c)
+    total, difference = plant.a2 + plant.a0, plant.a2 - plant.a0
+    # The conjugate of Z; its derivative with respect to w is z.
+    conj_Z = s + 1j * (u - plant.em)
+    wall_rate, m_rate, pole_rate = wall_slope / wall, (1j * difference * c - total * s) / m, z / conj_Z
+    rate = wall_rate + m_rate - pole_rate - 1j * n_plus_half - 0.5 * cosine / sine
+    curvature = beta * xp.conj(z) / wall - wall_rate**2 - (total * c + 1j * difference * s) / m - m_rate**2
+    curvature = curvature - 1j * pole_rate + pole_rate**2 + 0.25 / (sine * sine)
+    loop = -wall * m * delay / (2.0 * sine * conj_Z)
+    slope, conj_distance = rate * loop, xp.conj(1.0 + loop)
+    return xp.real(conj_distance * slope), xp.abs(slope) ** 2 + xp.real(
+        conj_distance * (curvature + rate * rate) * loop
+    )
 
-    def at(level: Array) -> Array:
-        """Where |L| has a value; pi if it is larger everywhere."""
-        w, exists = gain_crossover(alpha / level, beta / level, here)
+
+def find_modulus_margin(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
+    """Return the least ``|1 + L|`` over (0, pi] and its frequency w, for alpha > 0, elementwise."""
+    xp = namespace(alpha, plant.c)
+    wall = alpha, beta, plant
+
+    def is_dip(w: Array, curvature: Array, _: Array) -> Array:
+        return (w < np.pi) & (curvature > 0)
+
+    lowest = _find_lowest(*frozen(wall, xp), xp)
+    w = follow_root(
+        lambda *point: _differentiate_distance(*point)[0],
+        lowest,
+        is_dip,
+        *wall,
+        slope=lambda *point: _differentiate_distance(*point)[1],
+    )
+    return xp.sqrt(xp.maximum(compute_squared_distance(w, *wall), 0.0)), w
+
+
+def _find_lowest(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> Array:
+    """Return the frequency w at which |1 + L| is smallest."""
+
+    def find_frequency_of_gain(level: Array) -> Array:
+        """Return the frequency at which |L| has a value; pi if |L| is larger everywhere."""
+        w, exists = find_gain_crossover(alpha / level, beta / level, plant)
         w = xp.where(exists, w, np.pi)
         return store_once(w, w)
 
     alpha, beta = xp.asarray(alpha), xp.asarray(beta)
-    here = DeviceTerms(*(xp.asarray(field) for field in here))
-    wall = alpha[..., None], beta[..., None], DeviceTerms(*(field[..., None] for field in here))
-    center = at(xp.ones_like(alpha))
-    # With a share more: where the two bounds meet rounding has a say.
-    reached = 1.0001 * xp.sqrt(squared_distance(center, alpha, beta, here))
-    start, end = apply_each(at, [1.0 + reached, xp.where(reached < 1.0, 1.0 - reached, 1.0)], xp)
-    end = xp.where(reached < 1.0, end, np.pi)
-    # With room: the wall's own phase may rise by a quarter turn meanwhile.
-    turn = 3.0 * np.pi / (here.whole + 0.5)
+    plant = DeviceTerms(*(xp.asarray(field) for field in plant))
+    wall = alpha[..., None], beta[..., None], DeviceTerms(*(field[..., None] for field in plant))
+    center = find_frequency_of_gain(xp.ones_like(alpha))
+    # Increase the distance slightly, because rounding errors matter if both bounds nearly coincide.
+    distance = 1.0001 * xp.sqrt(compute_squared_distance(center, alpha, beta, plant))
+    start, end = apply_each(find_frequency_of_gain, [1.0 + distance, xp.where(distance < 1.0, 1.0 - distance, 1.0)], xp)
+    end = xp.where(distance < 1.0, end, np.pi)
+    # Three half turns of the delay phase contain one turn of the phase of L, because the phase of the wall may
+    # increase by a quarter turn meanwhile.
+    turn = 3.0 * np.pi / (plant.whole + 0.5)
     low = xp.minimum(xp.maximum(start, center - turn), center)
     high = xp.maximum(xp.minimum(end, center + turn), center)
 
-    def spread(count: int, least: float = 0.5) -> Array:
+    def list_fractions(count: int, least: float = 0.5) -> Array:
         return along((np.arange(count) + least) / count, center)
 
     grid = [
-        low[..., None] + (high - low)[..., None] * spread(_TURN, 1.0),
-        low[..., None] * (center / low)[..., None] ** spread(_BEFORE),
-        center[..., None] * (high / center)[..., None] ** spread(_BEHIND),
+        low[..., None] + (high - low)[..., None] * list_fractions(SAMPLES_PER_TURN, 1.0),
+        low[..., None] * (center / low)[..., None] ** list_fractions(SAMPLES_BELOW),
+        center[..., None] * (high / center)[..., None] ** list_fractions(SAMPLES_ABOVE),
     ]
     grid = xp.sort(xp.concatenate(grid, axis=-1), axis=-1)
-    values = squared_distance(grid, *wall)
-    edge = xp.full_like(values[..., :1], np.inf)
-    before, after = xp.concatenate([edge, values[..., :-1]], -1), xp.concatenate([values[..., 1:], edge], -1)
-    # A place that is there twice is one dip, whose zero may lie behind the second one.
-    dips = xp.where((values < before) & (values <= after), values, np.inf)
-    best = xp.argpartition(dips, _DIPS - 1, axis=-1)[..., :_DIPS]
+    values = compute_squared_distance(grid, *wall)
+    infinity = xp.full_like(values[..., :1], np.inf)
+    previous, following = (
+        xp.concatenate([infinity, values[..., :-1]], -1),
+        xp.concatenate([values[..., 1:], infinity], -1),
+    )
+    # A duplicated node counts as a single minimum; the zero of the derivative may lie to the right of the second copy.
+    dips = xp.where((values < previous) & (values <= following), values, np.inf)
+    best = xp.argpartition(dips, MAX_DIPS - 1, axis=-1)[..., :MAX_DIPS]
 
-    def beside(steps: int) -> Array:
+    def take_neighbor(steps: int) -> Array:
         return xp.take_along_axis(grid, xp.clip(best + steps, 0, grid.shape[-1] - 1), axis=-1)
 
-    middle = beside(0)
-    found = newton(lambda w: _slope_and_bend(w, *wall), beside(-2), beside(2), middle, _STEPS)[0]
-    # At an end of the range the lowest point is the end itself.
-    places = xp.concatenate([found, middle], axis=-1)
-    lowest = xp.argmin(squared_distance(places, *wall), axis=-1)[..., None]
-    return xp.take_along_axis(places, lowest, axis=-1)[..., 0]
+    middle = take_neighbor(0)
+    refined = newton(
+        lambda w: _differentiate_distance(w, *wall), take_neighbor(-2), take_neighbor(2), middle, NEWTON_STEPS
+    )[0]
+    # At an end of the range the minimum may be the end itself, therefore compare both candidates.
+    candidates = xp.concatenate([refined, middle], axis=-1)
+    lowest = xp.argmin(compute_squared_distance(candidates, *wall), axis=-1)[..., None]
+    return xp.take_along_axis(candidates, lowest, axis=-1)[..., 0]

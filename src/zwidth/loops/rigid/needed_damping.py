@@ -1,8 +1,17 @@
-"""The physical damping that a passive wall of the rigid loop needs, for any delay: one maximum over frequency.
+"""Compute the physical damping that a passive wall on a rigid device needs, for any delay: a maximum over frequency.
 
-What a wall needs at one frequency, N, where that is highest for alpha >= 0 (P1 to P3), and all letters stand in
-docs/theory/passivity.md. N is homogeneous in (alpha, beta), a polynomial in u under the root, and stationary where
-``E = A' + kappa (b^2 - a^2)/(8 N)`` vanishes, a prime for d/du.
+Notation of docs/theory/passivity.md: d = n + f, k = n + 1, a = alpha/2, b = beta + a, u = 1 - cos w and
+kappa = 4 f (1 - f). At one frequency the wall needs the damping N, the larger root of
+
+    N^2 - A N - S/4 = 0,    S = kappa (a^2 + (b^2 - a^2) u/2)
+
+A is a times a stiffness term minus beta times a damping term; both contain cos(k w) and tau = sin(k w)/sin w. The
+maximum over frequency is at w = 0, at w = pi, or at a single peak in between, depending on the direction beta/alpha (P1
+to P3, for alpha >= 0). N is homogeneous in (alpha, beta). At the peak dN/du = 0, i.e.
+
+    E = A' + kappa (b^2 - a^2)/(8 N) = 0
+
+A prime denotes d/du; in the code, a digit after a name is the order of this derivative.
 """
 
 from __future__ import annotations
@@ -16,12 +25,14 @@ from zwidth.arrays.roots import newton
 from zwidth.words.types import Array
 from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace
 
-# Of the peak, from its fit; of the direction from which it exists, from twice its beta at most.
-_STEPS, _DIRECTION_STEPS = 3, 12
+# Newton steps to the peak, from a fitted start.
+PEAK_STEPS = 3
+# Newton steps to the direction beyond which a peak exists, from at most twice its beta.
+DIRECTION_STEPS = 12
 
 
-class Delay(NamedTuple):
-    """What the condition needs to know of a delay."""
+class DelayTerms(NamedTuple):
+    """The terms of the condition that depend on the delay only."""
 
     f: Array
     k: Array
@@ -29,87 +40,101 @@ class Delay(NamedTuple):
 
 
 class PeakCondition(NamedTuple):
-    """The condition at one frequency."""
+    """The condition on the damping at one frequency."""
 
-    slope: Array  # E, of the sign of dN/du
-    bend: Array  # A''; of E the slope, where it vanishes
+    slope: Array  # E; it has the sign of dN/du
+    curvature: Array  # A''; it is dE/du if E = 0
     root: Array  # 2 N - A
-    needed: Array
+    needed: Array  # N
 
 
-def describe_delay(d: Array) -> Delay:
-    """The `Delay` of d >= 0."""
+def compute_delay_terms(d: Array) -> DelayTerms:
+    """Return the `DelayTerms` of d >= 0."""
     n, f = split_delay(d)
-    return Delay(f, n + 1.0, 4.0 * f * (1.0 - f))
+    return DelayTerms(f, n + 1.0, 4.0 * f * (1.0 - f))
 
 
-def larger_root(linear: Array, square: Array, xp: Any) -> tuple[Array, Array]:
-    """N and 2 N - A of ``N^2 - A N - S/4 = 0``, free of cancellation; finite derivatives for A = S = 0."""
-    total = linear * linear + square
-    root = xp.where(total > 0, xp.sqrt(xp.where(total > 0, total, 1.0)), 0.0)
-    other = root - linear
-    return xp.where(linear > 0, 0.5 * (root + linear), 0.5 * square / xp.where(other > 0, other, 1.0)), root
+def solve_larger_root(A: Array, S: Array, xp: Any) -> tuple[Array, Array]:
+    """Return N and 2 N - A of ``N^2 - A N - S/4 = 0`` without cancellation; finite derivatives for A = S = 0."""
+    discriminant = A * A + S
+    root = xp.where(discriminant > 0, xp.sqrt(xp.where(discriminant > 0, discriminant, 1.0)), 0.0)
+    difference = root - A
+    return xp.where(A > 0, 0.5 * (root + A), 0.5 * S / xp.where(difference > 0, difference, 1.0)), root
 
 
-def _rise(a: Array, beta: Array, delay: Delay) -> tuple[Array, Array, Array]:
-    """At w = 0: what is needed, E, and the derivative of E in beta."""
+def _evaluate_at_zero(a: Array, beta: Array, delay: DelayTerms) -> tuple[Array, Array, Array]:
+    """Return N, E and the derivative of E in beta at w = 0."""
     f, k, kappa = delay
     xp = namespace(a, f)
     n = k - 1.0
-    # Of A at u = 0: the sums 1 + 2 sum cos(i w) and cos(k w), with their derivatives -i^2 in u.
-    spring = (1.0 - f) * n * k * (2.0 * n + 1.0) + f * k * (k + 1.0) * (2.0 * k + 1.0)
-    damper = (1.0 - f) * k * k + f * (k + 1.0) ** 2
-    needed, root = larger_root(a * (2.0 * (n + f) + 1.0) - beta, kappa * a * a, xp)
-    per = 0.125 * kappa / xp.where(needed > 0, needed, 1.0)
-    pull = per * beta * (beta + 2.0 * a)
-    rise = beta * damper - a * spring / 3.0 + pull
-    return needed, rise, damper + 2.0 * per * (beta + a) + pull / xp.where(root > 0, root, 1.0)
+    # A' at u = 0, from the sums 1 + 2 sum cos(i w) and cos(k w), whose terms have the derivative -i^2 in u there.
+    stiffness_slope = (1.0 - f) * n * k * (2.0 * n + 1.0) + f * k * (k + 1.0) * (2.0 * k + 1.0)
+    damping_slope = (1.0 - f) * k * k + f * (k + 1.0) ** 2
+    needed, root = solve_larger_root(a * (2.0 * (n + f) + 1.0) - beta, kappa * a * a, xp)
+    S_factor = 0.125 * kappa / xp.where(needed > 0, needed, 1.0)
+    S_slope = S_factor * beta * (beta + 2.0 * a)
+    E = beta * damping_slope - a * stiffness_slope / 3.0 + S_slope
+    return needed, E, damping_slope + 2.0 * S_factor * (beta + a) + S_slope / xp.where(root > 0, root, 1.0)
 
 
-def turns(a: Array, beta: Array, delay: Delay) -> tuple[Array, Array, Array, Array]:
-    """Of the wall ``(2 a, beta)``: its need at w = 0, E there, its need at w = pi, and whether that is the peak."""
+def evaluate_ends(a: Array, beta: Array, delay: DelayTerms) -> tuple[Array, Array, Array, Array]:
+    """Return N at w = 0, E there, N at w = pi, and whether the latter is the maximum, for the wall ``(2 a, beta)``."""
     f, k, _ = delay
     xp = namespace(a, f)
-    at_zero, rise, _ = _rise(a, beta, delay)
+    at_zero, E, _ = _evaluate_at_zero(a, beta, delay)
     b = beta + a
-    end = beta * (1.0 - 5.0 * f) - 2.0 * a * f + 0.5 * f * beta * (beta + 2.0 * a) / xp.where(b > 0, b, 1.0)
-    return at_zero, xp.where(beta > 0, rise, -1.0), b * (1.0 - f), (k == 1) & (end >= 0)
+    E_at_pi = beta * (1.0 - 5.0 * f) - 2.0 * a * f + 0.5 * f * beta * (beta + 2.0 * a) / xp.where(b > 0, b, 1.0)
+    return at_zero, xp.where(beta > 0, E, -1.0), b * (1.0 - f), (k == 1) & (E_at_pi >= 0)
 
 
-def condition(u: Array, a: Array, beta: Array, delay: Delay) -> PeakCondition:
-    """The condition at ``u = 1 - cos w`` in (0, 2], for n >= 1 in (0, 1]."""
+def evaluate_condition(u: Array, a: Array, beta: Array, delay: DelayTerms) -> PeakCondition:
+    """Evaluate the condition at ``u = 1 - cos w``, in (0, 2] for n = 0 and in (0, 1] for n >= 1."""
     f, k, kappa = delay
     xp = namespace(u, a)
-    cos_w, square = 1.0 - u, u * (2.0 - u)
-    # For n = 0 all is a polynomial in u, up to w = pi.
+    cos_w, sin_squared = 1.0 - u, u * (2.0 - u)
+    # For n = 0 all terms are polynomials in u, up to w = pi.
     undelayed = k == 1
-    square_safe = xp.where(undelayed, 1.0, square)
-    cosine, sine = _wave(xp.minimum(u, 1.0), k, xp)
-    cosine, tau = xp.where(undelayed, cos_w, cosine), xp.where(undelayed, 1.0, sine / xp.sqrt(square_safe))
-    tau1 = xp.where(undelayed, 0.0, (k * cosine - tau * cos_w) / square_safe)
-    inner = (k * cosine - tau) / u
-    spring, spring1 = tau * (2.0 - u) - cosine, inner + k * tau
-    spring2 = (-k * k * tau - tau1 - inner) / u + k * tau1
-    damper, damper1, damper2 = cosine, -k * tau, -k * tau1
-    spring, spring1, spring2 = spring + 2.0 * f * cosine, spring1 - 2.0 * f * k * tau, spring2 - 2.0 * f * k * tau1
-    late, late_tau = cosine * cos_w - tau * square, tau * cos_w + cosine
-    late_tau1 = tau1 * cos_w - tau - k * tau
-    damper, damper1 = damper + f * (late - damper), damper1 - f * ((k + 1.0) * late_tau + damper1)
-    damper2 = damper2 - f * ((k + 1.0) * late_tau1 + damper2)
-    # Of the size of f: above, 1 - 1 would leave rounding errors.
-    spring1, spring2 = xp.where(undelayed, -2.0 * f, spring1), xp.where(undelayed, 0.0, spring2)
-    damper1 = xp.where(undelayed, 4.0 * f * u - 3.0 * f - 1.0, damper1)
-    damper2 = xp.where(undelayed, 4.0 * f, damper2)
-    linear, linear1, linear2 = a * spring - beta * damper, a * spring1 - beta * damper1, a * spring2 - beta * damper2
+    safe_sin_squared = xp.where(undelayed, 1.0, sin_squared)
+    cosine, sine = _compute_cosine_and_sine(xp.minimum(u, 1.0), k, xp)
+    cosine, tau = xp.where(undelayed, cos_w, cosine), xp.where(undelayed, 1.0, sine / xp.sqrt(safe_sin_squared))
+    tau1 = xp.where(undelayed, 0.0, (k * cosine - tau * cos_w) / safe_sin_squared)
+    quotient = (k * cosine - tau) / u
+    stiffness_term, stiffness_term1 = tau * (2.0 - u) - cosine, quotient + k * tau
+    stiffness_term2 = (-k * k * tau - tau1 - quotient) / u + k * tau1
+    damping_term, damping_term1, damping_term2 = cosine, -k * tau, -k * tau1
+    stiffness_term, stiffness_term1, stiffness_term2 = (
+        stiffness_term + 2.0 * f * cosine,
+        stiffness_term1 - 2.0 * f * k * tau,
+        stiffness_term2 - 2.0 * f * k * tau1,
+    )
+    next_cosine, next_tau = cosine * cos_w - tau * sin_squared, tau * cos_w + cosine
+    next_tau1 = tau1 * cos_w - tau - k * tau
+    damping_term, damping_term1 = (
+        damping_term + f * (next_cosine - damping_term),
+        damping_term1 - f * ((k + 1.0) * next_tau + damping_term1),
+    )
+    damping_term2 = damping_term2 - f * ((k + 1.0) * next_tau1 + damping_term2)
+    # For n = 0 use these exact values, because the terms of order f would lose accuracy by 1 - 1.
+    stiffness_term1, stiffness_term2 = (
+        xp.where(undelayed, -2.0 * f, stiffness_term1),
+        xp.where(undelayed, 0.0, stiffness_term2),
+    )
+    damping_term1 = xp.where(undelayed, 4.0 * f * u - 3.0 * f - 1.0, damping_term1)
+    damping_term2 = xp.where(undelayed, 4.0 * f, damping_term2)
+    A, A1, A2 = (
+        a * stiffness_term - beta * damping_term,
+        a * stiffness_term1 - beta * damping_term1,
+        a * stiffness_term2 - beta * damping_term2,
+    )
     gain = beta * (beta + 2.0 * a)
-    needed, root = larger_root(linear, kappa * (a * a + 0.5 * gain * u), xp)
-    # Stationary where this vanishes; its own slope is that of A there.
-    slope = linear1 + 0.125 * kappa * gain / xp.where(needed > 0, needed, 1.0)
-    return PeakCondition(slope, linear2, root, needed)
+    needed, root = solve_larger_root(A, kappa * (a * a + 0.5 * gain * u), xp)
+    # N is stationary if this E is 0; its derivative is then A''.
+    slope = A1 + 0.125 * kappa * gain / xp.where(needed > 0, needed, 1.0)
+    return PeakCondition(slope, A2, root, needed)
 
 
-def _wave(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
-    """Cosine and sine of ``k w`` in [0, pi], u in (0, 1]."""
+def _compute_cosine_and_sine(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
+    """Return the cosine and sine of ``k w`` in [0, pi], for u in (0, 1]."""
     if xp is np:
         x = 2.0 * k * np.arcsin(np.sqrt(0.5 * u))
         return np.cos(x), np.sin(x)
@@ -119,70 +144,73 @@ def _wave(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
     return (cosine - sine) * (cosine + sine), 2.0 * sine * cosine
 
 
-def peak(a: Array, beta: Array, delay: Delay, rise: Array) -> Array:
-    """u of the one peak between w = 0 and pi, where it exists; ``rise`` is E at u = 0."""
-    # The start, from ``(1 - x cot x)/x^2 = 2 sum 1/(i^2 pi^2 - x^2)``, is within a few per cent. An error of u enters
-    # the height squared.
+def find_peak(a: Array, beta: Array, delay: DelayTerms, rise: Array) -> Array:
+    """Return u of the only peak between w = 0 and pi, if it exists; ``rise`` is E at u = 0."""
+    # The start is within a few percent, from ``(1 - x cot x)/x^2 = 2 sum 1/(i^2 pi^2 - x^2)``. The error of N is of
+    # second order in that of u.
     f, k, _ = delay
     xp = namespace(a, f)
-    period = k + f
-    # b/(2 a (d + 1)) = (1 - x cot x)/x^2, as its inverse: a may be 0.
-    ratio = 2.0 * a * period / (beta + a)
+    periods = k + f
+    # Solve b/(2 a (d + 1)) = (1 - x cot x)/x^2, inverted because a may be 0.
+    ratio = 2.0 * a * periods / (beta + a)
     y = np.pi**2 - 2.0 * ratio / xp.maximum(1.0 - 0.1307 * ratio, 0.5)
     y = np.pi**2 - 2.0 * ratio / xp.maximum(1.0 - (0.1307 + 0.00216 * y) * ratio, 0.5)
-    end = xp.where(k == 1, 2.0, 2.0 * xp.sin(0.5 * np.pi / k) ** 2)
-    # Below this the height is that at 0 to the last digit.
-    floor = epsilon(a) ** 0.5 * end
-    # 1 - cos w to 1e-3
-    y = xp.maximum(y, 0.0) / (period * period)
-    u = xp.minimum(xp.maximum(0.5 * y * (1.0 - y * (1.0 / 12.0 - y * (1.0 / 360.0))), floor), end)
-    # Unrolled: XLA then makes one loop over the points out of all steps.
-    for _ in range(_STEPS):
-        here = condition(u, a, beta, delay)
-        # Near the turn E is all but a straight line from its value at 0, and Newton's method may leave (0, end].
-        new = u - here.slope / xp.where(here.bend < 0, here.bend, -1.0)
-        chord = u * rise / xp.where(here.slope < 0, rise - here.slope, 1.0)
+    largest_u = xp.where(k == 1, 2.0, 2.0 * xp.sin(0.5 * np.pi / k) ** 2)
+    # For smaller u the maximum equals N at w = 0 within rounding error.
+    floor = epsilon(a) ** 0.5 * largest_u
+    # The series of 1 - cos w, within 1e-3.
+    y = xp.maximum(y, 0.0) / (periods * periods)
+    u = xp.minimum(xp.maximum(0.5 * y * (1.0 - y * (1.0 / 12.0 - y * (1.0 / 360.0))), floor), largest_u)
+    # Unrolled, because XLA then fuses all steps into a single loop over the points.
+    for _ in range(PEAK_STEPS):
+        point = evaluate_condition(u, a, beta, delay)
+        # Near u = 0, E is nearly linear, and Newton's method may leave (0, largest_u]; then use the secant from u = 0.
+        new = u - point.slope / xp.where(point.curvature < 0, point.curvature, -1.0)
+        chord = u * rise / xp.where(point.slope < 0, rise - point.slope, 1.0)
         u = xp.where(new > 0, new, chord)
-        u = xp.minimum(xp.maximum(u, floor), end)
+        u = xp.minimum(xp.maximum(u, floor), largest_u)
     return u
 
 
-def needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
-    """The supremum over frequency of the damping needed, for alpha >= 0, elementwise, with its derivatives."""
+def compute_needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
+    """Return the supremum over frequency of the damping needed, for alpha >= 0, elementwise, with its derivatives."""
     xp = namespace(alpha, beta, d)
     if not (kind.long or kind.fractional):
         return 0.5 * alpha + xp.abs(beta)
-    delay = describe_delay(d)
+    delay = compute_delay_terms(d)
     scale = frozen(alpha + xp.abs(beta), xp)
     scale = xp.where(scale > 0, scale, 1.0)
     a, beta = 0.5 * alpha / scale, beta / scale
-    at_zero, rise, at_pi, reaches_pi = turns(a, beta, delay)
-    rises = rise > 0
-    inside = rises & ~reaches_pi
-    # Where there is no peak, harmless values that have one.
-    a_in, beta_in = xp.where(inside, a, 0.0), xp.where(inside, beta, 1.0)
-    f_in = xp.where(inside, delay.f, 0.5)
-    delay_in = Delay(f_in, delay.k, 4.0 * f_in * (1.0 - f_in))
-    u = peak(*frozen((a_in, beta_in, delay_in, xp.where(inside, rise, 1.0)), xp))
-    here = condition(u, a_in, beta_in, delay_in)
-    # One more step, as its effect on the height: with it the second derivatives are right too.
-    curvature = frozen(xp.where(here.bend < 0, here.bend * here.root / here.needed, -1.0), xp)
-    height = here.needed - xp.where(here.bend < 0, 0.5 * here.slope * here.slope / curvature, 0.0)
+    at_zero, E, at_pi, reaches_pi = evaluate_ends(a, beta, delay)
+    rises = E > 0
+    has_peak = rises & ~reaches_pi
+    # If there is no peak, substitute values that have one; the result is not used.
+    safe_a, safe_beta = xp.where(has_peak, a, 0.0), xp.where(has_peak, beta, 1.0)
+    safe_f = xp.where(has_peak, delay.f, 0.5)
+    safe_delay = DelayTerms(safe_f, delay.k, 4.0 * safe_f * (1.0 - safe_f))
+    u = find_peak(*frozen((safe_a, safe_beta, safe_delay, xp.where(has_peak, E, 1.0)), xp))
+    point = evaluate_condition(u, safe_a, safe_beta, safe_delay)
+    # Add the effect of one more Newton step on N, which makes the second derivatives correct as well.
+    curvature = frozen(xp.where(point.curvature < 0, point.curvature * point.root / point.needed, -1.0), xp)
+    height = point.needed - xp.where(point.curvature < 0, 0.5 * point.slope * point.slope / curvature, 0.0)
     return scale * xp.where(rises, xp.where(reaches_pi, at_pi, height), at_zero)
 
 
-def directions(d: Array) -> tuple[Array, Array]:
-    """``beta/alpha`` between which the peak lies inside (0, pi): below at w = 0, above at w = pi (f < 2/9 only)."""
+def find_directions(d: Array) -> tuple[Array, Array]:
+    """Return the directions ``beta/alpha`` between which the peak is inside (0, pi).
+
+    For smaller directions the maximum is at w = 0, for larger ones at w = pi, which occurs for d < 2/9 only.
+    """
     xp = namespace(d)
-    delay = describe_delay(d)
+    delay = compute_delay_terms(d)
     f, k, _ = delay
     half, zero = 0.5 + 0.0 * d, 0.0 * d
-    # E at w = 0 grows with beta. Without the pull of a fraction it vanishes at the first guess.
-    _, short, by_beta = _rise(half, zero, delay._replace(kappa=zero))
-    highest = -short / by_beta
-    first, _ = newton(lambda beta: _rise(half, beta, delay)[1:], zero, highest, highest, _DIRECTION_STEPS)
-    # (2 - 9 f) t^2 + (1 - 6 f) t = f
-    ends = (k == 1) & (9.0 * f < 2.0)
-    below = xp.where(ends, f, 0.0)
-    last = 2.0 * below / (1.0 - 6.0 * below + xp.sqrt(1.0 - 4.0 * below))
-    return first, xp.where(ends, last, xp.inf)
+    # E at w = 0 increases with beta. Without the term in S (f = 0) the first guess is the zero.
+    _, E_without_S, E_by_beta = _evaluate_at_zero(half, zero, delay._replace(kappa=zero))
+    largest = -E_without_S / E_by_beta
+    lower, _ = newton(lambda beta: _evaluate_at_zero(half, beta, delay)[1:], zero, largest, largest, DIRECTION_STEPS)
+    # Solve (2 - 9 f) t^2 + (1 - 6 f) t = f.
+    has_upper = (k == 1) & (9.0 * f < 2.0)
+    safe_f = xp.where(has_upper, f, 0.0)
+    upper = 2.0 * safe_f / (1.0 - 6.0 * safe_f + xp.sqrt(1.0 - 4.0 * safe_f))
+    return lower, xp.where(has_upper, upper, xp.inf)

@@ -1,7 +1,11 @@
-"""From SI quantities to the numbers that the stability of a rigid loop depends on, and back.
+"""Convert SI quantities to the normalized parameters alpha, beta, delta and d, and back; check their ranges.
 
-The normalization is the paper's eqs. (14) and (16): ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``,
-``d = t_d/T``.
+The stability of a rigid loop depends on four dimensionless parameters only (the paper's eqs. (14) and (16)):
+
+    alpha = K T^2/m    beta = B T/m    delta = b T/m    d = t_d/T
+
+A point is *invalid* if a parameter is not finite or has the wrong sign, and *out of range* if its magnitude is outside
+the range in which the model is computed (`words.quantities`).
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ from zwidth.words.xp import is_jax, is_traced, namespace, nan_unless, within
 
 @shown()
 class Normalized(NamedTuple):
-    """The four dimensionless numbers that the stability of the wall depends on."""
+    """The four dimensionless parameters that determine the stability of a wall."""
 
     alpha: Array
     beta: Array
@@ -34,7 +38,7 @@ class Normalized(NamedTuple):
 
 @shown(mass="kg", damping="N s/m", period="s", delay="s")
 class Physical(NamedTuple):
-    """The same wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
+    """The device, its loop and the wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
 
     mass: Array
     damping: Array
@@ -44,20 +48,20 @@ class Physical(NamedTuple):
     virtual_damping: Array
 
 
-def _magnitudes(name: str) -> tuple[float, float]:
-    """The magnitudes that are allowed beside 0."""
+def _find_magnitude_range(name: str) -> tuple[float, float]:
+    """Return the smallest and largest magnitude allowed, apart from 0."""
     return SIZES.get(name, SI_RANGE)
 
 
 def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
-    """Return ``value`` as float64; a scalar out of range raises. A traced value is left to JAX."""
+    """Return ``value`` as float64; raise `InputError` for a scalar out of range. Traced values are not checked."""
     if is_traced(value):
         return value
     number = as_float64(name, value)
     if number.ndim == 0:
-        parameter, (least, most) = PARAMETERS[name], _magnitudes(name)
+        parameter, (least, most) = PARAMETERS[name], _find_magnitude_range(name)
         unit = f" (in {parameter.unit})" if parameter.unit != "1" else ""
-        if not _valid(name, number):
+        if not _is_valid(name, number):
             bound = str(parameter.sign)
             raise InputError(f"{name}: got {value!r}; it must be finite{f' and {bound}' if bound else ''}{unit}")
         if not within(number, (least, most)):
@@ -66,69 +70,80 @@ def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
     return number
 
 
-def _valid(name: str, value: Array) -> Array:
+def _is_valid(name: str, value: Array) -> Array:
+    """Return whether a value is finite and has the sign that its parameter requires."""
     return namespace(value).isfinite(value) & PARAMETERS[name].sign.holds(value)
 
 
 def quantity_status(**values: Array) -> Array:
-    """The `Status` of quantities named as in `normalize`: INVALID_INPUT before OUT_OF_RANGE, elementwise."""
+    """Return the `Status` of quantities named as in `normalize`, elementwise; INVALID_INPUT precedes OUT_OF_RANGE."""
     xp = namespace(*values.values())
     valid = inside = True
     for name, value in values.items():
-        valid, inside = valid & _valid(name, value), inside & within(value, _magnitudes(name))
+        valid, inside = valid & _is_valid(name, value), inside & within(value, _find_magnitude_range(name))
     status = xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
     return status.astype(np.int32)
 
 
 def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """Whether a wall on a device lies where the model is computed."""
+    """Return whether a wall and its device are valid and in the range of the model."""
     return valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
 
 
 def device_status(delta: Array, d: Array) -> Array:
-    """The `Status` of a device and its delay."""
+    """Return the `Status` of a device and its delay."""
     return quantity_status(delta=delta, d=d)
 
 
 def wall_status(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """The `Status` of a wall on a device."""
+    """Return the `Status` of a wall on a device."""
     return quantity_status(alpha=alpha, beta=beta, delta=delta, d=d)
 
 
 def status_of_results(
-    shape: tuple[int, ...], numbers: Iterable[np.ndarray], walls: tuple[np.ndarray, ...], device: tuple[np.ndarray, ...]
+    shape: tuple[int, ...], results: Iterable[np.ndarray], walls: tuple[np.ndarray, ...], device: tuple[np.ndarray, ...]
 ) -> np.ndarray:
-    """The `Status` of each wall on each device, of numbers that are NaN where none was found."""
+    """Return the `Status` of results for each wall on each device.
+
+    Args:
+        shape: Shape of the result.
+        results: Arrays of results; NaN means NOT_CONVERGED.
+        walls: alpha and beta.
+        device: delta and d.
+    """
     status = np.full(shape, Status.OK, np.uint8)
-    for found in numbers:
-        status[np.isnan(found)] = Status.NOT_CONVERGED
-    # Each by itself first: seldom is one of them where the model is not computed.
+    for values in results:
+        status[np.isnan(values)] = Status.NOT_CONVERGED
+    # Check each argument separately first, because usually all are in range.
     if not (valid_device(*device).all() and all(within(part, WALL_RANGE).all() for part in walls)):
-        told = wall_status(*walls, *device)
-        np.copyto(status, told, where=told != Status.OK, casting="unsafe")
+        input_status = wall_status(*walls, *device)
+        np.copyto(status, input_status, where=input_status != Status.OK, casting="unsafe")
     return status
 
 
 def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
-    """Check the arguments, put NaN where an array's entry is out of range, and apply ``formula``."""
+    """Check the arguments, replace array entries out of range by NaN, and apply ``formula``."""
     checked = {name: _check_quantity(name, value) for name, value in values.items()}
     join_shapes((name, np.shape(value)) for name, value in checked.items())
     if any(map(is_jax, values.values())):
-        return evaluate(_formula_at, values, formula, tuple(values))
+        return evaluate(_apply_formula, values, formula, tuple(values))
     with np.errstate(all="ignore"):
-        result = _formula_at(*checked.values(), formula, tuple(values))
+        result = _apply_formula(*checked.values(), formula, tuple(values))
     return tuple(part[()] for part in result)
 
 
-def _formula_at(*arguments: Any) -> tuple[Array, ...]:
-    """``formula`` with NaN for what is out of range; the last two arguments are the formula and the names."""
+def _apply_formula(*arguments: Any) -> tuple[Array, ...]:
+    """Apply a formula with NaN for values out of range; the last two arguments are the formula and the names."""
     *values, formula, names = arguments
-    good = (_valid(name, value) & within(value, _magnitudes(name)) for name, value in zip(names, values, strict=True))
-    return formula(*(nan_unless(ok, value)[0] for ok, value in zip(good, values, strict=True)))
+    valid_masks = (
+        _is_valid(name, value) & within(value, _find_magnitude_range(name))
+        for name, value in zip(names, values, strict=True)
+    )
+    return formula(*(nan_unless(ok, value)[0] for ok, value in zip(valid_masks, values, strict=True)))
 
 
 def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:
-    """Eqs. (14), (16)."""
+    """Return the normalized parameters, eqs. (14), (16)."""
     return (
         stiffness * period * period / mass,
         virtual_damping * period / mass,
@@ -138,7 +153,7 @@ def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tupl
 
 
 def _denormalize(mass, period, alpha, beta, delta, d) -> tuple[Array, ...]:
-    """Eqs. (14), (16) solved for the SI quantities, in the order of `Physical`."""
+    """Return the SI quantities, in the order of `Physical`, from eqs. (14), (16)."""
     rate = mass / period
     return mass, delta * rate, period, d * period, alpha * rate / period, beta * rate
 
@@ -153,7 +168,7 @@ def normalize(
     stiffness: ArrayLike = 0.0,
     virtual_damping: ArrayLike = 0.0,
 ) -> Normalized:
-    """Turn SI quantities into the normalized ones.
+    """Convert SI quantities to normalized parameters.
 
     ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``, ``d = t_d/T``.
 
@@ -161,14 +176,14 @@ def normalize(
         mass: m in kg, > 0.
         damping: b, the physical damping of the device, in N s/m, >= 0.
         period: T, the sampling period, in s, > 0.
-        delay: t_d, from the sample to the moment its force acts, in s, >= 0.
+        delay: t_d, from the sample to the instant at which its force begins to act, in s, >= 0.
         stiffness: K of the virtual wall in N/m.
         virtual_damping: B of the virtual wall in N s/m.
             All broadcast against each other; each is 0 or 1e-30 to 1e30 in magnitude.
 
     Returns:
-        ``alpha``, ``beta``, ``delta``, ``d``. ``d`` is taken as whole where the quotient is whole but for rounding.
-        An entry of an array that is out of range gives NaN.
+        ``alpha``, ``beta``, ``delta``, ``d``. ``d`` is rounded to an integer if it differs from one by a rounding
+        error only. An array entry that is out of range yields NaN.
 
     Raises:
         InputError: a scalar is out of range, or an argument is no number.
@@ -204,7 +219,7 @@ def denormalize(
     delta: ArrayLike = 0.0,
     d: ArrayLike = 0.0,
 ) -> Physical:
-    """Turn normalized quantities back into SI ones, for a device of this mass and sampling period.
+    """Convert normalized parameters to SI quantities, for a device of this mass and sampling period.
 
     ``K = alpha m/T^2``, ``B = beta m/T``, ``b = delta m/T``, ``t_d = d T``.
 

@@ -1,8 +1,9 @@
-"""Passivity of the sampled wall of the rigid loop (Colgate's condition), for any delay.
+"""Test and measure the passivity of walls on rigid devices (Colgate's condition), for any delay.
 
-Per frequency the condition is a lower bound on the physical damping (docs/theory/passivity.md), convex and homogeneous
-in (alpha, beta): one convex set for each delay, whatever the device. Where the bound is highest:
-`loops.rigid.needed_damping`. On a map of one delay it is a polynomial of one variable, the direction.
+The wall is passive if the physical damping delta exceeds a bound at every frequency (docs/theory/passivity.md). The
+bound is convex and homogeneous in (alpha, beta), so the passive walls of all devices with the same delay are one convex
+set, scaled by delta. `loops.rigid.needed_damping` computes the maximum of the bound over frequency. On grids of one
+delay this maximum is evaluated from a polynomial in one variable that represents the direction beta/alpha.
 """
 
 from __future__ import annotations
@@ -15,127 +16,142 @@ import numpy as np
 from zwidth.arrays.evaluate import FEW, as_number, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.held_mass import ANY, DelayClasses, classify_delays, valid_device
 from zwidth.arrays.roots import integrate
-from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by, spread
-from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by_value, restore_shape
+from zwidth.loops.rigid.needed_damping import compute_needed_damping, find_directions, solve_larger_root
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import frozen, horner, is_traced, namespace, nan_with_nan_slopes
 
-# Chebyshev terms: the last one is below 1e-16 for every delay.
-_TERMS = 30
-# Each narrows the bracket of a direction eightfold.
-_ROUNDS = 17
-_NO_DELAY = DelayClasses(True, False, False)
+# Terms of the Chebyshev series; the last one is below 1e-16 for every delay.
+N_TERMS = 30
+# Rounds of the search in `passive_stiffness_slope`; each narrows the bracket of the direction by a factor of 8.
+SEARCH_ROUNDS = 17
+NO_DELAY = DelayClasses(True, False, False)
 
 
 def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
+    """Return `passivity_margin`, elementwise."""
     xp = namespace(alpha, beta, delta, d)
-    ok = valid_wall(alpha, beta, delta, d)
-    # At 0 with the slope from the right, which the larger of the two would halve.
-    stiff = xp.where(ok & (alpha >= 0), alpha, 0.0)
-    damper, delay = xp.where(ok, beta, 0.0), xp.where(ok, d, 0.0)
-    margin = delta - needed_damping(stiff, damper, delay, kind)
-    return _limit_margin(margin, alpha) + nan_with_nan_slopes(ok, alpha, beta, delta, d)
+    valid = valid_wall(alpha, beta, delta, d)
+    # Select by alpha >= 0 and not by the maximum with 0, because the latter would halve the derivative at alpha = 0.
+    safe_alpha = xp.where(valid & (alpha >= 0), alpha, 0.0)
+    safe_beta, safe_d = xp.where(valid, beta, 0.0), xp.where(valid, d, 0.0)
+    margin = delta - compute_needed_damping(safe_alpha, safe_beta, safe_d, kind)
+    return _limit_margin(margin, alpha) + nan_with_nan_slopes(valid, alpha, beta, delta, d)
 
 
 def _limit_margin(margin: Array, alpha: Array) -> Array:
-    """A spring of negative stiffness gives unbounded energy, which the frequency condition does not see."""
+    """Limit the margin for negative stiffness, which yields unbounded energy although the condition may hold."""
     xp = namespace(margin, alpha)
     return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
 
 
 @lru_cache(maxsize=256)
-def table(d: float) -> tuple[float, ...]:
-    """What all walls of one delay need, as one polynomial of the direction: what `_map_kernel` takes."""
-    # Between its directions ``needed/(beta + (width - first) alpha)`` is analytic in ``x/(x + width alpha)``, ``x =
-    # beta - first alpha``, up to beta = infinity; its Chebyshev series falls by a factor of 4 a term, for every delay.
-    first, last_turn = directions(np.float64(d))
+def fit_needed_damping(d: float) -> tuple[float, ...]:
+    """Fit the damping needed by all walls of one delay by a polynomial in the direction.
+
+    Between the directions ``lower`` and ``upper`` (`find_directions`), with x = beta - lower alpha,
+    ``needed/(beta + (width - lower) alpha)`` is an analytic function of ``x/(x + width alpha)``, up to beta = infinity.
+    The terms of its Chebyshev series decrease by a factor of 4, for every delay.
+
+    Returns:
+        The arguments of `_evaluate_fit` after the wall and delta.
+    """
+    lower, upper = find_directions(np.float64(d))
     width = 0.5 * (d + 0.5)
-    span = last_turn - first
-    last = span / (span + width) if np.isfinite(span) else 1.0
-    # Whole turns taken off in whole numbers: an angle of 30 pi would leave half of them without their last digits.
-    turns = np.outer(np.arange(_TERMS), 2 * np.arange(_TERMS) + 1) % (4 * _TERMS)
-    cosines = np.cos(np.pi * turns / (2 * _TERMS))
-    node = cosines[1]
-    place = 0.5 * last * (node + 1.0)
-    alpha = 1.0 - place
-    beta = first * alpha + place * width
+    span = upper - lower
+    end = span / (span + width) if np.isfinite(span) else 1.0
+    # Reduce the angles by integer arithmetic, because an angle of 30 pi would lose the last digits of its cosine.
+    multiples = np.outer(np.arange(N_TERMS), 2 * np.arange(N_TERMS) + 1) % (4 * N_TERMS)
+    cosines = np.cos(np.pi * multiples / (2 * N_TERMS))
+    nodes = cosines[1]
+    variable = 0.5 * end * (nodes + 1.0)
+    alpha = 1.0 - variable
+    beta = lower * alpha + variable * width
     with np.errstate(all="ignore"):
-        needed = needed_damping(alpha, beta, np.full(_TERMS, d))
-    # place width + alpha width is the width.
-    terms = cosines @ needed * (2.0 / (_TERMS * width))
+        needed = compute_needed_damping(alpha, beta, np.full(N_TERMS, d))
+    # Divide by the width, because ``beta + (width - lower) alpha`` equals it at these walls.
+    terms = cosines @ needed * (2.0 / (N_TERMS * width))
     terms[0] *= 0.5
-    # By powers, whose coefficients fall as well: Clenshaw's sum loses two digits towards the ends.
+    # Convert to powers, whose coefficients decrease as well, because Clenshaw's recurrence would lose two digits at the
+    # ends.
     powers = np.polynomial.chebyshev.cheb2poly(terms)
-    limit = float(last) if np.isfinite(span) else np.inf
-    return d - np.floor(d), d + 0.5, float(first), width, float(last), limit, *powers.tolist()
+    limit = float(end) if np.isfinite(span) else np.inf
+    return d - np.floor(d), d + 0.5, float(lower), width, float(end), limit, *powers.tolist()
 
 
-def _map_kernel(alpha: Array, beta: Array, delta: Array, *known: Any) -> Array:
-    """`passivity_margin` at one delay, given its `table`."""
-    # The fraction; the slope in alpha of what is needed at w = 0, for whole d; the first of the `directions`, a width,
-    # and the last one in the variable of the polynomial, twice: the limit is infinite where there is none.
+def _evaluate_fit(alpha: Array, beta: Array, delta: Array, *fit: Any) -> Array:
+    """Evaluate `passivity_margin` at one delay.
+
+    Args:
+        alpha: Normalized stiffness.
+        beta: Normalized virtual damping.
+        delta: Normalized physical damping.
+        *fit: Result of `fit_needed_damping`: the fraction f of the delay; for integer d, the derivative in alpha of the
+            damping needed at w = 0; the lower direction; the width; the upper end of the polynomial's variable; the
+            same as a limit, infinite if there is no upper direction; and the coefficients, lowest power first.
+    """
     xp = namespace(alpha)
-    f, at_zero, first, width, last, limit, *powers = known
-    ok = valid_wall(alpha, beta, delta, 0.0 * delta)
-    stiff = xp.maximum(alpha, 0.0)
-    beyond = beta - first * stiff
-    size = beyond + width * stiff
-    place = beyond / xp.where(beyond > 0, size, 1.0)
-    y = 2.0 * place / last - 1.0
-    inside = size * horner(y, powers)
-    zero, _ = larger_root(at_zero * stiff - beta, f * (1.0 - f) * stiff * stiff, xp)
-    pi = (1.0 - f) * (beta + 0.5 * stiff)
-    needed = xp.where(beyond > 0, xp.where(place < limit, inside, pi), zero)
-    return xp.where(ok, _limit_margin(delta - needed, alpha), xp.nan)
+    f, zero_slope, lower, width, end, limit, *powers = fit
+    valid = valid_wall(alpha, beta, delta, 0.0 * delta)
+    safe_alpha = xp.maximum(alpha, 0.0)
+    excess = beta - lower * safe_alpha
+    scale = excess + width * safe_alpha
+    variable = excess / xp.where(excess > 0, scale, 1.0)
+    y = 2.0 * variable / end - 1.0
+    peak_value = scale * horner(y, powers)
+    zero_value, _ = solve_larger_root(zero_slope * safe_alpha - beta, f * (1.0 - f) * safe_alpha * safe_alpha, xp)
+    pi_value = (1.0 - f) * (beta + 0.5 * safe_alpha)
+    needed = xp.where(excess > 0, xp.where(variable < limit, peak_value, pi_value), zero_value)
+    return xp.where(valid, _limit_margin(delta - needed, alpha), xp.nan)
 
 
 def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: float) -> np.ndarray:
-    """`passivity_margin` of arrays of one shape by NumPy; a point's value does not depend on the others."""
+    """Compute `passivity_margin` of arrays of one shape in NumPy; the values of the points are independent."""
     if not 0 <= d <= LONGEST_DELAY:
         return np.full(alpha.shape, np.nan)
     with np.errstate(all="ignore"):
-        return _map_kernel(alpha, beta, delta, *table(d))
+        return _evaluate_fit(alpha, beta, delta, *fit_needed_damping(d))
 
 
-def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
-    """`passivity_margin` of many walls that share few delays; None where they do not."""
+def _compute_on_grid(values: tuple[ArrayLike, ...]) -> Array | None:
+    """Compute `passivity_margin` of many walls that share few delays; return None for other arguments."""
     points, shape = fold_arguments(values)
     if points.size <= FEW or np.unique(points.d).size * FEW > points.size:
         return None
-    out = np.full(points.shape, np.nan)
-    for delay, arrays, place in group_by(points, points.d):
+    margins = np.full(points.shape, np.nan)
+    for delay, arrays, index in group_by_value(points, points.d):
         if not 0 <= delay <= LONGEST_DELAY:
             continue
         walls = Points(*arrays)
-        columns = [*walls.columns()[:3], *map(np.atleast_1d, table(float(delay)))]
-        out[place] = evaluate_columns(_map_kernel, columns, route="jax").reshape(walls.shape)
-    return to_caller(spread(out, shape), values)
+        columns = [*walls.columns()[:3], *map(np.atleast_1d, fit_needed_damping(float(delay)))]
+        margins[index] = evaluate_columns(_evaluate_fit, columns, route="jax").reshape(walls.shape)
+    return to_caller(restore_shape(margins, shape), values)
 
 
 def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
-    """Return by how much the physical damping exceeds what a passive wall needs.
+    """Return the margin by which the physical damping exceeds the damping that passivity requires.
 
-    ``margin = delta - sup_w needed(w)``, in units of delta = b T/m; the wall is passive where it is positive. At
-    d = 0 it is ``delta - alpha/2 - |beta|``, eq. (21).
+    ``margin = delta - sup_w needed(w)``, in units of delta = b T/m. The wall is passive if and only if the margin is
+    positive. At d = 0 it is ``delta - alpha/2 - |beta|``, eq. (21).
 
     Args:
         alpha: normalized stiffness; no damping makes a wall of negative stiffness passive, and its margin is at most
             alpha itself.
         beta: normalized virtual damping.
         delta: normalized physical damping, >= 0.
-        d: delay in periods, >= 0, whole or not (held). All four broadcast.
+        d: delay in periods, >= 0, integer or fractional. All four broadcast.
 
     Returns:
-        Array of the broadcast shape; NaN where the input is out of range (see `loops.rigid.normalization`).
+        Array of the broadcast shape; NaN for a point out of range.
 
     Numerics:
-        About 1e-15 of what is needed, at a cost that does not grow with d. Where the condition peaks is proved for
-        whole d, and seen for held delays (`loops.rigid.needed_damping`). Many walls that share a delay go by a
-        polynomial of their direction. Traceable, also twice; at whole d derivatives in d are those from the right, as
-        those in alpha at alpha = 0; those in beta at beta = 0 are from below where d = 0, and 0 at the peak without a
-        wall.
+        The error is about 1e-15 of the damping needed, at a cost independent of d. The frequency of the maximum is
+        proved for integer d and was verified numerically for fractional d (`loops.rigid.needed_damping`). For many
+        walls with one delay, a polynomial in the direction is evaluated. Traceable, with two derivatives. In d at
+        integer d and in alpha at alpha = 0 they are those from the right; in beta at beta = 0 and d = 0 that from
+        below; without a wall (alpha = beta = 0) they are 0 if the maximum is a peak.
 
     References:
         Colgate, Schenkel 1994; Hulin, Preusche, Hirzinger 2006, eqs. (20), (21), here extended to any delay.
@@ -151,14 +167,14 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
         return evaluate(_margin_kernel, arguments, ANY)
     if not all(isinstance(value, int | float | np.number) for value in values):
         check_scalars(arguments)
-        found = _on_maps(values)
-        if found is not None:
-            return found
-    return evaluate(_margin_kernel, arguments, _NO_DELAY if classify_delays(d) == _NO_DELAY else ANY)
+        margins = _compute_on_grid(values)
+        if margins is not None:
+            return margins
+    return evaluate(_margin_kernel, arguments, NO_DELAY if classify_delays(d) == NO_DELAY else ANY)
 
 
 def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
-    """Whether the wall is passive, for any delay: `passivity_margin` > 0.
+    """Return whether the wall is passive, i.e. `passivity_margin` > 0, for any delay.
 
     Passive implies stable for alpha > 0; stable does not imply passive.
 
@@ -166,8 +182,8 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         alpha, beta, delta, d: as for `passivity_margin`.
 
     Returns:
-        Boolean array of the broadcast shape; False where the input is out of range. Right beyond about 1e-15 of the
-        boundary.
+        Boolean array of the broadcast shape; False for a point out of range. Rounding errors matter only within about
+        1e-15 of the boundary of the passive set.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (21), here extended to any delay.
@@ -181,31 +197,31 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     margin = passivity_margin(*values)
     if is_traced(*values):
         return margin > 0
-    # Compared by NumPy: outside float64 mode JAX would warn of the type it keeps.
+    # Compare in NumPy, because JAX would warn about the type outside float64 mode.
     return to_caller(np.asarray(margin) > 0, values)
 
 
 def passive_stiffness_slope(d: float) -> tuple[float, float]:
-    """The stiffest passive wall and its damping, both over delta, for one delay: the condition is homogeneous."""
+    """Return alpha/delta and beta/delta of the stiffest passive wall for one delay."""
     check_scalars({"d": d})
     delay = as_number("d", d, 0.0)
     period = delay + 1.0
     if period == np.floor(period):
-        # Where cos((d + 1) w) = 0 the damping has no effect on the peak.
-        half = np.pi / (4.0 * period)
-        slope = 2.0 * np.tan(half)
-        return float(slope), float(slope * (0.25 / (period * np.sin(half) ** 2) - 0.5))
+        # At the frequency with cos((d + 1) w) = 0, the virtual damping has no effect on the condition.
+        angle = np.pi / (4.0 * period)
+        slope = 2.0 * np.tan(angle)
+        return float(slope), float(slope * (0.25 / (period * np.sin(angle) ** 2) - 0.5))
     unit = 1.0 / (period - 0.5)
 
     def stiffness(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         alpha, beta = unit * np.cos(angles), np.sin(angles)
-        needed = needed_damping(alpha, beta, np.full(angles.shape, delay))
+        needed = compute_needed_damping(alpha, beta, np.full(angles.shape, delay))
         return alpha / needed, beta / needed
 
     lower, upper = -0.49 * np.pi, 0.49 * np.pi
-    # The passive set is convex, so that it has one tip.
+    # The passive set is convex, so alpha has a single maximum over the direction.
     with np.errstate(all="ignore"):
-        for _ in range(_ROUNDS):
+        for _ in range(SEARCH_ROUNDS):
             angles = np.linspace(lower, upper, 17)
             best = int(np.argmax(stiffness(angles)[0]))
             lower, upper = angles[max(best - 1, 0)], angles[min(best + 1, 16)]
@@ -213,8 +229,10 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
     return float(alpha[0]), float(beta[0])
 
 
-# Gauss-Legendre nodes for each of the three parts of what is needed, and what a point weighs for them.
-_PASSIVE_NODES, _PASSIVE_WEIGHT = (64, 64, 32), 64
+# Gauss-Legendre nodes on each of the three analytic parts of the integrand.
+AREA_NODES = (64, 64, 32)
+# Weight of a point for `evaluate`, because of its nodes.
+AREA_WEIGHT = 64
 
 
 def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
@@ -226,14 +244,14 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
 
     Args:
         delta: normalized physical damping, >= 0.
-        d: delay in periods, >= 0, whole or not (held). Both broadcast.
+        d: delay in periods, >= 0, integer or fractional. Both broadcast.
 
     Returns:
-        Array of the broadcast shape; NaN out of range (see `loops.rigid.normalization`).
+        Array of the broadcast shape; NaN for a point out of range.
 
     Numerics:
-        Gauss-Legendre quadrature between the kinks of ``needed``: about 1e-14 relative, at a cost that does not grow
-        with d. Traceable, with derivatives; those in d at whole d are from the right.
+        Gauss-Legendre quadrature between the kinks of ``needed``: about 1e-14 relative, at a cost independent of d.
+        Traceable, with derivatives; at integer d the derivatives in d are those from the right.
 
     References:
         Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, eq. (21), here extended to any delay.
@@ -243,25 +261,28 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
         >>> print(f"{passive_area(0.5, 0):.4f}")
         0.5000
     """
-    return evaluate(_passive_area_kernel, {"delta": delta, "d": d}, weight=_PASSIVE_WEIGHT)
+    return evaluate(_passive_area_kernel, {"delta": delta, "d": d}, weight=AREA_WEIGHT)
 
 
 def _passive_area_kernel(delta: Array, d: Array) -> Array:
-    """By direction: ``alpha = cos(theta)/(d + 1/2)``, ``beta = sin(theta)``."""
-    # Below the first of `directions` what a wall needs is decided at omega = 0, above the last one (d < 2/9 only) at
-    # pi, between them at one omega that rises with theta, without a jump: what is needed is analytic in theta there.
+    """Return `passive_area`, elementwise, by an integral over the direction theta.
+
+    The walls are ``alpha = cos(theta)/(d + 1/2)``, ``beta = sin(theta)``. The damping needed is analytic in theta on
+    each of three parts: below the lower direction of `find_directions` the maximum is at omega = 0, above the upper one
+    (d < 2/9 only) at pi, and in between at a frequency that increases with theta continuously.
+    """
     xp = namespace(delta, d)
-    ok = valid_device(delta, d)
-    safe_d = xp.where(ok, d, 1.0)
+    valid = valid_device(delta, d)
+    safe_d = xp.where(valid, d, 1.0)
     unit = 1.0 / (safe_d + 0.5)
-    # Where the kinks lie does not matter to the first order.
-    first, last = (xp.arctan(t * frozen(unit, xp)) for t in directions(frozen(safe_d, xp)))
+    # Errors of the limits of the parts have no effect of first order.
+    lower, upper = (xp.arctan(t * frozen(unit, xp)) for t in find_directions(frozen(safe_d, xp)))
     end = 0.5 * np.pi + 0.0 * safe_d
 
-    def share(theta: Array) -> Array:
-        # The straight edge alpha = 0 is the range of theta: rounding must not lead beyond it.
+    def integrand(theta: Array) -> Array:
+        # At the edge of the range alpha = 0; a rounding error must not make it negative.
         alpha = xp.maximum(xp.cos(theta), 0.0) * unit[..., None]
-        return needed_damping(alpha, xp.sin(theta), safe_d[..., None] + 0.0 * theta) ** -2
+        return compute_needed_damping(alpha, xp.sin(theta), safe_d[..., None] + 0.0 * theta) ** -2
 
-    inverse_squares = integrate(share, (-end, first, last, end), _PASSIVE_NODES)
-    return 0.5 * delta * delta * unit * inverse_squares + nan_with_nan_slopes(ok, delta, d)
+    inverse_squares = integrate(integrand, (-end, lower, upper, end), AREA_NODES)
+    return 0.5 * delta * delta * unit * inverse_squares + nan_with_nan_slopes(valid, delta, d)

@@ -1,8 +1,12 @@
-"""Outermost poles of maps: one expansion a cell of walls, and one proof for all of its walls.
+"""Compute the dominant poles of a grid of walls: one power series and one certificate per cell of walls.
 
-In each cell one or two groups of poles are followed (`loops.rigid.pole_groups`), and one count says that no other pole
-of any of its walls is larger. The proofs, C1 to C6, are in docs/theory/maps.md. Cells that fail are cut in four; what
-is left of the smallest is for single walls.
+In each cell, one or two groups of poles are expanded in the wall's position (`loops.rigid.pole_groups`). One count
+(`loops.rigid.circle.count_poles_in_cell`) certifies for all walls of the cell that no other pole is larger. The proofs,
+C1 to C6, are in docs/theory/maps.md. Cells that fail are divided in four; walls of the smallest cells that fail are
+left open, and `loops.rigid.outermost_poles` computes them one by one.
+
+Arrays of cells or walls have the axes device, row (beta) and column (alpha); a *position* is an index triple of these.
+xi and eta are the positions in alpha and beta relative to the center of the cell, from -1 to 1.
 """
 
 from __future__ import annotations
@@ -15,384 +19,430 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebpts1, chebvander
 from numpy.polynomial.polynomial import polyvander
 
-from zwidth.loops.rigid.circle import Loop, count_in_cell, factor_loop
+from zwidth.loops.rigid.circle import LoopFactors, count_poles_in_cell, factor_loop
 from zwidth.loops.rigid.pole_groups import (
-    DOUBTFUL,
+    EXTRA_NODES,
     ORDERS,
-    REAL,
+    REAL_AXIS_WIDTH,
     ROUNDING,
-    SPARE,
+    VERDICT_WIDTH,
     AllowedErrors,
     Cells,
     Group,
-    enclose,
-    find_middle,
-    knows_larger,
-    larger_of_two,
-    pick,
-    sum_up,
+    compute_larger,
+    enclose_poles,
+    expand_sums,
+    find_stationary_point,
+    is_larger_accurate,
+    select_cells,
 )
-from zwidth.loops.rigid.pole_search import all_starts
+from zwidth.loops.rigid.pole_search import list_starts
 from zwidth.loops.rigid.pole_step import halley_step
 
-# Sides of cells on a map as long as wide, in walls; on others as many walls in the map's own proportions.
-_SIDES = (128, 64, 32, 16, 8)
-# Cells of one list, and of those how many have their sums made at one time, and walls: what they need stays in caches.
-_LIST, _BATCH, _WALLS = 1 << 9, 1 << 7, 1 << 16
-# Of Halley's method on every start; where the last one was shorter than this share of the distance between the poles of
-# a long delay it has arrived, and starts that end nearer to each other than that have found one pole.
-_STEPS, _NEARBY = 5, 1e-2
-# Values of an axis whose powers and shares are kept.
-_REMEMBERED = 1 << 14
-# How far inside of the groups the circles of a count are, in units of how far the groups move in the cell.
-_INSIDE = (0.3, 1.5, 6.0)
+# Sides of the cells of a square grid, in walls. Cells of other grids have as many walls and the grid's proportions.
+CELL_SIDES = (128, 64, 32, 16, 8)
+# Batch sizes, such that the working arrays stay in the cache.
+CELLS_PER_LIST = 1 << 9
+CELLS_PER_BATCH = 1 << 7  # cells whose sums are computed at once
+WALLS_PER_WRITE = 1 << 16
+# Halley steps from each starting point.
+HALLEY_STEPS = 5
+# Relative to the distance between neighboring poles of a long delay: a sequence whose last step was shorter has
+# converged, and sequences that end closer together have found the same pole.
+SAME_POLE_DISTANCE = 1e-2
+# Longest axis for which powers and interpolation weights are cached, in walls.
+MAX_CACHED = 1 << 14
+# Distances of the counting circles from the poles of the groups, relative to how far the poles move in the cell.
+COUNT_CIRCLES = (0.3, 1.5, 6.0)
 
 
 class Area(NamedTuple):
-    """A map of several devices, or a window of it: alpha and beta (devices or 1, walls), delta and d of each device."""
+    """A grid of walls for several devices, or a window of it.
+
+    alpha and beta have the shape (devices or 1, walls); delta and d have one value per device.
+    """
 
     alpha: np.ndarray
     beta: np.ndarray
     delta: np.ndarray
     d: np.ndarray
-    window: tuple[slice, slice]  # of the betas and the alphas
+    window: tuple[slice, slice]  # of beta and of alpha
 
     @classmethod
     def whole(cls, alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> Area:
-        """All of a map."""
+        """Return an area without a window, i.e. the whole grid."""
         return cls(alpha, beta, delta, d, (slice(0, beta.shape[1]), slice(0, alpha.shape[1])))
 
-    def walls(self, place: np.ndarray) -> list[np.ndarray]:
-        """alpha, beta, delta and d at places (3, walls) by device, row and column in the window."""
-        device, row, column = place
+    def walls(self, position: np.ndarray) -> list[np.ndarray]:
+        """Return alpha, beta, delta and d at positions (3, walls) in the window."""
+        device, row, column = position
         alpha, beta = (device if part.shape[0] > 1 else 0 * device for part in (self.alpha, self.beta))
         row, column = row + self.window[0].start, column + self.window[1].start
         return [self.alpha[alpha, column], self.beta[beta, row], self.delta[device], self.d[device]]
 
 
 @cache
-def _nodes(order: int) -> np.ndarray:
-    """Where polynomials of an order are put into another function: zeros of a Chebyshev polynomial."""
-    return chebpts1(order + SPARE)
+def _list_chebyshev_nodes(order: int) -> np.ndarray:
+    """Return the nodes for interpolating a function of a series of this order: zeros of a Chebyshev polynomial."""
+    return chebpts1(order + EXTRA_NODES)
 
 
-def _shares(places: np.ndarray, order: int) -> np.ndarray:
-    """What values at the nodes add to those at places: (..., nodes)."""
-    nodes = _nodes(order)
-    waves = chebvander(nodes, nodes.size - 1).T * (2.0 / nodes.size)
-    waves[0] *= 0.5
-    return chebvander(places, nodes.size - 1) @ waves
+def _compute_interpolation_weights(positions: np.ndarray, order: int) -> np.ndarray:
+    """Return the weights of the values at the nodes in the interpolated value at each position: (..., nodes)."""
+    nodes = _list_chebyshev_nodes(order)
+    polynomials = chebvander(nodes, nodes.size - 1).T * (2.0 / nodes.size)
+    polynomials[0] *= 0.5
+    return chebvander(positions, nodes.size - 1) @ polynomials
 
 
 class _AxisPieces:
-    """An axis in pieces: their middles and half lengths (devices, pieces), and what polynomials on them need."""
+    """An axis divided into pieces, with their centers and half widths (devices, pieces)."""
 
     def __init__(self, values: np.ndarray, side: int) -> None:
         with np.errstate(all="ignore"):
             pieces = np.pad(values, ((0, 0), (0, -values.shape[1] % side)), mode="edge")
             pieces = pieces.reshape(values.shape[0], -1, side)
             low, high = pieces.min(-1), pieces.max(-1)
-            self.middle = 0.5 * (low + high)
-            self.half = np.maximum(0.5 * (high - low), 1e-12 * np.abs(self.middle) + 1e-200)
-            self._places = (pieces - self.middle[..., None]) / self.half[..., None]
-        self._known: dict[Any, np.ndarray] = {}
+            self.center = 0.5 * (low + high)
+            self.half = np.maximum(0.5 * (high - low), 1e-12 * np.abs(self.center) + 1e-200)
+            self._positions = (pieces - self.center[..., None]) / self.half[..., None]
+        self._tables: dict[Any, np.ndarray] = {}
 
-    def table(self, kind: Callable[[np.ndarray, int], np.ndarray], order: int, pieces: Any) -> np.ndarray:
-        """`polyvander` or `_shares` of the walls of some pieces: (pieces, walls, ...)."""
-        if self._places.size > _REMEMBERED:
-            return kind(self._places[pieces], order)
-        if (kind, order) not in self._known:
-            self._known[kind, order] = kind(self._places, order)
-        return self._known[kind, order][pieces]
+    def table(self, function: Callable[[np.ndarray, int], np.ndarray], order: int, pieces: Any) -> np.ndarray:
+        """Evaluate powers or interpolation weights (``function``) at the walls of pieces: (pieces, walls, ...)."""
+        if self._positions.size > MAX_CACHED:
+            return function(self._positions[pieces], order)
+        if (function, order) not in self._tables:
+            self._tables[function, order] = function(self._positions, order)
+        return self._tables[function, order][pieces]
 
 
-def fill_up(index: np.ndarray) -> np.ndarray:
-    """A multiple of 16 places, the last one again: NumPy rounds odd ones at the end of a list otherwise."""
+def pad_to_16(index: np.ndarray) -> np.ndarray:
+    """Pad an index array to a multiple of 16 with its last entry, because NumPy may round remainders differently."""
     return np.concatenate([index, np.repeat(index[-1:], -index.size % 16)])
 
 
-def _on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithms of radii, smaller and larger by an error, on the same side of the unit circle and not next to it."""
-    gap = 2.0 * DOUBTFUL
+def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return log radii minus and plus an error, both on the same side of the unit circle and not close to it."""
+    gap = 2.0 * VERDICT_WIDTH
     return (
         np.where(re > 0, np.maximum(re - error, gap), re - error),
         np.where(re > 0, re + error, np.minimum(re + error, -gap)),
     )
 
 
-def _find_poles(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The largest pole to which a start leads, and the largest of the others, nearly: (2, cells)."""
-    before = re, im = all_starts(loop, fractional)
-    nearby = _NEARBY / loop.turns
-    for _ in range(_STEPS):
-        before = re, im
+def _find_two_poles(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest pole that the starting points lead to, and the largest of the other ones: (2, cells)."""
+    previous = re, im = list_starts(loop, fractional)
+    distance = SAME_POLE_DISTANCE / loop.n_plus_1
+    for _ in range(HALLEY_STEPS):
+        previous = re, im
         re, im = halley_step(re, im, loop, fractional)
-    arrived = np.abs(re - before[0]) + np.abs(im - before[1]) < nearby
-    im = np.where(im < REAL, 0.0, np.where(np.pi - im < REAL, np.pi, im))
-    re, cells = np.where(arrived, re, -np.inf), np.arange(re.shape[1])
+    converged = np.abs(re - previous[0]) + np.abs(im - previous[1]) < distance
+    im = np.where(im < REAL_AXIS_WIDTH, 0.0, np.where(np.pi - im < REAL_AXIS_WIDTH, np.pi, im))
+    re, cells = np.where(converged, re, -np.inf), np.arange(re.shape[1])
     first = re.argmax(0)
-    same = np.abs(re - re[first, cells]) + np.abs(im - im[first, cells]) < nearby
-    second = np.where(same, -np.inf, re).argmax(0)
+    is_same = np.abs(re - re[first, cells]) + np.abs(im - im[first, cells]) < distance
+    second = np.where(is_same, -np.inf, re).argmax(0)
     best = np.stack([first, second])
     return re[best, cells], im[best, cells]
 
 
-class FollowedPoles(NamedTuple):
-    """Radii (devices, betas, alphas), rates of decay if wanted, and where a radius is next to 1 or NaN."""
+class GridPoles(NamedTuple):
+    """Radii (devices, betas, alphas), and decay rates if requested; NaN for open walls."""
 
     radius: np.ndarray
     rate: np.ndarray
     special: tuple[np.ndarray, ...]
 
 
-class _Canvas:
-    """The values of a window and of what else its cells hold, and which of its walls are special."""
+class _ResultArrays:
+    """Result arrays of a window, extended to whole cells, and a list of the walls that need special treatment."""
 
     def __init__(self, area: Area, sides: tuple[int, int], with_rate: bool) -> None:
-        # All cells end where the largest ones do.
-        cells = list(zip(area.window, sides, strict=True))
-        first = [part.start // side * side for part, side in cells]
-        sizes = [-(-part.stop // side) * side - start for (part, side), start in zip(cells, first, strict=True)]
-        shape, self.first = (area.d.size, *sizes), np.array([[0], *([start] for start in first)])
+        # Extend the window to whole cells of the largest size.
+        windows = list(zip(area.window, sides, strict=True))
+        starts = [part.start // side * side for part, side in windows]
+        sizes = [-(-part.stop // side) * side - start for (part, side), start in zip(windows, starts, strict=True)]
+        shape, self.first = (area.d.size, *sizes), np.array([[0], *([start] for start in starts)])
         self.radius, self.rate = np.empty(shape), np.empty(shape if with_rate else (0, 0, 0))
-        # Devices, rows and columns of walls whose radius is next to 1 or NaN.
+        # Positions of walls whose radius is close to 1 or NaN.
         self.special: list[np.ndarray] = []
 
-    def cut_out(self, window: tuple[slice, slice]) -> FollowedPoles:
-        """What lies in the window."""
+    def cut_out(self, window: tuple[slice, slice]) -> GridPoles:
+        """Return the results in the window."""
         rows, columns = (
             slice(part.start - start, part.stop - start)
             for part, start in zip(window, self.first[1:, 0].tolist(), strict=True)
         )
         radius, rate = (values[:, rows, columns] for values in (self.radius, self.rate))
-        places = np.concatenate([np.empty((3, 0), int), *self.special], axis=1) - [[0], [rows.start], [columns.start]]
-        inside = (places[1:] >= 0).all(0) & (places[1] < radius.shape[1]) & (places[2] < radius.shape[2])
-        # Walls at which two groups were compared may be there twice.
-        noted = np.zeros(radius.shape, bool)
-        noted[tuple(places[:, inside])] = True
-        return FollowedPoles(radius, rate, np.unravel_index(np.flatnonzero(noted), radius.shape))
+        index = np.concatenate([np.empty((3, 0), int), *self.special], axis=1) - [[0], [rows.start], [columns.start]]
+        is_inside = (index[1:] >= 0).all(0) & (index[1] < radius.shape[1]) & (index[2] < radius.shape[2])
+        # Walls at which two groups were compared may occur twice.
+        is_special = np.zeros(radius.shape, bool)
+        is_special[tuple(index[:, is_inside])] = True
+        return GridPoles(radius, rate, np.unravel_index(np.flatnonzero(is_special), radius.shape))
 
 
-def _sides(rows: int, columns: int) -> list[tuple[int, int]]:
-    """Rows and columns of the cells of a map, from the largest on, each a power of 2."""
-    longer, all_sides = 0.5 * np.log2(columns / rows), []
-    # In larger ones another pole would mostly take over somewhere.
-    for side in (side for side in _SIDES if side < 0.1 * max(rows, columns) or side == _SIDES[-1]):
-        high = int(2.0 ** np.clip(np.round(np.log2(side) - longer), 0.0, 2.0 * np.log2(side)))
-        all_sides.append((high, side**2 // high))
+def _list_cell_sizes(rows: int, columns: int) -> list[tuple[int, int]]:
+    """Return rows and columns of the cells, the largest size first; each is a power of 2."""
+    log_aspect, all_sides = 0.5 * np.log2(columns / rows), []
+    # In cells larger than a tenth of the grid another pole would usually become dominant somewhere.
+    for side in (side for side in CELL_SIDES if side < 0.1 * max(rows, columns) or side == CELL_SIDES[-1]):
+        rows_per_cell = int(2.0 ** np.clip(np.round(np.log2(side) - log_aspect), 0.0, 2.0 * np.log2(side)))
+        all_sides.append((rows_per_cell, side**2 // rows_per_cell))
     return all_sides
 
 
-def _tiles(values: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
-    """The same values by device, row and column of cells, and those in them."""
-    (devices, rows, columns), (high, wide) = values.shape, sides
-    return values.reshape(devices, rows // high, high, columns // wide, wide).swapaxes(2, 3)
+def _view_as_cells(values: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
+    """Return a view with the axes device, cell row, cell column, row in the cell and column in the cell."""
+    (devices, rows, columns), (height, width) = values.shape, sides
+    return values.reshape(devices, rows // height, height, columns // width, width).swapaxes(2, 3)
 
 
-class _Level:
-    """The cells of one size of some devices."""
+class _CellGrid:
+    """The cells of one size, and the computation of their poles."""
 
-    def __init__(self, area: Area, sides: tuple[int, int], wanted: AllowedErrors, canvas: _Canvas) -> None:
-        self.area, self.sides, self.wanted, self.canvas = area, sides, wanted, canvas
+    def __init__(self, area: Area, sides: tuple[int, int], errors: AllowedErrors, results: _ResultArrays) -> None:
+        self.area, self.sides, self.errors, self.results = area, sides, errors, results
         self.axes = _AxisPieces(area.alpha, sides[1]), _AxisPieces(area.beta, sides[0])
-        self.radius, self.rate = _tiles(canvas.radius, sides), _tiles(canvas.rate, sides)
-        # Walls between neighbors, of devices, rows and columns of cells.
+        self.radius, self.rate = _view_as_cells(results.radius, sides), _view_as_cells(results.rate, sides)
+        # Step in walls between neighboring cells, along the axes device, row and column.
         self.steps = np.array([[1], *([side] for side in sides)])
-        self.first = canvas.first // self.steps
+        self.first = results.first // self.steps
 
-    def split(self, places: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
-        """Cells of such sides in those of this size, without what is beyond the window."""
-        parts = np.array([1, *sides]) // self.steps[:, 0]
-        within = np.indices(parts.tolist()).reshape(3, 1, -1)
-        places = ((places * parts[:, None])[:, :, None] + within).reshape(3, -1)
-        low, (start, stop) = (places * self.steps)[1:], np.array([(w.start, w.stop) for w in self.area.window]).T
-        return places[:, ((low < stop[:, None]) & (low + self.steps[1:] > start[:, None])).all(0)]
+    def split(self, positions: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
+        """Divide cells of the given size into cells of this size, without those outside the window."""
+        counts = np.array([1, *sides]) // self.steps[:, 0]
+        offsets = np.indices(counts.tolist()).reshape(3, 1, -1)
+        positions = ((positions * counts[:, None])[:, :, None] + offsets).reshape(3, -1)
+        low, (start, stop) = (positions * self.steps)[1:], np.array([(w.start, w.stop) for w in self.area.window]).T
+        return positions[:, ((low < stop[:, None]) & (low + self.steps[1:] > start[:, None])).all(0)]
 
-    def solve_all(self, places: np.ndarray, fractional: bool) -> np.ndarray:
-        """`solve` list by list."""
-        lists = (places[:, start : start + _LIST] for start in range(0, places.shape[1], _LIST))
-        return np.concatenate([places[:, :0], *(self.solve(some, fractional) for some in lists)], axis=1)
+    def solve_all(self, positions: np.ndarray, fractional: bool) -> np.ndarray:
+        """Apply `solve` to lists of limited length."""
+        lists = (positions[:, start : start + CELLS_PER_LIST] for start in range(0, positions.shape[1], CELLS_PER_LIST))
+        return np.concatenate([positions[:, :0], *(self.solve(some, fractional) for some in lists)], axis=1)
 
-    def solve(self, places: np.ndarray, fractional: bool) -> np.ndarray:
-        """Write the poles of the cells of which all is proved; the others are returned."""
-        count = places.shape[1]
-        places = places[:, fill_up(np.arange(count))]
-        along = self._along(places)
-        alpha, beta = (axis.middle[place] for axis, place in zip(self.axes, along, strict=True))
-        half = (axis.half[place] for axis, place in zip(self.axes, along, strict=True))
-        loop = factor_loop(alpha, beta, self.area.delta[places[0]], self.area.d[places[0]], fractional)
+    def solve(self, positions: np.ndarray, fractional: bool) -> np.ndarray:
+        """Write the poles of all cells that can be certified; return the positions of the other cells."""
+        count = positions.shape[1]
+        positions = positions[:, pad_to_16(np.arange(count))]
+        axis_indices = self._index_axes(positions)
+        alpha, beta = (axis.center[position] for axis, position in zip(self.axes, axis_indices, strict=True))
+        half = (axis.half[position] for axis, position in zip(self.axes, axis_indices, strict=True))
+        loop = factor_loop(alpha, beta, self.area.delta[positions[0]], self.area.d[positions[0]], fractional)
         cells = Cells(loop, *half)
-        re, im = _find_poles(loop, fractional)
-        single = enclose(1, re[0], im[0], cells, fractional, self.wanted)
-        done = self._prove([single], places, cells, fractional)
-        if self.wanted.is_coarse:
-            index = fill_up(np.flatnonzero(~done))
+        re, im = _find_two_poles(loop, fractional)
+        single = enclose_poles(1, re[0], im[0], cells, fractional, self.errors)
+        certified = self._certify([single], positions, cells, fractional)
+        if self.errors.is_coarse:
+            index = pad_to_16(np.flatnonzero(~certified))
             if index.size:
-                done[index] = self._prove_flat(re[0, index], places[:, index], pick(cells, index), fractional)
-        known = (single.order < len(ORDERS)) | done
-        # Where another pole is about to take over, both are followed; next to a double pole the two together.
-        for left, poles in ((known & ~done, 1), (~known, 2)):
-            index = fill_up(np.flatnonzero(left))
+                certified[index] = self._certify_uniform(
+                    re[0, index], positions[:, index], select_cells(cells, index), fractional
+                )
+        enclosed = (single.order < len(ORDERS)) | certified
+        # If another pole may become dominant in the cell, follow both; near a double pole, follow the pair.
+        for mask, poles in ((enclosed & ~certified, 1), (~enclosed, 2)):
+            index = pad_to_16(np.flatnonzero(mask))
             if not index.size:
                 continue
-            some = pick(cells, index)
+            part = select_cells(cells, index)
             if poles == 1:
-                followed = [pick(single, index), enclose(1, re[1, index], im[1, index], some, fractional, self.wanted)]
+                groups = [
+                    select_cells(single, index),
+                    enclose_poles(1, re[1, index], im[1, index], part, fractional, self.errors),
+                ]
             else:
-                middle = find_middle(re[0, index], im[0, index], some.loop, fractional)
-                followed = [enclose(2, *middle, some, fractional, self.wanted)]
-            done[index] = self._prove(followed, places[:, index], some, fractional)
-        return places[:, :count][:, ~done[:count]]
+                center = find_stationary_point(re[0, index], im[0, index], part.loop, fractional)
+                groups = [enclose_poles(2, *center, part, fractional, self.errors)]
+            certified[index] = self._certify(groups, positions[:, index], part, fractional)
+        return positions[:, :count][:, ~certified[:count]]
 
-    def _takes_logarithms(self, k: int) -> bool:
-        """Whether exponentials of all walls are taken: for rates, and where nodes would be as many."""
-        return self.wanted.with_rate or min(self.sides) <= _nodes(ORDERS[k]).size
+    def _evaluates_logarithms(self, k: int) -> bool:
+        """Return whether the series is evaluated at each wall: for rates, or if the nodes were as many as the walls."""
+        return self.errors.with_rate or min(self.sides) <= _list_chebyshev_nodes(ORDERS[k]).size
 
-    def _along(self, places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The pieces of alpha's axis and of beta's in which cells are."""
-        device, row, column = places
+    def _index_axes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the indices of the cells on the alpha axis and on the beta axis."""
+        device, row, column = positions
         return [
-            (device if axis.middle.shape[0] > 1 else 0 * device, place)
-            for axis, place in zip(self.axes, (column, row), strict=True)
+            (device if axis.center.shape[0] > 1 else 0 * device, position)
+            for axis, position in zip(self.axes, (column, row), strict=True)
         ]
 
-    def _prove(self, groups: list[Group], places: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Write the cells in which groups are known and hold the outermost pole whatever the wall (C4 to C6)."""
-        known = np.logical_and.reduce([group.order < len(ORDERS) for group in groups])
+    def _certify(self, groups: list[Group], positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
+        """Write the cells whose groups certainly contain the dominant pole of every wall (C4 to C6).
+
+        Args:
+            groups: One or two groups per cell.
+            positions: Positions of the cells.
+            cells: The cells.
+            fractional: Whether the delays are fractional.
+
+        Returns:
+            A mask of the cells that have been written.
+        """
+        enclosed = np.logical_and.reduce([group.order < len(ORDERS) for group in groups])
         if len(groups) == 2:
-            known &= groups[0].is_apart(groups[1])
-        index = fill_up(np.flatnonzero(known))
-        groups = [pick(group, index) for group in groups]
-        circles = [np.minimum.reduce([group.low - x * (group.re - group.low) for group in groups]) for x in _INSIDE]
-        many = [sum(group.many for group in groups)] * len(circles)
-        if self.wanted.is_coarse:
-            # Others may be larger by what is spared, on the same side of the unit circle.
+            enclosed &= groups[0].is_disjoint(groups[1])
+        index = pad_to_16(np.flatnonzero(enclosed))
+        groups = [select_cells(group, index) for group in groups]
+        circles = [
+            np.minimum.reduce([group.low - x * (group.re - group.low) for group in groups]) for x in COUNT_CIRCLES
+        ]
+        counts = [sum(group.n_poles for group in groups)] * len(circles)
+        if self.errors.is_coarse:
+            # Other poles may be larger by the reserve, on the same side of the unit circle.
             low = np.maximum.reduce([group.low for group in groups])
-            circles.append(_on_one_side(low, self.wanted.spare)[1])
-            many.append(0 * many[0])
-        loop, a, b = pick(cells, np.tile(index, len(circles)))
-        # One count for all of the circles.
-        outside, sure = count_in_cell(np.concatenate(circles), loop, (a, b), fractional)
+            circles.append(_bound_on_one_side(low, self.errors.reserve)[1])
+            counts.append(0 * counts[0])
+        loop, a, b = select_cells(cells, np.tile(index, len(circles)))
+        # Count on all circles in one call.
+        outside, certain = count_poles_in_cell(np.concatenate(circles), loop, (a, b), fractional)
         shape = len(circles), index.size
-        proved = np.zeros(places.shape[1], bool)
-        proved[index[(sure.reshape(shape) & (outside.reshape(shape) == many)).any(0)]] = True
-        where, places, cells = np.flatnonzero(proved[index]), places[:, index], pick(cells, index)
+        certified = np.zeros(positions.shape[1], bool)
+        certified[index[(certain.reshape(shape) & (outside.reshape(shape) == counts)).any(0)]] = True
+        selected, positions, cells = np.flatnonzero(certified[index]), positions[:, index], select_cells(cells, index)
         for k, group in enumerate(groups):
-            self._follow(group, where, places, cells, k > 0)
-        return proved
+            self._write_group(group, selected, positions, cells, k > 0)
+        return certified
 
-    def _prove_flat(self, re: np.ndarray, places: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Write one value in the cells in which all outermost poles are as large within the accuracy (C6)."""
-        loop, a, b = pick(cells, np.tile(np.arange(re.size), 2))
-        circles = np.concatenate(_on_one_side(re, self.wanted.accuracy))
-        outside, sure = (part.reshape(2, -1) for part in count_in_cell(circles, loop, (a, b), fractional))
-        flat = sure.all(0) & (outside[0] > 0) & (outside[1] == 0)
-        values = np.exp(np.where(re > 0, *_on_one_side(re, 0.0)))
-        self.radius[tuple((places - self.first)[:, flat])] = values[flat, None, None]
-        return flat
+    def _certify_uniform(self, re: np.ndarray, positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
+        """Write one value in the cells in which all spectral radii agree within the accuracy (C6)."""
+        loop, a, b = select_cells(cells, np.tile(np.arange(re.size), 2))
+        circles = np.concatenate(_bound_on_one_side(re, self.errors.accuracy))
+        outside, certain = (part.reshape(2, -1) for part in count_poles_in_cell(circles, loop, (a, b), fractional))
+        uniform = certain.all(0) & (outside[0] > 0) & (outside[1] == 0)
+        values = np.exp(np.where(re > 0, *_bound_on_one_side(re, 0.0)))
+        self.radius[tuple((positions - self.first)[:, uniform])] = values[uniform, None, None]
+        return uniform
 
-    def _follow(self, group: Group, where: np.ndarray, places: np.ndarray, cells: Cells, merge: bool) -> None:
-        """Write a group in some cells, in batches of one order."""
+    def _write_group(
+        self, group: Group, selected: np.ndarray, positions: np.ndarray, cells: Cells, merge: bool
+    ) -> None:
+        """Write a group in the selected cells, in batches of one order."""
         for k, order in enumerate(ORDERS):
-            index = where[group.order[where] == k]
-            for start in range(0, index.size, _BATCH):
-                some = index[start : start + _BATCH]
-                full = fill_up(some)
-                batch = pick(group, full)
+            index = selected[group.order[selected] == k]
+            for start in range(0, index.size, CELLS_PER_BATCH):
+                chosen = index[start : start + CELLS_PER_BATCH]
+                padded = pad_to_16(chosen)
+                batch = select_cells(group, padded)
                 with np.errstate(all="ignore"):
-                    self._write(places[:, some], sum_up(batch, pick(cells, full), order), batch, k, merge)
+                    self._write(
+                        positions[:, chosen], expand_sums(batch, select_cells(cells, padded), order), batch, k, merge
+                    )
 
-    def _write(self, places: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
-        """The poles of all walls of some cells, or the larger ones of these and of what is there."""
-        size, doubt = max(1, _WALLS // (self.sides[0] * self.sides[1])), group.doubt[k]
-        # Rounding between nodes is in units of the largest value: radii are taken from the middle's.
-        middle = np.exp(group.re)[:, None, None]
+    def _write(self, positions: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
+        """Write the poles of all walls of some cells; with ``merge``, only if they are larger than those written."""
+        size, log_error = max(1, WALLS_PER_WRITE // (self.sides[0] * self.sides[1])), group.log_error[k]
+        # Interpolate the differences from the radius at the center, because the rounding error of interpolation is
+        # relative to the largest value.
+        center = np.exp(group.re)[:, None, None]
         if len(sums) == 1:
             (logarithms,) = sums
             logarithms[:, 0, 0] += group.re
-            if self._takes_logarithms(k):
+            if self._evaluates_logarithms(k):
                 polynomials = [(logarithms, polyvander)]
             else:
-                powers = polyvander(_nodes(ORDERS[k]), ORDERS[k])
-                polynomials = [(np.exp(powers @ logarithms @ powers.T) - middle, _shares)]
-            # The size of all logarithms of a cell is at least that of its middle's less all that the others add.
+                powers = polyvander(_list_chebyshev_nodes(ORDERS[k]), ORDERS[k])
+                polynomials = [(np.exp(powers @ logarithms @ powers.T) - center, _compute_interpolation_weights)]
+            # Lower bound of |log radius| in each cell: the constant term minus all other terms.
             sizes = np.abs(logarithms)
-            least = np.maximum(2.0 * sizes[:, 0, 0] - sizes.sum((1, 2)), 0.0)
-            # No wall of the other cells is in doubt or unknown.
-            close = (least < 2.0 * self.wanted.doubt) | (doubt > self.wanted.allowed(least))
+            least_log = np.maximum(2.0 * sizes[:, 0, 0] - sizes.sum((1, 2)), 0.0)
+            # In the other cells no wall is uncertain or too inaccurate.
+            is_close = (least_log < 2.0 * self.errors.uncertain_width) | (log_error > self.errors.limit(least_log))
         else:
-            polynomials, close = [(x, polyvander) for x in sums], np.ones(doubt.size, bool)
-        # Into the same memory: new memory takes as long to get as all of this.
-        memories = np.empty((len(polynomials), min(size, places.shape[1]), *self.sides))
-        for start in range(0, places.shape[1], size):
-            part = slice(start, min(start + size, places.shape[1]))
-            some, noted = places[:, part], np.flatnonzero(close[part])
-            found = [
-                self._spread(x[part], by, k, some, memory)
-                for (x, by), memory in zip(polynomials, memories, strict=True)
+            polynomials, is_close = [(x, polyvander) for x in sums], np.ones(log_error.size, bool)
+        # Reuse one buffer, because allocating memory would take as long as the computation.
+        buffers = np.empty((len(polynomials), min(size, positions.shape[1]), *self.sides))
+        for start in range(0, positions.shape[1], size):
+            part = slice(start, min(start + size, positions.shape[1]))
+            batch, close_cells = positions[:, part], np.flatnonzero(is_close[part])
+            values = [
+                self._evaluate_at_walls(x[part], basis, k, batch, buffer)
+                for (x, basis), buffer in zip(polynomials, buffers, strict=True)
             ]
             if len(sums) == 2:
-                found = self._larger(found, pick(group, part), k)
-            elif self._takes_logarithms(k):
-                unknown = doubt[part][noted, None, None] > self.wanted.allowed(np.abs(found[0][noted]))
-                found[0][noted] = np.where(unknown, np.nan, found[0][noted])
-                found = [np.exp(found[0]), -found[0]][: 1 + self.wanted.with_rate]
+                values = self._select_larger(values, select_cells(group, part), k)
+            elif self._evaluates_logarithms(k):
+                inaccurate = log_error[part][close_cells, None, None] > self.errors.limit(
+                    np.abs(values[0][close_cells])
+                )
+                values[0][close_cells] = np.where(inaccurate, np.nan, values[0][close_cells])
+                values = [np.exp(values[0]), -values[0]][: 1 + self.errors.with_rate]
             else:
-                found[0] += middle[part]
-            if noted.size:
-                self._note(some[:, noted], found[0][noted])
-            here = tuple(some - self.first)
-            for whole, new, larger in zip((self.radius, self.rate), found, (np.maximum, np.minimum), strict=False):
-                whole[here] = larger(whole[here], new) if merge else new
+                values[0] += center[part]
+            if close_cells.size:
+                self._note_special(batch[:, close_cells], values[0][close_cells])
+            index = tuple(batch - self.first)
+            for array, new, choose in zip((self.radius, self.rate), values, (np.maximum, np.minimum), strict=False):
+                array[index] = choose(array[index], new) if merge else new
 
-    def _larger(self, sums: list[np.ndarray], group: Group, k: int) -> list[np.ndarray]:
-        """The radius and the rate of the larger of two poles, NaN where it is not known."""
+    def _select_larger(self, sums: list[np.ndarray], group: Group, k: int) -> list[np.ndarray]:
+        """Return radius and rate of the larger of two poles; NaN if it is not accurate enough."""
         re, disk, error = (x[:, None, None] for x in (group.re, group.disk, group.error[k] + ROUNDING))
-        values, inside = larger_of_two(sums[0], sums[1], disk)
+        values, discriminant = compute_larger(sums[0], sums[1], disk)
         values += re
-        known = knows_larger(inside, disk, error, self.wanted.allowed(np.abs(values)))
-        values[~known] = np.nan
-        return [np.exp(values), -values][: 1 + self.wanted.with_rate]
+        accurate = is_larger_accurate(discriminant, disk, error, self.errors.limit(np.abs(values)))
+        values[~accurate] = np.nan
+        return [np.exp(values), -values][: 1 + self.errors.with_rate]
 
-    def _spread(self, values: np.ndarray, by: Any, k: int, places: np.ndarray, memory: np.ndarray) -> np.ndarray:
-        """Polynomials of eta and xi, by their coefficients or their values at nodes, at all walls of cells."""
-        along = zip(self.axes, self._along(places), strict=True)
-        xi, eta = (axis.table(by, ORDERS[k], place) for axis, place in along)
+    def _evaluate_at_walls(
+        self, values: np.ndarray, basis: Any, k: int, positions: np.ndarray, buffer: np.ndarray
+    ) -> np.ndarray:
+        """Evaluate a bilinear form at all walls of cells.
+
+        Args:
+            values: Coefficients in eta and xi, or values at the nodes, of each cell.
+            basis: Function of `_AxisPieces.table`: powers or interpolation weights.
+            k: Index of the order in `ORDERS`.
+            positions: Positions of the cells.
+            buffer: Array for the result.
+        """
+        axis_indices = zip(self.axes, self._index_axes(positions), strict=True)
+        xi, eta = (axis.table(basis, ORDERS[k], position) for axis, position in axis_indices)
         xi = xi.transpose(0, 2, 1)
-        # The longer side last: it costs the more.
+        # Multiply along the longer side last, because that product is the larger one.
         first, second = (eta @ values, xi) if self.sides[0] < self.sides[1] else (eta, values @ xi)
-        return np.matmul(first, second, out=memory[: places.shape[1]])
+        return np.matmul(first, second, out=buffer[: positions.shape[1]])
 
-    def forget(self, places: np.ndarray) -> None:
-        """NaN for all walls of some cells."""
-        self._note(places, np.full((places.shape[1], *self.sides), np.nan))
-        self.radius[tuple(places - self.first)] = np.nan
+    def mark_open(self, positions: np.ndarray) -> None:
+        """Set all walls of some cells to NaN, i.e. leave them open."""
+        self._note_special(positions, np.full((positions.shape[1], *self.sides), np.nan))
+        self.radius[tuple(positions - self.first)] = np.nan
 
-    def _note(self, places: np.ndarray, radius: np.ndarray) -> None:
-        """Note the walls whose side of the circle is in doubt, or that are NaN."""
-        flat = np.flatnonzero(~(np.abs(radius - 1.0) > 1.01 * self.wanted.doubt))
-        cell, *inside = np.unravel_index(flat, radius.shape)
-        corner = (self.steps * (places - self.first))[1:, cell]
-        self.canvas.special.append(np.concatenate([places[:1, cell], corner + inside]))
+    def _note_special(self, positions: np.ndarray, radius: np.ndarray) -> None:
+        """Note the walls that are NaN, or so close to the unit circle that their side is uncertain."""
+        index = np.flatnonzero(~(np.abs(radius - 1.0) > 1.01 * self.errors.uncertain_width))
+        cell, *offset = np.unravel_index(index, radius.shape)
+        corner = (self.steps * (positions - self.first))[1:, cell]
+        self.results.special.append(np.concatenate([positions[:1, cell], corner + offset]))
 
 
-def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> FollowedPoles:
-    """The outermost poles of a window of a map, NaN where no cell knows them well enough."""
-    # A wall's value does not depend on the window: cells lie on the whole map, and each is computed by itself.
-    sizes, wanted = _sides(area.beta.shape[1], area.alpha.shape[1]), AllowedErrors(accuracy, with_rate)
-    held = area.d != np.floor(area.d)
-    canvas = _Canvas(area, sizes[0], with_rate)
+def compute_grid_poles(area: Area, accuracy: float, with_rate: bool = False) -> GridPoles:
+    """Compute the dominant poles of a window of a grid; NaN if no cell certifies them with sufficient accuracy."""
+    # The result of a wall does not depend on the window, because the cells are those of the whole grid, and each is
+    # computed separately.
+    sizes, errors = _list_cell_sizes(area.beta.shape[1], area.alpha.shape[1]), AllowedErrors(accuracy, with_rate)
+    is_fractional = area.d != np.floor(area.d)
+    results = _ResultArrays(area, sizes[0], with_rate)
     corners = [np.arange(w.start // side, -(-w.stop // side)) for w, side in zip(area.window, sizes[0], strict=True)]
-    left = [
-        np.stack([part.reshape(-1) for part in np.meshgrid(np.flatnonzero(held == kind), *corners, indexing="ij")])
+    open_cells = [
+        np.stack(
+            [part.reshape(-1) for part in np.meshgrid(np.flatnonzero(is_fractional == kind), *corners, indexing="ij")]
+        )
         for kind in (False, True)
     ]
     with np.errstate(all="ignore"):
         for sides, larger in zip(sizes, (sizes[0], *sizes), strict=False):
-            level = _Level(area, sides, wanted, canvas)
-            left = [level.solve_all(level.split(cells, larger), kind == 1) for kind, cells in enumerate(left)]
-            if not any(cells.size for cells in left):
+            level = _CellGrid(area, sides, errors, results)
+            open_cells = [
+                level.solve_all(level.split(cells, larger), kind == 1) for kind, cells in enumerate(open_cells)
+            ]
+            if not any(cells.size for cells in open_cells):
                 break
             if sides == sizes[-1]:
-                level.forget(np.concatenate(left, axis=1))
-    return canvas.cut_out(area.window)
+                level.mark_open(np.concatenate(open_cells, axis=1))
+    return results.cut_out(area.window)

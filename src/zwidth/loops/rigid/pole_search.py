@@ -1,8 +1,16 @@
-"""The outermost pole of one loop: two starts, a fixed number of steps, one proof; a search for what that leaves.
+"""Find the dominant pole of one loop: two starting points, a fixed number of steps, and one certificate.
 
-Either the slow pole next to 1 is the outermost, or the first pair of the ring that a delay makes. Halley's method
-follows both, and the larger one to its end. The proof: all poles are inside ``|z| = r (1 + tol)``, counted, and a pole
-is within tol of where the method ended. Where that fails the radius is searched for by halving an interval of counts.
+The dominant pole (largest |z|) is usually one of two: the *slow pole*, the pole near z = 1 that belongs to the
+wall's slow dynamics; or the *first pair*, the complex pair at the smallest angle among the poles that a delay places
+around the origin (the *ring*). Halley's method (`loops.rigid.pole_step`) refines both, then only the larger one.
+
+Certificate: let r be the modulus of the result and tol the tolerance. A count (`loops.rigid.circle`) shows that all
+poles lie inside ``|z| = r (1 + tol)``, and a pole lies within tol of the result. Then the spectral radius is r to
+within tol. If this fails, more starting points are tried, and finally the radius is bisected by counts.
+
+All positions are logarithms: a pole is ``e^(re + j im)`` with 0 <= im <= pi. There are two implementations: NumPy
+functions, which `loops.rigid.outermost_poles` applies to walls without a certificate, and one program for JAX
+transformations (`traced_kernel`).
 """
 
 from __future__ import annotations
@@ -12,9 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import follow_root
-from zwidth.loops.rigid.circle import Loop, count, factor_loop
+from zwidth.loops.rigid.circle import LoopFactors, count_poles, factor_loop
 from zwidth.loops.rigid.normalization import valid_wall
-from zwidth.loops.rigid.pole_step import halley_step, join, move_pole, newton_step, value_at
+from zwidth.loops.rigid.pole_step import evaluate_polynomial, halley_step, make_complex, newton_step, shift_pole
 from zwidth.words.types import Array
 from zwidth.words.xp import (
     angle,
@@ -28,314 +36,381 @@ from zwidth.words.xp import (
     store_once,
 )
 
-# Steps on both starts, then on the larger of the two; where that was not enough, on it and the other one, then on all.
-_BOTH, _LARGER, _AGAIN, _PATIENT = 2, 3, 6, 10
-# A start that is within so much of a pole has arrived.
-_ARRIVED = 1e-6
-# A step after which a pole is within so much of where it began may be taken without looking again: N |P/P'| bounds
-# the distance before the step, N >= 3, and the step is an N-th of it.
-_AFTER = 1.4
-# Of counts next to a pole: what their rounding allows, and what rates of decay promise.
-_COUNTED, _RELATIVE = 4096.0, 2e-11
-# From the smallest radius that float64 has, to the last digit: where many poles are of nearly one size, the places of
-# crossovers depend on it.
-_SMALLEST, _HALVINGS, _POLISHING, _NEWTON = -690.0, 62, 6, 3
-_TOGETHER = 3
-# Counts that the last proof tries, each ten times as far from the pole as the one before: rounding may blur near ones.
-_FARTHER = 6
-# Inside a transformation walls are taken in so many parts, or fewer of so many walls.
-_PARTS, _LEAST_PART = 16, 1 << 9
-# Off the real axis, of the angle of the first pair.
-_OFF = 0.1
-# And between there and the pair's angle, where a short delay has a third pole.
-_BETWEEN = 0.5
+# Halley steps.
+STEPS_ON_BOTH = 2  # on both starting points
+STEPS_ON_LARGER = 3  # then on the larger of the two
+STEPS_AGAIN = 6  # without a certificate: on the result, and on the starting point that is farther from it
+STEPS_ON_ALL = 10  # without a certificate again: on four starting points
+
+# A sequence has converged if a pole is within this distance of log z.
+CONVERGED_RADIUS = 1e-6
+# Largest factor by which a Newton step increases the bound of the distance to a pole. The bound before the step is
+# R = N |P/P'|, where N >= 3 is the degree, and the step has the length R/N.
+RADIUS_AFTER_STEP = 1.4
+# Distance between a pole and the circle of the count, see `certification_width`.
+COUNT_ROUNDING = 4096.0  # rounding error of a count, in rounding units of log r
+RATE_WIDTH = 2e-11  # relative to |re|, for the accuracy of decay rates
+
+# Bisection of the radius to full precision. The last digits matter if many poles have nearly the same modulus, because
+# the angles of the crossovers depend on them.
+MIN_LOG_RADIUS = -690.0  # e^-690 = 2e-300 is close to the smallest float64
+BISECTIONS = 62
+POLISHING_STEPS = 6  # Halley steps after the bisection
+NEWTON_STEPS = 3  # Newton steps after those, in `_find_in_rounds`
+BISECTIONS_PER_COUNT = 3  # in NumPy, where counting on 7 circles at once takes as long as on one, for few walls
+# Circles tried by the last certificate, each ten times as far from the pole as the previous one, because the rounding
+# error of the count may be too large on a close circle.
+MAX_TRIALS = 6
+
+# Inside a transformation, walls are divided into at most this many parts of at least this many walls.
+MAX_PARTS = 16
+MIN_PART_SIZE = 1 << 9
+# Angles of further starting points, relative to the angle of the first pair.
+OFF_AXIS_RATIO = 0.1  # close to the real axis, but not on it
+BETWEEN_RATIO = 0.5  # a third pole of short delays lies near there
 
 
-class OutermostPoles(NamedTuple):
-    """Outermost poles ``e^(re + j im)``, 0 <= im <= pi, by the relative error proved of the radius."""
+class DominantPoles(NamedTuple):
+    """Dominant poles ``e^(re + j im)``, 0 <= im <= pi, with the certified relative error of the spectral radius."""
 
     re: Array
     im: Array
-    error: Array  # infinite where none is proved
-    doubt: Array  # how far re may be from the pole; infinite where the proof is of the radius alone
+    error: Array  # of the radius; infinite without a certificate
+    pole_error: Array  # bound of |re - true re|; infinite if only the radius is certified
 
     @property
-    def proved(self) -> Array:
-        """Whether some error is."""
+    def certified(self) -> Array:
+        """True if an error bound is certified."""
         return self.error < np.inf
 
 
-def _largest(loop: Loop) -> Array:
-    """The logarithm of a radius that no pole exceeds: beyond it T is the larger part."""
+def _bound_log_radius(loop: LoopFactors) -> Array:
+    """Return the logarithm of a radius above all poles: on larger circles |T| > |B|."""
     xp = namespace(loop.alpha)
-    size = (loop.a2 + loop.h) * (1.0 + loop.q) * (xp.abs(loop.alpha) + 2.0 * xp.abs(loop.beta))
-    root = xp.sqrt(size)
-    # |T| >= r^(1+n) (r - 1)^2, |B| <= size r^2
-    short = xp.log1p(xp.where(loop.turns > 1, root, root + size))
-    steep = xp.maximum(np.log(2.0), xp.log(4.0 * size) / loop.turns)
-    return 1e-9 + xp.where(loop.turns > 1, xp.minimum(short, steep), short)
+    wall_bound = (loop.a2 + loop.h) * (1.0 + loop.q) * (xp.abs(loop.alpha) + 2.0 * xp.abs(loop.beta))
+    bound_root = xp.sqrt(wall_bound)
+    # |T| >= r^(1+n) (r - 1)^2 and |B| <= wall_bound r^2 for r > 1.
+    bound = xp.log1p(xp.where(loop.n_plus_1 > 1, bound_root, bound_root + wall_bound))
+    steep_bound = xp.maximum(np.log(2.0), xp.log(4.0 * wall_bound) / loop.n_plus_1)
+    return 1e-9 + xp.where(loop.n_plus_1 > 1, xp.minimum(bound, steep_bound), bound)
 
 
-def slow_pole(loop: Loop) -> tuple[Array, Array]:
-    """The larger pole near 1, of P to second order in z - 1."""
+def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
+    """Approximate the larger pole near 1, from the Taylor polynomial of P of second order in z - 1."""
     xp = namespace(loop.alpha)
-    alpha, s, turns = loop.alpha, loop.s, loop.turns
-    m0, m1 = (loop.a2 + loop.h) * (1.0 + loop.q), loop.a2 - loop.h * loop.q
-    constant = m0 * alpha
-    linear = loop.em + m0 * s + (m1 - turns * m0) * alpha
-    lead = 1.0 + (m1 - turns * m0) * s + (0.5 * turns * (turns + 1.0) * m0 - turns * m1) * alpha
-    lead = xp.where(lead > 0.1, lead, 1.0)
-    inside = linear * linear - 4.0 * lead * constant
-    root = xp.sqrt(xp.abs(inside))
-    sum_ = linear + xp.where(linear < 0, -root, root)
-    real = xp.where(linear < 0, -0.5 * sum_ / lead, -2.0 * constant / sum_)
-    pair = inside < 0
-    re, im = xp.where(pair, -0.5 * linear / lead, real), xp.where(pair, 0.5 * root / lead, 0.0)
+    alpha, s, n_plus_1 = loop.alpha, loop.s, loop.n_plus_1
+    numerator_at_1, numerator_slope = (loop.a2 + loop.h) * (1.0 + loop.q), loop.a2 - loop.h * loop.q
+    constant = numerator_at_1 * alpha
+    linear = loop.em + numerator_at_1 * s + (numerator_slope - n_plus_1 * numerator_at_1) * alpha
+    quadratic = (
+        1.0
+        + (numerator_slope - n_plus_1 * numerator_at_1) * s
+        + (0.5 * n_plus_1 * (n_plus_1 + 1.0) * numerator_at_1 - n_plus_1 * numerator_slope) * alpha
+    )
+    quadratic = xp.where(quadratic > 0.1, quadratic, 1.0)
+    discriminant = linear * linear - 4.0 * quadratic * constant
+    discriminant_root = xp.sqrt(xp.abs(discriminant))
+    doubled = linear + xp.where(linear < 0, -discriminant_root, discriminant_root)
+    real = xp.where(linear < 0, -0.5 * doubled / quadratic, -2.0 * constant / doubled)
+    is_complex = discriminant < 0
+    re, im = (
+        xp.where(is_complex, -0.5 * linear / quadratic, real),
+        xp.where(is_complex, 0.5 * discriminant_root / quadratic, 0.0),
+    )
     re = xp.maximum(re, -0.5)
     return 0.5 * xp.log1p(re * (2.0 + re) + im * im), angle(1.0 + re, im)
 
 
-def first_pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
-    """The first pair of the ring, where T and B have one size as they change with |z| from the unit circle on."""
+def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
+    """Approximate the first pair: its angle from the delay, and its radius from |T| = |B|, by z^(1+n) alone."""
     xp = namespace(loop.alpha)
-    im = np.pi / (loop.lag + 1.0)
-    # Where W is nearly a negative multiple of z - 1, the phases of T and B meet a half turn later.
-    im = xp.where((loop.alpha < -loop.beta * im) & (loop.turns > 1), 2.0 * im, im)
+    im = np.pi / (loop.d_plus_1 + 1.0)
+    # If beta is negative enough that W is nearly a negative multiple of z - 1, arg T and arg B coincide half a turn
+    # later.
+    im = xp.where((loop.alpha < -loop.beta * im) & (loop.n_plus_1 > 1), 2.0 * im, im)
     x = xp.sin(0.5 * im) ** 2
-    sizes = [(1.0 - zero) * (1.0 - zero) + 4.0 * zero * x for zero in (1.0, loop.c)]
-    body = (loop.a2 + loop.h) ** 2 - 4.0 * loop.a2 * loop.h * x
-    wall = loop.alpha * loop.alpha + 4.0 * loop.s * loop.beta * x
-    turns = loop.turns
+    device_factors = [(1.0 - zero) * (1.0 - zero) + 4.0 * zero * x for zero in (1.0, loop.c)]
+    numerator = (loop.a2 + loop.h) ** 2 - 4.0 * loop.a2 * loop.h * x
+    wall_factor = loop.alpha * loop.alpha + 4.0 * loop.s * loop.beta * x
+    n_plus_1 = loop.n_plus_1
     if fractional:
-        body, turns = body * ((1.0 + loop.q) ** 2 - 4.0 * loop.q * x), turns + 1.0
-    return xp.maximum(0.5 * xp.log(body * wall / (sizes[0] * sizes[1])) / turns, -1.0), im
+        numerator, n_plus_1 = numerator * ((1.0 + loop.q) ** 2 - 4.0 * loop.q * x), n_plus_1 + 1.0
+    return xp.maximum(
+        0.5 * xp.log(numerator * wall_factor / (device_factors[0] * device_factors[1])) / n_plus_1, -1.0
+    ), im
 
 
-def larger_pole(loop: Loop, fractional: bool) -> tuple[Array, Array]:
-    """The larger of the slow pole and the first pair of the ring, roughly."""
+def approximate_larger_pole(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
+    """Approximate the larger of the slow pole and the first pair by a few Halley steps on both."""
     xp = namespace(loop.alpha)
 
     def follow(start: tuple[Array, Array]) -> tuple[Array, Array]:
-        return repeat(_BOTH, lambda at: halley_step(*at, loop, fractional), start, xp)
+        return repeat(STEPS_ON_BOTH, lambda point: halley_step(*point, loop, fractional), start, xp)
 
-    slow, pair = apply_each(follow, [slow_pole(loop), first_pair(loop, fractional)], xp)
-    first = (slow[0] >= pair[0]) | xp.isnan(pair[0])
-    return xp.where(first, slow[0], pair[0]), xp.where(first, slow[1], pair[1])
+    slow, pair = apply_each(follow, [approximate_slow_pole(loop), approximate_first_pair(loop, fractional)], xp)
+    slow_is_larger = (slow[0] >= pair[0]) | xp.isnan(pair[0])
+    return xp.where(slow_is_larger, slow[0], pair[0]), xp.where(slow_is_larger, slow[1], pair[1])
 
 
-def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
-    """The larger of the two, nearly."""
-    start = larger_pole(loop, fractional)
-    return repeat(_LARGER, lambda at: halley_step(*at, loop, fractional), start, namespace(loop.alpha))
+def find_candidate(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
+    """Return the larger of the slow pole and the first pair, nearly converged."""
+    start = approximate_larger_pole(loop, fractional)
+    return repeat(STEPS_ON_LARGER, lambda point: halley_step(*point, loop, fractional), start, namespace(loop.alpha))
 
 
 def certification_width(re: Array, tolerance: Any) -> Array:
-    """How far outside of a pole the count finds no other: as near as its rounding allows, for rates of decay."""
+    """Return the distance of the counting circle from a pole.
+
+    It is as small as the rounding error of the count permits, because decay rates depend on it.
+    """
     xp = namespace(re)
-    return xp.minimum(tolerance, xp.maximum(_COUNTED * epsilon(re), _RELATIVE * xp.abs(re)))
+    return xp.minimum(tolerance, xp.maximum(COUNT_ROUNDING * epsilon(re), RATE_WIDTH * xp.abs(re)))
 
 
-def certify_pole(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool, single: bool) -> OutermostPoles:
-    """The pole after one more step, and whether its modulus is proved to be the radius within the tolerance."""
+def certify_pole(
+    re: Array, im: Array, tolerance: Array, loop: LoopFactors, fractional: bool, single: bool
+) -> DominantPoles:
+    """Take a Newton step, and certify within the tolerance that the modulus of the result is the spectral radius.
+
+    Args:
+        re: Log modulus of a pole, nearly converged.
+        im: Argument of this pole.
+        tolerance: Relative error of the radius.
+        loop: Factors of P.
+        fractional: Whether any delay is fractional.
+        single: Count with a single crossover, see `circle.count_poles`.
+    """
     xp = namespace(re, loop.alpha)
-    # A wall without stiffness has a pole at 1.
+    # Without stiffness one pole is exactly 1.
     at_one = (loop.alpha == 0) & ~(re > tolerance)
     step = newton_step(re, im, loop, fractional)
-    re, im = (xp.where(at_one, 0.0, part) for part in move_pole(re, im, step.re, step.im))
-    seen = count(re + certification_width(re, tolerance), loop, fractional, single)
-    proved = (at_one | (_AFTER * step.within <= tolerance)) & seen.full & seen.sure
-    return OutermostPoles(re, im, xp.where(proved, tolerance, np.inf), xp.where(at_one, 0.0, step.doubt))
+    re, im = (xp.where(at_one, 0.0, part) for part in shift_pole(re, im, step.re, step.im))
+    poles_outside = count_poles(re + certification_width(re, tolerance), loop, fractional, single)
+    certified = (
+        (at_one | (RADIUS_AFTER_STEP * step.radius <= tolerance)) & poles_outside.all_inside & poles_outside.certain
+    )
+    return DominantPoles(re, im, xp.where(certified, tolerance, np.inf), xp.where(at_one, 0.0, step.end_error))
 
 
 def quick_kernel(
     alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool
-) -> OutermostPoles:
-    """The outermost pole of most points."""
+) -> DominantPoles:
+    """Find and certify the dominant pole; succeeds for most walls."""
     loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
-    return certify_pole(*candidate(loop, fractional), tolerance, loop, fractional, fractional)
+    return certify_pole(*find_candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
-# Attempts to prove what the quick kernel has found but not proved, in NumPy; the loops are those of the walls.
+# Attempts to certify the results of `quick_kernel` that have no certificate, in NumPy; ``loop`` has only those walls.
 
 
 def _certify_largest(
-    starts: tuple[np.ndarray, np.ndarray], steps: int, tolerance: float, loop: Loop, fractional: bool
-) -> OutermostPoles:
-    """The largest of the poles to which starts lead, with a count that may meet several crossovers."""
+    starts: tuple[np.ndarray, np.ndarray], steps: int, tolerance: float, loop: LoopFactors, fractional: bool
+) -> DominantPoles:
+    """Certify the largest of the poles to which starting points lead, by a count with any number of crossovers."""
     re, im = repeat(steps, lambda at: halley_step(*at, loop, fractional), starts, np)
-    arrived = newton_step(re, im, loop, fractional).within < _ARRIVED
-    best = np.where(arrived, re, -np.inf).argmax(0), np.arange(re.shape[1])
+    converged = newton_step(re, im, loop, fractional).radius < CONVERGED_RADIUS
+    best = np.where(converged, re, -np.inf).argmax(0), np.arange(re.shape[1])
     return certify_pole(re[best], im[best], tolerance, loop, fractional, False)
 
 
-def certify_again(found: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
-    """What was found, and the start that is farther from it."""
-    slow, pair = slow_pole(loop), first_pair(loop, fractional)
-    farther = np.abs(found.im - slow[1]) > np.abs(found.im - pair[1])
-    re, im = (np.stack([leaf, np.where(farther, *both)]) for leaf, *both in zip(found[:2], slow, pair, strict=True))
-    return _certify_largest((re, im), _AGAIN, tolerance, loop, fractional)
+def certify_again(poles: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
+    """Continue from the result and from the starting point that is farther from it; certify the larger pole."""
+    slow, pair = approximate_slow_pole(loop), approximate_first_pair(loop, fractional)
+    farther = np.abs(poles.im - slow[1]) > np.abs(poles.im - pair[1])
+    re, im = (np.stack([leaf, np.where(farther, *both)]) for leaf, *both in zip(poles[:2], slow, pair, strict=True))
+    return _certify_largest((re, im), STEPS_AGAIN, tolerance, loop, fractional)
 
 
-def bound_radius(found: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
-    """What was found, where two counts prove its radius alone."""
-    above, below = (count(found.re + side, loop, fractional) for side in (tolerance, -tolerance))
-    proved = above.full & above.sure & ~below.full & below.sure
-    return found._replace(error=np.where(proved, tolerance, np.inf), doubt=np.where(proved, np.inf, found.doubt))
+def bound_radius(poles: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
+    """Certify the radius, but not the pole, by two counts, on circles on both sides of it."""
+    above, below = (count_poles(poles.re + side, loop, fractional) for side in (tolerance, -tolerance))
+    certified = above.all_inside & above.certain & ~below.all_inside & below.certain
+    return poles._replace(
+        error=np.where(certified, tolerance, np.inf), pole_error=np.where(certified, np.inf, poles.pole_error)
+    )
 
 
-def all_starts(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Both starts, then the slow one put on the real axis or off it, which steps do not leave or meet: (4, loops)."""
-    # Where the slow one is off the axis it is put on it, and the other way round.
-    (slow, turn), pair = slow_pole(loop), first_pair(loop, fractional)
-    other = np.where(turn > 0, 0.0, _OFF * pair[1])
-    return np.stack([slow, pair[0], slow, 0.0 * slow]), np.stack([turn, pair[1], other, _BETWEEN * pair[1]])
+def list_starts(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return four starting points, of shape (4, loops): both approximations, and two at other angles."""
+    # The third is the slow pole moved onto the real axis if it is complex, and off the axis otherwise, because steps
+    # from the real axis never leave it and other steps rarely reach it.
+    (slow, turn), pair = approximate_slow_pole(loop), approximate_first_pair(loop, fractional)
+    other = np.where(turn > 0, 0.0, OFF_AXIS_RATIO * pair[1])
+    return np.stack([slow, pair[0], slow, 0.0 * slow]), np.stack([turn, pair[1], other, BETWEEN_RATIO * pair[1]])
 
 
-def certify_starts(_: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
-    """What all of the starts lead to."""
-    return _certify_largest(all_starts(loop, fractional), _PATIENT, tolerance, loop, fractional)
+def certify_starts(_: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
+    """Certify the largest of the poles to which all four starting points lead."""
+    return _certify_largest(list_starts(loop, fractional), STEPS_ON_ALL, tolerance, loop, fractional)
 
 
-def search(_: OutermostPoles, tolerance: float, loop: Loop, fractional: bool) -> OutermostPoles:
-    """The outermost pole by halvings of the interval that counts leave, then a few steps."""
-    # Of few walls several radii are counted in the time of one.
-    parts = 2**_TOGETHER
+def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
+    """Find the dominant pole by bisecting the radius with counts, then by a few Halley steps."""
+    # Count on several circles at once, because for few walls this takes as long as a single count.
+    parts = 2**BISECTIONS_PER_COUNT
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
         low, width = state[0], (state[1] - state[0]) / parts
         radii = np.stack([low + k * width for k in range(1, parts)])
-        full = count(radii, Loop(*(np.broadcast_to(part, radii.shape) for part in loop)), fractional).full
-        low = low + width * (~full).sum(0)
+        all_inside = count_poles(
+            radii, LoopFactors(*(np.broadcast_to(part, radii.shape) for part in loop)), fractional
+        ).all_inside
+        low = low + width * (~all_inside).sum(0)
         return low, low + width
 
-    high = _largest(loop)
-    _, radius = repeat(-(-_HALVINGS // _TOGETHER), step, (0.0 * high + _SMALLEST, high), np)
-    best, im = np.inf, 0.0 * radius
-    # On that circle the pole is at a crossover or at one of the ends.
-    for place in (0.0 * radius, 0.0 * radius + np.pi, *count(radius, loop, fractional).crossings):
-        within = newton_step(radius, place, loop, fractional).within
-        im, best = np.where(within < best, place, im), np.minimum(within, best)
-    at = repeat(_POLISHING, lambda at: halley_step(*at, loop, fractional), (radius, im), np)
-    found = certify_pole(*at, tolerance, loop, fractional, False)
-    # Next to multiple poles the steps end anywhere; the counts still know the radius.
-    return found._replace(re=np.where(found.proved, found.re, radius))
+    high = _bound_log_radius(loop)
+    _, radius = repeat(-(-BISECTIONS // BISECTIONS_PER_COUNT), step, (0.0 * high + MIN_LOG_RADIUS, high), np)
+    least_distance, im = np.inf, 0.0 * radius
+    # On that circle the pole is at a crossover or on the real axis.
+    for angle_guess in (0.0 * radius, 0.0 * radius + np.pi, *count_poles(radius, loop, fractional).crossovers):
+        distance = newton_step(radius, angle_guess, loop, fractional).radius
+        im, least_distance = np.where(distance < least_distance, angle_guess, im), np.minimum(distance, least_distance)
+    point = repeat(POLISHING_STEPS, lambda point: halley_step(*point, loop, fractional), (radius, im), np)
+    poles = certify_pole(*point, tolerance, loop, fractional, False)
+    # Near multiple poles the steps do not converge; keep the bisected radius.
+    return poles._replace(re=np.where(poles.certified, poles.re, radius))
 
 
-class _Round(NamedTuple):
-    """What a round of `_find_part` knows."""
+class _SearchState(NamedTuple):
+    """State of the search in `_find_in_rounds`."""
 
     re: Array
     im: Array
-    proved: Array
-    low: Array  # halved interval of logarithms of the radius
+    certified: Array
+    low: Array  # lower bound of the log radius
     high: Array
-    places: Array  # arguments of the crossovers on the last circle
+    angles: Array  # angles of the crossovers on the last circle
 
 
-def _find_traced(loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
-    """The outermost pole, and whether it is proved to be it, a single one: as `quick_kernel` and `search` find it."""
-    # Part by part; then those walls alone that this has left are searched for, as many at one time, by one program.
+def _find_traced(loop: LoopFactors, fractional: bool) -> tuple[Array, Array, Array]:
+    """Return re and im of the dominant pole, and whether it is certified, under JAX transformations.
+
+    The method is that of `quick_kernel`, then of `bisect_radius`.
+    """
+    # Divide the walls into parts and run the first round on each part. Then collect the walls without a certificate
+    # into parts of the same size for the other rounds; thus a single compiled program serves both.
     import jax.numpy as xp
     from jax.lax import while_loop
 
     shape, size = loop.alpha.shape, loop.alpha.size
-    length = max(-(-size // _PARTS), _LEAST_PART)
+    length = max(-(-size // MAX_PARTS), MIN_PART_SIZE)
     if size <= length:
-        return _find_part(0, 3, loop, fractional)
+        return _find_in_rounds(0, 3, loop, fractional)
     columns, parts = [xp.broadcast_to(column, shape).reshape(-1) for column in loop], -(-size // length)
 
-    def take(state: tuple[Any, ...]) -> tuple[Any, ...]:
-        k, left, *known = state
+    def run_part(state: tuple[Any, ...]) -> tuple[Any, ...]:
+        k, is_open, *results = state
         first = k < parts
-        index = xp.where(first, k * length + xp.arange(length), xp.nonzero(left, size=length, fill_value=size)[0])
-        some = Loop(*(column.at[index].get(mode="clip") for column in columns))
-        found = _find_part(xp.where(first, 0, 1), xp.where(first, 1, 3), some, fractional)
-        left = left.at[index].set(first & ~(found[2] | xp.isnan(some.alpha)), mode="drop")
-        known = (whole.at[index].set(new, mode="drop") for whole, new in zip(known, found, strict=True))
-        return k + 1, left, *known
+        index = xp.where(first, k * length + xp.arange(length), xp.nonzero(is_open, size=length, fill_value=size)[0])
+        part_loop = LoopFactors(*(column.at[index].get(mode="clip") for column in columns))
+        part_results = _find_in_rounds(xp.where(first, 0, 1), xp.where(first, 1, 3), part_loop, fractional)
+        is_open = is_open.at[index].set(first & ~(part_results[2] | xp.isnan(part_loop.alpha)), mode="drop")
+        results = (column.at[index].set(new, mode="drop") for column, new in zip(results, part_results, strict=True))
+        return k + 1, is_open, *results
 
     none = 0.0 * columns[0]
     start = 0, none > 0, none, none, none > 0
-    found = while_loop(lambda state: (state[0] < parts) | state[1].any(), take, start)[2:]
-    re, im, proved = (part.reshape(shape) for part in found)
-    return re, im, proved
+    part_results = while_loop(lambda state: (state[0] < parts) | state[1].any(), run_part, start)[2:]
+    re, im, certified = (part.reshape(shape) for part in part_results)
+    return re, im, certified
 
 
-def _find_part(begin: Any, end: Any, loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:
-    """Some of the rounds of `_find_traced`, of some walls."""
-    # A step on a pole and a count, which take a compiler its time, stand in two loops that every round runs through:
-    # the larger pole and its proof; where that leaves any wall, the halvings; the pole on the circle, and its proof.
+def _find_in_rounds(begin: Any, end: Any, loop: LoopFactors, fractional: bool) -> tuple[Array, Array, Array]:
+    """Run the rounds ``begin`` to ``end - 1`` of the search on some walls, while any of them has no certificate.
+
+    Round 0 refines and certifies the larger pole, round 1 bisects the radius, and round 2 refines and certifies the
+    pole on the bisected circle.
+    """
+    # A pole step and a count take long to compile. Therefore each occurs only once, in a loop whose range depends on
+    # the round.
     import jax.numpy as xp
     from jax.lax import fori_loop, while_loop
 
     tolerance = epsilon(loop.c) ** 0.58
-    high = _largest(loop)
-    # At the ends of the circle, then at the crossovers.
-    looks = 5 if fractional else 4
-    last = looks + _POLISHING + _NEWTON
-    # By rounds: the steps on a pole, the first of which look at the places, and the counts, the last of which proves.
-    steps = xp.asarray([(looks + _POLISHING - _LARGER, last), (last, last), (0, last)])
-    first = _HALVINGS + 1
-    counts = xp.asarray([(first, first + 1), (0, first), (first, first + _FARTHER)])
+    high = _bound_log_radius(loop)
+    # Candidates for the angle of the pole: 0, pi and the crossovers on the circle.
+    n_candidates = 5 if fractional else 4
+    n_steps = n_candidates + POLISHING_STEPS + NEWTON_STEPS
+    # Ranges of the steps and of the counts, for each round. In round 2 the first steps evaluate the candidates; the
+    # counts after the bisections are trials of the certificate.
+    steps = xp.asarray([(n_candidates + POLISHING_STEPS - STEPS_ON_LARGER, n_steps), (n_steps, n_steps), (0, n_steps)])
+    first_trial = BISECTIONS + 1
+    counts = xp.asarray([(first_trial, first_trial + 1), (0, first_trial), (first_trial, first_trial + MAX_TRIALS)])
 
-    def run(state: tuple[Any, _Round]) -> tuple[Any, _Round]:
-        turn, known = state
+    def run_round(progress: tuple[Any, _SearchState]) -> tuple[Any, _SearchState]:
+        round_index, state = progress
 
-        def step(k: Any, at: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            re, im, within = at
-            looking = k < looks
-            place = xp.where(k < 2, np.pi * k, known.places[xp.clip(k - 2, 0, looks - 3)])
-            place = xp.where(looking, place, im)
-            by = newton_step(re, place, loop, fractional)
-            ahead = halley_step(re, place, loop, fractional), move_pole(re, place, by.re, by.im)
-            to_re, to_im = (xp.where(k < last - _NEWTON, *pair) for pair in zip(*ahead, strict=True))
-            # Of the places the nearest to a pole is kept.
-            kept = looking & ~(by.within < within)
-            im = xp.where(kept, im, xp.where(looking, place, to_im))
-            return xp.where(looking, re, to_re), im, xp.where(kept, within, by.within)
+        def step(k: Any, position: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            re, im, distance = position
+            is_candidate = k < n_candidates
+            argument = xp.where(k < 2, np.pi * k, state.angles[xp.clip(k - 2, 0, n_candidates - 3)])
+            argument = xp.where(is_candidate, argument, im)
+            newton = newton_step(re, argument, loop, fractional)
+            moves = halley_step(re, argument, loop, fractional), shift_pole(re, argument, newton.re, newton.im)
+            to_re, to_im = (xp.where(k < n_steps - NEWTON_STEPS, *pair) for pair in zip(*moves, strict=True))
+            # Keep the candidate that is nearest to a pole.
+            keeps_previous = is_candidate & ~(newton.radius < distance)
+            im = xp.where(keeps_previous, im, xp.where(is_candidate, argument, to_im))
+            return xp.where(is_candidate, re, to_re), im, xp.where(keeps_previous, distance, newton.radius)
 
-        at = xp.where(turn == 0, known.re, known.high), known.im, xp.full_like(high, np.inf)
-        re, im, within = fori_loop(steps[turn, 0], steps[turn, 1], step, at)
-        # A wall without stiffness has a pole at 1.
+        start = xp.where(round_index == 0, state.re, state.high), state.im, xp.full_like(high, np.inf)
+        re, im, distance = fori_loop(steps[round_index, 0], steps[round_index, 1], step, start)
+        # Without stiffness one pole is exactly 1.
         at_one = (loop.alpha == 0) & ~(re > tolerance)
         re, im = xp.where(at_one, 0.0, re), xp.where(at_one, 0.0, im)
 
-        def look(k: Any, at: _Round) -> _Round:
-            middle = xp.where(k < _HALVINGS, 0.5 * (at.low + at.high), at.high)
-            width = xp.minimum(certification_width(re, tolerance) * 10.0 ** (k - first), epsilon(re) ** 0.5)
-            log_r = xp.where(k > _HALVINGS, re + width, middle)
-            seen = count(log_r, loop, fractional)
-            inside = store_once(xp.where(seen.full, xp.where(seen.sure, 2.0, 1.0), 0.0), log_r)
-            proved = (k > _HALVINGS) & ~at.proved & (inside > 1) & (at_one | (_AFTER * within <= tolerance))
-            return _Round(
-                xp.where(proved, re, at.re),
-                xp.where(proved, im, at.im),
-                at.proved | proved,
-                xp.where((k < _HALVINGS) & (inside == 0), middle, at.low),
-                xp.where((k < _HALVINGS) & (inside > 0), middle, at.high),
-                xp.stack(seen.crossings),
+        def count_on_circle(k: Any, search: _SearchState) -> _SearchState:
+            middle = xp.where(k < BISECTIONS, 0.5 * (search.low + search.high), search.high)
+            width = xp.minimum(certification_width(re, tolerance) * 10.0 ** (k - first_trial), epsilon(re) ** 0.5)
+            log_r = xp.where(k > BISECTIONS, re + width, middle)
+            poles_outside = count_poles(log_r, loop, fractional)
+            inside_level = store_once(
+                xp.where(poles_outside.all_inside, xp.where(poles_outside.certain, 2.0, 1.0), 0.0), log_r
+            )
+            certifies = (
+                (k > BISECTIONS)
+                & ~search.certified
+                & (inside_level > 1)
+                & (at_one | (RADIUS_AFTER_STEP * distance <= tolerance))
+            )
+            return _SearchState(
+                xp.where(certifies, re, search.re),
+                xp.where(certifies, im, search.im),
+                search.certified | certifies,
+                xp.where((k < BISECTIONS) & (inside_level == 0), middle, search.low),
+                xp.where((k < BISECTIONS) & (inside_level > 0), middle, search.high),
+                xp.stack(poles_outside.crossovers),
             )
 
-        return turn + 1, fori_loop(counts[turn, 0], counts[turn, 1], look, known)
+        return round_index + 1, fori_loop(counts[round_index, 0], counts[round_index, 1], count_on_circle, state)
 
-    def going(state: tuple[Any, _Round]) -> Any:
-        return (state[0] == begin) | ((state[0] < end) & ~(state[1].proved | xp.isnan(loop.alpha)).all())
+    def is_unfinished(progress: tuple[Any, _SearchState]) -> Any:
+        return (progress[0] == begin) | ((progress[0] < end) & ~(progress[1].certified | xp.isnan(loop.alpha)).all())
 
-    none = xp.stack([0.0 * high] * (looks - 2))
-    start = _Round(*larger_pole(loop, fractional), high > np.inf, 0.0 * high + _SMALLEST, high, none)
-    return while_loop(going, run, (begin, start))[1][:3]
+    no_angles = xp.stack([0.0 * high] * (n_candidates - 2))
+    start = _SearchState(
+        *approximate_larger_pole(loop, fractional), high > np.inf, 0.0 * high + MIN_LOG_RADIUS, high, no_angles
+    )
+    return while_loop(is_unfinished, run_round, (begin, start))[1][:3]
 
 
 def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Array:
-    """The logarithm of the radius with its derivatives, inside somebody's transformation."""
-    # NaN where it was not found or the outermost pole is a multiple one.
+    """Return the log of the spectral radius, with its derivatives, under JAX transformations.
+
+    It is NaN if it could not be certified, or if the dominant pole is a multiple one.
+    """
     xp = namespace(alpha, beta, delta, d)
     loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
-    re, im, proved = _find_traced(frozen(loop, xp), fractional)
+    re, im, certified = _find_traced(frozen(loop, xp), fractional)
 
-    def at(place: Array, loop: Loop) -> list[Array]:
-        return [join(part.real, part.imag) for part in value_at(place.real, place.imag, loop, fractional)[:2]]
+    def evaluate(log_pole: Array, loop: LoopFactors) -> list[Array]:
+        return [
+            make_complex(part.real, part.imag)
+            for part in evaluate_polynomial(log_pole.real, log_pole.imag, loop, fractional)[:2]
+        ]
 
-    place = follow_root(lambda *x: at(*x)[0], join(re, im), lambda *_: True, loop, slope=lambda *x: at(*x)[1])
-    (log_radius,) = nan_unless(proved, place.real)
+    log_pole = follow_root(
+        lambda *x: evaluate(*x)[0], make_complex(re, im), lambda *_: True, loop, slope=lambda *x: evaluate(*x)[1]
+    )
+    (log_radius,) = nan_unless(certified, log_pole.real)
     return log_radius + nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)

@@ -1,9 +1,13 @@
-"""P and its derivatives at one point, the steps of Halley's method, and how far a pole is at most.
+"""Evaluate the characteristic polynomial P and its derivatives at a point, and take Newton or Halley steps to a pole.
 
-P = z^p A + D with p = 1 + n, A = (z - 1)(z - c) and D = (a2 z + h)(s z - beta); for delays that are not whole periods
-both take one factor more, z and z + q. On ``z = e^(re + j im)`` everything is formed from z - 1, so that poles next to
-1 keep their digits, and the larger of z^p and 1 is divided out, so that nothing grows with n. As a function of log z
-P is nearly an exponential, on which Halley's method converges from far away, and with the third power of the error.
+The polynomial is evaluated in factored form (`loops.rigid.circle.LoopFactors`),
+
+    P = z^p A + D      p = 1 + n      A = (z - 1)(z - c)      D = (a2 z + h)(s z - beta)
+
+For fractional delays both terms have one more factor: z^p becomes z^(p+1), and D is multiplied by z + q. At
+``z = e^(re + j im)`` all terms are computed from z - 1, so that poles near 1 keep their relative accuracy. P is
+divided by the larger of |z^p| and 1, so that nothing overflows for large n. As a function of log z, P is close to an
+exponential; for such functions Halley's method converges from distant starting points, and cubically near the pole.
 """
 
 from __future__ import annotations
@@ -13,18 +17,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.polynomials import square
-from zwidth.loops.rigid.circle import Loop
+from zwidth.loops.rigid.circle import LoopFactors
 from zwidth.words.types import Array
 from zwidth.words.xp import COSINE, SINE, epsilon, horner, namespace, store_once
 
-# Rounding errors of P in units of the sum of its parts' moduli: of its factors, and of the angle p im.
-_ROUNDING = 16.0
-# The longest step, over the distance between the poles of a long delay: longer ones lead to other poles.
-_LONGEST = 1.0
+# Rounding error of P from its factors, in rounding units of the sum of the moduli of its terms. The rounding error of
+# the angle p im is added.
+FACTOR_ROUNDING = 16.0
+# Longest step of Halley's method, relative to the distance 1/(1 + n) between neighboring poles of a long delay; longer
+# steps would lead to other poles.
+MAX_STEP = 1.0
 
 
 class Pair:
-    """A complex number by its parts, as compiled loops want it."""
+    """A complex array as a pair of real arrays, which XLA compiles to faster loops than complex arrays."""
 
     __slots__ = ("imag", "real")
 
@@ -43,135 +49,148 @@ class Pair:
         return Pair(self.real * other, self.imag * other)
 
     def over(self, other: Pair) -> Pair:
-        """The quotient."""
+        """Return the quotient."""
         size = square(other)
         real = (self.real * other.real + self.imag * other.imag) / size
         return Pair(real, (self.imag * other.real - self.real * other.imag) / size)
 
     def conjugate(self) -> Pair:
-        """The same above the real axis as below."""
+        """Return the complex conjugate."""
         return Pair(self.real, -self.imag)
 
 
-def join(re: Array, im: Array) -> Array:
-    """A complex array. As one array it is computed by one loop, as two by two loops that repeat what they share."""
+def make_complex(re: Array, im: Array) -> Array:
+    """Return the complex array re + j im."""
+    # Under JAX, XLA computes one complex array in a single loop, but two real arrays in two loops, which repeat the
+    # operations that they share.
     if namespace(re) is not np:
-        from jax.lax import complex as join
+        from jax.lax import complex as make_complex
 
-        return join(re, im)
+        return make_complex(re, im)
     value = np.empty(np.broadcast_shapes(re.shape, im.shape), complex)
     value.real, value.imag = re, im
     return value
 
 
-class Value(NamedTuple):
-    """P without the larger of z^p and 1, its derivatives by log z, and what rounding errors may add up to in P."""
+class PolynomialValue(NamedTuple):
+    """P, scaled by the larger of |z^p| and 1, with its derivatives in log z and a bound of its rounding error."""
 
     p: Any
-    first: Any
-    second: Any
-    rounding: Array
+    first: Any  # first derivative in log z
+    second: Any  # second derivative in log z
+    rounding: Array  # bound of the rounding error of p
 
 
-def _half_turn(x: Array, xp: Any) -> tuple[Array, Array]:
-    """Sine and cosine for |x| <= pi/2."""
+def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
+    """Return sine and cosine for |x| <= pi/2."""
     if xp is np:
-        # Python's numbers stay Python's.
+        # Return plain floats for a plain float, because they are faster than NumPy scalars.
         return (float(np.sin(x)), float(np.cos(x))) if type(x) is float else (np.sin(x), np.cos(x))
     square = x * x
     return x * horner(square, SINE), horner(square, COSINE)
 
 
-def _store(value: Any, witness: Array) -> Any:
-    """A pair that five loops use, each of which would repeat its series: a step takes 0.7 of the time."""
+def _store_pair(value: Any, witness: Array) -> Any:
+    """Return a pair that XLA computes once, although several of its loops use it."""
+    # Five loops use this pair and would each repeat its series; this reduces the time of a step to 70 %.
     return Pair(*store_once((value.real, value.imag), witness))
 
 
-def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
-    """Evaluate at ``e^(re + j im)``, |im| <= pi."""
+def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> PolynomialValue:
+    """Evaluate P and its derivatives at ``e^(re + j im)``, |im| <= pi."""
     xp = namespace(re, loop.alpha)
-    number: Any = join if xp is np else Pair
+    number: Any = make_complex if xp is np else Pair
     if xp is np and not np.ndim(re):
-        # Python's own are several times faster for single numbers.
-        number, re, im, loop = complex, float(re), float(im), Loop(*map(float, loop))
-    power = loop.turns + 1.0 if fractional else loop.turns
-    size = float(np.expm1(re)) if number is complex else xp.expm1(re)
-    r = 1.0 + size
-    sine, cosine = _half_turn(0.5 * im, xp)
-    gap = number(size - 2.0 * r * sine * sine, 2.0 * r * sine * cosine)
-    growth = power * re
-    # Not by the modulus: its derivative at 0 would be lost.
-    less = xp.exp(xp.where(growth < 0, growth, -growth))
-    up, down = xp.where(growth < 0, less, 1.0), xp.where(growth < 0, 1.0, less)
+        # Convert single numbers to Python's types, which are several times faster.
+        number, re, im, loop = complex, float(re), float(im), LoopFactors(*map(float, loop))
+    power = loop.n_plus_1 + 1.0 if fractional else loop.n_plus_1
+    expm1_re = float(np.expm1(re)) if number is complex else xp.expm1(re)
+    r = 1.0 + expm1_re
+    sine, cosine = _sine_and_cosine(0.5 * im, xp)
+    z_minus_1 = number(expm1_re - 2.0 * r * sine * sine, 2.0 * r * sine * cosine)
+    log_power = power * re
+    # Do not use abs(), because its derivative at 0 is not that of the function.
+    smaller = xp.exp(xp.where(log_power < 0, log_power, -log_power))
+    device_scale, wall_scale = xp.where(log_power < 0, smaller, 1.0), xp.where(log_power < 0, 1.0, smaller)
     phase = power * im
-    whole = xp.round(phase / (2.0 * np.pi))
+    full_turns = xp.round(phase / (2.0 * np.pi))
     if number is complex:
-        up, down, whole = float(up), float(down), float(whole)
-    phase = phase - 2.0 * np.pi * whole
-    turned, level = _half_turn(0.5 * phase, xp)
-    lag = number(up * (1.0 - 2.0 * turned * turned), 2.0 * up * turned * level)
+        device_scale, wall_scale, full_turns = float(device_scale), float(wall_scale), float(full_turns)
+    phase = phase - 2.0 * np.pi * full_turns
+    half_sine, half_cosine = _sine_and_cosine(0.5 * phase, xp)
+    delay = number(device_scale * (1.0 - 2.0 * half_sine * half_sine), 2.0 * device_scale * half_sine * half_cosine)
     if number is Pair:
-        gap, lag = _store(gap, re), _store(lag, re)
-    z = gap + 1.0
-    a, slope = gap * (gap + loop.em), z * (gap * 2.0 + loop.em)
-    lead = (z * loop.a2 + loop.h) * down
-    bend, wall, lean = z * (loop.a2 * down), gap * loop.s + loop.alpha, z * loop.s
-    d = lead * wall
-    d1 = bend * wall + lead * lean
-    d2 = d1 + bend * lean * 2.0
-    width = xp.abs(gap.real) + xp.abs(gap.imag)
-    sizes = down * (loop.h + loop.a2 * r) * (xp.abs(loop.alpha) + xp.abs(loop.s) * width)
+        z_minus_1, delay = _store_pair(z_minus_1, re), _store_pair(delay, re)
+    z = z_minus_1 + 1.0
+    device, device_slope = z_minus_1 * (z_minus_1 + loop.em), z * (z_minus_1 * 2.0 + loop.em)
+    numerator = (z * loop.a2 + loop.h) * wall_scale
+    numerator_slope, wall_factor, wall_slope = z * (loop.a2 * wall_scale), z_minus_1 * loop.s + loop.alpha, z * loop.s
+    d = numerator * wall_factor
+    d1 = numerator_slope * wall_factor + numerator * wall_slope
+    d2 = d1 + numerator_slope * wall_slope * 2.0
+    abs_z_minus_1 = xp.abs(z_minus_1.real) + xp.abs(z_minus_1.imag)
+    wall_size = wall_scale * (loop.h + loop.a2 * r) * (xp.abs(loop.alpha) + xp.abs(loop.s) * abs_z_minus_1)
     if fractional:
-        late = z + loop.q
-        d, d1, d2 = d * late, d1 * late + d * z, d2 * late + (d1 * 2.0 + d) * z
-        sizes = sizes * (r + loop.q)
-    t1 = lag * (a * power + slope)
-    t2 = lag * ((a * power + slope * 2.0) * power + slope + z * z * 2.0)
-    turning = power * (xp.abs(re) + xp.abs(im))
-    rounding = up * width * (width + loop.em) * (_ROUNDING + turning) + _ROUNDING * sizes
-    found = lag * a + d, t1 + d1, t2 + d2
-    # Unlike Python's numbers, NumPy's may be divided by zero.
-    return Value(*(map(np.complex128, found) if number is complex else found), rounding=epsilon(re) * rounding)
+        z_plus_q = z + loop.q
+        d, d1, d2 = d * z_plus_q, d1 * z_plus_q + d * z, d2 * z_plus_q + (d1 * 2.0 + d) * z
+        wall_size = wall_size * (r + loop.q)
+    t1 = delay * (device * power + device_slope)
+    t2 = delay * ((device * power + device_slope * 2.0) * power + device_slope + z * z * 2.0)
+    angle_rounding = power * (xp.abs(re) + xp.abs(im))
+    rounding = (
+        device_scale * abs_z_minus_1 * (abs_z_minus_1 + loop.em) * (FACTOR_ROUNDING + angle_rounding)
+        + FACTOR_ROUNDING * wall_size
+    )
+    values = delay * device + d, t1 + d1, t2 + d2
+    # Convert to NumPy's type, because Python's complex numbers raise an error on division by zero.
+    return PolynomialValue(
+        *(map(np.complex128, values) if number is complex else values), rounding=epsilon(re) * rounding
+    )
 
 
-class Step(NamedTuple):
-    """Newton's step for log z, how far from here a pole is at most, and how far from the step's end it may be."""
+class NewtonStep(NamedTuple):
+    """A Newton step for log z, with error bounds."""
 
-    re: Array
-    im: Array
-    within: Array
-    doubt: Array
+    re: Array  # the step in Re log z
+    im: Array  # the step in Im log z
+    radius: Array  # a pole is within this distance of the point before the step
+    end_error: Array  # estimated distance of the pole from the point after the step
 
 
-def newton_step(re: Array, im: Array, loop: Loop, fractional: bool) -> Step:
-    """One step from ``e^(re + j im)``, |im| <= pi."""
+def newton_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> NewtonStep:
+    """Compute one Newton step from ``e^(re + j im)``, |im| <= pi."""
     xp = namespace(re, loop.alpha)
-    at = value_at(re, im, loop, fractional)
-    norm = square(at.first)
-    by = at.p * at.first.conjugate() * (-1.0 / norm)
-    # A polynomial of degree N has a zero within N |P/P'| of any point.
-    poles, slope = loop.turns + (3.0 if fractional else 2.0), xp.sqrt(norm)
-    doubt = at.rounding / slope
-    # Of the step itself what the bend leaves: next to a double pole half of it.
-    bent = square(by) * xp.sqrt(square(at.second)) / slope
-    return Step(by.real, by.imag, poles * (xp.sqrt(square(at.p)) / slope + doubt), doubt + bent)
+    value = evaluate_polynomial(re, im, loop, fractional)
+    norm = square(value.first)
+    step = value.p * value.first.conjugate() * (-1.0 / norm)
+    # A polynomial of degree N has a zero within N |P/P'| of every point.
+    degree, slope = loop.n_plus_1 + (3.0 if fractional else 2.0), xp.sqrt(norm)
+    rounding_error = value.rounding / slope
+    # The second derivative leaves an error after the step; near a double pole it is half the step.
+    curvature_error = square(step) * xp.sqrt(square(value.second)) / slope
+    return NewtonStep(
+        step.real,
+        step.imag,
+        degree * (xp.sqrt(square(value.p)) / slope + rounding_error),
+        rounding_error + curvature_error,
+    )
 
 
-def halley_step(re: Array, im: Array, loop: Loop, fractional: bool) -> tuple[Array, Array]:
-    """The place in the upper half plane to which a step leads, not longer than about the distance between poles."""
+def halley_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
+    """Take one Halley step, limited to `MAX_STEP`; return the new point, in the upper half plane."""
     xp = namespace(re, loop.alpha)
-    at = value_at(re, im, loop, fractional)
-    back = at.first.conjugate() * (1.0 / square(at.first))
-    by = at.p * back
-    bent = by * (at.second * back) * -0.5 + 1.0
-    by = by * bent.conjugate() * (-1.0 / square(bent))
-    size = xp.sqrt(square(by)) * (loop.turns + 1.0)
-    shorter = _LONGEST / xp.maximum(size, _LONGEST)
-    return move_pole(re, im, by.real * shorter, by.imag * shorter)
+    value = evaluate_polynomial(re, im, loop, fractional)
+    inverse_first = value.first.conjugate() * (1.0 / square(value.first))
+    step = value.p * inverse_first
+    denominator = step * (value.second * inverse_first) * -0.5 + 1.0
+    step = step * denominator.conjugate() * (-1.0 / square(denominator))
+    size = xp.sqrt(square(step)) * (loop.n_plus_1 + 1.0)
+    factor = MAX_STEP / xp.maximum(size, MAX_STEP)
+    return shift_pole(re, im, step.real * factor, step.imag * factor)
 
 
-def move_pole(re: Array, im: Array, by_re: Array, by_im: Array) -> tuple[Array, Array]:
-    """The next place in the upper half plane: past the real axis the conjugate is meant."""
+def shift_pole(re: Array, im: Array, step_re: Array, step_im: Array) -> tuple[Array, Array]:
+    """Add a step to log z; a result below the real axis is replaced by its complex conjugate."""
     xp = namespace(re)
-    im = xp.abs(im + by_im)
-    return re + by_re, xp.where(im > np.pi, 2.0 * np.pi - im, im)
+    im = xp.abs(im + step_im)
+    return re + step_re, xp.where(im > np.pi, 2.0 * np.pi - im, im)

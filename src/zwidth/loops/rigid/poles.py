@@ -1,10 +1,20 @@
-"""All poles: eigenvalues of the companion matrix, polished, or of many walls at one time by Aberth's iteration.
+"""Compute all closed-loop poles: by eigenvalues, or by Aberth's iteration for many walls at once.
 
-That iteration, Ehrlich's too, moves all poles of a wall at once, with Smith's discs as its proof. With q_i the product
-of z_i - z_j over all j but i and q_i' its derivative by z_i, a step is P q/(P' q - P q'): products alone and one
-quotient a pole, which compilers make into one loop over the walls. The same q ends it. Every zero of a monic polynomial
-of degree N lies in one of the discs |z - z_i| <= N |P(z_i)/q_i| (Smith 1970), and where these are disjoint each holds
-exactly one.
+The eigenvalues are those of the companion matrix of the characteristic polynomial P. Newton's method on the factors of
+P (`loops.rigid.circle.LoopFactors`) then refines them.
+
+Aberth's iteration (Ehrlich 1967, Aberth 1973) updates all approximations z_i of a wall together. With P monic of
+degree N, q_i the product of z_i - z_j over all j != i, and q_i' its derivative in z_i, one step subtracts
+
+    P q_i/(P' q_i - P q_i')        at z_i
+
+This form needs only products and a single quotient per pole, which XLA fuses into one loop over the walls. The same
+q_i certify the result: every zero of P lies in one of the discs |z - z_i| <= N |P(z_i)/q_i|, and if these discs are
+disjoint, each of them contains exactly one zero (Smith 1970). Walls without this certificate are computed by
+eigenvalues instead.
+
+References:
+    Ehrlich 1967, Commun. ACM 10, 107-108. Aberth 1973, Math. Comp. 27, 339-344. Smith 1970, J. ACM 17, 661-674.
 """
 
 from __future__ import annotations
@@ -18,11 +28,11 @@ import numpy as np
 from zwidth.arrays.blocks import map_blocks
 from zwidth.arrays.evaluate import as_float64, to_caller
 from zwidth.arrays.polynomials import companion, square
-from zwidth.loops.rigid.circle import Loop, factor_loop
-from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
+from zwidth.loops.rigid.circle import LoopFactors, factor_loop
+from zwidth.loops.rigid.folding import Degree, count_uncompiled_points, find_degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall, wall_status
-from zwidth.loops.rigid.pole_step import Pair, join
-from zwidth.loops.rigid.polynomial import coefficients
+from zwidth.loops.rigid.pole_step import Pair, make_complex
+from zwidth.loops.rigid.polynomial import compute_coefficients
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
 from zwidth.words.status import Status
@@ -31,139 +41,156 @@ from zwidth.words.xp import epsilon, is_traced, namespace, nan_with_nan_slopes, 
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 
-# The eigenvalues start with errors near eps^(1/k) for a k-fold pole; two steps finish a simple one.
-_POLISHING_STEPS = 3
-# Of Aberth's, with half as many more as there are poles: all but some 2 walls in 1,000 are settled.
-_FIRST_STEPS = 9
-# Of the coefficients of N(z), which come from series, of their sum and of the products behind it, in rounding units.
-_ROUNDING = 32.0
-# Beyond, steps and the time to compile them grow, and the product of all distances between poles loses its digits.
-_MOST_AT_ONE_TIME = 24
-# Numbers of one kind, or of matrices, that a block of walls holds at most, which then stay in the cache.
-_NUMBERS = 1 << 15
+# Newton steps after the eigenvalues, whose errors are near eps^(1/k) for a k-fold pole; two steps suffice for a simple
+# pole.
+POLISHING_STEPS = 3
+# Aberth steps, in addition to half the number of poles; about 2 walls in 1,000 have not converged after these.
+MIN_ABERTH_STEPS = 9
+# Rounding error of the wall's part of P, in rounding units: of the coefficients of N(z), of their sum, and of the
+# products with them.
+NUMERATOR_ROUNDING = 32.0
+# Largest degree for Aberth's iteration. For more poles the number of steps and the compile time grow, and the product
+# of all distances between poles loses accuracy.
+MAX_ABERTH_POLES = 24
+# Numbers per array, or matrix elements, in a block of walls; such blocks fit in the cache.
+BLOCK_SIZE = 1 << 15
 
 
-def product_form(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Loop:
-    """The factors of P of every wall, NaN where it is out of range, with a new first axis for its poles."""
+def factor_with_pole_axis(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> LoopFactors:
+    """Return the factors of P of each wall, with a new first axis for its poles; NaN if the wall is out of range."""
     xp = namespace(alpha, beta, delta, d)
     loop = store_once(factor_loop(alpha, beta, delta, d, degree.fractional), delta)
-    return Loop(*(xp.asarray(part)[None] for part in loop))
+    return LoopFactors(*(xp.asarray(part)[None] for part in loop))
 
 
-def _power(z: Pair, power: int) -> Pair:
-    """z^power by repeated squaring."""
+def _raise_to_power(z: Pair, power: int) -> Pair:
+    """Return z^power by repeated squaring."""
     if power == 0:
         return Pair(0.0 * z.real + 1.0, 0.0 * z.imag)
-    root = _power(z, power // 2)
-    square = root * root
-    return square * z if power % 2 else square
+    half_power = _raise_to_power(z, power // 2)
+    squared = half_power * half_power
+    return squared * z if power % 2 else squared
 
 
-def _evaluate(z: Pair, loop: Loop, degree: Degree) -> tuple[Pair, Pair]:
-    """P(z) and P'(z)."""
+def _evaluate(z: Pair, loop: LoopFactors, degree: Degree) -> tuple[Pair, Pair]:
+    """Return P(z) and P'(z)."""
     power = degree.poles - 2
-    one, pole = z + -1.0, z + -loop.c
-    lag, quadratic, body = _power(z, power - 1), one * pole, z * (one + pole)
-    n, n_slope = z * loop.a2 + loop.h, loop.a2
+    z_minus_1, z_minus_c = z + -1.0, z + -loop.c
+    low_power, quadratic, z_times_slope = (
+        _raise_to_power(z, power - 1),
+        z_minus_1 * z_minus_c,
+        z * (z_minus_1 + z_minus_c),
+    )
+    numerator, numerator_slope = z * loop.a2 + loop.h, loop.a2
     if degree.fractional:
-        late = z + loop.q
-        n, n_slope = n * late, late * loop.a2 + n
-    wall = Pair(loop.alpha * z.real + loop.beta * one.real, loop.s * z.imag)
-    return lag * z * quadratic + n * wall, lag * (quadratic * power + body) + wall * n_slope + n * loop.s
+        z_plus_q = z + loop.q
+        numerator, numerator_slope = numerator * z_plus_q, z_plus_q * loop.a2 + numerator
+    wall = Pair(loop.alpha * z.real + loop.beta * z_minus_1.real, loop.s * z.imag)
+    return low_power * z * quadratic + numerator * wall, low_power * (
+        quadratic * power + z_times_slope
+    ) + wall * numerator_slope + numerator * loop.s
 
 
-def _bound_rounding(z: Pair, loop: Loop, degree: Degree, unit: float) -> Array:
-    """What rounding errors may add up to in P(z)."""
+def _bound_rounding(z: Pair, loop: LoopFactors, degree: Degree, unit: float) -> Array:
+    """Return a bound of the rounding error of P(z)."""
     xp, power = namespace(z.real), degree.poles - 2
-    # Sums of the parts' sizes are upper bounds of moduli that neither overflow nor underflow.
-    r, one, pole = (xp.abs(z.real - zero) + xp.abs(z.imag) for zero in (0.0, 1.0, loop.c))
-    lagged = r**power * one * ((3.0 * power + 8.0) * pole + 2.0 * loop.c)
-    n = (loop.a2 * r + loop.h) * (r + loop.q if degree.fractional else 1.0)
-    return unit * (lagged + _ROUNDING * n * (xp.abs(loop.alpha) * r + xp.abs(loop.beta) * one))
+    # |Re| + |Im| is an upper bound of the modulus that neither overflows nor underflows.
+    abs_z, abs_z_minus_1, abs_z_minus_c = (xp.abs(z.real - zero) + xp.abs(z.imag) for zero in (0.0, 1.0, loop.c))
+    device_part = abs_z**power * abs_z_minus_1 * ((3.0 * power + 8.0) * abs_z_minus_c + 2.0 * loop.c)
+    numerator = (loop.a2 * abs_z + loop.h) * (abs_z + loop.q if degree.fractional else 1.0)
+    return unit * (
+        device_part + NUMERATOR_ROUNDING * numerator * (xp.abs(loop.alpha) * abs_z + xp.abs(loop.beta) * abs_z_minus_1)
+    )
 
 
 def _split(z: Array) -> Pair:
-    """Real and imaginary parts."""
+    """Split a complex array into its real and imaginary parts."""
     return Pair(z.real, z.imag)
 
 
-def _differences(z: RootsFirst) -> list[Pair]:
-    """From each pole the ones that follow it, nearest in number first."""
+def _subtract_pairwise(z: RootsFirst) -> list[Pair]:
+    """Return the differences z_i - z_(i+k), indices modulo the number of poles, for k = 1, 2, ..."""
     twice, count = namespace(z).concatenate([z, z]), z.shape[0]
     return [_split(z - twice[k : k + count]) for k in range(1, count)]
 
 
-def _move_apart(z: RootsFirst, loop: Loop, degree: Degree) -> RootsFirst:
-    """A step of Aberth's iteration."""
-    q, *others = _differences(z)
-    at = _split(z)
-    q_slope = Pair(0.0 * at.real + 1.0, 0.0 * at.imag)
+def _take_aberth_step(z: RootsFirst, loop: LoopFactors, degree: Degree) -> RootsFirst:
+    """Take one step of Aberth's iteration."""
+    q, *others = _subtract_pairwise(z)
+    pair = _split(z)
+    q_slope = Pair(0.0 * pair.real + 1.0, 0.0 * pair.imag)
     for difference in others:
         q_slope = q_slope * difference + q
         q = q * difference
-    value, slope = _evaluate(at, loop, degree)
+    value, slope = _evaluate(pair, loop, degree)
     step = (value * q).over(slope * q + value * q_slope * -1.0)
-    return join(at.real - step.real, at.imag - step.imag)
+    return make_complex(pair.real - step.real, pair.imag - step.imag)
 
 
-def _start(loop: Loop, degree: Degree) -> RootsFirst:
-    """Two poles near those of the device, the others around 0, where the two parts of P are about equally large."""
-    xp, around, spring = namespace(loop.c), degree.poles - 2, loop.beta == 0
-    # Without virtual damping a pole is at 0, from which no step leads away.
-    last = loop.h * xp.where(spring, loop.alpha, loop.beta) * (loop.q if degree.fractional else 1.0)
-    r = xp.clip(xp.abs(last) ** (1.0 / xp.maximum(around - spring, 1)), 0.02, 3.0)
-    # No two are each other's conjugates: a symmetric set stays so, and could not change how many of it are real.
-    circle = np.exp(1j * (2.0 * np.pi * np.arange(around) / around + 0.4)).reshape(-1, *[1] * (r.ndim - 1))
-    first, others = xp.where(spring, 0.0, r * circle[:1]), r * circle[1:]
-    return xp.concatenate([first, others, 0.0 * r + (0.9 + 0.45j), 0.0 * r + (0.75 - 0.4j)])
+def _guess_poles(loop: LoopFactors, degree: Degree) -> RootsFirst:
+    """Return the starting points: two near the device's poles, the others on a circle where T and B are similar."""
+    xp, n_others, no_damping = namespace(loop.c), degree.poles - 2, loop.beta == 0
+    # Without virtual damping one pole is exactly 0; a step from there would not leave it.
+    constant_term = loop.h * xp.where(no_damping, loop.alpha, loop.beta) * (loop.q if degree.fractional else 1.0)
+    r = xp.clip(xp.abs(constant_term) ** (1.0 / xp.maximum(n_others - no_damping, 1)), 0.02, 3.0)
+    # Choose a set that is not symmetric about the real axis. The iteration would preserve such a symmetry, and the
+    # number of real poles could never change.
+    circle = np.exp(1j * (2.0 * np.pi * np.arange(n_others) / n_others + 0.4)).reshape(-1, *[1] * (r.ndim - 1))
+    first, rest = xp.where(no_damping, 0.0, r * circle[:1]), r * circle[1:]
+    return xp.concatenate([first, rest, 0.0 * r + (0.9 + 0.45j), 0.0 * r + (0.75 - 0.4j)])
 
 
-def discs(z: RootsFirst, loop: Loop, degree: Degree) -> tuple[RadiiFirst, Array, Array]:
-    """Radii of discs round ``z``, poles along the first axis: in each lies one pole if the second result says so."""
-    # The third says whether P is as small at each of them as rounding lets it be seen.
+def compute_discs(z: RootsFirst, loop: LoopFactors, degree: Degree) -> tuple[RadiiFirst, Array, Array]:
+    """Return Smith's discs around approximations ``z``, with the poles along the first axis.
+
+    Returns:
+        The radius of each disc; whether all discs of a wall are disjoint, so that each contains exactly one pole; and
+        whether |P| at every approximation is within its rounding error (the iteration has converged).
+    """
     xp, poles = namespace(z), len(z)
-    at, unit = _split(z), epsilon(z.real)
-    apart = [xp.sqrt(part.real * part.real + part.imag * part.imag) for part in _differences(z)]
-    q = 0.0 * at.real + 1.0
-    for distance in apart:
+    pair, unit = _split(z), epsilon(z.real)
+    distances = [xp.sqrt(part.real * part.real + part.imag * part.imag) for part in _subtract_pairwise(z)]
+    q = 0.0 * pair.real + 1.0
+    for distance in distances:
         q = q * distance
-    value, bound = _evaluate(at, loop, degree)[0], _bound_rounding(at, loop, degree, unit)
+    value, rounding = _evaluate(pair, loop, degree)[0], _bound_rounding(pair, loop, degree, unit)
     size = xp.abs(value.real) + xp.abs(value.imag)
-    # A thousandth more than N, for the rounding of q.
-    within = 1.001 * poles * (size + bound) / q
-    twice = xp.concatenate([within, within])
-    disjoint = xp.isfinite(within)
-    for k, distance in enumerate(apart[: poles // 2], start=1):
-        disjoint = disjoint & (distance > within + twice[k : k + poles])
-    settled = size <= bound + unit * (xp.abs(at.real) + xp.abs(at.imag)) * q
-    return within, xp.all(disjoint, axis=0), xp.all(settled, axis=0)
+    # The factor 1.001 covers the rounding error of q.
+    radius = 1.001 * poles * (size + rounding) / q
+    doubled = xp.concatenate([radius, radius])
+    disjoint = xp.isfinite(radius)
+    for k, distance in enumerate(distances[: poles // 2], start=1):
+        disjoint = disjoint & (distance > radius + doubled[k : k + poles])
+    converged = size <= rounding + unit * (xp.abs(pair.real) + xp.abs(pair.imag)) * q
+    return radius, xp.all(disjoint, axis=0), xp.all(converged, axis=0)
 
 
 def aberth_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> tuple[Roots, Radii, Array]:
-    """All poles, how far each is off at most, and whether that is proved and no digit is missing."""
-    loop = product_form(alpha, beta, delta, d, degree)
-    spoiled = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
-    xp, steps = namespace(loop.c), _FIRST_STEPS + degree.poles // 2
-    z = repeat(steps, lambda z: _move_apart(z, loop, degree), _start(loop, degree), xp)
-    within, proved, settled = discs(z, loop, degree)
-    # A disc on the real axis that holds one pole holds a real one, unless the pole's conjugate is in a disc close by.
-    real = xp.abs(z.imag) <= within
-    within = within + xp.where(real, xp.abs(z.imag), 0.0)
-    z = join(z.real, xp.where(real, 0.0, z.imag))
-    z, within = (xp.moveaxis(part, 0, -1) + spoiled[..., None] for part in (z, within))
-    return z, within, proved & settled
+    """Return all poles, a bound of each error, and whether the bounds are certified and the iteration has converged."""
+    loop = factor_with_pole_axis(alpha, beta, delta, d, degree)
+    nan_if_invalid = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    xp, steps = namespace(loop.c), MIN_ABERTH_STEPS + degree.poles // 2
+    z = repeat(steps, lambda z: _take_aberth_step(z, loop, degree), _guess_poles(loop, degree), xp)
+    radius, disjoint, converged = compute_discs(z, loop, degree)
+    # If a disc contains exactly one pole and meets the real axis, this pole is real, unless its conjugate is in a
+    # neighboring disc.
+    real = xp.abs(z.imag) <= radius
+    radius = radius + xp.where(real, xp.abs(z.imag), 0.0)
+    z = make_complex(z.real, xp.where(real, 0.0, z.imag))
+    z, radius = (xp.moveaxis(part, 0, -1) + nan_if_invalid[..., None] for part in (z, radius))
+    return z, radius, disjoint & converged
 
 
 def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
-    """All poles along a new last axis, from eigenvalues."""
-    matrices = companion(coefficients(alpha, beta, delta, d, degree))
+    """Return all poles from eigenvalues, along a new last axis."""
+    matrices = companion(compute_coefficients(alpha, beta, delta, d, degree))
     xp = namespace(matrices)
     z = _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices)
     return _polish_poles(z, alpha, beta, delta, d, degree)
 
 
 def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
-    """Eigenvalues by LAPACK; NaN for a matrix on which it gives up, which must not spoil the others."""
+    """Return eigenvalues by LAPACK; NaN only for those matrices for which LAPACK does not converge."""
     try:
         return np.linalg.eigvals(matrices) + 0j
     except np.linalg.LinAlgError:
@@ -173,30 +200,32 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
 
 
 def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
-    """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
+    """Improve poles by short Newton steps, each accepted only if it lowers |P|; multiple poles are not moved."""
     xp = namespace(z, alpha)
-    loop = product_form(alpha, beta, delta, d, degree)
-    spoiled = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    loop = factor_with_pole_axis(alpha, beta, delta, d, degree)
+    nan_if_invalid = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
 
-    def at(z: RootsFirst) -> tuple[Pair, Pair]:
+    def evaluate(z: RootsFirst) -> tuple[Pair, Pair]:
         return _evaluate(_split(z), loop, degree)
 
     def step(z: RootsFirst) -> RootsFirst:
-        here = _split(z)
-        value, slope = at(z)
-        still = (slope.real == 0) & (slope.imag == 0)
-        by = value.over(Pair(xp.where(still, 1.0, slope.real), slope.imag))
-        taken = ~still & (square(by) < 1e-6 * xp.maximum(square(here), 1e-6))
-        return join(here.real - xp.where(taken, by.real, 0.0), here.imag - xp.where(taken, by.imag, 0.0))
+        pair = _split(z)
+        value, slope = evaluate(z)
+        stationary = (slope.real == 0) & (slope.imag == 0)
+        correction = value.over(Pair(xp.where(stationary, 1.0, slope.real), slope.imag))
+        accepted = ~stationary & (square(correction) < 1e-6 * xp.maximum(square(pair), 1e-6))
+        return make_complex(
+            pair.real - xp.where(accepted, correction.real, 0.0), pair.imag - xp.where(accepted, correction.imag, 0.0)
+        )
 
     first = xp.moveaxis(z, -1, 0)
-    last = repeat(_POLISHING_STEPS, step, first, xp)
-    better = square(at(last)[0]) < square(at(first)[0])
-    return xp.moveaxis(xp.where(better, last, first), 0, -1) + spoiled[..., None]
+    last = repeat(POLISHING_STEPS, step, first, xp)
+    better = square(evaluate(last)[0]) < square(evaluate(first)[0])
+    return xp.moveaxis(xp.where(better, last, first), 0, -1) + nan_if_invalid[..., None]
 
 
 def check_degree(d: ArrayLike) -> None:
-    """Raise `InputError` for delays with so many poles that a point takes minutes and gigabytes."""
+    """Raise `InputError` for a delay with more than `MOST_POLES` poles, which would take minutes and gigabytes."""
     if is_traced(d):
         return
     delays = as_float64("d", d)
@@ -204,39 +233,41 @@ def check_degree(d: ArrayLike) -> None:
     poles = find_degree(longest).poles
     if poles > MOST_POLES:
         raise InputError(
-            f"d: got {longest:g}; its {poles} poles would take about {8e-6 * poles**2:.0f} MB and "
-            f"{2e-9 * poles**3:.0f} s a point, and at most {MOST_POLES} are computed; zwidth.spectral_radius, "
-            "decay_rate and is_stable answer for every delay at once"
+            f"d: got {longest:g}; its {poles} poles need about {8e-6 * poles**2:.0f} MB and "
+            f"{2e-9 * poles**3:.0f} s per point; at most {MOST_POLES} are computed. Use zwidth.spectral_radius, "
+            "decay_rate or is_stable instead"
         )
 
 
-def _check(values: tuple[ArrayLike, ...], method: str = "companion") -> None:
+def _check_arguments(values: tuple[ArrayLike, ...], method: str = "companion") -> None:
     """Raise `InputError` for an unknown method or too many poles."""
     check_choice("method", method, get_args(PoleMethod))
     check_degree(values[3])
 
 
-def _by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
-    """Poles of columns of one degree, with the eigenvalues of concrete ones from LAPACK on every processor."""
+def _compute_by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
+    """Return the poles of columns of one degree by eigenvalues; concrete matrices go to LAPACK on all processors."""
     columns = alpha, beta, delta, d
     if is_traced(*columns):
-        # As one program: differentiated outside `jit`, every operation would be compiled alone.
+        # Compile a single program, because JAX would otherwise compile every operation separately when it
+        # differentiates outside `jit`.
         return _compile_by_degree(pole_kernel, degree)(*columns)
-    # Of large matrices the eigenvalues take so long that nothing else is worth a compilation.
-    few = alpha.size <= few_poles(degree)
+    # Without compilation for few walls, and for large matrices, whose eigenvalues take most of the time.
+    few = alpha.size <= count_uncompiled_points(degree)
 
-    def block(*walls: Any) -> np.ndarray:
-        if few or degree.poles > _MOST_AT_ONE_TIME:
+    def compute_block(*walls: Any) -> np.ndarray:
+        if few or degree.poles > MAX_ABERTH_POLES:
             with np.errstate(all="ignore"):
                 return pole_kernel(*walls, degree=degree)
-        z = _eigenvalues(companion(np.asarray(_compile_by_degree(coefficients, degree)(*walls))))
+        z = _eigenvalues(companion(np.asarray(_compile_by_degree(compute_coefficients, degree)(*walls))))
         return np.asarray(_compile_by_degree(_polish_poles, degree)(z, *walls))
 
-    return block(*columns) if few else map_blocks(block, columns, max(1, _NUMBERS // degree.poles**2))
+    return compute_block(*columns) if few else map_blocks(compute_block, columns, max(1, BLOCK_SIZE // degree.poles**2))
 
 
 @cache
 def _compile_by_degree(kernel: Callable[..., Any], degree: Degree) -> Any:
+    """Return the compiled kernel for one degree, cached."""
     import jax
 
     return jax.jit(lambda *arrays: kernel(*arrays, degree))
@@ -282,7 +313,7 @@ def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, 
         np.True_
     """
     values = (alpha, beta, delta, d)
-    _check(values, method)
+    _check_arguments(values, method)
     if is_traced(*values) and method == "aberth":
         raise InputError(
             "method: 'aberth' falls back on the host; inside a JAX transformation use 'auto' or 'companion'"
@@ -291,34 +322,34 @@ def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, 
 
 
 def _find_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, method: PoleMethod) -> Roots:
-    """Poles of columns of one degree, by Aberth's iteration where it pays and by eigenvalues where it must."""
+    """Return the poles of columns of one degree, by Aberth's iteration for many walls of low degree."""
     columns = alpha, beta, delta, d
-    few = alpha.size <= few_poles(degree)
-    if method == "auto" and (few or is_traced(*columns) or degree.poles > _MOST_AT_ONE_TIME):
+    few = alpha.size <= count_uncompiled_points(degree)
+    if method == "auto" and (few or is_traced(*columns) or degree.poles > MAX_ABERTH_POLES):
         method = "companion"
     if method == "companion":
-        return _by_companion(*columns, degree)
+        return _compute_by_companion(*columns, degree)
     if few:
-        z, _, proved = aberth_kernel(*columns, degree)
+        z, _, certified = aberth_kernel(*columns, degree)
     else:
         compiled = _compile_by_degree(aberth_kernel, degree)
-        z, _, proved = map_blocks(compiled, columns, max(1, _NUMBERS // degree.poles))
-    left = np.flatnonzero(~proved & (wall_status(*columns) == Status.OK))
-    if left.size:
-        z[left] = _by_companion(*(column[left] for column in columns), degree=degree)
+        z, _, certified = map_blocks(compiled, columns, max(1, BLOCK_SIZE // degree.poles))
+    open_walls = np.flatnonzero(~certified & (wall_status(*columns) == Status.OK))
+    if open_walls.size:
+        z[open_walls] = _compute_by_companion(*(column[open_walls] for column in columns), degree=degree)
     return z
 
 
 def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Reals:
     """Return the spectral radius of each wall, from all poles; NaN for input out of range."""
     values = (alpha, beta, delta, d)
-    _check(values)
-    found = map_by_degree(_by_companion, values, route="numpy")
-    xp = namespace(found) if is_traced(*values) else np
-    z: Any = xp.asarray(found)
+    _check_arguments(values)
+    all_poles = map_by_degree(_compute_by_companion, values, route="numpy")
+    xp = namespace(all_poles) if is_traced(*values) else np
+    z: Any = xp.asarray(all_poles)
     # NaN marks a missing pole if the wall has other poles.
     missing = xp.isnan(z.real) & ~xp.isnan(z[..., :1].real)
     radius = xp.max(xp.where(missing, 0.0, xp.abs(z)), axis=-1)
-    # Without stiffness a pole is exactly at 1, but the computed one has a rounding error.
+    # Without stiffness one pole is exactly 1, but the computed one has a rounding error.
     radius = xp.where(xp.asarray(alpha) == 0, xp.maximum(radius, 1.0), radius)
     return radius if xp is not np else to_caller(radius, values)

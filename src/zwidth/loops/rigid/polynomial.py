@@ -1,11 +1,13 @@
-"""The closed loop of device and virtual wall, affine in (alpha, beta).
+"""Compute the characteristic polynomial of device and virtual wall: its coefficients, or walls with a given zero.
 
-Held delay d = n + f, with N(z) = a2 z^2 + a1 z + a0 of `arrays.held_mass`:
+For the delay d = n + f (n integer, 0 <= f < 1) and N(z) = a2 z^2 + a1 z + a0 of the discretized plant
+(`arrays.held_mass`),
 
-    P(z) = z^(2+n) (z - 1)(z - c) + N(z) (alpha z + beta (z - 1))
+    P(z) = z^(2+n) (z - 1)(z - c) + N(z) (alpha z + beta (z - 1)),   c = e^-delta
 
-For integer d, a0 = 0 and one factor z cancels; that is the paper's polynomial (17) over -delta^2, monic and
-factored. Pole methods use the coefficients `coefficients`, frequency methods `frequency_boundary`.
+P is affine in the wall (alpha, beta): P = D + alpha N1 + beta N2. For integer d, a0 = 0 and one factor z cancels; the
+result is the paper's polynomial (17) divided by -delta^2, which makes it monic. The pole methods use its coefficients
+(`compute_coefficients`), the frequency methods the wall with a given pole on the unit circle (`find_boundary_wall`).
 """
 
 from __future__ import annotations
@@ -16,61 +18,66 @@ from zwidth.arrays.held_mass import Plant, held_plant, split_delay
 from zwidth.arrays.polynomials import Affine
 from zwidth.loops.rigid.folding import Degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall
-from zwidth.loops.rigid.ridge_newton import expand_curve, wall, wave_at
+from zwidth.loops.rigid.ridge_newton import evaluate_wall, evaluate_wave_at, expand_curve
 from zwidth.words.types import Array, ArrayLike, Coefficients, Reals
 from zwidth.words.xp import namespace, nan_with_nan_slopes
 
 
-def affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
-    """The three coefficient vectors of devices of one degree, along a new last axis of degree.poles + 1."""
-    plant = held_plant(delta, d - degree.whole if degree.fractional else None)
+def expand_affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
+    """Return the coefficient vectors D, N1, N2 of devices of one degree, along a new last axis of degree.poles + 1."""
+    plant = held_plant(delta, d - degree.n if degree.fractional else None)
     xp = namespace(plant.a2)
     zero, one = 0.0 * plant.a2, 0.0 * plant.a2 + 1.0
     head = [one, -(1.0 + plant.c), plant.c]
-    # N(z) and (z - 1) N(z), without the common factor z that a whole delay leaves in them; a2 - a1 is then the gap.
+    # The coefficients of N(z) and of (z - 1) N(z). For an integer delay both are divided by the common factor z, and
+    # a2 - a1 is the gap.
     if degree.fractional:
-        n = [plant.a2, plant.a1, plant.a0]
+        numerator = [plant.a2, plant.a1, plant.a0]
         differences = [plant.a1 - plant.a2, plant.a0 - plant.a1]
     else:
-        n = [plant.a2, plant.a1]
+        numerator = [plant.a2, plant.a1]
         differences = [-plant.gap]
-    pad = [zero] * (degree.poles - len(n))
-    rows = (head + [zero] * (degree.poles - 2), [*pad, *n, zero], [*pad, n[0], *differences, -n[-1]])
+    pad = [zero] * (degree.poles - len(numerator))
+    rows = (
+        head + [zero] * (degree.poles - 2),
+        [*pad, *numerator, zero],
+        [*pad, numerator[0], *differences, -numerator[-1]],
+    )
     return Affine(*(xp.stack(row, axis=-1) for row in rows))
 
 
-def coefficients(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
-    """Coefficients of P, highest power first, along a new last axis of degree.poles + 1; P is monic."""
-    # Of what is out of range any numbers.
+def compute_coefficients(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
+    """Return the coefficients of the monic P, highest power first, along a new last axis of degree.poles + 1."""
+    # Replace arguments that are out of range by valid numbers; the caller sets these results to NaN.
     xp, ok = namespace(alpha, beta, delta, d), valid_wall(alpha, beta, delta, d)
     alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
-    parts = affine(delta, xp.where(ok, d, float(degree.whole)), degree)
-    return parts.D + alpha[..., None] * parts.N1 + beta[..., None] * parts.N2
+    polynomials = expand_affine(delta, xp.where(ok, d, float(degree.n)), degree)
+    return polynomials.D + alpha[..., None] * polynomials.N1 + beta[..., None] * polynomials.N2
 
 
 class Wall(NamedTuple):
-    """A wall by its normalized stiffness and damping, or an array of them."""
+    """The normalized stiffness and damping of a wall, or arrays of them."""
 
     alpha: Reals
     beta: Reals
 
 
 class FrequencyLoop(NamedTuple):
-    """Parameters of one loop that do not depend on the frequency."""
+    """The parameters of one loop that do not depend on the frequency."""
 
     plant: Plant
-    lag: Array  # integer periods of delay
+    n: Array  # n, integer part of the delay
 
 
-def frequency_loop(delta: Array, d: Array) -> FrequencyLoop:
-    """Return the loop of one (delta, d) for evaluation on the unit circle."""
-    whole, fraction = split_delay(d)
-    return FrequencyLoop(held_plant(delta, fraction), whole)
+def build_frequency_loop(delta: Array, d: Array) -> FrequencyLoop:
+    """Return the discretized plant and the integer delay of one (delta, d)."""
+    n, fraction = split_delay(d)
+    return FrequencyLoop(held_plant(delta, fraction), n)
 
 
-def frequency_boundary(omega: Reals, loop: FrequencyLoop) -> Wall:
-    """Return the wall that puts a pole at z = e^(j omega), 0 <= omega <= pi, in closed form."""
-    return Wall(*wall(wave_at(omega, loop.lag), expand_curve(loop.plant)))
+def find_boundary_wall(omega: Reals, loop: FrequencyLoop) -> Wall:
+    """Return the wall that has a pole at z = e^(j omega), 0 <= omega <= pi, in closed form."""
+    return Wall(*evaluate_wall(evaluate_wave_at(omega, loop.n), expand_curve(loop.plant)))
 
 
 def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Coefficients:
@@ -110,5 +117,5 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike)
 
 
 def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
-    spoiled = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
-    return coefficients(alpha, beta, delta, d, degree) + spoiled[..., None]
+    nan_if_invalid = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    return compute_coefficients(alpha, beta, delta, d, degree) + nan_if_invalid[..., None]

@@ -1,4 +1,4 @@
-"""Step response of the rigid device in contact with the wall, exact at the samples and between them.
+"""Compute the step response of a rigid device in contact with the wall, exactly at and between the samples.
 
 Between two instants at which a force changes, the damped mass has the exact solution
 
@@ -20,7 +20,7 @@ from zwidth.arrays.held_mass import phi_functions
 from zwidth.arrays.roots import bisect
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.folding import find_degree
-from zwidth.loops.rigid.outermost_poles import slowest_pole
+from zwidth.loops.rigid.outermost_poles import find_dominant_pole
 from zwidth.parts.checks import check_whole
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, Samples
@@ -33,11 +33,13 @@ MOST_PERIODS = 1 << 21  # longest simulation for a settling time; takes some sec
 
 def advance(x: Array, v: Array, force: Array, t: Array, delta: float) -> tuple[Array, Array]:
     """Return the exact state of the damped mass after time t under a constant force."""
-    at = phi_functions(delta * t)
-    return x + t * at.phi1 * v + t * t * at.phi2 * force, np.exp(-delta * t) * v + t * at.phi1 * force
+    phi = phi_functions(delta * t)
+    return x + t * phi.phi1 * v + t * t * phi.phi2 * force, np.exp(-delta * t) * v + t * phi.phi1 * force
 
 
-def move(x: Array, v: Array, older: Array, newer: Array, t: Array, delta: float, f: float) -> tuple[Array, Array]:
+def advance_period(
+    x: Array, v: Array, older: Array, newer: Array, t: Array, delta: float, f: float
+) -> tuple[Array, Array]:
     """Return the state at the instant t of a period whose force changes at the fraction f."""
     x, v = advance(x, v, older, np.minimum(t, f), delta)
     return advance(x, v, newer, np.maximum(t - f, 0.0), delta)
@@ -52,25 +54,28 @@ def settling_time(alpha: float, beta: float, delta: float, d: float) -> float:
     wall = alpha, beta, delta, d
     with np.errstate(all="ignore"):
         stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
-        rate = slowest_pole(wall)[1] if stable else math.nan
+        rate = find_dominant_pole(wall)[1] if stable else math.nan
     periods = 2.0 * (d + 2.0 - math.log(SETTLING_BAND) / rate) if rate > 0 else math.inf
     while periods < MOST_PERIODS:
-        last = _last_outside(wall, math.ceil(periods))
+        last = _find_last_outside(wall, math.ceil(periods))
         if last < 0.5 * periods:
             return last
         periods *= 2.0
     return math.nan
 
 
-def _last_outside(wall: tuple[float, float, float, float], periods: int) -> float:
+def _find_last_outside(wall: tuple[float, float, float, float], periods: int) -> float:
     """Return the last instant of a simulated step response at which it is outside the band; 0 if there is none."""
     alpha, _, delta, d = wall
     f = d - math.floor(d)
     instants = np.unique([*np.arange(INSTANTS) / INSTANTS, f, 1.0])
-    x, v, older, newer = _run(*wall, 1.0, periods)[:, :, None]
+    x, v, older, newer = _simulate(*wall, 1.0, periods)[:, :, None]
 
     def is_outside(k: slice, t: np.ndarray) -> np.ndarray:
-        return np.abs(alpha * move(x[k], v[k], 1.0 + older[k], 1.0 + newer[k], t, delta, f)[0] - 1.0) > SETTLING_BAND
+        return (
+            np.abs(alpha * advance_period(x[k], v[k], 1.0 + older[k], 1.0 + newer[k], t, delta, f)[0] - 1.0)
+            > SETTLING_BAND
+        )
 
     rows = BLOCK // instants.size
     for stop in range(periods, 0, -rows):
@@ -102,23 +107,23 @@ class StepResponse(NamedTuple):
     settling_time: float  # in periods
 
 
-def _run(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> np.ndarray:
+def _simulate(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> np.ndarray:
     """Return x and v at the start of each period, from rest, and the wall's force before and after its change."""
     # Use plain floats: a period takes one or two microseconds, so the import of a compiler would take longer.
-    lag = find_degree(d).whole
-    f = d - lag
+    n = find_degree(d).n
+    f = d - n
     # x and v after each part of a period are linear in x, v and the force: three coefficients per part.
-    parts = []
+    coefficients = []
     for t in (f, 1.0 - f):
-        at = phi_functions(np.float64(delta * t))
-        parts.append((float(t * at.phi1), float(t * t * at.phi2), math.exp(-delta * t)))
-    (xv0, xf0, c0), (xv1, xf1, c1) = parts
+        phi = phi_functions(np.float64(delta * t))
+        coefficients.append((float(t * phi.phi1), float(t * t * phi.phi2), math.exp(-delta * t)))
+    (xv0, xf0, c0), (xv1, xf1, c1) = coefficients
     # The velocity changes by t phi1 F; t phi1 is also the factor of v in x.
     x = v = previous = 0.0
-    forces = [0.0] * (periods + lag + 2)
+    forces = [0.0] * (periods + n + 2)
     rows = []
     for k in range(periods):
-        forces[k + lag + 1] = -(alpha * x + beta * (x - previous))
+        forces[k + n + 1] = -(alpha * x + beta * (x - previous))
         older, newer = forces[k], forces[k + 1]
         rows.append((x, v, older, newer))
         previous = x
@@ -170,10 +175,10 @@ def step_response(
     substeps = check_whole("substeps", substeps, 1, 10_000)
     fractions = np.arange(substeps) / substeps
     with np.errstate(all="ignore"):
-        samples = _run(alpha, beta, delta, d, force, periods)
+        samples = _simulate(alpha, beta, delta, d, force, periods)
         x, v, older, newer = samples[:, :, None]
         f = d - math.floor(d)
-        x, v = move(x, v, force + older, force + newer, fractions, delta, f)
+        x, v = advance_period(x, v, force + older, force + newer, fractions, delta, f)
         parts = (np.broadcast_to(part, (periods, substeps)) for part in (x, v, np.where(fractions < f, older, newer)))
     position, velocity, wall_force = (part.ravel() for part in parts)
     time = (np.arange(periods)[:, None] + fractions).ravel()

@@ -1,4 +1,10 @@
-"""The maximum stiffness of the rigid loop, alpha_max(delta, d), and its derivative for strong damping, eq. (22)."""
+"""Return the maximum stiffness of rigid devices, alpha_max(delta, d), with derivatives in delta and d.
+
+The point of maximum stiffness is the *ridge* (docs/theory/boundary.md, B2): a smooth maximum of alpha on the stability
+lobe, or the corner, a wall with a double pole at z = -1. `loops.rigid.ridge_newton` solves for it. Its derivatives
+follow from the optimality condition, in closed form for NumPy and by a custom rule for JAX. For strong damping,
+alpha_max is proportional to delta; `stiffness_slope` returns the factor, the paper's eq. (22).
+"""
 
 from __future__ import annotations
 
@@ -23,12 +29,12 @@ from zwidth.loops.rigid.normalization import device_status
 from zwidth.loops.rigid.ridge_newton import (
     Ridge,
     Start,
+    evaluate_stationarity,
+    evaluate_wall,
+    evaluate_wave,
     expand_curve,
     guess_start,
-    solve,
-    stationarity,
-    wall,
-    wave,
+    solve_ridge,
 )
 from zwidth.words.errors import check_choice
 from zwidth.words.results import RidgePoint
@@ -37,53 +43,55 @@ from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import epsilon, horner, namespace, nan_unless, push_forward, store_once
 
 
-def _chi(x: Array, gap: Array) -> Array:
-    """``gap/x = -phi2'``, 1/6 at 0; ``psi' = chi - psi`` and ``phi1' = -psi``."""
+def _compute_chi(x: Array, gap: Array) -> Array:
+    """Return chi = ``gap/x = -phi2'``, which is 1/6 at 0; ``psi' = chi - psi`` and ``phi1' = -psi``."""
     xp = namespace(x)
-    small = x < 2.5
-    half = xp.where(small, 0.5 * x, 0.0)
-    return xp.where(small, xp.exp(-half) * horner(half * half, GAP), gap / xp.where(small, 1.0, x))
+    is_small = x < 2.5
+    half = xp.where(is_small, 0.5 * x, 0.0)
+    return xp.where(is_small, xp.exp(-half) * horner(half * half, GAP), gap / xp.where(is_small, 1.0, x))
 
 
 def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     """Return the derivatives of `arrays.held_mass.held_plant` in delta and in the fraction of the delay."""
     f, t = fraction, 1.0 - fraction
     c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
-    at_t, at_f = phi_functions(delta * t), phi_functions(delta * f)
-    chi_t, chi_f = _chi(delta * t, at_t.gap), _chi(delta * f, at_f.gap)
+    phi_t, phi_f = phi_functions(delta * t), phi_functions(delta * f)
+    chi_t, chi_f = _compute_chi(delta * t, phi_t.gap), _compute_chi(delta * f, phi_f.gap)
     # Each term of a1 decreases with delta, so the sum of their derivatives has no cancellation.
     a2 = -t * t * t * chi_t
-    a1 = t * t * t * (at_t.psi - chi_t) + f * f * f * chi_f
-    a1 = -(a1 + t * f * (e_t * (t * at_f.phi1 + f * at_f.psi) + t * at_t.psi * at_f.phi1 + f * at_t.phi1 * at_f.psi))
-    a0 = -e_t * f * f * (t * at_f.psi + f * (at_f.psi - chi_f))
-    slow, fast = t * at_t.phi1, e_t * f * at_f.phi1
+    a1 = t * t * t * (phi_t.psi - chi_t) + f * f * f * chi_f
+    a1 = -(
+        a1 + t * f * (e_t * (t * phi_f.phi1 + f * phi_f.psi) + t * phi_t.psi * phi_f.phi1 + f * phi_t.phi1 * phi_f.psi)
+    )
+    a0 = -e_t * f * f * (t * phi_f.psi + f * (phi_f.psi - chi_f))
+    slow, fast = t * phi_t.phi1, e_t * f * phi_f.phi1
     zero = 0.0 * c
     return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
 
 
-def follow(s: Array, plant: Plant, lag: Array, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
-    """Recompute alpha, beta, omega and s at a solved ridge, for correct derivatives in ``plant`` and ``lag``."""
-    # Differentiate a single step of Newton's method, because its derivative at the solution is that of the solution. A
-    # corner stays at s = 1. At a maximum the derivative of alpha in s is 0, so alpha is computed at the fixed s.
-    xp = namespace(s, plant.a2, lag)
-    undelayed, curve, corner = not kind.long, expand_curve(plant), s >= 1.0
-    inside = xp.where(corner, 0.5, s)
-    first, second = stationarity(inside, curve, lag, undelayed)
-    inside = xp.where(corner, 0.5, inside - first / xp.where(corner, 1.0, second))
-    moved = xp.where(corner, 1.0, inside)
-    # Do not use the series of `wave`, because its derivative has fewer digits.
-    omega = xp.where(corner, np.pi, 2.0 * xp.arctan(inside / xp.sqrt((1.0 - inside) * (1.0 + inside))))
-    alpha, beta = (wall(wave(place, lag, undelayed), curve) for place in (s, moved))
-    return alpha[0], beta[1], omega, moved
+def recompute_ridge(s: Array, plant: Plant, n: Array, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
+    """Recompute alpha, beta, omega and s at a solved ridge, for correct derivatives in ``plant`` and n."""
+    # Differentiate one step of Newton's method, which has the derivative of the solution if it starts at the solution.
+    # A corner stays at s = 1. At a maximum the derivative of alpha in s is 0, so alpha is computed at the fixed s.
+    xp = namespace(s, plant.a2, n)
+    undelayed, curve, is_corner = not kind.long, expand_curve(plant), s >= 1.0
+    s_inside = xp.where(is_corner, 0.5, s)
+    T, T1 = evaluate_stationarity(s_inside, curve, n, undelayed)
+    s_inside = xp.where(is_corner, 0.5, s_inside - T / xp.where(is_corner, 1.0, T1))
+    s_moved = xp.where(is_corner, 1.0, s_inside)
+    # Do not use the series of `evaluate_wave`, because its derivative has fewer digits.
+    omega = xp.where(is_corner, np.pi, 2.0 * xp.arctan(s_inside / xp.sqrt((1.0 - s_inside) * (1.0 + s_inside))))
+    alpha, beta = (evaluate_wall(evaluate_wave(s_value, n, undelayed), curve) for s_value in (s, s_moved))
+    return alpha[0], beta[1], omega, s_moved
 
 
-def differentiable_ridge(plant: Plant, lag: Array, start: Start, kind: DelayClasses) -> Ridge:
-    """Return the ridge of one plant with an integer delay of ``lag`` periods.
+def differentiable_ridge(plant: Plant, n: Array, start: Start, kind: DelayClasses) -> Ridge:
+    """Return the ridge of one plant with a delay of n periods.
 
-    For JAX arrays, the derivatives in ``plant`` and ``lag`` are those of `follow`, which are exact to any order.
+    For JAX arrays, the derivatives in ``plant`` and n are those of `recompute_ridge`, which are exact to any order.
     """
-    ridge = solve if namespace(plant.a2, lag) is np else _jax_ridge()
-    return ridge(plant, lag, start, kind)
+    ridge = solve_ridge if namespace(plant.a2, n) is np else _jax_ridge()
+    return ridge(plant, n, start, kind)
 
 
 @cache
@@ -96,25 +104,25 @@ def _jax_plant() -> Any:
     @function.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple[Plant, Plant]:
         (by_delta, by_f), (d_delta, d_f) = plant_slopes(*primals), tangents
-        change = (a * d_delta + b * d_f for a, b in zip(by_delta, by_f, strict=True))
-        return function(*primals), Plant(*change)
+        plant_tangent = (a * d_delta + b * d_f for a, b in zip(by_delta, by_f, strict=True))
+        return function(*primals), Plant(*plant_tangent)
 
     return function
 
 
 @cache
 def _jax_ridge() -> Any:
-    """Return `solve` as a JAX function with the derivatives of `follow`."""
+    """Return `solve_ridge` as a JAX function with the derivatives of `recompute_ridge`."""
     import jax
 
-    function = jax.custom_jvp(solve, nondiff_argnums=(3,))
+    function = jax.custom_jvp(solve_ridge, nondiff_argnums=(3,))
 
     def rule(kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
         # The derivative of s follows from the same rule, so derivatives of every order are exact.
         ridge = function(*primals, kind)
 
-        def moving(plant: Plant, lag: Array) -> Ridge:
-            return Ridge(*follow(ridge.s, plant, lag, kind), ridge.last)
+        def moving(plant: Plant, n: Array) -> Ridge:
+            return Ridge(*recompute_ridge(ridge.s, plant, n, kind), ridge.last)
 
         return ridge, jax.jvp(moving, primals[:2], tangents[:2])[1]
 
@@ -168,25 +176,29 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
         from zwidth.loops.rigid.exact_points import kkt_kernel
 
         return RidgePoint(*evaluate(kkt_kernel, arguments, route="jax"))
-    return evaluate(ridge_kernel, arguments, classify_delays(d), slopes=move_point)
+    return evaluate(ridge_kernel, arguments, classify_delays(d), slopes=differentiate_point)
 
 
 def ridge_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgePoint:
     """Return `alpha_max`, elementwise."""
-    return _point(*_solve_ridge(delta, d, kind)[:2])
+    return _make_point(*_solve_point(delta, d, kind)[:2])
 
 
-def move_point(delta: Array, d: Array, kind: DelayClasses = ANY) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
+def differentiate_point(
+    delta: Array, d: Array, kind: DelayClasses = ANY
+) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
     """Return `ridge_kernel` and its derivatives in delta and d."""
-    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, kind)
-    point, arrived = _point(ridge, status), converged(ridge)
+    ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
+    point, has_converged = _make_point(ridge, status), converged(ridge)
 
-    def move(change: Plant) -> RidgePoint:
-        moved = push_forward(lambda plant: follow(ridge.s, plant, lag, kind), (plant,), (change,), np)
-        return point._replace(**dict(zip(RidgePoint._fields, nan_unless(arrived, *moved[:3]), strict=False)))
+    def differentiate(change: Plant) -> RidgePoint:
+        derivatives = push_forward(lambda plant: recompute_ridge(ridge.s, plant, n, kind), (plant,), (change,), np)
+        return point._replace(
+            **dict(zip(RidgePoint._fields, nan_unless(has_converged, *derivatives[:3]), strict=False))
+        )
 
     by_delta, by_f = plant_slopes(delta, f)
-    return point, (move(by_delta), move(by_f))
+    return point, (differentiate(by_delta), differentiate(by_f))
 
 
 class RidgeSlopes(NamedTuple):
@@ -199,43 +211,43 @@ class RidgeSlopes(NamedTuple):
 
 def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlopes:
     """Return `alpha_max` and the derivatives of alpha, elementwise; in d those from the right at integer d."""
-    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, kind)
-    xp, at = namespace(ridge.s), wave(ridge.s, lag, not kind.long)
+    ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
+    xp, wave = namespace(ridge.s), evaluate_wave(ridge.s, n, not kind.long)
 
-    def move(change: Plant) -> Array:
-        return push_forward(lambda plant: wall(at, expand_curve(plant))[0], (plant,), (change,), xp)
+    def differentiate(change: Plant) -> Array:
+        return push_forward(lambda plant: evaluate_wall(wave, expand_curve(plant))[0], (plant,), (change,), xp)
 
-    slopes = map(move, store_once(plant_slopes(delta, f), ridge.s))
+    slopes = map(differentiate, store_once(plant_slopes(delta, f), ridge.s))
     by_delta, by_d = nan_unless(converged(ridge), *slopes)
-    return RidgeSlopes(_point(ridge, status), by_delta, by_d)
+    return RidgeSlopes(_make_point(ridge, status), by_delta, by_d)
 
 
 def stiffness_slopes(
-    found: RidgeSlopes, mass: Array, period: Array, delta: Array, d: Array
+    slopes: RidgeSlopes, mass: Array, period: Array, delta: Array, d: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return K_max and its derivatives in mass, damping, period and delay; see `zwidth.sensitivities`."""
-    alpha, rate, change = found.point.alpha, 1.0 / period, delta * found.by_delta
+    alpha, rate, change = slopes.point.alpha, 1.0 / period, delta * slopes.by_delta
     return (
         alpha * mass * rate * rate,
         (alpha - change) * rate * rate,
-        found.by_delta * rate,
-        (change - d * found.by_d - 2.0 * alpha) * mass * rate**3,
-        found.by_d * mass * rate**3,
+        slopes.by_delta * rate,
+        (change - d * slopes.by_d - 2.0 * alpha) * mass * rate**3,
+        slopes.by_d * mass * rate**3,
     )
 
 
-def _solve_ridge(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
+def _solve_point(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
     """Return the ridge, its status, the plant, its integer delay, and delta and the fraction of the delay."""
     status = device_status(delta, d)
     delta, d = nan_unless(status == Status.OK, delta, d)
-    whole, f = split_delay(d)
+    n, f = split_delay(d)
     start = guess_start(delta, d, f, kind)
     if kind.fractional:
         plant = held_plant(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
     else:
         plant = held_plant(delta)
-    ridge = store_once(differentiable_ridge(plant, whole, start, kind), delta)
-    return ridge, status, plant, whole, (delta, f)
+    ridge = store_once(differentiable_ridge(plant, n, start, kind), delta)
+    return ridge, status, plant, n, (delta, f)
 
 
 def converged(ridge: Ridge) -> Array:
@@ -244,13 +256,13 @@ def converged(ridge: Ridge) -> Array:
     return namespace(ridge.s).abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s
 
 
-def _point(ridge: Ridge, status: Array) -> RidgePoint:
+def _make_point(ridge: Ridge, status: Array) -> RidgePoint:
     xp = namespace(ridge.alpha)
-    arrived = converged(ridge)
-    status = xp.where((status == Status.OK) & ~arrived, int(Status.NOT_CONVERGED), status)
+    has_converged = converged(ridge)
+    status = xp.where((status == Status.OK) & ~has_converged, int(Status.NOT_CONVERGED), status)
     kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
     kind = xp.where(status == Status.OK, kind, int(RidgeKind.NONE))
-    alpha, beta, omega = nan_unless(arrived, ridge.alpha, ridge.beta, ridge.omega)
+    alpha, beta, omega = nan_unless(has_converged, ridge.alpha, ridge.beta, ridge.omega)
     return RidgePoint(alpha, beta, omega, kind.astype(np.int32), status.astype(np.int32))
 
 
@@ -293,9 +305,9 @@ def slope_kernel(d: Array, kind: DelayClasses = ANY) -> Array:
     """Return `stiffness_slope`, elementwise."""
     (d,) = nan_unless(valid_device(0.0 * d, d), d)
     zero = 0.0 * d
-    lag, f = split_delay(d)
+    n, f = split_delay(d)
     # The limit of delta N(z) for delta -> infinity: the velocity is proportional to the force, and e^-delta vanishes.
     plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
     start = guess_start(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
-    ridge = differentiable_ridge(plant, lag, start, kind)
+    ridge = differentiable_ridge(plant, n, start, kind)
     return nan_unless(converged(ridge), ridge.alpha)[0]

@@ -1,10 +1,12 @@
-"""The ridge of the rigid loop by Newton's method on its closed-form optimality condition.
+"""Find the ridge, the point of maximum stiffness, by Newton's method on its closed-form optimality condition.
 
-Curve and condition are written in ``y = s^2``, ``s = sin(omega/2)``, with D = lag + 1, lag = n, and the letters of
-docs/theory/boundary.md, B1 and B2. A prime on that page is a trailing digit or a leading d in the code.
+The boundary curve and the condition T = 0 are written in ``y = s^2``, ``s = sin(omega/2)``, with q = 1 - y, D = n + 1,
+n the integer part of the delay, and the letters of docs/theory/boundary.md, B1 and B2. A prime on that page is a
+trailing digit or a leading d in the code.
 
-The lobe has one maximum (docs/theory/one-lobe.md, Theorem B), so no search is needed. The number of steps is fixed, so
-that no point of a batch waits for another.
+The stability lobe has a single maximum of alpha (docs/theory/one-lobe.md, Theorem B), so no search is needed: a fitted
+start and three Newton steps suffice. The maximum is smooth (T = 0), or it is the *corner* at y = 1, the wall with a
+double pole at z = -1. The number of steps is fixed, because in a batch all points take the same steps.
 """
 
 from __future__ import annotations
@@ -19,18 +21,18 @@ from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, name
 
 
 class Curve(NamedTuple):
-    """Coefficients in y of the curve of one device: all that the solver needs beside the exponent D."""
+    """Coefficients of the boundary curve of one device, as far as they do not depend on D."""
 
-    E: tuple[Array, Array, Array]
-    H: tuple[Array, Array]
+    E: tuple[Array, Array, Array]  # in powers of y
+    H: tuple[Array, Array]  # in powers of y
     at_one: Array  # N(1)
-    sigma: Array
-    mu: Array
+    sigma: Array  # a2 + a0
+    mu: Array  # a2 - a0
     gap: Array  # N(-1)
 
 
 def expand_curve(plant: Plant | DeviceTerms) -> Curve:
-    """The curve of one plant; every coefficient is free of cancellation where the ridge can be."""
+    """Expand the curve of one plant; no coefficient has cancellation in the range of the ridge."""
     c, em, a2, a1, a0, gap = plant.c, plant.em, plant.a2, plant.a1, plant.a0, plant.gap
     sigma = a2 + a0
     at_one = sigma + a1
@@ -40,98 +42,98 @@ def expand_curve(plant: Plant | DeviceTerms) -> Curve:
 
 
 class Wave(NamedTuple):
-    """What depends on the frequency and the exponent alone."""
+    """The terms of the curve that depend only on the frequency and on D; tau = sin(D w)/sin w, kappa = cos(D w)."""
 
     y: Array
     q: Array
     tau: Array
     kappa: Array
-    # For the ridge:
-    half: Any = None  # omega/2, of no meaning at the corner
-    per_sin: Any = None  # 1/sin omega, of no meaning at the corner
+    # For the ridge only:
+    half_omega: Any = None  # omega/2; arbitrary at the corner
+    per_sin: Any = None  # 1/sin omega; arbitrary at the corner
     tau1: Any = None  # d tau/dy
 
 
-def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
-    """The oscillating factors at one s, finite with their derivatives up to the corner. ``undelayed``: all D are 1."""
-    xp = namespace(s, lag)
+def evaluate_wave(s: Array, n: Array, undelayed: bool) -> Wave:
+    """Return the terms at one s, with finite derivatives up to the corner; ``undelayed`` if D = 1 for all points."""
+    xp = namespace(s, n)
     y, q = s * s, (1.0 - s) * (1.0 + s)
     cos_w = q - y
-    # At the corner D = 1, and what the root enters is 0.
-    root = xp.sqrt(xp.where(s < 1.0, q, 1.0))
-    low = y < 0.5
-    small = xp.where(low, s, root)
-    half = small * horner(4.0 * small * small - 1.0, ARCSINE)
-    half = xp.where(low, half, 0.5 * np.pi - half)
-    per_sin = 0.5 / (s * root)
+    # Replace the cosine at the corner (y = 1) to avoid a division by 0; there D = 1, and its factor is 0.
+    cos_half = xp.sqrt(xp.where(s < 1.0, q, 1.0))
+    is_low = y < 0.5
+    small = xp.where(is_low, s, cos_half)
+    half_omega = small * horner(4.0 * small * small - 1.0, ARCSINE)
+    half_omega = xp.where(is_low, half_omega, 0.5 * np.pi - half_omega)
+    per_sin = 0.5 / (s * cos_half)
     if undelayed:
-        return Wave(y, q, 1.0, cos_w, half, per_sin, 0.0)
-    # D omega as omega + lag omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
-    D, x = lag + 1.0, lag * half
+        return Wave(y, q, 1.0, cos_w, half_omega, per_sin, 0.0)
+    # Write D omega as omega + n omega, so that nothing cancels near pi, and D = 1 keeps its derivatives in D.
+    D, x = n + 1.0, n * half_omega
     square = x * x
     sine, cosine = x * horner(square, SINE), horner(square, COSINE)
-    ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
+    sine_ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
     sin2 = 4.0 * y * q
-    tau, kappa = cosine + cos_w * ratio, cos_w * cosine - sin2 * ratio
-    # For D = 1 kappa is cos omega and D kappa - tau cos omega exactly 0.
-    tau1 = (lag * cos_w * cosine - ratio * (D * sin2 + cos_w * cos_w)) * (2.0 * per_sin * per_sin)
-    return Wave(y, q, tau, kappa, half, per_sin, tau1)
+    tau, kappa = cosine + cos_w * sine_ratio, cos_w * cosine - sin2 * sine_ratio
+    # For D = 1, kappa is cos omega and D kappa - tau cos omega is exactly 0.
+    tau1 = (n * cos_w * cosine - sine_ratio * (D * sin2 + cos_w * cos_w)) * (2.0 * per_sin * per_sin)
+    return Wave(y, q, tau, kappa, half_omega, per_sin, tau1)
 
 
-def wave_at(omega: Array, lag: Array) -> Wave:
-    """Return the factors that `wall` needs at a frequency from 0 to pi, for an integer lag."""
-    xp = namespace(omega, lag)
+def evaluate_wave_at(omega: Array, n: Array) -> Wave:
+    """Return the terms that `evaluate_wall` needs at a frequency from 0 to pi, for an integer delay n."""
+    xp = namespace(omega, n)
     s, cos_half = xp.sin(0.5 * omega), xp.abs(xp.cos(0.5 * omega))
     y, q = s * s, cos_half * cos_half
-    D = lag + 1.0
-    # Above 2 use pi - omega; the second part of pi, added separately, keeps its last digits.
-    sign, beyond = 1.0 - 2.0 * xp.mod(D, 2.0), omega > 2.0
-    x = xp.where(beyond, (np.pi - omega) + 1.2246467991473532e-16, omega)
-    tau = xp.where(beyond, -sign, 1.0) * D * _cardinal_sine(D * x) / _cardinal_sine(x)
-    return Wave(y, q, tau, xp.where(beyond, sign, 1.0) * xp.cos(D * x))
+    D = n + 1.0
+    # Above omega = 2 use pi - omega. pi is not a float64, so its low-order part is added separately.
+    sign, near_pi = 1.0 - 2.0 * xp.mod(D, 2.0), omega > 2.0
+    x = xp.where(near_pi, (np.pi - omega) + 1.2246467991473532e-16, omega)
+    tau = xp.where(near_pi, -sign, 1.0) * D * _compute_cardinal_sine(D * x) / _compute_cardinal_sine(x)
+    return Wave(y, q, tau, xp.where(near_pi, sign, 1.0) * xp.cos(D * x))
 
 
-def _cardinal_sine(x: Array) -> Array:
-    """``sin(x)/x``, for small x by its series: the quotient has no digit of its derivatives there."""
+def _compute_cardinal_sine(x: Array) -> Array:
+    """Return ``sin(x)/x``; by its series for small x, because the quotient has inaccurate derivatives there."""
     xp = namespace(x)
-    small = xp.abs(x) < 1.5
-    inner, outer = xp.where(small, x, 0.0), xp.where(small, 2.0, x)
-    return xp.where(small, horner(inner * inner, SINE), xp.sin(outer) / outer)
+    is_small = xp.abs(x) < 1.5
+    small_x, large_x = xp.where(is_small, x, 0.0), xp.where(is_small, 2.0, x)
+    return xp.where(is_small, horner(small_x * small_x, SINE), xp.sin(large_x) / large_x)
 
 
-def _sides(at: Wave, curve: Curve) -> tuple[Array, Array, Array, Array]:
-    """E, H, m and V at one s."""
-    xp = namespace(at.y, curve.sigma)
-    E = curve.E[0] + at.y * (curve.E[1] + at.y * curve.E[2])
-    H = curve.H[0] + at.y * curve.H[1]
-    # Free of cancellation at both ends.
-    m = xp.where(at.y < 0.5, curve.at_one - 2.0 * curve.sigma * at.y, 2.0 * curve.sigma * at.q - curve.gap)
-    return E, H, m, m * m + curve.mu * curve.mu * (4.0 * at.y * at.q)
+def _evaluate_polynomials(wave: Wave, curve: Curve) -> tuple[Array, Array, Array, Array]:
+    """Return E, H, m and V at one s."""
+    xp = namespace(wave.y, curve.sigma)
+    E = curve.E[0] + wave.y * (curve.E[1] + wave.y * curve.E[2])
+    H = curve.H[0] + wave.y * curve.H[1]
+    # Choose the form of m that has no cancellation.
+    m = xp.where(wave.y < 0.5, curve.at_one - 2.0 * curve.sigma * wave.y, 2.0 * curve.sigma * wave.q - curve.gap)
+    return E, H, m, m * m + curve.mu * curve.mu * (4.0 * wave.y * wave.q)
 
 
-def wall(at: Wave, curve: Curve) -> tuple[Array, Array]:
-    """(alpha, beta) of the curve at one s."""
-    E, H, _, V = _sides(at, curve)
+def evaluate_wall(wave: Wave, curve: Curve) -> tuple[Array, Array]:
+    """Return alpha and beta of the curve at one s."""
+    E, H, _, V = _evaluate_polynomials(wave, curve)
     per_V = 1.0 / V
-    alpha = 4.0 * at.y * (at.tau * E + at.kappa * H) * per_V
-    return alpha, -(at.kappa * E - 4.0 * at.y * at.q * at.tau * H) * per_V - 0.5 * alpha
+    alpha = 4.0 * wave.y * (wave.tau * E + wave.kappa * H) * per_V
+    return alpha, -(wave.kappa * E - 4.0 * wave.y * wave.q * wave.tau * H) * per_V - 0.5 * alpha
 
 
-def stationarity(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
-    """T of B2, and dT/ds."""
-    at = wave(s, lag, undelayed)
-    y, q, tau, kappa, tau1 = at.y, at.q, at.tau, at.kappa, at.tau1
-    E, H, m, V = _sides(at, curve)
-    cos_w, k2, twice = q - y, curve.mu * curve.mu, 2.0 * (lag + 1.0)
-    tau2 = 0.0 if undelayed else -(1.5 * cos_w * tau1 + lag * (lag + 2.0) * tau) * (4.0 * at.per_sin * at.per_sin)
+def evaluate_stationarity(s: Array, curve: Curve, n: Array, undelayed: bool = False) -> tuple[Array, Array]:
+    """Return T of B2 and dT/ds at one s."""
+    wave = evaluate_wave(s, n, undelayed)
+    y, q, tau, kappa, tau1 = wave.y, wave.q, wave.tau, wave.kappa, wave.tau1
+    E, H, m, V = _evaluate_polynomials(wave, curve)
+    cos_w, mu_squared, two_D = q - y, curve.mu * curve.mu, 2.0 * (n + 1.0)
+    tau2 = 0.0 if undelayed else -(1.5 * cos_w * tau1 + n * (n + 2.0) * tau) * (4.0 * wave.per_sin * wave.per_sin)
     dE, dH = curve.E[1] + 2.0 * y * curve.E[2], curve.H[1]
-    dV, ddV = 4.0 * (k2 * cos_w - curve.sigma * m), 8.0 * (curve.sigma * curve.sigma - k2)
-    value = tau * E + kappa * H
-    slope = tau1 * E + tau * (dE - twice * H) + kappa * dH
-    bend = tau2 * E + tau1 * (2.0 * dE - twice * H) + 2.0 * tau * (curve.E[2] - twice * dH)
-    weighted = y * value
-    first = V * (value + y * slope) - weighted * dV
-    return first, 2.0 * s * (V * (2.0 * slope + y * bend) - weighted * ddV)
+    dV, ddV = 4.0 * (mu_squared * cos_w - curve.sigma * m), 8.0 * (curve.sigma * curve.sigma - mu_squared)
+    Q = tau * E + kappa * H
+    Q1 = tau1 * E + tau * (dE - two_D * H) + kappa * dH
+    Q2 = tau2 * E + tau1 * (2.0 * dE - two_D * H) + 2.0 * tau * (curve.E[2] - two_D * dH)
+    yQ = y * Q
+    T = V * (Q + y * Q1) - yQ * dV
+    return T, 2.0 * s * (V * (2.0 * Q1 + y * Q2) - yQ * ddV)
 
 
 class Corner(NamedTuple):
@@ -139,115 +141,117 @@ class Corner(NamedTuple):
 
     alpha: Array
     beta: Array
-    reached: Array  # whether the lobe ends there
-    is_ridge: Array  # and whether it is the stiffest stable wall
+    reached: Array  # the lobe ends in the corner
+    is_ridge: Array  # the corner is the wall of maximum stiffness
 
 
-def corner(curve: Curve, lag: Array) -> Corner:
-    """The corner: where the lobe reaches y = 1 with alpha > 0, the ridge if it is still rising there."""
-    # The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, mu > 0.
-    xp = namespace(curve.sigma, lag)
+def find_corner(curve: Curve, n: Array) -> Corner:
+    """Return the corner, where the lobe reaches y = 1 with alpha > 0; the ridge if alpha still increases there."""
+    # The first lobe reaches y = 1 only if D = 1 and arg M increases up to pi, i.e. N(-1) > 0 and mu > 0.
+    xp = namespace(curve.sigma, n)
     E = sum(curve.E[1:], curve.E[0])
     H = curve.H[0] + curve.H[1]
     value, slope = E - H, curve.E[1] + 2.0 * curve.E[2] - 2.0 * H - curve.H[1]
     V, dV = curve.gap**2, 4.0 * (curve.sigma * curve.gap - curve.mu**2)
-    reached = (lag <= 0.0) & (curve.gap > 0.0) & (curve.mu > 0.0) & (value > 0.0)
+    reached = (n <= 0.0) & (curve.gap > 0.0) & (curve.mu > 0.0) & (value > 0.0)
     is_ridge = reached & (V * (value + slope) - value * dV >= 0.0)
-    # Elsewhere nothing may overflow: its derivative would be NaN and spoil what is chosen instead.
+    # For the other points avoid overflow, because its derivatives would be NaN and spoil the selected values.
     V = xp.where(reached, V, 1.0)
     alpha = 4.0 * value / V
     return Corner(alpha, E / V - 0.5 * alpha, reached, is_ridge)
 
 
 class Start(NamedTuple):
-    """Where the solver begins."""
+    """The starting point of Newton's method."""
 
     scale: Array  # u = 1/(d + 1): s lies between 0.5 u and 1.3 u
     s: Array
     power: Array  # Newton's method is applied to T s^power
-    corner: Array  # whether the ridge is a corner, where (delta, d) alone says so: 1 yes, -1 no, 0 unknown
+    corner: Array  # 1: (delta, d) implies that the ridge is the corner; -1: that it is smooth; 0: unknown
 
 
-# The last smooth delta at d = 0: the corner takes over at 3.6593616274217835070, 4e-18 above this float64. Judged by
-# rounded coefficients of the curve, its next neighbors would fall on either side.
-_TAKE_OVER = 3.6593616274217835
+# For d = 0 the ridge is the corner above this delta; the exact threshold 3.6593616274217835070 is 4e-18 larger. The
+# comparison is made with delta, because rounded coefficients of the curve would decide differently for its neighbors.
+CORNER_DELTA = 3.6593616274217835
 
-# s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 0.8 % below one
-# period, 1.1 % beyond.
-_SHORT = (
+# Start s/u as a polynomial in t = r/(r + 3), with r = delta (d + 1), and u = 1/(d + 1), fitted over all devices. The
+# error is at most 0.8 % for d < 1 and 1.1 % for d >= 1. Each row is a polynomial in u, the coefficient of a power of t.
+SHORT_START = (
     (0.3748, 0.6572, -0.7317, -0.01088, 0.2558),
     (-0.1878, 3.83, -4.872, 1.835),
     (1.511, -6.996, 5.233),
     (0.2643, 1.186),
     (-0.4501,),
 )
-_LONG = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
-# Power of s in `Start` below one period, where T has a larger curvature.
-_POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
-_STEPS = 3  # Newton steps; two leave an error of 5e-9
+LONG_START = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
+# `Start.power` for d < 1, because T has a larger curvature there; the same form.
+SHORT_POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
+# Two steps would leave an error of 5e-9.
+NEWTON_STEPS = 3
 
 
-def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
+def _evaluate_bivariate(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
+    """Evaluate a polynomial in t whose coefficients are polynomials in u."""
     return horner(t, [horner(u, list(row)) for row in rows])
 
 
 def guess_start(
     delta: Array, d: Array, fraction: Array, kind: DelayClasses = ANY, strength: Array | None = None
 ) -> Start:
-    """Where to begin for one (delta, d); ``strength`` 1 stands for delta -> infinity."""
+    """Return the starting point for one (delta, d), from a fit; ``strength`` = 1 means delta -> infinity."""
     xp = namespace(delta, d)
     delta, d, f = frozen((delta, d, fraction), xp)
     r = delta * (d + 1.0)
     u, t = 1.0 / (d + 1.0), r / (r + 3.0) if strength is None else strength
     s = power = corner = zero = 0.0 * u
     if kind.long:
-        s = _polynomial(t, u, _LONG) + 0.4702 * f * (1.0 - f) * u * u * t
+        s = _evaluate_bivariate(t, u, LONG_START) + 0.4702 * f * (1.0 - f) * u * u * t
     if kind.short:
-        short, low, bent = d < 1.0, _polynomial(t, u, _SHORT), _polynomial(t, u, _POWER)
+        short, low, bent = d < 1.0, _evaluate_bivariate(t, u, SHORT_START), _evaluate_bivariate(t, u, SHORT_POWER)
         s, power = (xp.where(short, low, s), xp.where(short, bent, zero)) if kind.long else (low, bent)
-        corner = xp.where(d == 0.0, xp.where(delta > _TAKE_OVER, 1.0, -1.0), zero)
+        corner = xp.where(d == 0.0, xp.where(delta > CORNER_DELTA, 1.0, -1.0), zero)
     return Start(u, s * u, power, corner)
 
 
 class Ridge(NamedTuple):
-    """The ridge of one plant: s is exactly 1 at a corner, ``last`` the last step taken in s."""
+    """The point of maximum stiffness of one plant."""
 
     alpha: Array
     beta: Array
     omega: Array
-    s: Array
-    last: Array
+    s: Array  # sin(omega/2), exactly 1 at a corner
+    last: Array  # the last step taken in s
 
 
-def _find_stationary(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
+def _find_stationary(curve: Curve, n: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
     """Return s at the smooth maximum and the last step, by Newton's method in a bracket that contains every ridge."""
-    xp = namespace(curve.sigma, lag)
+    xp = namespace(curve.sigma, n)
     lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
     s = xp.minimum(xp.maximum(start.s, lower), upper)
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
         s, _ = state
-        first, second = stationarity(s, curve, lag, undelayed)
+        first, second = evaluate_stationarity(s, curve, n, undelayed)
         new = s - first * s / (second * s + start.power * first)
         return xp.minimum(xp.maximum(new, lower), upper), s
 
-    s, before = repeat(_STEPS, step, (s, s), xp)
+    s, before = repeat(NEWTON_STEPS, step, (s, s), xp)
     return s, s - before
 
 
-def solve(plant: Plant | DeviceTerms, lag: Array, start: Start, kind: DelayClasses) -> Ridge:
-    """Return the ridge of one plant with an integer delay of ``lag`` periods."""
-    xp = namespace(plant.a2, lag)
+def solve_ridge(plant: Plant | DeviceTerms, n: Array, start: Start, kind: DelayClasses) -> Ridge:
+    """Return the ridge of one plant with a delay of n periods."""
+    xp = namespace(plant.a2, n)
     undelayed = not kind.long
     curve = expand_curve(store_once(plant, start.scale))
-    s, last = _find_stationary(curve, lag, start, undelayed)
+    s, last = _find_stationary(curve, n, start, undelayed)
     # Keep s below 1, because a smooth maximum near the corner may round to 1.
     s = xp.minimum(s, 1.0 - 0.5 * epsilon(s))
-    at = wave(s, lag, undelayed)
-    ridge = Ridge(*wall(at, curve), 2.0 * at.half, s, last)
+    wave = evaluate_wave(s, n, undelayed)
+    ridge = Ridge(*evaluate_wall(wave, curve), 2.0 * wave.half_omega, s, last)
     if not kind.short:
         return ridge
-    at_end = corner(curve, lag)
-    taken = xp.where(start.corner == 0.0, at_end.is_ridge, start.corner > 0.0)
-    there = Ridge(at_end.alpha, at_end.beta, np.pi, 1.0, 0.0)
-    return Ridge(*(xp.where(taken, end, value) for end, value in zip(there, ridge, strict=True)))
+    corner = find_corner(curve, n)
+    is_corner = xp.where(start.corner == 0.0, corner.is_ridge, start.corner > 0.0)
+    corner_ridge = Ridge(corner.alpha, corner.beta, np.pi, 1.0, 0.0)
+    return Ridge(*(xp.where(is_corner, end, value) for end, value in zip(corner_ridge, ridge, strict=True)))

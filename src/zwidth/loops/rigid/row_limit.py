@@ -1,12 +1,12 @@
-"""Where a row of the (alpha, beta) plane ends: the stiffest wall of each damping, in closed form (rigid loop).
+"""Compute the stability limit of alpha for given beta, delta and d in closed form.
 
-For a held delay d = n + f the stable walls of one (beta, delta, d) are ``0 < alpha < limit``: the limit is the first
-lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1 (docs/theory/one-lobe.md,
-Theorem C).
+For each (beta, delta, d) the stable walls are ``0 < alpha < limit`` (docs/theory/one-lobe.md, Theorem C). The limit is
+the point of the first lobe of the boundary curve with this beta, or a point of the line of poles at z = -1, which cuts
+the lobe off. All walls with one (beta, delta, d) form a *line of constant beta*, also called row.
 
-The boundary is taken in the form of docs/theory/boundary.md, B1, by half angles, with its letters and k = n + 1/2.
-Rows are told apart by ``b = beta + delta``, which vanishes with w^2: ``V b = delta V - cos(k w)/cos(w/2) E + ...`` is
-rearranged below so that nothing cancels, for every damping.
+The boundary curve is used in its form with half angles (docs/theory/boundary.md, B1), with the letters of that page
+and k = n + 1/2. Lines of constant beta are parameterized by ``b = beta + delta``, which vanishes like w^2 at w = 0.
+``V b = delta V - cos(k w)/cos(w/2) E + ...`` is rearranged such that nothing cancels, for every delta.
 """
 
 from __future__ import annotations
@@ -17,278 +17,323 @@ import numpy as np
 
 from zwidth.arrays.evaluate import FEW, Route, evaluate_columns
 from zwidth.arrays.held_mass import DeviceTerms, device
-from zwidth.loops.rigid.crossover import long_curve, short_curve
-from zwidth.loops.rigid.folding import Points, group_by
+from zwidth.loops.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve
+from zwidth.loops.rigid.folding import Points, group_by_value
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
 from zwidth.words.xp import COSINE, SINE, horner, namespace, nan_beyond, repeat
 
-# From the starting points below each sequence doubles its digits a step: 6 steps end a lobe, the last one to confirm;
-# 2 leave a row with some 2e-9 of its frequency, which the step in alpha behind them squares.
-_END_STEPS = 6
-_ROW_STEPS = 2
+# Newton steps. Each doubles the number of correct digits.
+END_STEPS = 6  # to the end of a lobe; the last one only confirms
+ROW_STEPS = 2  # to the frequency of a limit; they leave a relative error of 2e-9, which a last step in alpha squares
 
 # Abramowitz, Stegun 1964, eq. (4.4.47): arctan t on [0, 1] within 1e-5.
-_ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
+ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
 
 
 class LongLobe(NamedTuple):
-    """The lobe of a device with d >= 1: E, H, V and ``(delta V - E)/y`` by powers of y, and what rows start from."""
+    """The boundary curve of a device with d >= 1, in powers of y = sin^2(w/2), and the starting values for Newton."""
 
     delta: Array
-    k: Array
-    g0: Array
-    g1: Array
-    g2: Array
-    h0: Array
-    h1: Array
-    v0: Array
-    v1: Array
-    v2: Array
-    b1: Array
-    b2: Array
-    end: Any = None  # the lobe's last w
-    top: Any = None  # b there
-    bow: Any = None  # how the start of a row bends
-    sin_bow: Any = None
-    bend: Any = None
+    k: Array  # n + 1/2
+    E0: Array  # E = E0 + E1 y + E2 y^2
+    E1: Array
+    E2: Array
+    H0: Array  # H = H0 + H1 y
+    H1: Array
+    V0: Array  # V = V0 + V1 y + V2 y^2
+    V1: Array
+    V2: Array
+    excess1: Array  # delta V - E = excess1 y + excess2 y^2
+    excess2: Array
+    end: Any = None  # w at the end of the lobe
+    end_b: Any = None  # b at the end of the lobe
+    # Start of Newton's method: sqrt(b/end_b) = sin(start_angle w/end)/start_sine, plus a correction.
+    start_angle: Any = None
+    start_sine: Any = None
+    start_correction: Any = None
 
 
-def _sin_cos(x: Array) -> tuple[Array, Array]:
-    """Sine and cosine for 0 <= x <= pi/4 by their series."""
+def _compute_sine_and_cosine(x: Array) -> tuple[Array, Array]:
+    """Return sine and cosine for 0 <= x <= pi/4 by their series."""
     square = x * x
     return x * horner(square, SINE[:8]), horner(square, COSINE[:9])
 
 
-def short_place(b: Array, curve: Any) -> tuple[Array, Array]:
-    """The y of a row on the lobe of `short_curve`, the first zero of a quadratic, and whether there is one."""
+def find_on_short_lobe(b: Array, curve: Any) -> tuple[Array, Array]:
+    """Return y of the lobe (`expand_short_delay_curve`) at one b, the first root of a quadratic; and if it is real."""
     (u0, u1), (v0, v1, v2), _ = curve
     xp = namespace(b, u0)
     linear = u0 - b * v1
-    square = linear * linear + 4.0 * b * v0 * (u1 - b * v2)
-    return 2.0 * b * v0 / (linear + xp.sqrt(xp.maximum(square, 0.0))), square >= 0
+    discriminant = linear * linear + 4.0 * b * v0 * (u1 - b * v2)
+    return 2.0 * b * v0 / (linear + xp.sqrt(xp.maximum(discriminant, 0.0))), discriminant >= 0
 
 
-def short_row(beta: Array, device: DeviceTerms) -> Array:
-    """The limit for d < 1, beyond the corner that of the line; 0 where no alpha is stable, NaN for bad input."""
-    p1, psi, tilt = device.p1, device.psi, device.tilt
-    xp = namespace(beta, device.delta)
-    b = beta + device.delta
-    # For d = 0 the row ends at phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
-    whole = p1 * b * (1.0 - psi * beta) / (psi * (p1 + device.p2 * b))
-    (u0, u1), size, shape = curve = short_curve(device)
-    y, real = short_place(b, curve)
-    # V = |N|^2 vanishes where the curve runs to infinity; rounding must not turn its sign there.
-    limit = 4.0 * y * horner(y, shape) / xp.abs(horner(y, size))
-    corner_reached = (tilt > 0) & (shape[0] + shape[1] + shape[2] > 0)
+def limit_short_delay(beta: Array, plant: DeviceTerms) -> Array:
+    """Return the limit for d < 1: on the lobe, or beyond the corner on the line of poles at z = -1.
+
+    It is 0 if no alpha is stable, and NaN for invalid input.
+    """
+    p1, psi, tilt = plant.p1, plant.psi, plant.tilt
+    xp = namespace(beta, plant.delta)
+    b = beta + plant.delta
+    # For d = 0 the limit is phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
+    integer_limit = p1 * b * (1.0 - psi * beta) / (psi * (p1 + plant.p2 * b))
+    (u0, u1), modulus_terms, stiffness_terms = curve = expand_short_delay_curve(plant)
+    y, meets_curve = find_on_short_lobe(b, curve)
+    # V = |N|^2 is 0 where the curve goes to infinity; rounding errors must not change its sign there.
+    limit = 4.0 * y * horner(y, stiffness_terms) / xp.abs(horner(y, modulus_terms))
+    corner_reached = (tilt > 0) & (stiffness_terms[0] + stiffness_terms[1] + stiffness_terms[2] > 0)
     beyond = xp.where(corner_reached, xp.inf, 0.0)
-    # Behind the lobe the curve comes from infinity with b < 0: a row above all of the lobe must not end there.
-    fractional = xp.where(real & (y <= 1) & (u0 + u1 * y > 0), limit, beyond)
-    limit = xp.where(device.f == 0, whole, fractional)
-    line = 1.0 / xp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
-    limit = xp.where(tilt > 0, xp.minimum(limit, line), limit)
-    return _finish(limit, b)
+    # Beyond the lobe the curve returns from infinity, with b < 0 at first. A line above the whole lobe may meet that
+    # part, but it is no stability limit.
+    fractional = xp.where(meets_curve & (y <= 1) & (u0 + u1 * y > 0), limit, beyond)
+    limit = xp.where(plant.f == 0, integer_limit, fractional)
+    line_limit = 1.0 / xp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
+    limit = xp.where(tilt > 0, xp.minimum(limit, line_limit), limit)
+    return _mask_limit(limit, b)
 
 
-def _finish(limit: Array, b: Array) -> Array:
+def _mask_limit(limit: Array, b: Array) -> Array:
+    """Return the limit, but 0 if no alpha is stable, and NaN if b is not finite."""
     xp = namespace(b)
     return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
 
 
-def open_lobe(device: DeviceTerms) -> LongLobe:
-    """The curve alone, whose end is not known yet."""
-    g, h, v, base = long_curve(device)
-    return LongLobe(device.delta, device.whole + 0.5, *g, *h, *v, *base)
+def expand_long_lobe(plant: DeviceTerms) -> LongLobe:
+    """Expand the curve of one device, without the end of the lobe."""
+    E, H, V, excess = expand_long_delay_curve(plant)
+    return LongLobe(plant.delta, plant.whole + 0.5, *E, *H, *V, *excess)
 
 
-def long_lobe(device: DeviceTerms) -> LongLobe:
-    """What rows with d >= 1 need of a device, its lobe's end included."""
-    lobe = open_lobe(device)
-    em, p1, whole, f = device.em, device.p1, device.whole, device.f
+def build_long_lobe(plant: DeviceTerms) -> LongLobe:
+    """Expand the curve of one device, and find the end of its lobe and the starting values."""
+    lobe = expand_long_lobe(plant)
+    em, p1, n, f = plant.em, plant.p1, plant.whole, plant.f
     xp = namespace(lobe.delta)
-    end = _lobe_end(lobe, em / (p1 + f * em), whole + f)
-    total, d_total, scale, d_scale = offset(Angles(end, lobe))
-    top = total / scale
-    # Rows start from sqrt(b/top) = sin(bow w/end)/sin(bow), with the slope of the curve at the lobe's end, where
-    # strong damping makes it nearly flat; `bend` adds the slope at w = 0. Right to 0.4 %. The relative slope at the
-    # end, bow/tan(bow), is inverted by a rational function.
-    flat = xp.clip(1.0 - 0.5 * end * (d_total / total - d_scale / scale), 0.0, 1.0)
-    bow = xp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
-    sin_bow = xp.sin(bow)
-    # As the rows compute it, so that they start exact at the lobe's end, where strong damping and a long delay leave b
-    # no slope and Newton's steps would only halve an error.
-    bow = _arcsine(sin_bow)
-    slope = (0.25 * lobe.b1 + 0.5 * lobe.g0 * (lobe.k * lobe.k - 0.25) + lobe.k * lobe.h0) / lobe.v0
-    bend = xp.sqrt(top / slope) / end - sin_bow / bow
-    # As one array: the compiler computes a device once, and not again for every row.
-    return LongLobe(*xp.stack([*lobe[:-5], end, top, bow, sin_bow, bend]))
+    end = _find_lobe_end(lobe, em / (p1 + f * em), n + f)
+    numerator, d_numerator, denominator, d_denominator = evaluate_offset(LobeTerms(end, lobe))
+    end_b = numerator / denominator
+    # Start from sqrt(b/end_b) = sin(start_angle w/end)/sin(start_angle). It has the curve's derivative at the end of
+    # the lobe, where strong damping makes the curve nearly flat; `start_correction` adds the derivative at w = 0. The
+    # error is at most 0.4 %. start_angle/tan(start_angle), the relative derivative at the end, is inverted by a
+    # rational function.
+    flat = xp.clip(1.0 - 0.5 * end * (d_numerator / numerator - d_denominator / denominator), 0.0, 1.0)
+    start_angle = xp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
+    start_sine = xp.sin(start_angle)
+    # Invert the sine with the same approximation as the start, so that the start is exact at the end of the lobe. For
+    # strong damping and long delays db/dw vanishes there, and Newton's method would only halve an error.
+    start_angle = _approximate_arcsine(start_sine)
+    d_b = (0.25 * lobe.excess1 + 0.5 * lobe.E0 * (lobe.k * lobe.k - 0.25) + lobe.k * lobe.H0) / lobe.V0
+    start_correction = xp.sqrt(end_b / d_b) / end - start_sine / start_angle
+    # Stack the fields into one array, so that XLA computes them once per device and not again for every line.
+    return LongLobe(*xp.stack([*lobe[:-5], end, end_b, start_angle, start_sine, start_correction]))
 
 
-class Angles:
-    """The trigonometric terms of one frequency, from two short series."""
+class LobeTerms:
+    """The terms of the curve at one frequency: with s, c of w/2, sin_k, cos_k of k w, and derivatives d... in w."""
 
     def __init__(self, omega: Array, lobe: LongLobe):
-        _, k, g0, g1, g2, h0, h1, v0, v1, v2, b1, b2, *_ = lobe
+        _, k, E0, E1, E2, H0, H1, V0, V1, V2, excess1, excess2, *_ = lobe
         self.k = k
-        s4, c4 = _sin_cos(0.25 * omega)
-        sk4, ck4 = _sin_cos(0.25 * k * omega)
-        # Differences of cosines are formed from half angles, which keeps their relative accuracy at small w.
+        s4, c4 = _compute_sine_and_cosine(0.25 * omega)
+        sk4, ck4 = _compute_sine_and_cosine(0.25 * k * omega)
+        # Compute differences of cosines from half angles, which keeps their relative accuracy for small w.
         s_half = 2.0 * sk4 * ck4
         self.s, self.c = 2.0 * s4 * c4, 1.0 - 2.0 * s4 * s4
         self.sin_k = 2.0 * s_half * (1.0 - 2.0 * sk4 * sk4)
         self.cos_k = 1.0 - 2.0 * s_half * s_half
         # cos(w/2) - cos(k w)
-        self.drop = 2.0 * (s_half * s_half - s4 * s4)
+        self.cosine_drop = 2.0 * (s_half * s_half - s4 * s4)
         y = self.s * self.s
-        self.E, self.H, self.V = g0 + y * (g1 + y * g2), h0 + y * h1, v0 + y * (v1 + y * v2)
-        # Derivatives with respect to w: dy/dw = sin(w/2) cos(w/2).
+        self.E, self.H, self.V = E0 + y * (E1 + y * E2), H0 + y * H1, V0 + y * (V1 + y * V2)
+        # Derivatives in w, with dy/dw = sin(w/2) cos(w/2).
         dy = self.s * self.c
-        self.dE, self.dH, self.dV = dy * (g1 + 2.0 * y * g2), dy * h1, dy * (v1 + 2.0 * y * v2)
-        self.base, self.dbase = y * (b1 + y * b2), dy * (b1 + 2.0 * y * b2)
+        self.dE, self.dH, self.dV = dy * (E1 + 2.0 * y * E2), dy * H1, dy * (V1 + 2.0 * y * V2)
+        self.excess, self.d_excess = y * (excess1 + y * excess2), dy * (excess1 + 2.0 * y * excess2)
 
 
-def offset(at: Angles) -> tuple[Array, Array, Array, Array]:
-    """``b = beta + delta`` on the curve as T/Q, accurate relative to b itself, with the derivatives of T and Q."""
-    k, s, c = at.k, at.s, at.c
-    total = c * at.base + at.E * at.drop + s * c * 2.0 * at.sin_k * at.H
-    d_total = c * at.dbase - 0.5 * s * at.base + at.dE * at.drop + at.E * (k * at.sin_k - 0.5 * s)
-    d_total += at.H * (at.sin_k * (1.0 - 2.0 * s * s) + 2.0 * k * s * c * at.cos_k) + 2.0 * s * c * at.sin_k * at.dH
-    return total, d_total, c * at.V, c * at.dV - 0.5 * s * at.V
+def evaluate_offset(terms: LobeTerms) -> tuple[Array, Array, Array, Array]:
+    """Return numerator and denominator of ``b = beta + delta`` on the curve, each with its derivative in w.
+
+    Both are accurate relative to b.
+
+    Args:
+        terms: Terms of one frequency.
+
+    Returns:
+        Numerator, its derivative, denominator, its derivative.
+    """
+    k, s, c = terms.k, terms.s, terms.c
+    numerator = c * terms.excess + terms.E * terms.cosine_drop + s * c * 2.0 * terms.sin_k * terms.H
+    d_numerator = (
+        c * terms.d_excess
+        - 0.5 * s * terms.excess
+        + terms.dE * terms.cosine_drop
+        + terms.E * (k * terms.sin_k - 0.5 * s)
+    )
+    d_numerator += (
+        terms.H * (terms.sin_k * (1.0 - 2.0 * s * s) + 2.0 * k * s * c * terms.cos_k)
+        + 2.0 * s * c * terms.sin_k * terms.dH
+    )
+    return numerator, d_numerator, c * terms.V, c * terms.dV - 0.5 * s * terms.V
 
 
-class _Turned(NamedTuple):
-    """``X = sin((n+1) w) E + cos((n+1) w) sin w H``, proportional to alpha, its companion a quarter turn on, and dX."""
+class AlphaTerms(NamedTuple):
+    """Numerator of alpha on the curve, and the terms from which it is computed."""
 
-    across: Array
-    along: Array
-    d_across: Array
-    F: Array
+    projection: Array  # sin((n + 1) w) E + cos((n + 1) w) F, proportional to alpha
+    quadrature: Array  # cos((n + 1) w) E - sin((n + 1) w) F
+    d_projection: Array  # derivative of the projection in w
+    F: Array  # H sin w
     dF: Array
 
 
-def turn_angles(at: Angles) -> _Turned:
+def evaluate_alpha_terms(terms: LobeTerms) -> AlphaTerms:
+    """Evaluate the numerator of alpha at one frequency."""
     # (n + 1) w = k w + w/2
-    turns = at.k + 0.5
-    sine = at.sin_k * at.c + at.cos_k * at.s
-    cosine = at.cos_k * at.c - at.sin_k * at.s
-    sin_w, cos_w = 2.0 * at.s * at.c, 1.0 - 2.0 * at.s * at.s
-    F, dF = sin_w * at.H, cos_w * at.H + sin_w * at.dH
-    along = cosine * at.E - sine * F
-    return _Turned(sine * at.E + cosine * F, along, turns * along + sine * at.dE + cosine * dF, F, dF)
+    n_plus_1 = terms.k + 0.5
+    sine = terms.sin_k * terms.c + terms.cos_k * terms.s
+    cosine = terms.cos_k * terms.c - terms.sin_k * terms.s
+    sin_w, cos_w = 2.0 * terms.s * terms.c, 1.0 - 2.0 * terms.s * terms.s
+    F, dF = sin_w * terms.H, cos_w * terms.H + sin_w * terms.dH
+    quadrature = cosine * terms.E - sine * F
+    return AlphaTerms(
+        sine * terms.E + cosine * F, quadrature, n_plus_1 * quadrature + sine * terms.dE + cosine * dF, F, dF
+    )
 
 
-def _lobe_end(lobe: LongLobe, ratio: Array, d: Array) -> Array:
-    """The first w at which alpha returns to 0: the phase of ``e^(j (n+1) w) (E + j sin w H)`` reaches pi there."""
-    # Newton's method on that phase, nearly linear in w; ``ratio`` is E/H at w = 0 and places the start between pi/(2
-    # (n+1)), for no damping, and pi/(n+1).
-    turns = lobe.k + 0.5
-    xp = namespace(turns)
+def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
+    """Return the first w at which alpha is 0 again: there the phase of ``e^(j (n+1) w) (E + j H sin w)`` reaches pi."""
+    # Newton's method on this phase, which is nearly linear in w. ``start_ratio`` = E/H at w = 0 selects the start
+    # between pi/(2 (n+1)), for an undamped device, and pi/(n+1).
+    n_plus_1 = lobe.k + 0.5
+    xp = namespace(n_plus_1)
     limit = np.pi / (d + 0.5)
 
     def step(omega: Array) -> Array:
-        at = Angles(omega, lobe)
-        x = turn_angles(at)
-        size = at.E * at.E + x.F * x.F
-        # Less than a quarter turn away sin cos is a safe stand-in for the phase left; farther off, creep up.
-        left = xp.where(x.along < 0, x.across * x.along, -0.2 * size)
-        return xp.minimum(omega - left / (turns * size + (at.E * x.dF - x.F * at.dE)), limit)
+        terms = LobeTerms(omega, lobe)
+        alpha_terms = evaluate_alpha_terms(terms)
+        size = terms.E * terms.E + alpha_terms.F * alpha_terms.F
+        # If the remaining phase is less than a quarter turn, approximate it by sin cos; otherwise approach slowly.
+        remaining = xp.where(alpha_terms.quadrature < 0, alpha_terms.projection * alpha_terms.quadrature, -0.2 * size)
+        return xp.minimum(
+            omega - remaining / (n_plus_1 * size + (terms.E * alpha_terms.dF - alpha_terms.F * terms.dE)), limit
+        )
 
-    # A loop, not a long expression: a device is solved once, and a short program compiles in a fifth of the time.
-    start = 0.5 * np.pi / turns * (1.0 + 0.7 * ratio / (ratio + 1.0 / turns))
-    return repeat(_END_STEPS, step, start, xp)
+    # Use a loop, which compiles five times faster than unrolled steps. Its slower execution does not matter, because
+    # each device is solved once.
+    start = 0.5 * np.pi / n_plus_1 * (1.0 + 0.7 * start_ratio / (start_ratio + 1.0 / n_plus_1))
+    return repeat(END_STEPS, step, start, xp)
 
 
-def long_row_point(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
-    """The limit for d >= 1, 0 where no alpha is stable and NaN for bad input; and its frequency w, if there is one."""
-    # b grows with w along the whole lobe, so Newton's method on sqrt(b), nearly linear in w, needs no bracket but the
-    # lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
-    delta, end, top, bow, sin_bow, bend = lobe.delta, *lobe[-5:]
+def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
+    """Return the limit for d >= 1, and its frequency w if it exists.
+
+    The limit is 0 if no alpha is stable, and NaN for invalid input.
+    """
+    # b increases with w along the lobe, so Newton's method on sqrt(b), which is nearly linear in w, needs no other
+    # bracket than the lobe. Clip to the lobe and do not bisect, because a midpoint near convergence would undo the last
+    # step.
+    delta, end, end_b, start_angle, start_sine, start_correction = lobe.delta, *lobe[-5:]
     xp = namespace(beta, delta)
     b = beta + delta
-    inside = (b > 0) & (b < top)
-    goal = xp.where(inside, b, 0.5 * top)
-    share = goal / top
+    meets_lobe = (b > 0) & (b < end_b)
+    target_b = xp.where(meets_lobe, b, 0.5 * end_b)
+    share = target_b / end_b
     r = xp.sqrt(share)
-    omega = xp.minimum(end * (_arcsine(r * sin_bow) / bow + bend * r * (1.0 - share)), end)
-    for _ in range(_ROW_STEPS):
-        omega = xp.clip(omega - _newton_step(goal, Angles(omega, lobe)), 0.0, end)
-    at = Angles(omega, lobe)
-    x = turn_angles(at)
-    numerator, denominator = 2.0 * at.s * x.across, at.c * at.V
-    # The last step is taken in alpha itself.
-    step = _newton_step(goal, at)
-    numerator -= step * (at.c * x.across + 2.0 * at.s * x.d_across)
-    denominator -= step * (at.c * at.dV - 0.5 * at.s * at.V)
-    return _finish(xp.where(inside, numerator / denominator, 0.0), b), omega - step
+    omega = xp.minimum(
+        end * (_approximate_arcsine(r * start_sine) / start_angle + start_correction * r * (1.0 - share)), end
+    )
+    for _ in range(ROW_STEPS):
+        omega = xp.clip(omega - _compute_newton_step(target_b, LobeTerms(omega, lobe)), 0.0, end)
+    terms = LobeTerms(omega, lobe)
+    alpha_terms = evaluate_alpha_terms(terms)
+    numerator, denominator = 2.0 * terms.s * alpha_terms.projection, terms.c * terms.V
+    # Take the last step in alpha.
+    step = _compute_newton_step(target_b, terms)
+    numerator -= step * (terms.c * alpha_terms.projection + 2.0 * terms.s * alpha_terms.d_projection)
+    denominator -= step * (terms.c * terms.dV - 0.5 * terms.s * terms.V)
+    return _mask_limit(xp.where(meets_lobe, numerator / denominator, 0.0), b), omega - step
 
 
-def _arcsine(x: Array) -> Array:
-    """Three to four digits of arcsin x for 0 <= x <= 1, half of it by its tangent; good enough for a start."""
+def _approximate_arcsine(x: Array) -> Array:
+    """Approximate arcsin x for 0 <= x <= 1 to three or four digits, from its half-angle tangent."""
     xp = namespace(x)
     t = x / (1.0 + xp.sqrt(xp.maximum((1.0 - x) * (1.0 + x), 0.0)))
-    return 2.0 * t * horner(t * t, _ARCTAN)
+    return 2.0 * t * horner(t * t, ARCTAN)
 
 
-def _newton_step(goal: Array, at: Angles) -> Array:
-    """``2 (b - sqrt(goal b))/b'`` with sqrt(goal/b) as (1 + 3 goal/b)/(3 + goal/b): one division in all."""
-    # XLA fuses a chain of such steps into one loop over the rows only while no quotient is used twice.
-    total, d_total, scale, d_scale = offset(at)
-    part = goal * scale
-    return 4.0 * total * scale * (total - part) / ((d_total * scale - total * d_scale) * (3.0 * total + part))
+def _compute_newton_step(target_b: Array, terms: LobeTerms) -> Array:
+    """Return ``2 (b - sqrt(target_b b))/b'``, with sqrt(r) approximated by (1 + 3 r)/(3 + r); a single division."""
+    # XLA fuses a chain of such steps into one loop over the lines only if no quotient is used twice.
+    numerator, d_numerator, denominator, d_denominator = evaluate_offset(terms)
+    target_numerator = target_b * denominator
+    return (
+        4.0
+        * numerator
+        * denominator
+        * (numerator - target_numerator)
+        / ((d_numerator * denominator - numerator * d_denominator) * (3.0 * numerator + target_numerator))
+    )
 
 
-# Smaller maps, and of fewer rows, are compared as they are: a pattern of two rows would be a cost of its own.
-_LARGE, _ENOUGH_ROWS = 1 << 16, 8
+# Smallest grid and number of lines for which labels are copied from a pattern; for others comparing is faster.
+MIN_PATTERN_SIZE = 1 << 16
+MIN_PATTERN_ROWS = 8
 
 
-def boundary_map(points: Points) -> np.ndarray:
-    """Labels of all points, False out of range: stable walls are those with ``0 < alpha < limit`` of their row."""
-    # The limit is right to about 1e-15 relative, and to 1e-15 of the largest limit near the lobe's end.
+def label_grid(points: Points) -> np.ndarray:
+    """Return whether each point is stable, i.e. ``0 < alpha < limit`` of its line; False if out of range."""
+    # The relative error of the limit is about 1e-15; near the end of the lobe, 1e-15 of the largest limit.
     alpha, beta = nan_beyond(WALL_RANGE, points.alpha, points.beta)
-    return _compare(alpha, row_limits(beta, points.delta, points.d))
+    return _compare_with_limits(alpha, row_limits(beta, points.delta, points.d))
 
 
 def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route = "auto") -> np.ndarray:
-    """The stiffest stable wall of every (beta, delta, d), of their broadcast shape; NaN where out of range."""
+    """Return the largest stable alpha for each (beta, delta, d), of their broadcast shape; NaN if out of range."""
     shape = np.broadcast_shapes(beta.shape, delta.shape, d.shape)
-    out = np.empty(shape)
-    for long, points, place in group_by((beta, delta, d), d >= 1):
+    limits = np.empty(shape)
+    for long, points, index in group_by_value((beta, delta, d), d >= 1):
         kernel = _long_limit if long else _short_limit
-        if route == "numpy" or (route == "auto" and out.size <= FEW):
-            # Each device is computed once.
+        if route == "numpy" or (route == "auto" and limits.size <= FEW):
+            # Do not broadcast beta, so that each device is computed once.
             with np.errstate(all="ignore"):
-                out[place] = kernel(points[0], *np.broadcast_arrays(*points[1:]))
+                limits[index] = kernel(points[0], *np.broadcast_arrays(*points[1:]))
         else:
-            whole = np.broadcast_arrays(*points)
-            limits = evaluate_columns(kernel, [array.reshape(-1) for array in whole], route="jax")
-            out[place] = limits.reshape(whole[0].shape)
-    return out
+            all_arrays = np.broadcast_arrays(*points)
+            computed = evaluate_columns(kernel, [array.reshape(-1) for array in all_arrays], route="jax")
+            limits[index] = computed.reshape(all_arrays[0].shape)
+    return limits
 
 
 def _short_limit(beta: Array, delta: Array, d: Array) -> Array:
-    return short_row(beta, device(delta, d))
+    """Return the limits for d < 1."""
+    return limit_short_delay(beta, device(delta, d))
 
 
 def _long_limit(beta: Array, delta: Array, d: Array) -> Array:
-    return long_row_point(beta, long_lobe(device(delta, d)))[0]
+    """Return the limits for d >= 1."""
+    return find_limit_long_delay(beta, build_long_lobe(device(delta, d)))[0]
 
 
-def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """``0 < alpha < limit``, broadcast."""
+def _compare_with_limits(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """Return ``0 < alpha < limit``, broadcast."""
     shape, values = np.broadcast_shapes(alpha.shape, limit.shape), alpha.reshape(-1)
-    rising = slice(None, None, -1 if values.size and values[0] > values[-1] else 1)
-    values = values[rising]
+    ascending = slice(None, None, -1 if values.size and values[0] > values[-1] else 1)
+    values = values[ascending]
     varying = [axis for axis, length in enumerate(alpha.shape) if length > 1]
-    large = np.prod(shape) >= _LARGE and limit.size >= _ENOUGH_ROWS
+    large = np.prod(shape) >= MIN_PATTERN_SIZE and limit.size >= MIN_PATTERN_ROWS
     if not (large and len(varying) == 1 and limit.shape[varying[0]] == 1 and np.all(values[1:] >= values[:-1])):
         stable = alpha < limit
         stable &= alpha > 0
         return stable
-    # A row is true in its first places: a piece of one pattern that is true up to its middle, copied at memory speed.
+    # The labels of a line are True up to its limit. Copy them at memory speed from a pattern that is True in its first
+    # half and False in the second.
     pattern = np.arange(2 * values.size) < values.size
-    # No alpha lies below NaN, which would sort last.
+    # Replace NaN by -inf, because searchsorted treats NaN as the largest value.
     count = np.searchsorted(values, np.where(np.isnan(limit), -np.inf, limit).reshape(-1))
     stable = np.lib.stride_tricks.sliding_window_view(pattern, values.size)[values.size - count]
     stable[:, : np.searchsorted(values, 0.0, side="right")] = False
     rows = [length for axis, length in enumerate(limit.shape) if axis != varying[0]]
-    return np.moveaxis(stable[:, rising].reshape(*rows, values.size), -1, varying[0])
+    return np.moveaxis(stable[:, ascending].reshape(*rows, values.size), -1, varying[0])

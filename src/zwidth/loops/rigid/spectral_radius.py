@@ -1,4 +1,8 @@
-"""The dominant pole of arrays of walls: spectral radius and decay rate."""
+"""Return the spectral radius and the decay rate of arrays of walls, from their dominant poles.
+
+The dominant pole is the pole with the largest modulus. `loops.rigid.outermost_poles` computes and certifies it. With
+method "companion", `loops.rigid.poles` computes all poles instead. This module has the public functions.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +22,8 @@ from zwidth.words.xp import is_traced, namespace
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
 
-# Closer in, the rounding of two counts would meet.
-_LEAST_ACCURACY = 1e-12
+# Smallest accuracy that can be required. For smaller ones the rounding errors of the counts on two circles overlap.
+MIN_ACCURACY = 1e-12
 
 
 def spectral_radius(
@@ -75,7 +79,7 @@ def spectral_radius(
         1.207346
     """
     values = (alpha, beta, delta, d)
-    wanted = _check_radius(method, accuracy)
+    required = _check_accuracy(method, accuracy)
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
     if method == "companion":
@@ -83,7 +87,7 @@ def spectral_radius(
     if is_traced(*values):
         log_radius = evaluate(traced_kernel, arguments, classify_delays(d).fractional)
         return namespace(log_radius).exp(log_radius)
-    return to_caller(find_poles(broadcast(arguments), wanted).radius, values)
+    return to_caller(find_poles(broadcast(arguments), required).radius, values)
 
 
 def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -109,7 +113,7 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     Numerics:
         The logarithm of the dominant pole of `zwidth.spectral_radius`, computed from z - 1. For soft walls the rate has
         at least 11 digits, however small it is; for a pole pair near the unit circle its absolute error is about 1e-16.
-        A proved error bound is below a thousandth of the rate, otherwise the rate is NaN. If the magnitudes of several
+        A certified error bound is below a thousandth of the rate, otherwise the rate is NaN. If the magnitudes of some
         poles agree within 1e-12, the rate is that of any of them. Inside `jit` it has the ambient precision and no
         error bound.
 
@@ -129,15 +133,15 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     return to_caller(find_poles(broadcast(arguments), ACCURACY, with_rate=True).rate, values)
 
 
-def _check_radius(method: str, accuracy: float | None) -> float:
+def _check_accuracy(method: str, accuracy: float | None) -> float:
     """Return the accuracy; raise `InputError` for an unknown method or an accuracy out of range."""
     check_choice("method", method, get_args(RadiusMethod))
     if accuracy is None:
         return ACCURACY
-    least = 0.0 if method == "companion" else _LEAST_ACCURACY
+    least = 0.0 if method == "companion" else MIN_ACCURACY
     number: Any = accuracy
-    good = isinstance(number, int | float | np.floating) and np.isfinite(number) and 0 < number < 1 and number >= least
-    if not good:
+    valid = isinstance(number, int | float | np.floating) and np.isfinite(number) and 0 < number < 1 and number >= least
+    if not valid:
         raise InputError(
             f"accuracy: got {accuracy!r}; a relative error of at least {least:g} and below 1 is needed for "
             f"method={method!r}; 'companion' takes any"

@@ -1,4 +1,13 @@
-"""Stability verdicts for arrays of walls."""
+"""Decide the stability of arrays of walls on rigid devices, by one of three methods.
+
+The public functions are `is_stable` (labels only) and `decide_stability` (labels, statuses and the method used). The
+methods:
+
+- "crossover": the closed form at the gain crossover (`loops.rigid.crossover`). On a large grid, alpha is compared with
+  the stability limit of its line of constant beta, by the same closed form (`loops.rigid.row_limit`).
+- "companion": the spectral radius from all eigenvalues of the companion matrix (`loops.rigid.poles`).
+- "certified": the closed form with error bounds, then ball arithmetic (`loops.rigid.certified`).
+"""
 
 from __future__ import annotations
 
@@ -9,10 +18,10 @@ import numpy as np
 from zwidth.arrays.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.held_mass import classify_delays
 from zwidth.loops.rigid.crossover import stable_kernel
-from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, spread
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, restore_shape
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.loops.rigid.poles import radius_by_companion
-from zwidth.loops.rigid.row_limit import boundary_map
+from zwidth.loops.rigid.row_limit import label_grid
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.results import Stability
 from zwidth.words.status import Method, Status
@@ -22,7 +31,9 @@ from zwidth.words.xp import is_traced
 StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
 STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
 
-_ROUGH = 2e-8  # error of the eigenvalues at a double pole: about the square root of the rounding unit
+# Error of the computed eigenvalues at a double pole, about the square root of the rounding unit. The companion method
+# reports spectral radii closer to 1 than this as UNDECIDED.
+DOUBLE_POLE_ERROR = 2e-8
 
 
 def is_stable(
@@ -81,7 +92,7 @@ def is_stable(
             )
         return radius_by_companion(*values) < 1.0
     points, shape = fold_arguments(values)
-    return to_caller(spread(_decide(points, method)[0], shape), values)
+    return to_caller(restore_shape(_decide(points, method)[0], shape), values)
 
 
 def decide_stability(
@@ -115,19 +126,19 @@ def decide_stability(
     if is_traced(*values):
         raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
     points, shape = fold_arguments(values)
-    stable, used, status = _decide(points, method)
-    ranged = wall_status(*points)
-    status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
-    codes = np.broadcast_to(status, points.shape).astype(np.int32), np.asarray(used, np.int32)
-    return to_caller(Stability(*(spread(leaf, shape) for leaf in (stable, *codes))), values)
+    stable, deciding_method, status = _decide(points, method)
+    input_status = wall_status(*points)
+    status = input_status if status is None else np.where(input_status == Status.OK, status, input_status)
+    codes = np.broadcast_to(status, points.shape).astype(np.int32), np.asarray(deciding_method, np.int32)
+    return to_caller(Stability(*(restore_shape(leaf, shape) for leaf in (stable, *codes))), values)
 
 
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
     """Return labels, the method that decided them, and statuses unless all are OK."""
     if method == "companion":
         radius = np.asarray(radius_by_companion(*points))
-        rough = (np.abs(radius - 1.0) < _ROUGH) & (np.asarray(points[0]) != 0)
-        return radius < 1.0, Method.COMPANION, np.where(rough, Status.UNDECIDED, Status.OK)
+        inconclusive = (np.abs(radius - 1.0) < DOUBLE_POLE_ERROR) & (np.asarray(points[0]) != 0)
+        return radius < 1.0, Method.COMPANION, np.where(inconclusive, Status.UNDECIDED, Status.OK)
     if method == "certified":
         # Import only on demand, because most programs never certify.
         from zwidth.loops.rigid.certified import certify_labels
@@ -135,6 +146,6 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
         stable, status = certify_labels(points)
         return stable, Method.CERTIFIED, status
     if points.is_dense:
-        return boundary_map(points), Method.CROSSOVER, None
+        return label_grid(points), Method.CROSSOVER, None
     stable = evaluate_columns(stable_kernel, points.columns(), classify_delays(points.d))
     return stable.reshape(points.shape), Method.CROSSOVER, None

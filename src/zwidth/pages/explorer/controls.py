@@ -1,4 +1,4 @@
-"""What can be set on the page, the numbers and the parts of a scene; and the view as text that reproduces it."""
+"""Controls of the page, the parameters and parts of a scene; and texts that reproduce the view."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ plt.show()
 
 
 class Slider(NamedTuple):
-    """One number of the page: its label, the unit shown, how many of these are one SI unit, and the slider's range."""
+    """Slider of one parameter: label, unit, number of these units per SI unit, and range."""
 
     label: str
     unit: str
@@ -67,25 +67,25 @@ def _make_slider(parameter: Parameter, system: UnitSystem) -> Slider:
     unit, per_si = _SHOWN.get(parameter.unit, (parameter.unit.removeprefix("1"), 1.0))
     low, high = parameter.slider or (0.0, 0.0)
     if system.rotary and parameter.unit in _TURNED:
-        # Walls are set on a chart that is in SI units.
+        # Show walls in SI units, because the chart on which walls are set has SI units.
         unit, per_si = (ROTARY[parameter.unit], 1.0) if parameter.name in _WALL else _TURNED[parameter.unit]
         low, high = low * _SMALLER[parameter.unit], high * _SMALLER[parameter.unit]
     name = f"{parameter.words_in(system)} {parameter.symbol_in(system).lstrip(chr(92))}"
     return Slider(name, unit, per_si, low * per_si, high * per_si, parameter.whole)
 
 
-# The units of the page, and how many of them are one SI unit; of rotary devices those that differ.
+# Units of the page and their number per SI unit; _TURNED: those of rotary devices that differ.
 _SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3)}
 _TURNED = {"kg": ("g cm^2", 1e7), "N s/m": ("mN m s/rad", 1e3), "N/m": ("N m/rad", 1.0)}
-# What rotary devices have in SI units for one of a linear device, roughly: masses at some centimeters.
+# Typical ratios of rotary to linear parameters in SI units, for masses at a radius of about 3 cm.
 _SMALLER = {"kg": 1e-3, "N s/m": 1e-3, "N/m": 1e-3}
 _BARE = ("device", "timing", "wall")
 _DEVICE, _WALL = ("mass", "damping", "period", "delay", "delta", "d"), ("stiffness", "virtual_damping", "alpha", "beta")
-# By the path in a scene. A range that begins at 0 is cubic on the page, one above logarithmic.
+# Sliders by path in a scene. Ranges that begin at 0 are cubic on the page, others logarithmic.
 _MOVED = [name for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider]
 SLIDERS = {name: _make_slider(PARAMETERS[name], LINEAR) for name in _MOVED}
 ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], ROTARY) for name in _MOVED}
-# With m = 1 and T = 1 these are the scene's own numbers.
+# Parameters of a scene with m = 1 and T = 1 that equal the normalized ones.
 _NORMALIZED = {"delta": "damping", "d": "delay", "alpha": "stiffness", "beta": "virtual_damping"}
 CHOICES = {
     "mode": {"physical": "physical", "normalized": "normalized"},
@@ -108,11 +108,11 @@ _SMALL_ROTARY = Scene(Device(1e-4, 0.01, rotary=True), Timing(1e-3, 1e-3), Virtu
 
 @dataclass(frozen=True)
 class Controls:
-    """A scene with its wall; a normalized one has m = 1 and T = 1, so that K is alpha and B is beta."""
+    """Scene of the page with its wall; a normalized scene has m = 1 and T = 1, so that K is alpha and B is beta."""
 
     scene: Scene = _SMALL_DEVICE
     normalized: bool = False
-    # Mass, period and whether it is rotary, that a normalized scene takes when it gets units again.
+    # Mass, period and kind (rotary or not) to which a normalized scene returns in SI units.
     scale: tuple[float, float, bool] = (0.1, 1e-3, False)
 
     @property
@@ -121,7 +121,7 @@ class Controls:
 
     @property
     def rotary(self) -> bool:
-        """Whether the device turns."""
+        """True if the device is rotary."""
         return bool(self.scene.device.rotary)
 
     @property
@@ -257,7 +257,7 @@ def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Co
 
 
 def read_controls(path: Path | None) -> Controls:
-    """The scene of a configuration; without one, a small device."""
+    """Return the controls for the scene of a configuration; without a path, those of a default device."""
     if path is None:
         return Controls()
     given: Any = load_config(path).scene
@@ -272,12 +272,12 @@ def _in_seconds(scene: Scene) -> Scene:
 
 
 def _show_scene(given: Any, origin: Any) -> Controls:
-    """The scene of a configuration; where it has no wall, one well inside of the stable set, if there is one."""
+    """Return the controls for the scene of a configuration; the default wall has half the maximum stiffness."""
     device = getattr(given, "device", None)
     if device is not None and (isinstance(device, ResponseSection) or device.sampled):
         raise InputError(
-            f"{origin}: scene.device: the page shows poles and motions at any rate, which a response or a sampled "
-            "system does not tell; judge it by zwidth check, draw it by zwidth run"
+            f"{origin}: scene.device: the page needs a model for all rates, not a response or a sampled system; "
+            "use zwidth check or zwidth run"
         )
     bare = isinstance(given, NormalizedScene)
     controls = normalized_controls(0, 0, given.delta, given.d) if bare else Controls(_in_seconds(given.to_scene()))
@@ -290,14 +290,14 @@ def _show_scene(given: Any, origin: Any) -> Controls:
 
 
 def to_link(controls: Controls) -> str:
-    """The scene as the part of an address behind its ``#``, which any explorer opens: ``mass=100+g&damping=...``."""
+    """Return the scene as the fragment of an address, ``mass=100+g&damping=...``, which any explorer opens."""
     section = _spell_section(controls).items()
     texts = {name: own if isinstance(own, str) else json.dumps(own, separators=(",", ":")) for name, own in section}
     return urlencode(texts, safe="/{}[]:,")
 
 
 def read_link(link: str) -> Controls:
-    """The view that `to_link` has spelled."""
+    """Return the controls for a fragment written by `to_link`."""
     try:
         section = {name: _read_value(text) for name, text in parse_qsl(link, strict_parsing=True, max_num_fields=99)}
     except (ValueError, RecursionError):
@@ -308,21 +308,21 @@ def read_link(link: str) -> Controls:
 
 
 def _read_value(text: str) -> Any:
-    """A number, a list or a part as JSON has it, else the text."""
+    """Parse a value as JSON; return other texts unchanged."""
     with suppress(json.JSONDecodeError):
         return json.loads(text)
     return text
 
 
 def _spell_section(controls: Controls) -> dict[str, Any]:
-    """The section ``scene`` of a configuration; quantities have their units."""
+    """Return the section ``scene`` of a configuration; quantities have units."""
     if controls.normalized:
         return {name: value for name, value in controls.shown().items() if name != "mode"}
     return _add_units(spell_scene(controls.scene), controls.scene.unit_system)
 
 
 def _add_units(value: Any, system: UnitSystem, path: str = "") -> Any:
-    """Return a section with all numbers as text with the unit of their path."""
+    """Return a section with each quantity as a text with its unit, which follows from its path."""
     if isinstance(value, dict):
         return {name: _add_units(part, system, f"{path}.{name}".lstrip(".")) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -332,7 +332,7 @@ def _add_units(value: Any, system: UnitSystem, path: str = "") -> Any:
 
 
 def to_yaml(controls: Controls) -> str:
-    """A configuration: the scene, its stable walls and, of a rigid device, the passive ones and the response."""
+    """Return a configuration with the scene and studies of its stable walls and, if rigid, its step response."""
     scene = controls.scene
     studies: list[dict[str, Any]] = [{"kind": "boundary", "name": "stable_walls"}]
     if not scene.parts_beyond:
@@ -342,7 +342,7 @@ def to_yaml(controls: Controls) -> str:
 
 
 def to_python(controls: Controls) -> str:
-    """A script that builds the scene, judges its wall and draws the stable set."""
+    """Return a script that builds the scene, checks its wall and draws the stable walls."""
     system = controls.scene.unit_system
     units = None if controls.normalized else system
     parts = spell_part(controls.scene).items()

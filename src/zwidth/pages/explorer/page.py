@@ -240,8 +240,10 @@ class Page:
         self.update(dict(zip(names, place, strict=True)), rest=True)
 
     def update(self, changes: dict[str, Any], *, rest: bool, link: str | None = None) -> None:
-        """Show what follows a drag at once, and have the rest computed where the slider rests."""
-        # A link is the scene to begin with, as the page's address has it; an empty one is that of the first visit.
+        """Show fast results of changed controls; if the slider rests, also start the computation of the others.
+
+        ``link`` is the fragment of the page's address; "" is that of the first visit.
+        """
         try:
             with IMPORTING:
                 before = self.controls if link is None else read_link(link) if link else self.start
@@ -250,7 +252,7 @@ class Page:
         except Exception as error:
             self.tell({"error": _explain(error), "state": self.controls.shown(), "busy": False})
             return
-        # A refused value does not cancel the computation for the state that stays shown.
+        # Cancel older computations only now, because a refused change keeps the state for which they run.
         self.generation += 1
         if rest:
             assert self.frame is not None, "it has just been shown"
@@ -311,11 +313,11 @@ class Page:
             self.sources[name].data = columns
 
     def tell(self, texts: dict[str, Any]) -> None:
-        """Send texts and numbers that the page writes by itself."""
+        """Send texts and numbers to the scripts of the page."""
         self.answer.data = {"json": [json.dumps({"serial": self.serial, **texts})]}
 
     def _compute(self, generation: int, scene: Scene, *frame: model.Range, **wanted: bool) -> None:
-        """In the worker's thread: compute part by part, unless something newer is wanted."""
+        """Compute part by part, in the worker's thread, until a newer change cancels the computation."""
         try:
             for update in compute_details(scene, *frame, **wanted):
                 if generation != self.generation:
@@ -323,7 +325,7 @@ class Page:
                 self._hand_over(generation, update)
             self._hand_over(generation, {"busy": False})
         except Exception as error:
-            # What belongs to the wall before goes.
+            # Clear the verdict, which belongs to the previous wall.
             self._hand_over(generation, {"error": _explain(error), "verdict": "", "busy": False})
 
     def close(self) -> None:

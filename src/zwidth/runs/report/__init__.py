@@ -1,1 +1,1 @@
-"""A finished run as one HTML file that needs no server and no network."""
+"""The report of a finished run: one HTML file that works without a server and without a network."""

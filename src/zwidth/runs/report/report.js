@@ -1,5 +1,5 @@
 "use strict";
-// Slices of stored maps: every block holds its numbers; nothing is fetched.
+// Draw the maps of the report. Each block contains its values as JSON; the script loads nothing from a network.
 (() => {
   const spell = (value, digits = 6) => typeof value === "string" ? value : Number(value.toPrecision(digits)).toString();
 
@@ -43,15 +43,16 @@
       });
       tell();
     }
-    // The place of a value among the cells of an axis, from 0 to their number.
+    // Return the position of a value on an axis, in cells: from 0 to the number of cells.
     function place(steps, value) {
       const up = steps[steps.length - 1] >= steps[0];
       let k = steps.findIndex((step) => up ? step > value : step < value);
       k = Math.min(Math.max(k < 0 ? steps.length - 1 : k, 1), steps.length - 1);
       return k - 0.5 + (value - steps[k - 1]) / (steps[k] - steps[k - 1]);
     }
-    // Round values where the steps are even, or their ratios over a decade or more, else some of the steps themselves. Many
-    // steps may be chosen ones of a finer map, each off by half of its steps.
+    // Return the ticks of an axis: round numbers if the values are evenly spaced (linearly, or logarithmically over at
+    // least a decade), otherwise some of the values. The tolerance is larger for many values, because these may be a
+    // selection from a finer grid, each off by up to half a step of that grid.
     function ticks(steps, most) {
       const last = steps.length - 1, span = Math.abs(steps[last] - steps[0]), slack = last > 20 ? 0.6 : 0.01;
       const low = Math.min(steps[0], steps[last]), number = typeof steps[0] === "number";
@@ -95,7 +96,7 @@
       const named = (axis) => axis.unit ? `${axis.name} in ${axis.unit}` : axis.name;
       write(named(data.x), left + across / 2, high - 8, "center", across);
       pen.save(); pen.translate(9, top + up / 2); pen.rotate(-Math.PI / 2); write(named(data.y), 0, 0, "center", up); pen.restore();
-      // The colors, and what they stand for at both ends and in the middle.
+      // Draw the color bar, with the values at its ends and in its middle.
       const bar = left + across + 12;
       for (let k = 0; k < up; k++) { pen.fillStyle = `rgb(${color(data.truth ? +(k < up / 2) : 1 - k / up)})`; pen.fillRect(bar, top + k, 12, 1.5); }
       // Draw an arrow at each end of the color bar beyond which values lie; these values have the color of that end.
@@ -105,7 +106,7 @@
       }
       pen.fillStyle = style.color;
       const valueAt = (share) => logarithmic ? data.low * (data.high / data.low) ** share : data.low + share * (data.high - data.low);
-      // So few digits as leave each where it is between the ends.
+      // Use the fewest digits with which each printed value is within 1 % of the range of the color bar.
       const digits = [3, 4, 5, 6, 7].find((most) => [0, 0.5, 1].every((share) => Math.abs(spell(valueAt(share), most) - valueAt(share)) <= 0.01 * (data.high - data.low)));
       for (const share of data.truth ? [0.25, 0.75] : [0, 0.5, 1])
         write(data.truth ? (share > 0.5 ? "yes" : "no") : spell(valueAt(share), digits), bar + 16, top + Math.min(Math.max(up * (1 - share), 6), up - 6), "left", box.right - 30);
@@ -117,7 +118,7 @@
         for (let k = 0; k < points.length; k += 2)
           pen.lineTo(left + place(data.x.values, points[k]) / columns * across, top + up - place(data.y.values, points[k + 1]) / rows * up);
         pen.closePath();
-        // Seen on every color.
+        // Draw black on white, which is visible on every color.
         for (const [width, ink] of [[4, "#ffffff"], [2, "#000000"]]) { pen.lineWidth = width; pen.strokeStyle = ink; pen.stroke(); }
       }
       pen.restore();
@@ -130,7 +131,7 @@
     function tell() {
       draw();
       const value = values[offset() + at.row * columns + at.column];
-      const words = Number.isNaN(value) ? "not known" : !Number.isFinite(value) ? "infinite" : data.truth ? (value ? data.name : `not ${data.name}`) : spell(value);
+      const words = Number.isNaN(value) ? "no result" : !Number.isFinite(value) ? "infinite" : data.truth ? (value ? data.name : `not ${data.name}`) : spell(value);
       const known = (axis, k) => `${axis.name} = ${spell(axis.values[k])} ${axis.unit}`.trim();
       readout.textContent = `${known(data.x, at.column)}, ${known(data.y, at.row)}: ${words} ${data.truth ? "" : data.unit}`;
     }

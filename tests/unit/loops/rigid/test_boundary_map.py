@@ -5,7 +5,7 @@ import pytest
 
 from zwidth.arrays.held_mass import device
 from zwidth.loops.rigid import row_limit as maps
-from zwidth.loops.rigid.row_limit import long_lobe, long_row_point, row_limits
+from zwidth.loops.rigid.row_limit import build_long_lobe, find_limit_long_delay, row_limits
 from zwidth.loops.rigid.verdict import is_stable
 
 ROWS, COLUMNS = 331, 400
@@ -51,8 +51,8 @@ def test_every_layout_is_the_plain_comparison(make, layout):
         limit = np.stack([limit, 0.5 * limit])
         alpha = alpha[None]
     expected = (alpha > 0) & (alpha < limit)
-    assert expected.size >= maps._LARGE
-    got = maps._compare(alpha, limit)
+    assert expected.size >= maps.MIN_PATTERN_SIZE
+    got = maps._compare_with_limits(alpha, limit)
     assert got.dtype == bool
     np.testing.assert_array_equal(got, expected)
 
@@ -61,9 +61,9 @@ def test_few_long_rows_and_more_values_than_places():
     alpha = np.linspace(0.0, 1.0, 70_001)[None, :]
     for rows in (3, 9):
         limit = np.linspace(0.2, 0.9, rows)[:, None]
-        np.testing.assert_array_equal(maps._compare(alpha, limit), (alpha > 0) & (alpha < limit))
+        np.testing.assert_array_equal(maps._compare_with_limits(alpha, limit), (alpha > 0) & (alpha < limit))
     shuffled = np.random.default_rng(4).permutation(alpha[0])[None, :]
-    np.testing.assert_array_equal(maps._compare(shuffled, limit), (shuffled > 0) & (shuffled < limit))
+    np.testing.assert_array_equal(maps._compare_with_limits(shuffled, limit), (shuffled > 0) & (shuffled < limit))
 
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.0, 4.3, 50.0])
@@ -79,11 +79,11 @@ def test_a_map_and_its_points_one_by_one_agree(d):
 @pytest.mark.parametrize("d", [1.0, 2.5, 8.0, 60.0, 500.0])
 @pytest.mark.parametrize("delta", [0.0, 1e-8, 0.3, 4.0, 1e3, 1e6])
 def test_rows_are_solved_to_the_last_digits(d, delta, monkeypatch):
-    fields = long_lobe(device(np.float64(delta), np.float64(d)))
-    beta = np.linspace(0.0, 0.999, 500)[1:] * fields.top - delta
+    fields = build_long_lobe(device(np.float64(delta), np.float64(d)))
+    beta = np.linspace(0.0, 0.999, 500)[1:] * fields.end_b - delta
     limit = row_limits(beta, np.array([delta]), np.array([d]))
-    monkeypatch.setattr("zwidth.loops.rigid.row_limit._ROW_STEPS", 6)
-    more = long_row_point(beta, fields)[0]
+    monkeypatch.setattr("zwidth.loops.rigid.row_limit.ROW_STEPS", 6)
+    more = find_limit_long_delay(beta, fields)[0]
     # beta itself is known to an ulp of delta, which near the lobe's end is more of the limit.
     np.testing.assert_allclose(limit, more, rtol=1e-13, atol=2e-13 * more.max())
 

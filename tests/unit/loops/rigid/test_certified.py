@@ -56,7 +56,7 @@ def test_every_reference_label_is_found():
     left = filter_walls(*walls) == OPEN
     assert left.mean() < 0.2
     for alpha, beta, delta, d in zip(*(column[left].tolist() for column in walls), strict=True):
-        found = certified.verdict(alpha, beta, delta, d, certified.BITS[0])
+        found = certified.compute_verdict(alpha, beta, delta, d, certified.BITS[0])
         assert found.stable or found.unstable
 
 
@@ -217,7 +217,7 @@ def test_without_balls_open_points_are_undecided(monkeypatch):
 
 
 def test_too_little_precision_is_undecided(monkeypatch):
-    monkeypatch.setattr(certified, "verdict", lambda *_: Verdict(False, False))
+    monkeypatch.setattr(certified, "compute_verdict", lambda *_: Verdict(False, False))
     result = certified_stable(0.6, 0.5, 0.0, 0.0)
     assert (result.status, result.stable) == (Status.UNDECIDED, False)
 

@@ -64,7 +64,7 @@ def test_enclosures_shrink_with_the_precision():
 @pytest.mark.parametrize("bits", [128, 1024, 4096])
 def test_zeros_on_the_circle_are_never_labelled_by_precision(bits):
     # R = z^2 + 1 is left of P at alpha = 0, beta = 2, without delay and damping.
-    found = certified.verdict(0.0, 2.0, 0.0, 0.0, bits)
+    found = certified.compute_verdict(0.0, 2.0, 0.0, 0.0, bits)
     assert not found.stable
     assert not found.unstable
 
@@ -90,7 +90,7 @@ def test_what_is_exactly_on_the_circle_stays_undecided():
     for beta in (np.nextafter(2.0, 1.0), np.nextafter(2.0, 3.0)):
         expected = Status.ON_BOUNDARY if beta < 2 else Status.OK
         assert certified.decide(0.0, float(beta), 0.0, 0.0)[1] == expected
-        first = certified.verdict(0.0, float(beta), 0.0, 0.0, certified.BITS[0])
+        first = certified.compute_verdict(0.0, float(beta), 0.0, 0.0, certified.BITS[0])
         assert first.stable or first.unstable
 
 
@@ -98,8 +98,12 @@ def at_precision(alpha, beta, bits):
     """The verdict of a rational wall at delta = 0, d = 1."""
     with flint.ctx.workprec(bits):
         wall = flint.arb(alpha), flint.arb(beta)
-        return certified.long_verdict(
-            *wall, 1, certified.device(0.0, 1.0, bits), certified._enclose_zero, certified._take_lag
+        return certified.decide_long_delay(
+            *wall,
+            1,
+            certified.device(0.0, 1.0, bits),
+            certified._enclose_root_in_balls,
+            certified._evaluate_phase_in_balls,
         )
 
 

@@ -12,8 +12,14 @@ from proved import certified_stable
 import oracles
 from zwidth.arrays.held_mass import classify_delays, phi_functions
 from zwidth.loops.rigid import certified
-from zwidth.loops.rigid.certified import CROSSOVER_WIDTH, CUBIC_TOLERANCE, TOLERANCE, Sized, enclose_zero, size_device
-from zwidth.loops.rigid.crossover import gain_cubic, long_curve, long_verdict, short_curve, short_verdict
+from zwidth.loops.rigid.certified import CROSSOVER_WIDTH, CUBIC_TOLERANCE, TOLERANCE, Sized, enclose_root, size_device
+from zwidth.loops.rigid.crossover import (
+    decide_long_delay,
+    decide_short_delay,
+    expand_gain_difference,
+    expand_long_delay_curve,
+    expand_short_delay_curve,
+)
 
 flint = pytest.importorskip("flint")
 BITS = 400
@@ -40,7 +46,9 @@ def numbers(plant, exact):
     """Return the terms of a device and the coefficients of its curve, with their exact values."""
     names = [name for name, value in plant._asdict().items() if isinstance(value, Sized) and name not in ("p2", "tilt")]
     pairs = [(getattr(plant, name), getattr(exact, name)) for name in names]
-    for curve in (long_curve, short_curve) if exact.a0 is not None else (long_curve,):
+    for curve in (
+        (expand_long_delay_curve, expand_short_delay_curve) if exact.a0 is not None else (expand_long_delay_curve,)
+    ):
         parts = zip(curve(plant), curve(exact), strict=True)
         pairs += [pair for part in parts for pair in zip(*part, strict=True)]
     return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
@@ -123,26 +131,26 @@ def test_bounds_of_the_crossover_hold(d, monkeypatch):
     wall = Sized(alpha), Sized(beta)
     with np.errstate(all="ignore"):
         plant = size_device(delta, d, classify_delays(d))
-        cubic = gain_cubic(*wall, plant)
-        u, found = enclose_zero(cubic)
-        computed = certified.size_lag(u, np.floor(d))
+        cubic = expand_gain_difference(*wall, plant)
+        u, found = enclose_root(cubic)
+        computed = certified.size_phase(u, np.floor(d))
     differences = computed_differences(
-        monkeypatch, lambda: long_verdict(*wall, plant.whole, plant, enclose_zero, certified.size_lag)
+        monkeypatch, lambda: decide_long_delay(*wall, plant.whole, plant, enclose_root, certified.size_phase)
     )
     seen = 0
     for index in range(alpha.size):
         exact = certified.device(delta[index], d[index], BITS)
         with flint.ctx.workprec(BITS):
             x, y = flint.arb(alpha[index]), flint.arb(beta[index])
-            true_cubic = gain_cubic(x, y, exact)
+            true_cubic = expand_gain_difference(x, y, exact)
             assert max(errors(cubic, true_cubic, index)) < CUBIC_TOLERANCE / 2
             assert max(errors(*numbers(plant, exact), index)) < CUBIC_TOLERANCE / 2
             if not found[index]:
                 continue
-            root, sure = certified._enclose_zero(true_cubic)
+            root, sure = certified._enclose_root_in_balls(true_cubic)
             assert sure
             assert float(abs(root / u.value[index] - 1).upper()) < CROSSOVER_WIDTH
-            lag = certified._take_lag(root, int(d[index]))
+            lag = certified._evaluate_phase_in_balls(root, int(d[index]))
             assert not computed.within[index] or lag.within
             assert not computed.beyond[index] or lag.beyond
             if not lag.within:
@@ -152,7 +160,7 @@ def test_bounds_of_the_crossover_hold(d, monkeypatch):
 
             def judge(a, b, terms, root=root, whole=int(d[index]), lag=lag):
                 phase = lag._replace(**{k: a.new(v) for k, v in lag._asdict().items() if isinstance(v, flint.arb)})
-                return long_verdict(a, b, whole, terms, lambda _: (a.new(root), True), lambda *_: phase)
+                return decide_long_delay(a, b, whole, terms, lambda _: (a.new(root), True), lambda *_: phase)
 
             true = exact_differences(judge, (x, y), exact)
             assert len(true) == len(differences)
@@ -172,12 +180,12 @@ def test_bounds_of_a_short_device_hold(d):
 def test_bounds_of_a_short_verdict_hold(d, monkeypatch):
     alpha, beta, delta, _ = walls(80, 13, d)
     plant = size_device(delta, np.full(80, d), classify_delays(d))
-    differences = computed_differences(monkeypatch, lambda: short_verdict(Sized(alpha), Sized(beta), plant))
+    differences = computed_differences(monkeypatch, lambda: decide_short_delay(Sized(alpha), Sized(beta), plant))
     compared = 0
     for index in range(80):
         with flint.ctx.workprec(BITS):
             wall, exact = (flint.arb(alpha[index]), flint.arb(beta[index])), certified.device(delta[index], d, BITS)
-            true = exact_differences(short_verdict, wall, exact)
+            true = exact_differences(decide_short_delay, wall, exact)
             assert len(true) == len(differences)
             # Skip differences without a finite value, because beyond the end of the lobe the root does not exist.
             kept = [k for k, value in enumerate(true) if value.is_finite()]

@@ -10,7 +10,7 @@ import pytest
 import oracles
 import zwidth
 from zwidth.loops.rigid.circle import factor_loop
-from zwidth.loops.rigid.pole_search import first_pair, slow_pole
+from zwidth.loops.rigid.pole_search import approximate_first_pair, approximate_slow_pole
 from zwidth.loops.rigid.pole_step import halley_step
 
 REFERENCE = Path(__file__).resolve().parents[3] / "reference"
@@ -130,7 +130,7 @@ def troubled_walls(count, rng):
 
 def follow_both(steps, loop, fractional):
     """The slow pole and the first pair of the ring, after so many steps from their starts."""
-    places = slow_pole(loop), first_pair(loop, fractional)
+    places = approximate_slow_pole(loop), approximate_first_pair(loop, fractional)
     for _ in range(steps):
         places = [halley_step(*place, loop, fractional) for place in places]
     return places

@@ -12,7 +12,7 @@ from compiling import compile_bends
 from scipy.optimize import linprog
 
 import zwidth
-from zwidth.loops.rigid.needed_damping import directions
+from zwidth.loops.rigid.needed_damping import find_directions
 from zwidth.loops.rigid.passivity import margin_at_one_delay, passive_stiffness_slope
 from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.words.errors import InputError
@@ -185,7 +185,7 @@ def needed_in_mpmath(alpha, beta, d):
 
 def directions_to_judge(random, d):
     """beta/alpha at all angles, near the two turns of the peak, and of both signs."""
-    turn = directions(np.float64(d))
+    turn = find_directions(np.float64(d))
     ratios = [*(10 ** random.uniform(-3, 4, 3) * (d + 0.1)), -(10 ** random.uniform(-3, 3))]
     for edge in turn:
         if 0 < edge < np.inf:

@@ -6,15 +6,21 @@ from bounds import bound_radius
 
 import zwidth
 from zwidth.loops.rigid.folding import Points, fold
-from zwidth.loops.rigid.outermost_poles import FEW_FOR_CELLS, SMALLEST_MAP, area_poles, as_area, outermost_poles
-from zwidth.loops.rigid.pole_map import Area, follow_poles
+from zwidth.loops.rigid.outermost_poles import (
+    FEW_FOR_CELLS,
+    SMALLEST_MAP,
+    area_poles,
+    arrange_as_area,
+    compute_dominant_poles,
+)
+from zwidth.loops.rigid.pole_map import Area, compute_grid_poles
 from zwidth.words.status import Status
 
 ALPHA, BETA = np.linspace(-0.1, 1.5, 223), np.linspace(-0.3, 1.5, 157)
 
 
 def laid_out(*values):
-    return as_area(Points(*map(fold, np.broadcast_arrays(*map(np.asarray, values)))))
+    return arrange_as_area(Points(*map(fold, np.broadcast_arrays(*map(np.asarray, values)))))
 
 
 def check_against_points(found, walls, seed, count=1500):
@@ -57,12 +63,12 @@ def test_every_accuracy_is_kept(d, accuracy):
     rng = np.random.default_rng(3)
     alpha, beta = np.linspace(0.001, 1.5 / (1.0 + d), 320), np.linspace(0.0, 1.5 / (1.0 + d), 320)
     area = Area.whole(alpha[None], beta[None], np.array([0.1]), np.array([d]))
-    found = np.log(follow_poles(area, accuracy).radius[0])
+    found = np.log(compute_grid_poles(area, accuracy).radius[0])
     left = np.isnan(found)
     assert left.mean() < 0.1
     row, column = rng.integers(0, 320, (2, 2000))
     row, column = row[~left[row, column]], column[~left[row, column]]
-    exact = outermost_poles([alpha[column], beta[row], np.full(row.size, 0.1), np.full(row.size, d)], 1e-9)
+    exact = compute_dominant_poles([alpha[column], beta[row], np.full(row.size, 0.1), np.full(row.size, d)], 1e-9)
     assert (np.abs(found[row, column] - exact.re) <= accuracy + exact.error).all()
 
 
@@ -87,7 +93,7 @@ def test_lines_and_long_thin_maps_are_as_well_known(rows, columns, d):
     alpha, beta = np.linspace(1e-4, 1.2 / (1.0 + d), columns), np.linspace(0.3, 0.9, rows)
     walls = (alpha, beta[:, None], 0.1, d)
     area = Area.whole(alpha[None], beta[None], np.array([0.1]), np.array([d]))
-    assert np.isfinite(follow_poles(area, 1e-9).radius).mean() > 0.99
+    assert np.isfinite(compute_grid_poles(area, 1e-9).radius).mean() > 0.99
     check_against_points(bound_radius(*walls), walls, 5)
     rate, radius = zwidth.decay_rate(*walls), zwidth.spectral_radius(*walls)
     np.testing.assert_allclose(np.exp(-rate), radius, rtol=2e-9)
@@ -123,10 +129,10 @@ def test_two_poles_that_meet_are_followed_together(z, d, width):
     alpha, beta = double_pole(z, 0.1, d)
     alphas, betas = (middle * (1.0 + width * np.linspace(-1.0, 1.0, 64)) for middle in (alpha, beta))
     area = Area.whole(alphas[None], betas[None], np.array([0.1]), np.array([d]))
-    found = np.log(follow_poles(area, 1e-9).radius[0])
+    found = np.log(compute_grid_poles(area, 1e-9).radius[0])
     assert np.isnan(found).sum() < 64
     columns = [np.tile(alphas, 64), np.repeat(betas, 64), np.full(4096, 0.1), np.full(4096, d)]
-    alone = outermost_poles(columns, 1e-9)
+    alone = compute_dominant_poles(columns, 1e-9)
     error, known = np.abs(found - alone.re.reshape(64, 64)), ~np.isnan(found)
     assert (error <= 1e-9 + alone.error.reshape(64, 64))[known].all()
     # The double pole is the outermost one, known to the root of rounding.
@@ -159,11 +165,11 @@ def test_a_window_has_the_bits_of_the_whole_map(d, accuracy, longer):
 def test_poles_of_nearly_one_size_need_not_be_told_apart(d, low):
     """Of a coarse map next to all poles of a ring, and where the outermost one changes, cells find nearly all."""
     alpha, beta = np.linspace(1e-4, 0.9, 128) / (1.0 + d), np.linspace(0.1, 0.54, 128)
-    found = follow_poles(Area.whole(alpha[None], beta[None], np.array([0.5]), np.array([d])), 1e-2).radius[0]
+    found = compute_grid_poles(Area.whole(alpha[None], beta[None], np.array([0.5]), np.array([d])), 1e-2).radius[0]
     known = ~np.isnan(found)
     assert known.mean() > low
     row, column = np.nonzero(known)
-    alone = outermost_poles([alpha[column], beta[row], np.full(row.size, 0.5), np.full(row.size, d)], 1e-9)
+    alone = compute_dominant_poles([alpha[column], beta[row], np.full(row.size, 0.5), np.full(row.size, d)], 1e-9)
     assert (np.abs(np.log(found[known]) - alone.re) <= 1e-2 + alone.error).all()
     stable = zwidth.is_stable(alpha[column], beta[row], 0.5, d)
     sure = np.abs(alone.re) > 1.1e-5
@@ -173,8 +179,8 @@ def test_poles_of_nearly_one_size_need_not_be_told_apart(d, low):
 def test_cells_know_the_pair_of_a_short_delay_that_is_neither_slow_nor_of_the_ring():
     """From half the angle of the ring's first pair; from that pair and from the slow one steps lead to real poles."""
     alpha, beta, device = np.linspace(0.31, 0.37, 100), np.linspace(0.55, 0.62, 100), (0.1, 0.37)
-    found = follow_poles(Area.whole(alpha[None], beta[None], *np.transpose([device])), 1e-9).radius[0]
+    found = compute_grid_poles(Area.whole(alpha[None], beta[None], *np.transpose([device])), 1e-9).radius[0]
     assert np.isfinite(found).mean() > 0.95
     row, column = np.nonzero(np.isfinite(found))
-    alone = outermost_poles([alpha[column], beta[row], *(np.full(row.size, x) for x in device)], 1e-9)
+    alone = compute_dominant_poles([alpha[column], beta[row], *(np.full(row.size, x) for x in device)], 1e-9)
     assert (np.abs(np.log(found[row, column]) - alone.re) <= 1e-9 + alone.error).all()

@@ -15,7 +15,7 @@ from waiting import LONGEST
 
 import oracles
 import zwidth
-from zwidth.loops.rigid.outermost_poles import outermost_poles
+from zwidth.loops.rigid.outermost_poles import compute_dominant_poles
 from zwidth.loops.rigid.pole_search import quick_kernel
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
@@ -154,7 +154,7 @@ def test_many_walls_inside_jit_are_those_called_directly(labels):
     with np.errstate(all="ignore"):
         alpha, beta, delta, d = walls
         found = quick_kernel(alpha, beta, delta, d, np.full(alpha.size, 3e-10), fractional=True)
-    left = np.flatnonzero(~found.proved)
+    left = np.flatnonzero(~found.certified)
     # A pair next to 1 and two real poles next to -1 blur the count right outside of them.
     blurred = np.array(
         [
@@ -182,7 +182,7 @@ def test_many_walls_inside_jit_are_those_called_directly(labels):
 
 def test_poles_that_are_compiled_are_those_that_are_not(labels):
     columns = [labels[name][::7] for name in ("alpha", "beta", "delta", "d")]
-    few, many = (outermost_poles(columns, 1e-9, route) for route in ("numpy", "jax"))
-    assert few.proved.sum() > 100
-    np.testing.assert_array_equal(many.proved, few.proved)
-    np.testing.assert_allclose(many.re[few.proved], few.re[few.proved], rtol=0, atol=2e-9)
+    few, many = (compute_dominant_poles(columns, 1e-9, route) for route in ("numpy", "jax"))
+    assert few.certified.sum() > 100
+    np.testing.assert_array_equal(many.certified, few.certified)
+    np.testing.assert_allclose(many.re[few.certified], few.re[few.certified], rtol=0, atol=2e-9)

@@ -41,7 +41,7 @@ def test_a_pole_is_as_near_as_is_said(d):
             with mp.workdps(60):
                 z = mp.exp(re) * mp.expj(im)
                 nearest = min(abs(pole / z - 1) for pole in poles)
-            assert nearest <= step.within
+            assert nearest <= step.radius
             re, im = re + step.re, im + step.im
             if not abs(im) <= np.pi:
                 break

@@ -143,7 +143,7 @@ def test_thousands_of_poles_say_what_they_would_take(d):
 
         check_degree(d)
         return
-    with pytest.raises(InputError, match=r"poles would take about .* MB and .* s a point"):
+    with pytest.raises(InputError, match=r"poles need about .* MB and .* s per point"):
         zwidth.poles(0.1, 0.1, 0.1, d)
 
 

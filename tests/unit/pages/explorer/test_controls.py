@@ -94,7 +94,7 @@ def test_what_cannot_be_is_refused_by_its_name(change, says):
 def test_configurations_set_their_own_scene_or_say_why_not(file):
     given: Any = zwidth.load_config(file).scene
     if given is None or getattr(given, "device", None) is not None:
-        says = "scene: missing" if given is None else "scene.device: the page shows poles and motions at any rate"
+        says = "scene: missing" if given is None else "scene.device: the page needs a model for all rates"
         with pytest.raises(zwidth.InputError, match=says):
             read_controls(file)
         return

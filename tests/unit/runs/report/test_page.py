@@ -95,7 +95,7 @@ def test_slices_hold_what_the_store_holds(run, page):
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(StoreError, match="holds no run"):
+    with pytest.raises(StoreError, match="contains no run"):
         zwidth.write_report(tmp_path)
 
 
@@ -134,7 +134,7 @@ def test_a_store_behind_a_link_is_not_shown(run, tmp_path):
     (tmp_path / "out" / "plane.zarr").rename(tmp_path / "elsewhere.zarr")
     (tmp_path / "out" / "plane.zarr").symlink_to(tmp_path / "elsewhere.zarr")
     text = zwidth.write_report(tmp_path / "out").read_text(encoding="utf-8")
-    assert "plane.zarr is a link, and not shown" in text
+    assert "plane.zarr is a link and is not shown" in text
     assert "application/json" not in text
 
 
@@ -176,7 +176,7 @@ def test_a_sweep_over_one_parameter_has_its_curve_and_a_map_without_edges_names_
     assert "<figcaption>top_alpha_max</figcaption>" in page
     assert "<figcaption>tops_alpha_max</figcaption>" not in page
     assert page.count('<div class="slices">') == 1
-    assert "exact edges" not in page
+    assert "exact boundary" not in page
 
 
 def test_the_day_of_a_run_is_told_as_people_write_it(page):
@@ -192,7 +192,7 @@ def test_a_study_that_an_interrupted_run_never_began_is_named(tmp_path, monkeypa
     assert zwidth.run({"version": 1, "name": "example", "studies": [TOP, *walls]}, out=tmp_path).interrupted
     page = zwidth.write_report(tmp_path).read_text(encoding="utf-8")
     for name in ("walls", "more"):
-        assert f"<strong>{name} is not here</strong>, for it is not finished; " in page
+        assert f"<strong>{name} is missing</strong> because it is not finished; " in page
 
 
 def test_a_study_that_failed_is_told_and_has_no_section(tmp_path, monkeypatch):
@@ -203,7 +203,7 @@ def test_a_study_that_failed_is_told_and_has_no_section(tmp_path, monkeypatch):
     walls = {"kind": "boundary", "name": "walls", "delta": 0.1, "d": 1}
     assert not zwidth.run({"version": 1, "name": "example", "studies": [TOP, walls]}, out=tmp_path).ok
     page = zwidth.write_report(tmp_path).read_text(encoding="utf-8")
-    assert "<strong>top is not here</strong>, for it failed: ValueError: &lt;no luck&gt;; " in page
+    assert "<strong>top is missing</strong> because it failed: ValueError: &lt;no luck&gt;; " in page
     assert 'id="top"' not in page
     assert 'id="walls"' in page
 
@@ -231,4 +231,4 @@ def test_a_map_has_the_colors_of_its_figure(tmp_path):
                 assert blocks[name]["extend"] == bar._colorbar.extend
     assert blocks["alpha_max"]["high"] > 1e4 * blocks["alpha_max"]["low"]
     assert blocks["settling_time"]["extend"] == "max"
-    assert "above: arrow" in page
+    assert "higher values: arrow" in page
