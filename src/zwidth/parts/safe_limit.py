@@ -84,5 +84,5 @@ class SafeLimit(Part):
 
 
 def reserve_damping(scene: Any) -> float:
-    """Return the physical damping in N s/m that does not count for passivity, according to the safe limit of a scene."""
+    """Return the physical damping of a device that does not count for passivity, from the safe limit of its scene."""
     return 0.0 if scene.safe_limit is None else scene.safe_limit.damping_reserve
