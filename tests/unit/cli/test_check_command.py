@@ -277,7 +277,7 @@ def test_a_coded_period_that_is_not_the_loop_s_is_pointed_out():
         (["--velocity-order", "2"], "--velocity-order does not belong to a velocity estimate of kind"),
         (["--velocity-kind", "butterworth"], "needs --velocity-cutoff"),
         (["--coupling-mass", "1"], "a coupling has a mass and a stiffness; give --coupling-stiffness"),
-        (["--operator-coupling-damping", "1"], "'--operator-coupling-damping': got 1.0 without a spring"),
+        (["--operator-coupling-damping", "1"], "'--operator-coupling-damping': got 1.0 without a coupling spring"),
         (["--operator-mass", "70 gg"], "'--operator-mass': got '70 gg'; the units allowed are kg, g, mg"),
     ],
 )
